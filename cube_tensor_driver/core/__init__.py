@@ -1,0 +1,1 @@
+"""Physics of the cubic stress tensor sensor: numpy only, no I/O, no clock, no ROS."""

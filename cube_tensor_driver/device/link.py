@@ -1,0 +1,310 @@
+"""One link: a byte stream from and to a hub over a serial port, a pseudo-terminal or TCP.
+
+Nothing here blocks or waits, keeps a thread or knows a frame; `reader` drives it. Serial ports are opened by
+pyserial (``serial_for_url``) and read with ``os.read``, which takes all there is in one call per 4 kB. What
+goes wrong is a `LinkError` whose `kind` is one word and whose text names the fix:
+
+    no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
+    refused  no_answer  unreachable  unresolved                       opening a TCP link
+    lost  overflow                                                    while open
+    silent  wrong_hub                                                 found by the reader
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import glob
+import os
+import socket
+import struct
+import termios
+from dataclasses import dataclass
+from enum import Enum
+
+import serial
+
+from ..core.errors import LinkError
+from .protocol import Decoder, Hello
+from .tcp import Connecting, parse_url
+
+READ_CHUNK = 1 << 16
+READ_LIMIT = 1 << 18
+"""Bytes taken from one link per wake-up; a link that floods leaves the others their turn."""
+OUT_LIMIT = 4096
+BACKOFF_S = (0.25, 5.0)
+BACKOFF_TCP_S = 1.5
+"""Nothing announces that a TCP peer is back, so a longer pause would break "back within 2 s"."""
+
+_NO_PERMISSION = "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
+_OPEN_ERRORS = {
+    errno.ENOENT: ("no_port", "plug the hub in or correct the port"),
+    errno.ENXIO: ("no_port", "nothing is behind this port: plug the hub in or correct the port"),
+    errno.ENODEV: ("no_port", "nothing is behind this port: plug the hub in or correct the port"),
+    errno.EIO: ("no_port", "nothing is behind this port: plug the hub in or correct the port"),
+    errno.EACCES: ("no_permission", _NO_PERMISSION),
+    errno.EPERM: ("no_permission", _NO_PERMISSION),
+    errno.EBUSY: ("busy", "another program has it open: end that one (fuser -v shows which)"),
+    errno.EAGAIN: ("busy", "another program has it open: end that one (fuser -v shows which)"),
+    errno.ENOTTY: ("not_serial", "this is no serial port: correct the port"),
+    errno.EINVAL: ("not_serial", "this is no serial port: correct the port"),
+    errno.EISDIR: ("not_serial", "this is no serial port: correct the port"),
+    errno.ENOTDIR: ("not_serial", "this is no serial port: correct the port"),
+}
+
+
+class LinkState(str, Enum):
+    """closed: not in use. waiting: not there yet, tried again with back-off. open: port open. silent: open,
+    but no sample for max(3 sample periods, 0.2 s) although samples were asked for."""
+
+    CLOSED = "closed"
+    WAITING = "waiting"
+    OPEN = "open"
+    SILENT = "silent"
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """Where a hub is.
+
+    port: device path, which may be a pattern such as ``/dev/ttyACM*`` (each match is tried in turn, which
+    finds a hub that comes back under another name), or ``socket://host:port``, or another URL that pyserial
+    opens. baud: ignored by USB and TCP. hub_uid: the hub that must answer, None for any.
+    """
+
+    name: str
+    port: str
+    baud: int = 921_600
+    hub_uid: int | None = None
+
+
+class Link:
+    """One link. `state` and `error` are set by the reader; `decoder`, `hello` (the hub's last, or None) and
+    `counters` outlive reconnects."""
+
+    def __init__(self, config: LinkConfig) -> None:
+        """LinkError `bad_port`: no port at all, or a TCP address that is none."""
+        self.config = config
+        self.state = LinkState.CLOSED
+        self.error: LinkError | None = None
+        self.decoder = Decoder()
+        self.hello: Hello | None = None
+        self.opened = self.lost = self.silences = self.before_hello = self.bytes_out = 0
+        self.path = config.port
+        self.is_pattern = "://" not in config.port and glob.has_magic(config.port)
+        self._tcp = config.port.startswith("socket://")
+        self._stream: serial.SerialBase | socket.socket | None = None
+        self._connecting: Connecting | None = None
+        self._fd = -1
+        self._out = bytearray()
+        self._backoff = BACKOFF_S[0]
+        self._turn = 0
+        if self._tcp:
+            parse_url(config.port)
+        elif not config.port:
+            raise LinkError(
+                f"link {config.name!r} has an empty port: name a device path or socket://host:port",
+                "bad_port",
+            )
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """The decoder's counters and: opened, lost (while open), silences, before_hello (samples not
+        delivered because the hub had not said yet who it is), bytes_out."""
+        names = ("opened", "lost", "silences", "before_hello", "bytes_out")
+        return {**self.decoder.counters.as_dict(), **{name: getattr(self, name) for name in names}}
+
+    @property
+    def is_open(self) -> bool:
+        return self._stream is not None
+
+    @property
+    def unsent(self) -> bool:
+        """Whether bytes wait in our buffer for room in the kernel's."""
+        return bool(self._out)
+
+    def fileno(self) -> int:
+        return self._fd
+
+    def open(self) -> bool:
+        """Take one step towards open; True when open, False while a TCP connection is under way (call again).
+
+        LinkError when this attempt failed.
+        """
+        if self._tcp:
+            self._open_tcp()
+        else:
+            self._open_serial()
+        if self._stream is None:
+            return False
+        self._fd = self._stream.fileno()
+        self.opened += 1
+        return True
+
+    def read(self) -> bytes:
+        """All there is, up to READ_LIMIT; b"" if nothing. LinkError `lost` when the other end is gone."""
+        chunks: list[bytes] = []
+        size = 0
+        try:
+            while size < READ_LIMIT:
+                chunk = os.read(self._fd, READ_CHUNK)
+                if not chunk:
+                    raise OSError(errno.EIO, "end of stream")
+                chunks.append(chunk)
+                size += len(chunk)
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            # What came before the loss is delivered first; the next call finds the loss again.
+            if not chunks:
+                raise self._lost(error) from error
+        return chunks[0] if len(chunks) == 1 else b"".join(chunks)
+
+    def write(self, data: bytes) -> None:
+        """Send without waiting; what the kernel does not take now waits for `flush`.
+
+        LinkError `overflow`: OUT_LIMIT bytes already wait, the hub does not read. LinkError `lost`.
+        """
+        if len(self._out) + len(data) > OUT_LIMIT:
+            raise LinkError(
+                f"{self.path}: the hub has not taken the last {len(self._out)} bytes (limit {OUT_LIMIT}): "
+                "check flow control, or replug it",
+                "overflow",
+            )
+        self._out += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what waits, as far as the kernel takes it. LinkError `lost`."""
+        try:
+            while self._out:
+                sent = os.write(self._fd, self._out)
+                self.bytes_out += sent
+                del self._out[:sent]
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def draining(self) -> bool:
+        """Whether bytes sent are still on their way out of this machine's serial port."""
+        if self._tcp or self._stream is None:
+            return False
+        try:
+            (waiting,) = struct.unpack("i", fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0" * 4))
+        except OSError:
+            return False
+        return bool(self._out) or waiting > 0
+
+    def close(self) -> None:
+        """Close at once, whatever the state; safe to call twice. A half-received frame is counted as
+        framing."""
+        if self._connecting is not None:
+            self._connecting.close()
+            self._connecting = None
+        if self._stream is not None:
+            if self.draining():
+                # Else the kernel waits up to 30 s for a hub that does not read.
+                with contextlib.suppress(termios.error):
+                    termios.tcflush(self._fd, termios.TCOFLUSH)
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            self._stream = None
+            self.decoder.reset()
+        self._fd = -1
+        self._out.clear()
+
+    def next_pause(self) -> float:
+        """Seconds until the next attempt: 0.25, 0.5, 1 … 5 (TCP 1.5)."""
+        pause = self._backoff
+        self._backoff = min(2 * pause, BACKOFF_TCP_S if self._tcp else BACKOFF_S[1])
+        return pause
+
+    def reset_pause(self) -> None:
+        """The hub answered: the next loss starts at the shortest pause again."""
+        self._backoff = BACKOFF_S[0]
+
+    def next_candidate(self) -> None:
+        """The port opened is not the one wanted: begin with the next match of the pattern."""
+        self._turn += 1
+
+    def fingerprint(self) -> tuple[object, ...]:
+        """What the port's path leads to now; a change means that trying again is worth it at once."""
+        return () if self._tcp else tuple(_identity(path) for path in self._candidates())
+
+    def _candidates(self) -> list[str]:
+        return sorted(glob.glob(self.config.port)) if self.is_pattern else [self.config.port]
+
+    def _open_serial(self) -> None:
+        paths = self._candidates()
+        error = LinkError(
+            f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port"
+        )
+        for i in range(len(paths)):
+            self.path = paths[(self._turn + i) % len(paths)]
+            try:
+                self._stream = _open_port(self.path, self.config.baud)
+                self._turn += i
+                return
+            except LinkError as failure:
+                error = failure
+        raise error
+
+    def _open_tcp(self) -> None:
+        if self._connecting is None:
+            self._connecting = Connecting(self.config.port)
+        try:
+            self._stream = self._connecting.poll()
+        except LinkError:
+            self._connecting = None
+            raise
+        if self._stream is not None:
+            self._connecting = None
+
+    def _lost(self, error: OSError) -> LinkError:
+        reason = error.strerror or str(error)
+        return LinkError(
+            f"{self.path}: connection lost ({reason}): replug the hub, it is taken up again by itself", "lost"
+        )
+
+
+def open_error(path: str, error: BaseException) -> LinkError:
+    """What a failed attempt to open `path` means, in words: kinds of the module's first line."""
+    code = getattr(error, "errno", None)
+    if code is None and isinstance(error.__context__, termios.error):
+        # pyserial swallows the number of the errors that termios reports.
+        code = error.__context__.args[0]
+    if code in _OPEN_ERRORS:
+        kind, fix = _OPEN_ERRORS[code]
+        return LinkError(f"{path}: {os.strerror(code)}: {fix}", kind)
+    return LinkError(f"{path}: cannot open it ({error}): correct the port", "bad_port")
+
+
+def _open_port(path: str, baud: int) -> serial.SerialBase:
+    try:
+        # inter_byte_timeout=0 is VMIN=1: reading nothing is then EAGAIN, and b"" only ever means unplugged.
+        port = serial.serial_for_url(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
+    except OSError as error:
+        raise open_error(path, error) from error
+    except ValueError as error:
+        kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"
+        raise LinkError(f"{path} at {baud} baud: {error}: correct the port or the baud rate", kind) from error
+    try:
+        port.fileno()
+    except (AttributeError, OSError) as error:
+        port.close()
+        raise LinkError(
+            f"{path}: this kind of port cannot be waited on: use a device path or socket://", "bad_port"
+        ) from error
+    with contextlib.suppress(ValueError, AttributeError, NotImplementedError, OSError):
+        port.set_low_latency_mode(True)
+    return port
+
+
+def _identity(path: str) -> tuple[object, ...] | None:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return path, found.st_ino, found.st_rdev, found.st_mode, found.st_uid, found.st_gid

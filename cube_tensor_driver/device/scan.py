@@ -1,0 +1,177 @@
+"""From samples of hubs to rows of a skin: which cube a value belongs to, and when a scan of all links is complete.
+
+A row is one sample of one cube. Rows that belong to no cube of the skin, or to a cube with another number of pads, are
+counted and left out. Nothing here looks at a value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Hello, Sample
+
+
+class Place(NamedTuple):
+    """Where the skin says a cube is: by uid on any link or on `link`, or by link and index. n_pads: of its layout."""
+
+    name: str
+    link: int | None
+    index: int | None
+    uid: int | None
+    n_pads: int
+
+
+class Rows(NamedTuple):
+    """Rows of one scan, earliest first within a link.
+
+    cube (N,) uint16 index in the skin; sequence (N,) uint32; stamp_ns (N,) int64, node clock; frequency (N, P) float32 Hz,
+    NaN not measured; temperature (N,) float32 °C, NaN unknown; pad_fault (N,) uint32.
+    """
+
+    cube: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    stamp_ns: NDArray[np.int64]
+    frequency: NDArray[np.float32]
+    temperature: NDArray[np.float32]
+    pad_fault: NDArray[np.uint32]
+
+
+class Scan:
+    """Gathers the samples of all links between two messages.
+
+    rows: delivered so far; unknown_cube, wrong_pads: rows left out because the skin does not have the cube, or has it
+    with another number of pads.
+    """
+
+    def __init__(self, n_links: int, places: Sequence[Place]) -> None:
+        self.rows = self.unknown_cube = self.wrong_pads = 0
+        self.n_pads = max(place.n_pads for place in places)
+        self._places = tuple(places)
+        self._pads = np.array([place.n_pads for place in places])
+        self._cubes: list[NDArray[np.int32]] = [np.empty(0, np.int32) for _ in range(n_links)]
+        self._hellos: list[Hello | None] = [None] * n_links
+        self._live = [False] * n_links
+        self._gathered: list[list[tuple[Sample, int]]] = [[] for _ in range(n_links)]
+
+    def hello(self, link: int, frame: Hello) -> list[str] | None:
+        """Learn which cubes a link carries. Returns what does not fit the skin, in words; None if nothing changed."""
+        last = self._hellos[link]
+        if (
+            last is not None
+            and last.n_pads == frame.n_pads
+            and np.array_equal(last.cube_uids, frame.cube_uids)
+        ):
+            return None
+        self._hellos[link] = frame
+        cubes = np.full(frame.n_cubes, -1, np.int32)
+        uids = {int(uid): index for index, uid in enumerate(frame.cube_uids)}
+        problems = []
+        for number, place in enumerate(self._places):
+            if place.uid is not None:
+                index = uids.get(place.uid)
+                if index is None and place.link == link:
+                    problems.append(f"cube {place.name}: the hub has no cube with uid {place.uid:#x}")
+                elif index is not None and place.link not in (None, link):
+                    problems.append(
+                        f"cube {place.name}: uid {place.uid:#x} is on this link, the skin says another one"
+                    )
+                    index = None
+            else:
+                index = place.index if place.link == link else None
+                if index is not None and index >= frame.n_cubes:
+                    problems.append(
+                        f"cube {place.name}: index {index}, but the hub has {frame.n_cubes} cubes"
+                    )
+                    index = None
+            if index is None:
+                continue
+            cubes[index] = number
+            if place.n_pads != frame.n_pads:
+                problems.append(
+                    f"cube {place.name}: the hub reports {frame.n_pads} pads, its layout has {place.n_pads}; "
+                    "correct the layout and calibration in the skin file"
+                )
+        for index in np.flatnonzero(cubes < 0):
+            problems.append(
+                f"the hub's cube {index} (uid {int(frame.cube_uids[index]):#x}) is not in the skin file"
+            )
+        self._cubes[link] = cubes
+        return problems
+
+    def live(self, link: int, live: bool) -> None:
+        """Whether a link delivers samples now, so that a scan waits for it."""
+        self._live[link] = live
+
+    def add(self, link: int, sample: Sample, stamp_ns: int) -> None:
+        """One sample, with the time it was taken at in the node's clock."""
+        self._live[link] = True
+        self._gathered[link].append((sample, stamp_ns))
+
+    def complete(self) -> bool:
+        """Whether every live link has given a sample, or one has given a second before another gave its first."""
+        counts = [len(samples) for samples in self._gathered]
+        return max(counts) > 1 or all(
+            count or not live for count, live in zip(counts, self._live, strict=True)
+        )
+
+    def take(self) -> Rows | None:
+        """The rows gathered since the last time; None if there are none."""
+        parts: list[tuple[NDArray[np.uint16], Sample, int]] = []
+        for link, samples in enumerate(self._gathered):
+            for sample, stamp_ns in samples:
+                part = self._select(link, sample)
+                if part is not None:
+                    parts.append((*part, stamp_ns))
+            samples.clear()
+        if not parts:
+            return None
+        counts = [len(cube) for cube, _, _ in parts]
+        cube = np.concatenate([cube for cube, _, _ in parts])
+        self.rows += len(cube)
+        temperature = np.concatenate([sample.temperature for _, sample, _ in parts])
+        celsius = temperature.astype(np.float32) * np.float32(0.01)
+        celsius[temperature == TEMPERATURE_UNKNOWN] = np.nan
+        return Rows(
+            cube,
+            np.repeat(np.array([sample.sequence for _, sample, _ in parts], np.uint32), counts),
+            np.repeat(np.array([stamp_ns for _, _, stamp_ns in parts], np.int64), counts),
+            self._frequency([sample.frequency for _, sample, _ in parts]),
+            celsius,
+            np.concatenate([sample.pad_fault for _, sample, _ in parts]),
+        )
+
+    def _select(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
+        """The skin's cubes of a sample, and the sample without the rows that belong to none."""
+        cubes = self._cubes[link][sample.first_cube : sample.first_cube + sample.n_cubes]
+        known = cubes >= 0
+        fits = known & (self._pads[cubes] == sample.n_pads)
+        if len(cubes) == sample.n_cubes and fits.all():
+            return cubes.astype(np.uint16), sample
+        self.unknown_cube += sample.n_cubes - int(known.sum())
+        self.wrong_pads += int(known.sum() - fits.sum())
+        if not fits.any():
+            return None
+        rows = np.flatnonzero(fits)
+        frequency, pad_fault, temperature = (
+            sample.frequency[rows],
+            sample.pad_fault[rows],
+            sample.temperature[rows],
+        )
+        kept = Sample(sample.sequence, sample.first_cube, sample.device_us, frequency, pad_fault, temperature)
+        return cubes[rows].astype(np.uint16), kept
+
+    def _frequency(self, parts: list[NDArray[np.uint32]]) -> NDArray[np.float32]:
+        if all(part.shape[1] == self.n_pads for part in parts):
+            millihertz = np.concatenate(parts)
+        else:
+            narrow = [(part, self.n_pads - part.shape[1]) for part in parts]
+            millihertz = np.concatenate([np.pad(part, ((0, 0), (0, pads))) for part, pads in narrow])
+        # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.
+        hertz = (millihertz * 1e-3).astype(np.float32)
+        if millihertz.size and millihertz.min() == NOT_MEASURED:
+            hertz[millihertz == NOT_MEASURED] = np.nan
+        return hertz

@@ -1,0 +1,81 @@
+"""Meshes of the positive quarter or eighth of a box with a cube |x_k| <= 1 in its middle (lengths in d0).
+
+The stress is infinite at the corner (in 3-D the edges) of the cube, so elements shrink towards it. Pad edges
+are element ends. Everything is symmetric under exchange of axes where the box and the pads are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import skfem
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_RINGS = 26  # the corner element of half(0.5, 26 times) is 7e-9 d0: what it leaves out is below 1e-4 of any entry
+_DIRECTIONS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float)
+
+
+def section(half: Sequence[float], stops: Iterable[float], refine: int = 0) -> skfem.MeshTri:
+    """Triangles on [0, half[0]] x [0, half[1]], with self-similar rings around the cube's corner (1, 1).
+
+    stops: pad edges on [0, 1]; refine: how many times each triangle is cut in four.
+    """
+    inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
+    rho = min(0.5, 1.0 - inner[-1], *(h - 1.0 for h in half))
+    lines = [np.concatenate([_inner(inner, 1.0 - rho, 0.5), [1.0], _outer(1.0 + rho, h, rho, 2.0)]) for h in half]
+    base = skfem.MeshTri.init_tensor(*lines)
+    away = np.any(np.abs(base.p[:, base.t].mean(axis=1) - 1.0) > rho, axis=0)
+    ring, corner = _rings(rho)
+    points = np.concatenate([base.p.T, ring])
+    triangles = np.concatenate([base.t.T[away], corner + base.p.shape[1]])
+    unique, inverse = np.unique(points[triangles.ravel()], axis=0, return_inverse=True)
+    mesh = skfem.MeshTri(unique.T.copy(), inverse.reshape(-1, 3).T.copy())
+    return mesh.refined(refine) if refine else mesh
+
+
+def block(half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float) -> skfem.MeshHex:
+    """Bricks on the product of [0, half[k]]: size on the face, shrinking to `smallest` at the cube's edges."""
+    inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
+    fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
+    return skfem.MeshHex.init_tensor(
+        *(np.concatenate([_inner(inner, inner[-1], size), fine[1:], 1.0 + _graded(h - 1.0, smallest, growth)[1:]]) for h in half)
+    )
+
+
+def _inner(stops: Sequence[float], end: float, size: float) -> Array:
+    """Points through all stops to end, no further apart than size."""
+    stops = sorted({*stops, end})
+    steps = [np.linspace(a, b, int(np.ceil((b - a) / size - 1e-9)) + 1)[1:] for a, b in zip(stops, stops[1:])]
+    return np.concatenate([[stops[0]], *steps])
+
+
+def _outer(start: float, end: float, first: float, growth: float) -> Array:
+    """Points from start to end, both included, with steps that grow from about `first`."""
+    return np.array([start]) if start == end else start + _graded(end - start, first * growth, growth)
+
+
+def _graded(length: float, first: float, growth: float) -> Array:
+    """Points 0 ... length; steps grow by the same factor, starting at or below `first`."""
+    n = max(1, int(np.ceil(np.log1p(length * (growth - 1.0) / first) / np.log(growth) - 1e-9)))
+    steps = growth ** np.arange(n, dtype=float)
+    points = np.concatenate([[0.0], np.cumsum(steps)]) * (length / steps.sum())
+    points[-1] = length
+    return points
+
+
+def _rings(rho: float) -> tuple[Array, NDArray[np.int64]]:
+    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1), each half the size of the last."""
+    radii = rho * 0.5 ** np.arange(_RINGS + 1)
+    points = np.concatenate([1.0 + np.multiply.outer(radii, _DIRECTIONS).reshape(-1, 2), [[1.0, 1.0]]])
+    triangles = []
+    for k in range(_RINGS):
+        for j in range(0, 8, 2):  # j: mid of a side; its neighbours are corners
+            for i in ((j + 1) % 8, (j - 1) % 8):
+                out, out_corner, into, into_corner = 8 * k + j, 8 * k + i, 8 * k + 8 + j, 8 * k + 8 + i
+                triangles += [(out, out_corner, into_corner), (out, into_corner, into)]  # the shorter diagonal
+    last = 8 * _RINGS
+    triangles += [(last + j, last + (j + 1) % 8, len(points) - 1) for j in range(8)]
+    return points, np.array(triangles)

@@ -1,0 +1,157 @@
+"""Linear elasticity of a box with a bonded cube in its middle, solved in its positive quarter or eighth.
+
+Box and cube are symmetric under the mirrors x_k -> -x_k, so every load splits into parts of one *parity* (+1
+even or -1 odd for each axis), and each part is solved where all coordinates are positive. On the plane x_k = 0
+an even field has u_k = 0; an odd one has the other components zero. Lengths in units of d0.
+
+    int sigma(u) : eps(w) dV = int_outer w . (sigma_load n) dS = int sigma_load : eps(w) dV   for all w
+
+The last step holds because the load is in equilibrium; it also makes the loads balance to rounding.
+Source: T. J. R. Hughes, The Finite Element Method (1987), chapters 2 and 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+import skfem
+from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
+from skfem.helpers import ddot, sym_grad, trace
+
+from .pads import interval_weights
+
+Array = NDArray[np.float64]
+Parity = tuple[int, ...]
+
+_SAME = 1e-13  # coordinates are known to rounding; the smallest element is 1e-10
+
+
+def _at(x: Array, value: float | Array) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(x - value) < _SAME)
+
+
+def lame(young: float, poisson: float, plane: str = "strain") -> tuple[float, float]:
+    """Lame's lambda and mu, Pa; for plane stress the lambda that makes sigma_yy vanish."""
+    mu = young / (2.0 * (1.0 + poisson))
+    lam = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    return (2.0 * lam * mu / (lam + 2.0 * mu) if plane == "stress" else lam), mu
+
+
+@skfem.BilinearForm
+def _virtual_work(u, w, p):  # type: ignore[no-untyped-def]
+    e, d = sym_grad(u), sym_grad(w)
+    return p.lam * trace(e) * trace(d) + 2.0 * p.mu * ddot(e, d)
+
+
+@skfem.LinearForm
+def _load_work(w, p):  # type: ignore[no-untyped-def]
+    return ddot(p.sigma, sym_grad(w))
+
+
+class Solid:
+    """A meshed body with a cube; triangles of order 4 in the plane, 27-node bricks in space.
+
+    mesh  from elastic.mesh: the positive part of the box, lengths in d0
+    body  Lame's lambda and mu of the body
+    cube  the same of the cube, in the same unit, or None for a rigid one
+    """
+
+    def __init__(self, mesh: skfem.Mesh, body: tuple[float, float], cube: tuple[float, float] | None) -> None:
+        self.dim = int(mesh.dim())
+        self.order = 4 if self.dim == 2 else 2
+        element = skfem.ElementVector(skfem.ElementTriP4() if self.dim == 2 else skfem.ElementHex2())
+        inside = np.all(mesh.p[:, mesh.t].mean(axis=1) < 1.0, axis=0)
+        self.basis = skfem.Basis(mesh, element, intorder=2 * self.order)
+        self.place = self.basis.doflocs  # (dim, dofs)
+        self.component = np.zeros(self.basis.N, dtype=int)
+        for k in range(self.dim):
+            self.component[self.basis.get_dofs(elements=True).all(f"u^{k + 1}")] = k
+        self.rigid = cube is None
+        self.body = self._stiffness(inside == 0, body)
+        self.total = self.body if cube is None else self.body + self._stiffness(inside, cube)
+
+    def solve(self, parity: Parity, loads: Sequence[tuple[Array, Array]]) -> Array:
+        """Displacements (dofs, n) under n loads of one parity.
+
+        A load is the field sigma_ij = S_ij + G_ijk x_k: S (dim, dim), G (dim, dim, dim).
+        """
+        free = np.flatnonzero(~self._held(parity))
+        order = {"permc_spec": "MMD_AT_PLUS_A"}
+        if self.dim == 3:  # five times faster and half the memory of SuperLU's own ordering
+            free = free[nested_dissection(self.place[:, free])]
+            order = {"permc_spec": "NATURAL"}
+        forces = np.stack([self._forces(*load) for load in loads], axis=1)
+        matrix = self.total[free][:, free].tocsc()
+        factor = splu(matrix, diag_pivot_thresh=0.0, options={"SymmetricMode": True}, **order)
+        u = np.zeros_like(forces)
+        u[free] = factor.solve(forces[free])
+        return u
+
+    def reactions(self, u: Array) -> Array:
+        """Nodal forces (dofs, n) of the body on whatever holds it: on the cube's surface, those on the cube, reversed."""
+        return np.asarray(self.body @ u)
+
+    def mean_stress(self, reactions: Array, parity: Parity, axis: int, intervals: Sequence[tuple[float, float]]) -> Array:
+        """Mean normal stress (n,) on a pad of the face x_axis = 1, one interval in [-1, 1] per other axis."""
+        others = [k for k in range(self.dim) if k != axis]
+        x = self.place
+        dofs = np.flatnonzero((self.component == axis) & _at(x[axis], 1.0) & np.all(x[others] < 1.0 + _SAME, axis=0))
+        weights = np.ones(len(dofs))
+        for k, (start, stop) in zip(others, intervals):
+            nodes, index = np.unique(np.round(x[k, dofs], 14), return_inverse=True)
+            w = interval_weights(nodes, self.order, parity[k], start, stop)
+            weights *= w[index] / (stop - start)
+        return np.asarray(-weights @ reactions[dofs])
+
+    def _stiffness(self, elements: NDArray[np.bool_], lame_: tuple[float, float]) -> sp.csr_matrix:
+        part = skfem.Basis(
+            self.basis.mesh, self.basis.elem, elements=np.flatnonzero(elements), intorder=2 * self.order
+        )
+        return _virtual_work.assemble(part, lam=lame_[0], mu=lame_[1]).tocsr()
+
+    def _forces(self, stress: Array, gradient: Array) -> Array:
+        x = self.basis.default_parameters()["x"]
+        sigma = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, np.asarray(x))
+        return _load_work.assemble(self.basis, sigma=sigma)
+
+    def _held(self, parity: Parity) -> NDArray[np.bool_]:
+        """Which dofs are zero: by the mirrors, in a rigid cube, or to stop the one rigid motion that is left.
+
+        A rigid cube can be held altogether: the motion that its parity allows it is the body's own rigid motion.
+        """
+        x, c = self.place, self.component
+        held = np.zeros(len(c), dtype=bool)
+        for k, sign in enumerate(parity):
+            held |= _at(x[k], 0.0) & ((c == k) == (sign > 0))
+        if self.rigid:
+            return held | np.all(x < 1.0 + _SAME, axis=0)
+        odd = [k for k, sign in enumerate(parity) if sign < 0]
+        if len(odd) == 1:  # translation along the odd axis
+            held |= (c == odd[0]) & np.all(_at(x, 0.0), axis=0)
+        elif len(odd) == 2:  # rotation in the plane of the two
+            at = np.zeros(self.dim)
+            at[odd[1]] = 1.0
+            held |= (c == odd[0]) & np.all(_at(x, at[:, None]), axis=0)
+        return held
+
+
+def nested_dissection(place: Array) -> NDArray[np.int64]:
+    """Elimination order (n,) of nodes (dim, n) on a product grid of quadratic elements: halves first, cuts last.
+
+    Source: A. George, SIAM J. Numer. Anal. 10 (1973) 345.
+    """
+    index = np.stack([np.unique(np.round(x, 14), return_inverse=True)[1] for x in place])
+
+    def order(part: NDArray[np.int64]) -> NDArray[np.int64]:
+        axis = int(np.argmax(np.ptp(index[:, part], axis=1)))
+        along = index[axis, part]
+        ends = np.unique(along[along % 2 == 0])[1:-1]  # planes between elements
+        if len(part) < 60 or len(ends) == 0:
+            return part
+        cut = ends[len(ends) // 2]
+        return np.concatenate([order(part[along < cut]), order(part[along > cut]), part[along == cut]])
+
+    return order(np.arange(place.shape[1]))

@@ -1,0 +1,1 @@
+"""Files: skin and calibration files in YAML."""

@@ -1,0 +1,144 @@
+"""What both nodes share: parameters with descriptions, qualities of service, how a node is started, spun and ended."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from lifecycle_msgs.msg import State
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from ..core.errors import CubeError
+
+PAUSE_S = 0.5
+"""The longest pause of a reader that no message is lost in: queue depths are rate times this."""
+UNKNOWN_RATE = 1000.0
+SPIN_S = 0.2
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def queue(rate: float | None, reliability: str = "reliable") -> QoSProfile:
+    """Quality of service of the batch topics at `rate` messages per second, None when it is not known."""
+    depth = min(max(10, math.ceil((rate or UNKNOWN_RATE) * PAUSE_S)), 1000)
+    policy = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}[reliability]
+    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=policy)
+
+
+class CubeNode(LifecycleNode):
+    """A lifecycle node whose errors are one line in the log and a transition that fails, never a traceback."""
+
+    def declare(
+        self, name: str, default: Any, description: str, span: tuple[float, float] | None = None, choices: str = ""
+    ) -> None:
+        """Declare a parameter; span bounds a number, choices (words separated by commas) a text."""
+        descriptor = ParameterDescriptor(description=description, additional_constraints=choices and f"one of: {choices}")
+        descriptor.read_only = False
+        if span is not None:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)]
+        self.declare_parameter(name, default, descriptor)
+
+    def value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
+        """Do the work of a transition; a CubeError becomes a line in the log and a failure."""
+        try:
+            work()
+        except CubeError as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def configure(self) -> None:
+        """Make all that does not touch the outside yet. CubeError: why it cannot be."""
+
+    def activate(self) -> None:
+        """Begin. CubeError: why it cannot be."""
+
+    def deactivate(self) -> None:
+        """End what `activate` began; safe to call twice."""
+
+    def cleanup(self) -> None:
+        """End what `configure` made; safe to call twice."""
+
+    def on_configure(self, state: Any) -> TransitionCallbackReturn:
+        return self.attempt(self.configure)
+
+    def on_activate(self, state: Any) -> TransitionCallbackReturn:
+        result: TransitionCallbackReturn = super().on_activate(state)
+        return result if result != TransitionCallbackReturn.SUCCESS else self.attempt(self.activate)
+
+    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
+        self.deactivate()
+        result: TransitionCallbackReturn = super().on_deactivate(state)
+        return result
+
+    def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
+        self.cleanup()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
+        self.deactivate()
+        self.cleanup()
+        return TransitionCallbackReturn.SUCCESS
+
+
+def run(make: Callable[[], CubeNode]) -> None:
+    """Run a node until SIGINT or SIGTERM, then end it; exit code 1 when it could not be started."""
+    stopping = False
+
+    def stop(*_: object) -> None:
+        nonlocal stopping
+        stopping = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    code = 0
+    # rclpy's own handlers would end the context under a thread that publishes.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = make()
+        executor = make_executor()
+        executor.add_node(node)
+        if node.value("autostart"):
+            for transition in (node.trigger_configure, node.trigger_activate):
+                if not stopping and transition() != TransitionCallbackReturn.SUCCESS:
+                    stopping, code = True, 1
+        while not stopping:
+            # EventsExecutor.spin() can burn a core and does not return on a signal; spin_once in the main thread does.
+            with contextlib.suppress(ExternalShutdownException):
+                executor.spin_once(timeout_sec=SPIN_S)
+        node.deactivate()
+        node.cleanup()
+        executor.remove_node(node)
+        node.destroy_node()
+    except (ParameterException, CubeError) as error:
+        print(f"cube_tensor_driver: {error}", file=sys.stderr)
+        code = 1
+    finally:
+        rclpy.try_shutdown()
+    raise SystemExit(code)
+
+
+def make_executor() -> Any:
+    """The executor that costs a third of the default one, where this rclpy has it."""
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+ACTIVE = State.PRIMARY_STATE_ACTIVE

@@ -1,0 +1,45 @@
+"""What to start for a skin: the one list that the launch files and ./cube demo both take. Does not import ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+Value = str | float | bool
+
+
+@dataclass(frozen=True)
+class Process:
+    """One process of a running skin.
+
+    executable: its name in the package, also the module that `python -m` runs. node: whether it is a ROS node and takes
+    parameters; otherwise it takes arguments.
+    """
+
+    executable: str
+    module: str
+    node: bool = True
+    parameters: dict[str, Value] = field(default_factory=dict)
+    arguments: tuple[str, ...] = ()
+
+
+def skin_processes(
+    config: Path, *, port: str = "", rate: float = 0.0, simulated_ports: Path | None = None, book: Path | None = None
+) -> list[Process]:
+    """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
+
+    port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0 for
+    the file's. book: where the simulator writes what it sampled.
+    """
+    skin: dict[str, Value] = {"config": str(config)}
+    driver: dict[str, Value] = {**skin, "port": port, "rate": rate, "port_directory": str(simulated_ports or "")}
+    processes = [
+        Process("reconstruction", "cube_tensor_driver.ros.reconstruction", parameters=skin),
+        Process("driver", "cube_tensor_driver.ros.driver", parameters=driver),
+    ]
+    if simulated_ports is not None:
+        arguments = ["--config", str(config), "--ports", str(simulated_ports)]
+        if book is not None:
+            arguments += ["--book", str(book)]
+        processes.insert(0, Process("simulator", "cube_tensor_driver.simulation.main", False, arguments=tuple(arguments)))
+    return processes

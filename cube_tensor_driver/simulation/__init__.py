@@ -1,0 +1,1 @@
+"""Simulated hubs: true stress fields in, bytes of the wire protocol out."""

@@ -1,0 +1,142 @@
+"""Judges what came out of a running skin against the simulator's book: what was sent, when, and under which load."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.modes import COMPONENTS
+from ..core.pipeline import StressRows
+from ..files.skin import Skin
+from .cubes import true_components
+from .load import MovingLoad
+
+TIMES_CHECKED = 500
+"""Instants at most whose tensors are compared with the load: each costs a contact problem."""
+
+
+class Judge:
+    """Takes rows as they arrive; `read_book` then fixes what should have arrived in a span of time."""
+
+    def __init__(self, skin: Skin) -> None:
+        self.contradictions = 0
+        self._skin = skin
+        self._tensors: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int]] = []
+        self._samples: list[tuple[NDArray[Any], NDArray[Any]]] = []
+        self._sent = 0
+        self._time_ns: Callable[[NDArray[Any], NDArray[Any]], NDArray[np.int64]] | None = None
+        self._span = (0, 0)
+        self._book_start = 0
+
+    def stress(
+        self, cube: NDArray[Any], sequence: NDArray[Any], stamp_ns: NDArray[Any], rows: StressRows, received_ns: int
+    ) -> None:
+        """Rows of one stress message, received at received_ns (wall clock)."""
+        values = np.concatenate([rows.stress, rows.gradient], axis=1)
+        self._tensors.append((np.array(cube), np.array(sequence), np.array(stamp_ns), values, received_ns))
+
+    def frequencies(self, cube: ArrayLike, sequence: ArrayLike) -> None:
+        """Rows of one frequencies message."""
+        self._samples.append((np.array(cube), np.array(sequence)))
+
+    def read_book(self, book: dict[str, Any], start_ns: int, end_ns: int) -> None:
+        """What the simulator sampled; only samples taken from start_ns to end_ns (wall clock) are judged."""
+        self._span = start_ns, end_ns
+        self._book_start = book["start_time_ns"]
+        link_of = np.zeros(len(self._skin.cubes), int)
+        runs: list[tuple[int, int, int, int, int]] = []
+        self._sent = 0
+        for number, link in enumerate(book["links"].values()):
+            members = [cube for cube in link["cubes"] if cube >= 0]
+            link_of[members] = number
+            for run in link["runs"]:
+                runs.append((number, run["first"], run["last"], run["start_us"], run["period_us"]))
+                times = self._book_start + 1000 * (run["start_us"] + np.arange(run["last"] - run["first"] + 1) * run["period_us"])
+                self._sent += len(members) * int(np.count_nonzero((times >= start_ns) & (times < end_ns)))
+
+        def time_ns(cube: NDArray[Any], sequence: NDArray[Any]) -> NDArray[np.int64]:
+            result = np.full(len(cube), -1, np.int64)
+            for number, first, last, start_us, period_us in runs:
+                there = (link_of[cube] == number) & (sequence >= first) & (sequence <= last)
+                result[there] = self._book_start + 1000 * (start_us + (sequence[there].astype(np.int64) - first) * period_us)
+            return result
+
+        self._time_ns = time_ns
+
+    def complete(self) -> bool:
+        """Whether a tensor of every sample sent has arrived."""
+        return len(self._received()[0]) >= self._sent
+
+    def result(self) -> dict[str, object]:
+        """Figures of the span: counts in rows (one cube, one instant), times in ms, errors relative to the applied range."""
+        cube, _, stamp_ns, values, received_ns, true_ns = self._received()
+        samples = self._in_span(*_joined(self._samples, 2))[0]
+        latency = (received_ns - true_ns) * 1e-6
+        stamp_error = np.abs(stamp_ns - true_ns) * 1e-6
+        rms, worst = self._errors(cube, values, true_ns)
+        return {
+            "samples_sent": self._sent,
+            "samples_received": len(samples),
+            "tensors_received": len(cube),
+            "lost": self._sent - len(cube),
+            "latency_p50_ms": _percentile(latency, 50),
+            "latency_p99_ms": _percentile(latency, 99),
+            "stamp_error_p99_ms": _percentile(stamp_error, 99),
+            "error_rel_rms": rms,
+            "error_rel_worst": worst,
+        }
+
+    def _in_span(self, cube: NDArray[Any], sequence: NDArray[Any], *others: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+        """Of rows those of samples taken in the span, each once, with the times they were taken at."""
+        if self._time_ns is None or not len(cube):
+            return (*(a[:0] for a in (cube, sequence, *others)), np.empty(0, np.int64))
+        true_ns = self._time_ns(cube, sequence)
+        rows = np.flatnonzero((true_ns >= self._span[0]) & (true_ns < self._span[1]))
+        key = cube[rows].astype(np.int64) << 32 | sequence[rows]
+        rows = rows[np.sort(np.unique(key, return_index=True)[1])]
+        return (*(a[rows] for a in (cube, sequence, *others)), true_ns[rows])
+
+    def _received(self) -> tuple[NDArray[Any], ...]:
+        cube, sequence, stamp_ns, values = _joined([part[:4] for part in self._tensors], 4)
+        counts = [len(part[0]) for part in self._tensors]
+        received_ns = np.repeat(np.array([part[4] for part in self._tensors], np.int64), counts)
+        return self._in_span(cube, sequence, stamp_ns, values, received_ns)
+
+    def _errors(self, cube: NDArray[Any], values: NDArray[Any], true_ns: NDArray[Any]) -> tuple[float, float]:
+        """Root mean square and worst deviation of the observed components, each relative to the range that was applied."""
+        load = MovingLoad(self._skin)
+        calibrations = {c.calibration.id: c.calibration for c in self._skin.cubes}
+        kind = np.array([c.calibration.id for c in self._skin.cubes])
+        times = np.unique(true_ns)
+        times = times[:: max(1, len(times) // TIMES_CHECKED)]
+        found, applied = [], []
+        for time_ns in times:
+            rows = np.flatnonzero(true_ns == time_ns)
+            stress, gradient = load.at((time_ns - self._book_start) * 1e-9)
+            truth = np.empty((len(rows), len(COMPONENTS)))
+            for name, calibration in calibrations.items():
+                chosen = kind[cube[rows]] == name
+                members = cube[rows][chosen]
+                truth[chosen] = true_components(calibration, stress[members], gradient[members])
+            found.append(values[rows])
+            applied.append(truth)
+        if not found:
+            return float("nan"), float("nan")
+        got, want = np.concatenate(found), np.concatenate(applied)
+        observed = np.isfinite(got).all(axis=0)
+        span = np.ptp(want[:, observed], axis=0)
+        relative = (got[:, observed] - want[:, observed])[:, span > 0] / span[span > 0]
+        return float(np.sqrt(np.mean(relative**2))), float(np.abs(relative).max())
+
+
+def _joined(parts: list[tuple[Any, ...]], columns: int) -> list[NDArray[Any]]:
+    if not parts:
+        return [np.empty(0, np.int64) for _ in range(columns)]
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
+def _percentile(values: NDArray[Any], percent: float) -> float:
+    return round(float(np.percentile(values, percent)), 3) if len(values) else float("nan")

@@ -1,0 +1,197 @@
+"""./cube demo: simulated hubs, driver and reconstruction as real processes, watched over DDS and judged against truth."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.signals import SignalHandlerOptions
+
+from cube_tensor_driver.msg import SkinFrequencies, SkinStress
+
+from ..core.errors import ConfigError, CubeError, MessageError
+from ..files.grid import grid
+from ..files.share import share
+from ..files.skin import Skin, read_skin
+from ..files.yaml import write_yaml
+from ..ros.children import Children
+from ..ros.messages import read_stress
+from ..ros.node import make_executor, queue
+from ..ros.start import skin_processes
+from ..simulation.judge import Judge
+from .table import LiveTable
+
+FIRST_TENSORS_S = 20.0
+LAST_TENSORS_S = 1.0
+CALIBRATION, LAYOUT, PITCH, RATE, CUBES_PER_HUB = "planar_illustrative", "planar", 0.012, 100.0, 8
+
+
+@dataclass(frozen=True)
+class Options:
+    """As on the command line; None: not given. duration in s, None: until Ctrl-C."""
+
+    config: Path | None
+    cubes: int | None
+    rate: float | None
+    duration: float | None
+    headless: bool
+    json: Path | None
+
+
+class Interrupted(CubeError):
+    """Ctrl-C, or asked to end."""
+
+
+def demo_skin(options: Options, folder: Path) -> Path:
+    """The skin file to run: the given one, the shipped one, or a grid of as many cubes as asked for."""
+    if options.config is not None:
+        return options.config.resolve()
+    if options.cubes is None:
+        return share() / "config" / "skin_demo.yaml"
+    if not 1 <= options.cubes <= 4096:
+        raise ConfigError(f"--cubes is {options.cubes}, allowed: 1 to 4096")
+    nx = math.ceil(math.sqrt(options.cubes))
+    skin = grid("skin", nx, math.ceil(options.cubes / nx), PITCH, math.ceil(options.cubes / CUBES_PER_HUB),
+                CALIBRATION, LAYOUT, options.rate or RATE, "/dev/ttyACM{}")  # fmt: skip
+    skin["cubes"] = skin["cubes"][: options.cubes]
+    used = {cube["link"] for cube in skin["cubes"]}
+    skin["links"] = [link for link in skin["links"] if link["name"] in used]
+    path = folder / "skin.yaml"
+    write_yaml(path, skin)
+    return path
+
+
+def run_demo(options: Options) -> int:
+    """Run until the duration is over or Ctrl-C; returns the exit code."""
+    interrupted = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: interrupted.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        with tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
+            folder = Path(name)
+            path = demo_skin(options, folder)
+            return _run(options, path, read_skin(path), folder, interrupted)
+    except Interrupted:
+        return 130
+    finally:
+        rclpy.try_shutdown()
+
+
+def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: threading.Event) -> int:
+    rate = options.rate or skin.rate or RATE
+    book = folder / "book.json"
+    judge = Judge(skin)
+    with LiveTable(skin, show=not options.headless) as table, Children(folder) as children:
+        for process in skin_processes(path, rate=rate, simulated_ports=folder / "ports", book=book):
+            children.start(process)
+        node = rclpy.create_node("demo", automatically_declare_parameters_from_overrides=False)
+
+        def on_stress(message: SkinStress) -> None:
+            received_ns = time.time_ns()
+            try:
+                times, rows = read_stress(message)
+            except MessageError as error:
+                judge.contradictions += 1
+                node.get_logger().error(str(error))
+                return
+            if options.duration is not None:
+                judge.stress(times.cube, times.sequence, times.stamp_ns, rows, received_ns)
+            table.update(times.cube, rows)
+
+        def on_frequencies(message: SkinFrequencies) -> None:
+            judge.frequencies(message.cube, message.sequence)
+
+        crc: dict[str, int] = {}
+
+        def on_diagnostics(message: DiagnosticArray) -> None:
+            for status in message.status:
+                crc.update({status.name: int(pair.value) for pair in status.values if pair.key == "crc"})
+
+        node.create_subscription(SkinStress, "stress", on_stress, queue(rate))
+        if options.duration is not None:
+            node.create_subscription(SkinFrequencies, "frequencies", on_frequencies, queue(rate))
+            node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
+        executor = make_executor()
+        executor.add_node(node)
+        spin = _spinner(executor, children, table, interrupted)
+        try:
+            spin(FIRST_TENSORS_S, lambda: table.seen_all)
+            if not table.seen_all:
+                raise CubeError(
+                    f"after {FIRST_TENSORS_S:g} s only {table.seen} of {len(skin.cubes)} cubes have a tensor.\n"
+                    + "\n".join(children.log(name)[-1500:] for name in ("driver", "reconstruction"))
+                )
+            if options.duration is None:
+                spin(math.inf, lambda: False)
+            spin(0.1, lambda: False)
+            start_ns, processes = time.time_ns(), _processes(children)
+            cpu = {name: _cpu(process) for name, process in processes.items()}
+            spin(options.duration or 0.0, lambda: False)
+            seconds = (time.time_ns() - start_ns) * 1e-9
+            used = {name: 100 * (_cpu(process) - cpu[name]) / seconds for name, process in processes.items()}
+            memory = {name: process.memory_info().rss / 2**20 for name, process in processes.items()}
+            children.end(["simulator"])
+            judge.read_book(json.loads(book.read_text()), start_ns, start_ns + round((options.duration or 0) * 1e9))
+            spin(LAST_TENSORS_S, judge.complete)
+        finally:
+            executor.remove_node(node)
+            node.destroy_node()
+    result = {
+        "cubes": len(skin.cubes),
+        "rate_hz": rate,
+        "duration_s": options.duration,
+        **judge.result(),
+        "crc_errors": sum(crc.values()),
+        **{f"cpu_{name}_percent": round(value, 1) for name, value in used.items()},
+        **{f"rss_{name}_mb": round(value, 1) for name, value in memory.items()},
+    }
+    _report(result, options)
+    return 0
+
+
+def _spinner(
+    executor: Any, children: Children, table: LiveTable, interrupted: threading.Event
+) -> Callable[[float, Callable[[], bool]], None]:
+    def spin(seconds: float, done: Callable[[], bool]) -> None:
+        """Spin for so long or until done. Interrupted: Ctrl-C. ChildError: a process ended."""
+        until = time.monotonic() + seconds
+        while not done() and (left := until - time.monotonic()) > 0:
+            if interrupted.is_set():
+                raise Interrupted("interrupted")
+            executor.spin_once(timeout_sec=min(left, 0.05))
+            children.check()
+            table.refresh()
+
+    return spin
+
+
+def _processes(children: Children) -> dict[str, psutil.Process]:
+    return {name: psutil.Process(children.pid(name)) for name in ("driver", "reconstruction")}
+
+
+def _cpu(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def _report(result: dict[str, object], options: Options) -> None:
+    text = json.dumps(result, indent=2)
+    if options.json is None:
+        print(text)
+        return
+    try:
+        options.json.write_text(text + "\n")
+    except OSError as error:
+        raise ConfigError(f"--json {options.json}: {error.strerror}; name a file in a folder that can be written") from None

@@ -1,0 +1,283 @@
+"""Rows in, rows out: exact where it can be, marked where it cannot, fast."""
+
+import dataclasses
+import subprocess
+import sys
+import timeit
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.errors import CalibrationError, CubeError, LayoutError
+from cube_tensor_driver.core.estimator import make_estimator
+from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency, pad_stress
+from cube_tensor_driver.core.pipeline import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE, Pipeline
+
+DTYPES = [(np.float64, 1e-9), (np.float32, 3e-5)]
+QUAD_NEGLECT = ("xx", "xx_z", "xx_x")
+
+
+def individual(layout: str, seed: int, **changes):
+    """An illustrative calibration whose pads all differ."""
+    rng, c = np.random.default_rng(seed), illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+    n = c.layout.n_pads
+    return dataclasses.replace(
+        c, gain=1 + 0.05 * rng.normal(size=n), beta=0.3 + 0.05 * rng.normal(size=n), noise=3 * rng.uniform(1, 2, size=n),
+        rest_frequency=1e5 + 100 * rng.normal(size=n), modulus=3e5 * (1 + 0.1 * rng.normal(size=n)), **changes)
+
+
+def frequencies(calibration, states):
+    return pad_frequency(states @ calibration.response.T, calibration.rest_frequency, calibration.beta,
+                         calibration.modulus)
+
+
+def truth(calibration, states):
+    return states @ calibration.modes.components.T / np.repeat([1, calibration.half_side], [6, 9])
+
+
+def states_of(calibration, count, seed=0):
+    states = 1e3 * np.random.default_rng(seed).normal(size=(count, calibration.modes.n_modes))
+    states[:, calibration.modes.index(calibration.neglect)] = 0
+    return states
+
+
+def joined(rows):
+    return np.concatenate([rows.stress, rows.gradient], axis=1)
+
+
+def check_rows(rows, expected, tolerance):
+    got, seen = joined(rows), (rows.observed[:, None] >> np.arange(15)) & 1 > 0
+    np.testing.assert_array_equal(np.isnan(got), ~seen)
+    scale = np.abs(expected).max(axis=0)
+    np.testing.assert_allclose(np.where(seen, got, 0) / scale.clip(1), np.where(seen, expected, 0) / scale.clip(1),
+                               rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype, tolerance", DTYPES)
+@pytest.mark.parametrize("layout", ["quad", "planar", "cube"])
+@pytest.mark.parametrize("make", [illustrative, individual])
+def test_recovers_the_applied_fields(layout, make, dtype, tolerance):
+    c = make(layout, 3) if make is individual else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+    states = states_of(c, 50)
+    rows = Pipeline([c] * 50, dtype).process(np.arange(50), frequencies(c, states), np.zeros(50, np.uint32))
+    check_rows(rows, truth(c, states), tolerance)
+    assert rows.status.tolist() == [0] * 50
+    assert rows.stress.dtype == rows.gradient.dtype == rows.residual.dtype == dtype
+    assert rows.status.dtype == rows.observed.dtype == np.uint16
+    if layout == "quad":
+        assert np.isnan(rows.residual).all()
+    else:
+        assert np.all(rows.residual < 0.1)
+
+
+@pytest.mark.parametrize("dtype, tolerance", DTYPES)
+def test_cubes_of_all_kinds_in_one_batch(dtype, tolerance):
+    kinds = [individual(name, seed) for seed, name in enumerate(["planar", "cube", "quad", "planar", "quad"])]
+    pipeline = Pipeline(kinds, dtype)
+    cube = np.array([4, 0, 1, 3, 2, 0, 1, 4, 4])
+    frequency, expected = np.full((9, 24), np.nan), np.zeros((9, 15))
+    for i, k in enumerate(cube):
+        states = states_of(kinds[k], 1, seed=i)
+        frequency[i, : kinds[k].layout.n_pads] = frequencies(kinds[k], states)
+        expected[i] = truth(kinds[k], states)
+    for _ in range(2):  # the second time from what is kept
+        rows = pipeline.process(cube, frequency)
+        check_rows(rows, expected, tolerance)
+        assert not rows.status.any()
+    assert np.isnan(rows.residual[cube == 4]).all() and np.all(rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1)
+    pads = pipeline.pad_stress(cube, frequency)
+    assert np.isnan(pads[0, 4:]).all() and np.isfinite(pads[2]).all()
+    k = kinds[0]
+    np.testing.assert_allclose(pads[1, :8], pad_stress(frequency[1, :8], k.rest_frequency, k.beta, k.modulus),
+                               atol=0.2 if dtype == np.float32 else 1e-8)
+
+
+@pytest.mark.parametrize("dtype, tolerance", DTYPES)
+def test_bad_pads_are_left_out(dtype, tolerance):
+    c = individual("cube", 1)
+    states = states_of(c, 8)
+    frequency = frequencies(c, states)
+    frequency[0, 3], frequency[1, 4], frequency[2, 5], frequency[3, 6], frequency[4, 7] = np.nan, np.inf, 0, -5, 1e9
+    fault = np.zeros(8, np.uint32)
+    fault[5], fault[6] = 0b11, 0xFFFFFFFF
+    rows = Pipeline([c] * 8, dtype).process(np.arange(8), frequency, fault)
+    check_rows(rows, truth(c, states), tolerance * 10)
+    assert rows.status.tolist() == [PAD_FAULT] * 6 + [PAD_FAULT | INVALID, 0]
+    assert rows.observed.tolist() == [0x7FFF] * 6 + [0, 0x7FFF]
+    assert np.isnan(rows.residual[6])
+
+
+def test_what_the_remaining_pads_cannot_see_is_not_invented():
+    c = illustrative("planar")
+    frequency = frequencies(c, states_of(c, 1))
+    for bits in range(256):
+        rows = Pipeline([c]).process(np.array([0]), frequency, np.array([bits]))
+        missing = [p for p in range(8) if bits >> p & 1]
+        alone = make_estimator(c.response, c.noise, c.modes, missing)
+        assert rows.observed[0] == sum(1 << i for i in range(15) if alone.observed[i])
+        assert np.isnan(rows.residual[0]) == (alone.dof == 0)
+        assert (rows.observed[0] == 0) == bool(rows.status[0] & INVALID)
+
+
+def test_strange_rows_end_in_their_status_never_in_an_error():
+    c = illustrative("planar")
+    pipeline = Pipeline([c] * 3)
+    good = frequencies(c, states_of(c, 1))[0]
+    rows = pipeline.process(np.array([0, -1, 3, 2]), np.tile(good, (4, 1)))
+    assert rows.status.tolist() == [0, INVALID, INVALID, 0] and np.isnan(joined(rows)[1:3]).all()
+    rng = np.random.default_rng(0)
+    wild = rng.choice([0, -1, np.nan, np.inf, -np.inf, 1e300, 1e-300, 1e5, 4.4e5], size=(500, 8))
+    with np.errstate(all="raise"):
+        for dtype in (np.float32, np.float64):
+            rows = Pipeline([c] * 3, dtype).process(rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500))
+            assert not np.isinf(joined(rows)).any()
+    empty = pipeline.process(np.empty(0, int), np.empty((0, 8)), np.empty(0, np.uint32))
+    assert empty.stress.shape == (0, 6) and empty.gradient.shape == (0, 9) and empty.status.shape == (0,)
+
+
+def test_wrong_shapes_and_settings_are_errors():
+    c = illustrative("planar")
+    pipeline = Pipeline([c] * 2)
+    with pytest.raises(LayoutError, match=r"\(2, 4\).*\(N, 8\)"):
+        pipeline.process(np.arange(2), np.ones((2, 4)))
+    with pytest.raises(CalibrationError, match="no calibrations"):
+        Pipeline([])
+    with pytest.raises(CubeError, match="float16"):
+        Pipeline([c], np.float16)
+    with pytest.raises(LayoutError, match=r"\(8,\).*\(2, 8\)"):
+        pipeline.rest_frequency = np.full(8, 1e5)
+    with pytest.raises(CubeError, match="above 0"):
+        pipeline.rest_frequency = np.zeros((2, 8))
+
+
+def test_the_residual_rings_for_what_no_field_explains():
+    c = illustrative("planar")
+    v = states_of(c, 2) @ c.response.T
+    v[1, 0] += 30 * c.noise[0]
+    frequency = pad_frequency(v, 1e5, c.beta, c.modulus)
+    rows = Pipeline([c]).process(np.zeros(2, int), frequency)
+    assert rows.status.tolist() == [0, RESIDUAL]
+    assert rows.residual[1] == pytest.approx(30 / np.sqrt(8))  # all eight pads check it alike
+    cube = illustrative("cube")
+    v = states_of(cube, 2) @ cube.response.T
+    v[1, 5] += 50 * cube.noise[5]
+    pipeline = Pipeline([cube])
+    marked = pipeline.suspects(np.zeros(2, int), pad_frequency(v, 1e5, cube.beta, cube.modulus))
+    assert not marked[0].any() and {cube.layout.pads[i] for i in np.flatnonzero(marked[1])} == {"+x+z", "-x-z"}
+
+
+def test_false_alarms_are_as_stated():
+    c = illustrative("planar")
+    rng = np.random.default_rng(2)
+    frequency = 1e5 * (1 + 8e-6 * rng.normal(size=(200_000, 8)))
+    rows = Pipeline([c], np.float64).process(np.zeros(200_000, int), frequency)
+    assert np.mean(rows.status == RESIDUAL) == pytest.approx(1e-3, abs=4 * np.sqrt(1e-3 / 2e5))
+    assert np.sqrt(np.mean(rows.residual**2)) == pytest.approx(1, rel=0.01)
+    stated = np.sqrt(np.diag(Pipeline([c]).covariance(0)))
+    scatter = joined(rows).std(axis=0)
+    seen = np.isfinite(stated)
+    np.testing.assert_allclose(scatter[seen], stated[seen], rtol=0.03)
+
+
+def test_tare_moves_the_rest_frequency():
+    c = illustrative("planar")
+    pipeline = Pipeline([c] * 2)
+    drifted = np.array([[1e5] * 8, np.linspace(1.01e5, 1.02e5, 8)])
+    assert np.abs(pipeline.process(np.arange(2), drifted).stress[1, 2]) > 1e3
+    pipeline.rest_frequency = drifted
+    np.testing.assert_array_equal(pipeline.rest_frequency, drifted)
+    np.testing.assert_allclose(pipeline.process(np.arange(2), drifted).stress[:, 2], 0, atol=1e-9)
+
+
+def test_the_temperature_model_is_taken_out():
+    model = TemperatureModel(25, np.outer(np.linspace(-1, 1, 8), [1e-3, 1e-5]))
+    c, plain = dataclasses.replace(illustrative("planar"), temperature=model), illustrative("planar")
+    states = states_of(c, 4)
+    warm = np.array([40.0, np.nan, 25.0, 10.0])
+    frequency = frequencies(c, states)
+    frequency[[0, 3]] *= model.factor(warm[[0, 3]])
+    pipeline = Pipeline([c, plain])
+    rows = pipeline.process(np.array([0, 0, 0, 0]), frequency, None, warm)
+    check_rows(rows, truth(c, states), 1e-9)
+    assert rows.status.tolist() == [0, TEMPERATURE, 0, 0]
+    mixed = pipeline.process(np.array([1, 0]), frequencies(c, states[:2]))
+    assert mixed.status.tolist() == [0, TEMPERATURE]
+    factor = pipeline.temperature_factor(np.array([0, 1]), np.array([40.0, 40.0]))
+    np.testing.assert_allclose(factor, [model.factor([40.0])[0], np.ones(8)])
+
+
+def test_covariance_of_a_cube_with_a_bad_pad():
+    c = individual("planar", 5)
+    pipeline = Pipeline([illustrative("quad"), c])
+    whole, less = np.diag(pipeline.covariance(1)), np.diag(pipeline.covariance(1, 1))
+    seen = np.isfinite(whole)
+    assert np.all(less[seen] >= whole[seen] * (1 - 1e-9)) and np.isnan(np.diag(pipeline.covariance(0))[0])
+    alone = make_estimator(c.response, c.noise, c.modes).covariance
+    np.testing.assert_allclose(whole[6:], np.diag(alone)[6:] / c.half_side**2)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_speed_against_bare_numpy(dtype):
+    """Medians of interleaved timings; the bounds are the issue's, measured ratios are well below."""
+    c = illustrative("planar")
+    k = np.zeros((8, 16), dtype)
+    cost = {}
+    for count in (64, 1024, 1260):
+        f = (1e5 + 10 * np.random.default_rng(0).normal(size=(count, 8))).astype(dtype)
+        f0, cube, fault = np.full((count, 8), 1e5, dtype), np.arange(count), np.zeros(count, np.uint32)
+        one, beta, modulus = dtype(1), dtype(0.3), dtype(3e5)
+        pipeline = Pipeline([c] * count, dtype)
+
+        def bare():
+            r = f / f0
+            return (modulus * (r / (one + beta * (one - r)) - one)) @ k
+
+        def ours():
+            return pipeline.process(cube, f, fault)
+
+        times = np.array([[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)])
+        cost[count] = np.median(times, axis=0)
+    assert cost[1260][1] < 2 * cost[1260][0], cost
+    assert cost[1024][1] < 12 * cost[64][1], cost
+
+
+def test_no_loop_over_rows():
+    """Ten times the rows, all kinds of them, make no more Python calls."""
+    kinds = [individual("planar", seed) for seed in range(4)]
+    pipeline = Pipeline(kinds)
+
+    def calls(count: int) -> int:
+        cube = np.arange(count) % 4
+        f = np.full((count, 8), 1e5)
+        f[::3, 0] = np.nan
+        pipeline.process(cube, f)
+        seen = [0]
+        sys.setprofile(lambda *_: seen.__setitem__(0, seen[0] + 1))
+        try:
+            pipeline.process(cube, f)
+        finally:
+            sys.setprofile(None)
+        return seen[0]
+
+    assert calls(1200) == calls(120)
+
+
+def test_core_imports_numpy_and_the_standard_library_only():
+    script = """
+import pathlib, sys
+import numpy, importlib
+before = set(sys.modules)
+import cube_tensor_driver.core as core
+for path in sorted(pathlib.Path(core.__path__[0]).glob("*.py")):
+    if path.stem not in ("__init__", "tensor"):
+        importlib.import_module("cube_tensor_driver.core." + path.stem)
+def strange():
+    own = {"numpy", "cube_tensor_driver", "__mp_main__"} | set(sys.stdlib_module_names)
+    return sorted({m.split(".")[0] for m in set(sys.modules) - before} - own)
+print(strange())
+import cube_tensor_driver.core.tensor
+print(strange())
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines() == ["[]", "['transforms3d']"], done.stdout + done.stderr

@@ -1,0 +1,122 @@
+"""Tensor algebra against its definitions."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cube_tensor_driver.core.errors import CubeError
+from cube_tensor_driver.core.modes import SPACE, to_matrix, to_six
+from cube_tensor_driver.core.symmetry import group
+from cube_tensor_driver.core.tensor import (
+    contact_wrench,
+    invariants,
+    principal_stresses,
+    quaternion_from_rpy,
+    rotate_gradient,
+    rotate_stress,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    traction,
+    von_mises,
+)
+
+ANGLES = st.tuples(*[st.floats(-3.1, 3.1)] * 3)
+RNG = np.random.default_rng(0)
+STRESS = RNG.normal(size=(20, 6))
+
+
+def test_principal_stresses_are_tractions_along_their_directions():
+    values, directions = principal_stresses(STRESS)
+    assert np.all(np.diff(values, axis=1) <= 0)
+    for k in range(3):
+        np.testing.assert_allclose(traction(STRESS, directions[:, k]), values[:, k, None] * directions[:, k], atol=1e-12)
+    np.testing.assert_allclose(directions @ directions.transpose(0, 2, 1), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12)
+    values, directions = principal_stresses(np.array([[np.nan, 0, 0, 0, 0, 0], [1, 2, 3, 0, 0, 0]]))
+    assert np.isnan(values[0]).all() and np.isnan(directions[0]).all() and values[1].tolist() == [3, 2, 1]
+
+
+def test_invariants_are_those_of_the_principal_stresses():
+    a, b, c = principal_stresses(STRESS)[0].T
+    np.testing.assert_allclose(invariants(STRESS), np.stack([a + b + c, a * b + b * c + c * a, a * b * c], 1), atol=1e-12)
+    np.testing.assert_allclose(von_mises(STRESS), np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2), atol=1e-12)
+    assert von_mises(np.array([5.0, 0, 0, 0, 0, 0])) == 5  # uniaxial
+    assert von_mises(np.array([0, 0, 0, 0, 2.0, 0])) == pytest.approx(2 * np.sqrt(3))  # shear
+
+
+def test_traction_on_the_faces_is_a_column():
+    s = np.array([1.0, 2, 3, 4, 5, 6])  # xx yy zz yz zx xy
+    assert traction(s, [0, 0, 7]).tolist() == [5, 4, 3]
+    assert traction(s, [-1, 0, 0]).tolist() == [-1, -6, -5]
+    with pytest.raises(CubeError, match="length 0"):
+        traction(s, [0, 0, 0])
+
+
+@given(ANGLES, ANGLES)
+def test_rotations_compose(one, two):
+    r1, r2 = rotation_from_rpy(*one), rotation_from_rpy(*two)
+    gradient = SPACE.gradient
+    np.testing.assert_allclose(rotate_stress(rotate_stress(STRESS, r1), r2), rotate_stress(STRESS, r2 @ r1), atol=1e-12)
+    np.testing.assert_allclose(rotate_gradient(rotate_gradient(gradient, r1), r2), rotate_gradient(gradient, r2 @ r1),
+                               atol=1e-12)
+    np.testing.assert_allclose(rotate_stress(rotate_stress(STRESS, r1), r1.T), STRESS, atol=1e-12)
+    np.testing.assert_allclose(invariants(rotate_stress(STRESS, r1)), invariants(STRESS), atol=1e-10)
+
+
+@given(ANGLES)
+def test_a_turned_field_is_the_field_at_the_turned_point(rpy):
+    """sigma'(R x) = R sigma(x) R', and equilibrium survives."""
+    r, x = rotation_from_rpy(*rpy), np.array([0.3, -0.2, 0.7])
+    s, g = STRESS[0], SPACE.gradient[9]
+    there = to_matrix(s) + g @ x
+    turned = to_matrix(rotate_stress(s, r)) + rotate_gradient(g, r) @ (r @ x)
+    np.testing.assert_allclose(turned, r @ there @ r.T, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("ijj->i", rotate_gradient(g, r)), 0, atol=1e-12)
+
+
+def test_rotations_agree_with_the_groups_action():
+    state = RNG.normal(size=21)
+    for r in group("full")[::5]:
+        stress, gradient = SPACE.field(SPACE.action(r) @ state)
+        before, slope = SPACE.field(state)
+        np.testing.assert_allclose(to_six(stress), rotate_stress(to_six(before), r), atol=1e-12)
+        np.testing.assert_allclose(gradient, rotate_gradient(slope, r), atol=1e-12)
+
+
+@given(ANGLES)
+def test_rpy_and_quaternions_agree(rpy):
+    roll, pitch, yaw = rpy
+
+    def turn(axis: int, angle: float) -> np.ndarray:
+        r, c, s = np.eye(3), np.cos(angle), np.sin(angle)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        r[i, i], r[i, j], r[j, i], r[j, j] = c, -s, s, c
+        return r
+
+    r = rotation_from_rpy(*rpy)
+    np.testing.assert_allclose(r, turn(2, yaw) @ turn(1, pitch) @ turn(0, roll), atol=1e-12)
+    q = quaternion_from_rpy(*rpy)
+    assert q[3] >= 0 and np.linalg.norm(q) == pytest.approx(1)
+    np.testing.assert_allclose(rotation_from_quaternion(3 * q), r, atol=1e-9)
+
+
+def test_quaternions_are_in_ros_order():
+    np.testing.assert_allclose(quaternion_from_rpy(0, 0, np.pi / 2), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
+    for bad in ([0, 0, 0, 0], [np.nan, 0, 0, 1]):
+        with pytest.raises(CubeError, match="quaternion"):
+            rotation_from_quaternion(bad)
+
+
+def test_the_wrench_is_the_integral_over_the_face():
+    stress = np.array([[1.0, 2, 3, 4, 5, 6]])
+    gradient = np.arange(1.0, 10)[None]
+    side, n = 0.004, 400
+    at = (np.arange(n) + 0.5) / n * side - side / 2
+    x, y = np.meshgrid(at, at, indexing="ij")
+    zz = 3 + gradient[0, 6] * x + gradient[0, 7] * y
+    area = (side / n) ** 2
+    force, torque = contact_wrench(stress, gradient, side)
+    np.testing.assert_allclose(force[0], [5 * side**2, 4 * side**2, zz.sum() * area])
+    np.testing.assert_allclose(torque[0], [(y * zz).sum() * area, -(x * zz).sum() * area, 0], rtol=1e-4)
+    force, torque = contact_wrench(np.full((1, 6), np.nan), np.full((1, 9), np.nan), side)
+    assert not force.any() and not torque.any()
