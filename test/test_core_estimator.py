@@ -1,12 +1,14 @@
 """Inversion: what was put in comes out, with the stated scatter, residual and suspects."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.stats import chi2 as chi2_truth
 
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import SymmetryError
-from cube_tensor_driver.core.estimator import FALSE_ALARM, chi2_limit, chi2_tail, make_estimator
+from cube_tensor_driver.core.estimator import FALSE_ALARM, chi2_limit, chi2_tail, make_estimator, summary
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE
 from cube_tensor_driver.core.response import response
@@ -19,12 +21,12 @@ PAIRS = [("quad", "slab"), ("quad", "mirrors"), ("quad", "none"),
 def random_case(layout: str, symmetry: str, seed: int = 0):
     structure = find_structure(LAYOUTS[layout], symmetry)
     rng = np.random.default_rng(seed)
-    values = dict(zip(structure.names, rng.normal(size=structure.n_coefficients)))
+    values = dict(zip(structure.names, rng.normal(size=structure.n_coefficients), strict=True))
     return structure.modes, response(structure, values), rng
 
 
 def components_seen(estimator) -> set[str]:
-    return {c for c, seen in zip(COMPONENTS, estimator.observed) if seen}
+    return {c for c, seen in zip(COMPONENTS, estimator.observed, strict=True) if seen}
 
 
 @pytest.mark.parametrize("layout, symmetry", PAIRS)
@@ -84,9 +86,26 @@ def test_what_the_layouts_see():
     alone = make_estimator(quad.response, quad.noise, quad.modes, neglect=("xx", "xx_z", "xx_x"))
     assert components_seen(alone) == {"zz", "zx", "zz_x", "zz_z"} and alone.dof == 0
     hidden = make_estimator(cube.response, cube.noise, SPACE, targets=np.eye(21)).observed
-    assert {n for n, seen in zip(SPACE.names, hidden) if not seen} == {"yz_x", "zx_y", "xy_z"}
+    assert {n for n, seen in zip(SPACE.names, hidden, strict=True) if not seen} == {"yz_x", "zx_y", "xy_z"}
     with pytest.raises(SymmetryError, match="'zy'"):
         make_estimator(quad.response, quad.noise, quad.modes, neglect=("zy",))
+
+
+def test_the_summary_of_a_layout():
+    c = illustrative("cube")
+    s = summary(c.structure, c.response)
+    assert list(s) == ["pads", "modes", "n_coefficients", "rank_uniform", "condition_uniform", "rank_gradient",
+                       "condition_gradient", "unobservable", "noise"]  # fmt: skip
+    assert (s["n_coefficients"], s["rank_uniform"], s["rank_gradient"]) == (12, 6, 12)
+    assert s["unobservable"] == ["yz_x", "zx_y", "xy_z"] and s["noise"]["yz_x"] is None
+    whole = make_estimator(c.response, np.ones(24), SPACE)
+    assert s["noise"]["zz_z"] == pytest.approx(np.sqrt(whole.covariance[14, 14]))
+    singular = np.linalg.svd(c.response[:, :6], compute_uv=False)
+    assert s["condition_uniform"] == pytest.approx(singular[0] / singular[-1])
+    quad = illustrative("quad", ("xx", "xx_z", "xx_x"))
+    s = summary(quad.structure, quad.response, quad.neglect)
+    assert s["rank_uniform"] == s["rank_gradient"] == 2 and s["unobservable"] == ["xx", "xx_z", "xx_x"]
+    json.dumps(s, allow_nan=False)
 
 
 def test_missing_pads_cost_what_they_must():

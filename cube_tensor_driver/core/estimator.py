@@ -15,10 +15,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from .modes import Modes
+from .symmetry import Structure
 
 # A combination of modes counts as unseen when the pads answer it with less than this part of the strongest answer.
 RANK_TOLERANCE = 1e-4
@@ -122,6 +124,30 @@ def chi2_tail(x: float, dof: int) -> float:
         tail += math.exp(a * math.log(h) - h - math.lgamma(a + 1))
         a += 1
     return tail
+
+
+def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] = ()) -> dict[str, Any]:
+    """What a response (P, M) lets a layout see, in plain types.
+
+    rank_uniform, rank_gradient: of the columns of uniform and gradient modes, and their condition numbers (None for 0)
+    unobservable: modes hidden from the pads; noise: {mode: standard deviation per unit of pad noise}, None if hidden
+    """
+    modes, n_pads = structure.modes, structure.layout.n_pads
+    estimator = make_estimator(response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes))
+    deviations = np.sqrt(np.diag(estimator.covariance))
+    result: dict[str, Any] = {"pads": list(structure.layout.pads), "modes": list(modes.names),
+                              "n_coefficients": structure.n_coefficients}
+    uniform = np.any(modes.stress, axis=(1, 2)) & ~np.isin(modes.names, neglect)
+    gradient = np.any(modes.gradient, axis=(1, 2, 3)) & ~np.isin(modes.names, neglect)
+    for part, columns in (("uniform", uniform), ("gradient", gradient)):
+        s = np.linalg.svd(response[:, columns], compute_uv=False)
+        s = s[s > RANK_TOLERANCE * s[0]] if s.size else s
+        result[f"rank_{part}"] = len(s)
+        result[f"condition_{part}"] = float(s[0] / s[-1]) if s.size else None
+    result["unobservable"] = [name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen]
+    result["noise"] = {name: float(d) if seen else None
+                       for name, d, seen in zip(modes.names, deviations, estimator.observed, strict=True)}
+    return result
 
 
 @lru_cache

@@ -16,13 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .calibration import Calibration
-from .errors import CalibrationError, FitError
-from .modes import AXES, Modes
+from .errors import FitError
+from .modes import Modes
 from .oscillator import pad_stress
 from .symmetry import Structure
 
 HUBER, TUKEY = 1.345, 4.685  # 95 % efficient on normal noise
-STEPS, STILL = 100, 1e-10  # Gauss-Newton steps at most; relative change that ends them
+STEPS = 100  # Gauss-Newton steps of one stage at most
+STILL = {"plain": 1e-10, "huber": 1e-3, "tukey": 1e-9}  # relative change that ends a stage; Huber's only leads on
 DIRECTION_TOLERANCE = 1e-6  # a direction of coefficients and gains below this part of the strongest is not determined
 FOLDS = 10  # of the cross-validation
 
@@ -97,47 +98,50 @@ def traction_loads(modes: Modes, force: np.ndarray, area: float) -> np.ndarray:
 
 
 def fit(structure: Structure, loads: np.ndarray, measured: np.ndarray, noise: np.ndarray | float = 1.0,
-        fixed: Mapping[str, float] | None = None) -> Fit:
+        fixed: Mapping[str, float] | None = None, gains: bool = True) -> Fit:
     """Coefficients and gains from loads (N, M) in Pa and measured pad stresses (N, P) in Pa.
 
     noise: standard deviation of readings in Pa, one or (P,); fixed: coefficients that are known from elsewhere
+    gains: False takes every gain as 1, for loads that reach too few pads to tell gains from coefficients
     FitError for wrong shapes, NaN, loads of zero, and loads that determine no coefficient at all.
     """
     fixed = dict(fixed or {})
     x, y, noise = _check(structure, loads, measured, noise, fixed)
-    model = _Model(structure, noise, fixed)
-    theta, weights, scale = model.solve(x, y)
-    jacobian = model.jacobian(theta, x)
+    model = _Model(structure, noise, fixed, gains)
+    design = model.design(x)
+    theta, weights, scale = model.solve(design, y)
+    jacobian = model.jacobian(theta, design)
     hidden = _hidden(jacobian)
     open_ = _open(hidden, len(model.free))
     names = [structure.names[k] for k in model.free]
     if len(names) and open_.all():
         raise FitError("these loads determine no coefficient: " + "; ".join(_advise(model, theta, x, hidden, open_)))
-    covariance = _covariance(jacobian, model.residuals(theta, x, y) / scale, scale)
+    covariance = _covariance(jacobian, model.residuals(theta, design, y) / scale, scale)
     covariance[: len(names)][open_] = covariance[:, : len(names)][:, open_] = np.nan
     k = np.full((structure.n_coefficients,) * 2, 0.0)
     k[np.ix_(model.free, model.free)] = covariance[: len(names), : len(names)]
     c, g = model.unpack(theta)
     c[np.array(model.free, dtype=int)[open_]] = np.nan
     spread = model.gains @ covariance[len(names):, len(names):] @ model.gains.T
-    fitted = model.predict(theta, x)
+    fitted = model.predict(theta, design)
     kept = weights > 0
     return Fit(
-        structure, dict(zip(structure.names, c.tolist())), dict(zip(structure.names, np.sqrt(np.diag(k)).tolist())),
+        structure, dict(zip(structure.names, c.tolist(), strict=True)), dict(zip(structure.names, np.sqrt(np.diag(k)).tolist(), strict=True)),
         k, g, np.sqrt(np.diag(spread).clip(0)), float(scale), float(np.sum(((y - fitted) / noise)[kept] ** 2)),
-        int(kept.sum()) - (jacobian.shape[1] - hidden.shape[1]), _held_out(model, x, y), fitted, ~kept,
-        tuple(n for n, o in zip(names, open_) if o), tuple(_advise(model, theta, x, hidden, open_)))
+        int(kept.sum()) - (jacobian.shape[1] - hidden.shape[1]), _held_out(model, design, y), fitted, ~kept,
+        tuple(n for n, o in zip(names, open_, strict=True) if o), tuple(_advise(model, theta, x, hidden, open_)))
 
 
 class _Model:
     """theta = free coefficients, then coordinates of the gains around 1."""
 
-    def __init__(self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float]) -> None:
+    def __init__(self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float],
+                 gains: bool) -> None:
         self.structure, self.noise = structure, noise
         self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
         self.start = np.array([fixed.get(name, 0.0) for name in structure.names], dtype=float)
         columns = []
-        for first, *others in structure.pad_orbits:
+        for first, *others in structure.pad_orbits if gains else ():
             for pad in others:
                 column = np.zeros(structure.layout.n_pads)
                 column[pad], column[first] = 1, -1
@@ -149,35 +153,39 @@ class _Model:
         c[self.free] = theta[: len(self.free)]
         return c, 1 + self.gains @ theta[len(self.free):]
 
-    def predict(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def design(self, x: np.ndarray) -> np.ndarray:
+        """(N, P, K): what each coefficient adds to each reading at gain 1, for loads (N, M)."""
+        return np.moveaxis(np.tensordot(x, self.structure.basis, axes=(1, 2)), 1, 2)
+
+    def predict(self, theta: np.ndarray, design: np.ndarray) -> np.ndarray:
         c, g = self.unpack(theta)
-        return g * (x @ np.tensordot(c, self.structure.basis, axes=1).T)
+        return g * (design @ c)
 
-    def residuals(self, theta: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return ((y - self.predict(theta, x)) / self.noise).ravel()
+    def residuals(self, theta: np.ndarray, design: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return ((y - self.predict(theta, design)) / self.noise).ravel()
 
-    def jacobian(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def jacobian(self, theta: np.ndarray, design: np.ndarray) -> np.ndarray:
         """(N P, parameters) derivatives of the whitened predictions."""
         c, g = self.unpack(theta)
-        by_c = np.einsum("kpm,nm->npk", self.structure.basis[self.free], x) * g[:, None]
-        by_g = (x @ np.tensordot(c, self.structure.basis, axes=1).T)[:, :, None] * self.gains
+        by_c = design[:, :, self.free] * g[:, None]
+        by_g = (design @ c)[:, :, None] * self.gains
         return (np.concatenate([by_c, by_g], axis=2) / self.noise[:, None]).reshape(-1, theta.size)
 
-    def solve(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    def solve(self, design: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """theta, the weights (N, P) of the readings, and the scatter in units of the noise."""
         theta = np.zeros(len(self.free) + self.gains.shape[1])
         weights, scale = np.ones(y.size), 1.0
         for stage in ("plain", "huber", "tukey"):
             for _ in range(STEPS):
-                r = self.residuals(theta, x, y)
+                r = self.residuals(theta, design, y)
                 if stage == "huber":  # the scale of the last stage stays, so that it settles
                     scale = _scale(r)
                 if stage != "plain":
                     weights = _weights(stage, r / scale)
                 root = np.sqrt(weights)
-                step = _least_squares(root[:, None] * self.jacobian(theta, x), root * r)
+                step = _least_squares(root[:, None] * self.jacobian(theta, design), root * r)
                 theta = theta + step
-                if np.linalg.norm(step) <= STILL * (1 + np.linalg.norm(theta)):
+                if np.linalg.norm(step) <= STILL[stage] * (1 + np.linalg.norm(theta)):
                     break
         return theta, weights.reshape(y.shape), scale
 
@@ -248,14 +256,14 @@ def _covariance(jacobian: np.ndarray, r: np.ndarray, scale: float) -> np.ndarray
                                               rcond=DIRECTION_TOLERANCE**2) / np.outer(size, size)
 
 
-def _held_out(model: _Model, x: np.ndarray, y: np.ndarray) -> float:
-    if len(x) < 2:
+def _held_out(model: _Model, design: np.ndarray, y: np.ndarray) -> float:
+    if len(y) < 2:
         return float("nan")
     errors = np.empty_like(y)
-    fold = np.arange(len(x)) % min(FOLDS, len(x))
+    fold = np.arange(len(y)) % min(FOLDS, len(y))
     for k in range(fold.max() + 1):
-        theta, _, _ = model.solve(x[fold != k], y[fold != k])
-        errors[fold == k] = y[fold == k] - model.predict(theta, x[fold == k])
+        theta, _, _ = model.solve(design[fold != k], y[fold != k])
+        errors[fold == k] = y[fold == k] - model.predict(theta, design[fold == k])
     return float(np.sqrt(np.mean(errors**2) / np.mean(y**2))) if np.any(y) else float("nan")
 
 
@@ -267,15 +275,15 @@ def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray,
     loads, size = x, np.sqrt(np.mean(x[x != 0] ** 2))
     while open_.any():
         trials = [np.vstack([loads, size * np.eye(x.shape[1])[m]]) for m in range(x.shape[1])]
-        hiddens = [_hidden(model.jacobian(theta, trial)) for trial in trials]
+        hiddens = [_hidden(model.jacobian(theta, model.design(trial))) for trial in trials]
         counts = [(_open(h, len(open_)).sum(), h.shape[1]) for h in hiddens]
         best = min(range(len(counts)), key=counts.__getitem__)
         still = _open(hiddens[best], len(open_))
-        names = [model.structure.names[k] for k, o in zip(model.free, open_) if o]
+        names = [model.structure.names[k] for k, o in zip(model.free, open_, strict=True) if o]
         if hiddens[best].shape[1] >= hidden.shape[1]:
             advice.append(f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry")
             break
-        settled = [model.structure.names[k] for k, now, then in zip(model.free, open_, still) if now and not then]
+        settled = [model.structure.names[k] for k, now, then in zip(model.free, open_, still, strict=True) if now and not then]
         mode = model.structure.modes.names[best]
         advice.append(f"these loads do not determine {', '.join(settled or names)}: add a load of {mode} alone, "
                       f"{describe_mode(mode)}, of about {size:.3g} Pa")
@@ -285,9 +293,5 @@ def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray,
 
 def describe_mode(name: str) -> str:
     """A mode's name in words, such as "sigma_zz growing along x"."""
-    parts = []
-    for part in name.split("-"):
-        if part[0] not in AXES:
-            raise CalibrationError(f"{name!r} is no mode")
-        parts.append(f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform"))
-    return " against ".join(parts)
+    return " against ".join(f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform")
+                            for part in name.split("-"))

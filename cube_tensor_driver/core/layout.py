@@ -41,7 +41,7 @@ class Layout:
             raise LayoutError(f"layout {self.name!r}: {len(positions)} pads; allowed are 1 to {MAX_PADS}")
         if not 0 < self.pad_size <= 2:
             raise LayoutError(f"layout {self.name!r}: pad_size {self.pad_size}; allowed is above 0, up to 2")
-        for i, (x, n) in enumerate(zip(positions, normals)):
+        for i, (x, n) in enumerate(zip(positions, normals, strict=True)):
             if sorted(np.abs(n)) != [0, 0, 1]:
                 raise LayoutError(f"layout {self.name!r}: pad {i + 1} has normal {n.tolist()}; "
                                   "a normal is one axis, such as [0, 0, -1]")
@@ -67,9 +67,9 @@ class Layout:
     @property
     def pads(self) -> tuple[str, ...]:
         """Stable names: face, then side of the face, such as "+z-x"; a second pad there is "+z-x#2"."""
-        plain = [_signed_axes(n) + _signed_axes(x - n * (x @ n)) for x, n in zip(self.positions, self.normals)]
+        plain = [_signed_axes(n) + _signed_axes(x - n * (x @ n)) for x, n in zip(self.positions, self.normals, strict=True)]
         repeats = [plain[:i].count(name) for i, name in enumerate(plain)]
-        return tuple(f"{name}#{k + 1}" if k else name for name, k in zip(plain, repeats))
+        return tuple(f"{name}#{k + 1}" if k else name for name, k in zip(plain, repeats, strict=True))
 
     @property
     def planar(self) -> bool:
@@ -121,7 +121,7 @@ def _vectors(value: Any, what: str) -> np.ndarray:
 
 
 def _signed_axes(vector: np.ndarray) -> str:
-    return "".join("-+"[int(c > 0)] + a for c, a in zip(vector, AXES) if abs(c) > 1e-9)
+    return "".join("-+"[int(c > 0)] + a for c, a in zip(vector, AXES, strict=True) if abs(c) > 1e-9)
 
 
 def _section(sides: str, name: str, offset: float = PAD_OFFSET) -> Layout:

@@ -59,7 +59,7 @@ class Modes:
     def reading(self) -> np.ndarray:
         """(M, 36): how each amplitude is read off a field; reading @ fields = 1."""
         rows = np.zeros((self.n_modes, 36))
-        for row, name in zip(rows, self.names):
+        for row, name in zip(rows, self.names, strict=True):
             terms = _terms(name)
             for sign, place in terms:
                 row[place] = sign / len(terms)
@@ -69,7 +69,7 @@ class Modes:
     def components(self) -> np.ndarray:
         """(15, M): takes a state to the COMPONENTS, gradients times d0, all in Pa."""
         rows = np.zeros((len(COMPONENTS), 36))
-        for row, name in zip(rows, COMPONENTS):
+        for row, name in zip(rows, COMPONENTS, strict=True):
             for part in {name, name[1::-1] + name[2:]}:  # zx is the mean of sigma_zx and sigma_xz
                 row[_terms(part)[0][1]] = 1.0
             row /= row.sum()
@@ -127,14 +127,14 @@ def _terms(name: str) -> list[tuple[float, int]]:
 def _modes(names: Sequence[str], shears: str, symmetric: bool = True) -> Modes:
     """Modes by name; `shears` are the axes over which the balance of a gradient ii_i is spread."""
     flat = np.zeros((len(names), 36))
-    for row, name in zip(flat, names):
+    for row, name in zip(flat, names, strict=True):
         for sign, place in _terms(name):
             row[place] = sign
     stress, gradient = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:].reshape(-1, 3, 3, 3)
     if symmetric:
         stress = stress + np.where(stress == 0, stress.transpose(0, 2, 1), 0)
         gradient = gradient + np.where(gradient == 0, gradient.transpose(0, 2, 1, 3), 0)
-    for g, name in zip(gradient, names):
+    for g, name in zip(gradient, names, strict=True):
         if name in GRADIENT and name[0] == name[3]:  # equilibrium: the shears' divergence cancels the normal one's
             i = AXES.index(name[0])
             for j in (AXES.index(a) for a in shears if a != name[0]):

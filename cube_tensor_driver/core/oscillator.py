@@ -47,7 +47,7 @@ def stress_slope(frequency, rest_frequency, beta, modulus):
 
 def highest_frequency(rest_frequency, beta):
     """f0 (1 + beta) / beta in Hz, which an infinitely thick pad would have; inf without parasitic capacitance."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):
         return rest_frequency * (1 + beta) / np.asarray(beta, dtype=float)
 
 

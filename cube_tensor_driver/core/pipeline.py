@@ -270,5 +270,5 @@ def _distinct(kind: np.ndarray, mask: np.ndarray, everything: bool = False):
     pairs, where = np.unique(kind[rows] << 32 | mask[rows], return_inverse=True)
     order = np.argsort(where, kind="stable")
     ends = np.searchsorted(where[order], np.arange(len(pairs) + 1))
-    for pair, start, end in zip(pairs.tolist(), ends[:-1], ends[1:]):
+    for pair, start, end in zip(pairs.tolist(), ends[:-1], ends[1:], strict=True):
         yield pair >> 32, pair & 0xFFFFFFFF, rows[order[start:end]]

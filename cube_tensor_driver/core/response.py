@@ -43,7 +43,7 @@ def response(structure: Structure, coefficients: Mapping[str, float]) -> np.ndar
                                f"unknown {_some(unknown)}")
     values = np.array([coefficients[name] for name in structure.names], dtype=float)
     if not np.all(np.isfinite(values)):
-        bad = [n for n, v in zip(structure.names, values) if not np.isfinite(v)]
+        bad = [n for n, v in zip(structure.names, values, strict=True) if not np.isfinite(v)]
         raise CalibrationError(f"coefficients must be finite; {_some(bad)} are not")
     return np.tensordot(values, structure.basis, axes=1)
 
@@ -62,7 +62,7 @@ def project(structure: Structure, matrix: np.ndarray) -> tuple[dict[str, float],
     left = matrix - np.tensordot(values, structure.basis, axes=1)
     size = np.linalg.norm(matrix)
     unexplained = float(np.linalg.norm(left) / size) if size else 0.0
-    return dict(zip(structure.names, values.tolist())), unexplained
+    return dict(zip(structure.names, values.tolist(), strict=True)), unexplained
 
 
 def _illustrative_response(structure: Structure) -> np.ndarray:

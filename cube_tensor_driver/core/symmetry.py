@@ -70,7 +70,7 @@ def pad_images(layout: Layout, rotation: np.ndarray) -> np.ndarray:
     """(P,) the pad onto which each pad is carried by a rotation or mirror; SymmetryError names one without image."""
     r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
-    for pad, (x, n) in enumerate(zip(layout.positions @ r.T, layout.normals @ r.T)):
+    for pad, (x, n) in enumerate(zip(layout.positions @ r.T, layout.normals @ r.T, strict=True)):
         same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(np.abs(layout.normals - n) < 1e-6, axis=1)
         if not same.any():
             raise SymmetryError(f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be carried "
@@ -150,7 +150,7 @@ def _structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
             names.append(name)
             basis.append(member)
     if letters:
-        names, basis = map(list, zip(*sorted(zip(names, basis), key=lambda pair: pair[0])))
+        names, basis = map(list, zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True))
     stacked = np.array(basis).reshape(-1, n_pads, n_modes)
     stacked.flags.writeable = False
     return Structure(layout, modes, symmetry, tuple(names), stacked)

@@ -22,6 +22,7 @@ import struct
 import termios
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 
 import serial
 
@@ -234,7 +235,9 @@ class Link:
         return () if self._tcp else tuple(_identity(path) for path in self._candidates())
 
     def _candidates(self) -> list[str]:
-        return sorted(glob.glob(self.config.port)) if self.is_pattern else [self.config.port]
+        if not self.is_pattern:
+            return [self.config.port]
+        return sorted(glob.glob(self.config.port))  # noqa: PTH207  (Path.glob takes no absolute pattern)
 
     def _open_serial(self) -> None:
         paths = self._candidates()
@@ -304,7 +307,7 @@ def _open_port(path: str, baud: int) -> serial.SerialBase:
 
 def _identity(path: str) -> tuple[object, ...] | None:
     try:
-        found = os.stat(path)
+        found = Path(path).stat()
     except OSError:
         return None
     return path, found.st_ino, found.st_rdev, found.st_mode, found.st_uid, found.st_gid

@@ -8,6 +8,7 @@ and what one link does not take stays in its own bounded buffer.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import selectors
@@ -123,10 +124,8 @@ class Reader:
         # The lock keeps a late send from writing to a number that the closed pipe has given back.
         with self._wake_lock:
             if self._wake_write >= 0:
-                try:
+                with contextlib.suppress(BlockingIOError):
                     os.write(self._wake_write, b"\0")
-                except BlockingIOError:
-                    pass
 
     def _run(self, wake_read: int) -> None:
         selector = selectors.DefaultSelector()
@@ -239,6 +238,7 @@ class Reader:
                 and now - session.last_sample > session.silent_after()
             ):
                 link.silences += 1
+                session.hello_at = now
                 period = (
                     f"sample period {session.actual_us} µs"
                     if session.actual_us
@@ -334,10 +334,8 @@ class Reader:
     def _shut(self, selector: selectors.BaseSelector, wake_read: int) -> None:
         for link in self.links:
             if link.is_open:
-                try:
+                with contextlib.suppress(LinkError):
                     link.write(encode(Request(Command.STOP)))
-                except LinkError:
-                    pass
         until = time.monotonic() + DRAIN_S
         while any(link.draining() for link in self.links) and time.monotonic() < until:
             time.sleep(0.002)

@@ -1,31 +1,45 @@
-"""The response matrix of a cube in a body, computed: what each pad feels under each mode."""
+"""The response matrix of a cube in a body, computed: the mean normal stress of every pad under every mode.
+
+The body is a box with the cube bonded in its middle, loaded on its outer faces by the tractions of each mode;
+that is the field which would be everywhere in the body if the cube were not there.
+"""
 
 from __future__ import annotations
 
 import itertools
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.calibration import Calibration
 from ..core.errors import ElasticError
+from ..core.estimator import LEAK_TOLERANCE, RANK_TOLERANCE
 from ..core.layout import Layout
-from ..core.symmetry import default_modes
+from ..core.response import project
+from ..core.symmetry import default_modes, find_structure
 from .mesh import block, section
-from .solid import Solid, lame
+from .solid import Parity, Solid, lame
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
+_PLANE_MESHES = (0, 1, 2)  # how often the triangles of the coarsest mesh are cut in four
+_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.5, 0.1, 2.0), (0.25, 0.05, 2.0))  # brick on a face, at an edge, growth
+_SPACE_BYTES = 30e3  # of memory per node at the peak, measured
+
 
 @dataclass(frozen=True)
 class Body:
-    """A box of elastomer with a cube bonded in its middle; lengths m, moduli Pa.
+    """A box of elastomer with a cube bonded in its middle; lengths in m, moduli in Pa.
 
-    width, depth, height along x, y, z (depth only in 3-D); side of the cube; cube_young inf is a rigid cube.
-    plane: "strain" or "stress", for planar layouts.
+    width, depth, height: along x, y and z (depth in 3-D only); side: of the cube
+    young, poisson: of the body; cube_young, cube_poisson: of the cube, cube_young = inf makes it rigid
+    plane: "strain" or "stress", for layouts in a plane
+    Raises ElasticError when no such body can be computed.
     """
 
     width: float = 60e-3
@@ -38,35 +52,255 @@ class Body:
     cube_poisson: float = 0.30
     plane: str = "strain"
 
+    def __post_init__(self) -> None:
+        for name in ("width", "depth", "height", "side", "young", "cube_young"):
+            value = getattr(self, name)
+            if not value > 0 or (np.isinf(value) and name != "cube_young"):
+                raise ElasticError(f"{name} is {value}; it must be a positive number in SI units")
+        for name in ("poisson", "cube_poisson"):
+            value = getattr(self, name)
+            if not 0 <= value < 0.5:
+                raise ElasticError(
+                    f"{name} is {value}; it must lie in [0, 0.5). For rubber take 0.48 to 0.4999: these elements "
+                    "do not lock, but at 0.5 pressure is no longer a function of strain"
+                )
+        for name in ("width", "depth", "height"):
+            if not getattr(self, name) > 1.1 * self.side:
+                raise ElasticError(
+                    f"the cube's side is {self.side * 1e3:g} mm but the body's {name} is "
+                    f"{getattr(self, name) * 1e3:g} mm; the body must be at least 1.1 times as large"
+                )
+        if self.plane not in ("strain", "stress"):
+            raise ElasticError(f"plane is {self.plane!r}; it must be 'strain' or 'stress'")
 
-def response(body, layout, level, progress=None):
-    modes = default_modes(layout)
-    axes = (0, 2) if layout.planar else (0, 1, 2)
-    d0 = body.side / 2
-    half = [s / body.side for s in (body.width, body.depth, body.height)]
-    half = [half[k] for k in axes]
-    size = layout.pad_size / 2
-    stops = sorted({round(abs(c + s), 12) for x, n in zip(layout.positions, layout.normals) for k in axes if not n[k] for c in [x[k]] for s in (-size, size)})
-    mesh = section(half, stops, level) if layout.planar else block(half, stops, *level)
-    unit = body.young
-    rigid = np.isinf(body.cube_young)
-    solid = Solid(mesh, lame(1.0, body.poisson, body.plane if layout.planar else "strain"),
-                  None if rigid else lame(body.cube_young / unit, body.cube_poisson, body.plane))
-    S = modes.stress[np.ix_(range(modes.n_modes), axes, axes)]
-    G = modes.gradient[np.ix_(range(modes.n_modes), axes, axes, axes)]
-    dim = len(axes)
-    A = np.zeros((layout.n_pads, modes.n_modes))
-    e = np.eye(dim, dtype=int)
-    for c, parity in enumerate(itertools.product((1, -1), repeat=dim)):
-        odd = np.array(parity) < 0
-        ms = np.all((e[:, None] + e[None, :]) % 2 == odd, axis=-1)
-        mg = np.all((e[:, None, None] + e[None, :, None] + e[None, None, :]) % 2 == odd, axis=-1)
-        s, g = S * ms, G * mg
-        used = np.flatnonzero(np.any(s, axis=(1, 2)) | np.any(g, axis=(1, 2, 3)))
-        if not len(used): continue
-        R = solid.reactions(solid.solve(parity, [(s[m], g[m]) for m in used]))
-        for p, (x, n) in enumerate(zip(layout.positions[:, axes], layout.normals[:, axes])):
-            a = int(np.flatnonzero(n)[0])
-            sign = parity[a] if n[a] < 0 else 1
-            A[p, used] += sign * solid.mean_stress(R, parity, a, [(x[k] - size, x[k] + size) for k in range(dim) if k != a])
-    return A, solid.basis.N
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A computed response matrix.
+
+    matrix: (pads, modes), Pa per Pa, tension positive, gradients times d0
+    coefficients, structure_residual: its projection on the matrices that `symmetry` allows, and the relative
+    part that is left; mode_residual: that part for each mode
+    rank: number of independent states the pads see; unobservable: modes that cannot be told, by name
+    convergence: one row per mesh: unknowns, seconds, coefficients, and `change`, the largest change of an entry to
+    the next finer mesh relative to the largest entry (None for the last)
+    """
+
+    body: Body
+    layout: Layout
+    symmetry: str
+    modes: tuple[str, ...]
+    matrix: Array
+    coefficients: dict[str, float]
+    structure_residual: float
+    mode_residual: dict[str, float]
+    rank: int
+    unobservable: tuple[str, ...]
+    convergence: tuple[dict[str, Any], ...]
+    seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types for JSON."""
+        return {
+            "matrix": self.matrix.tolist(),
+            "coefficients": self.coefficients,
+            "structure_residual": self.structure_residual,
+            "convergence": list(self.convergence),
+            "seconds": self.seconds,
+            "pads": list(self.layout.pads),
+            "modes": list(self.modes),
+            "symmetry": self.symmetry,
+            "mode_residual": self.mode_residual,
+            "rank": self.rank,
+            "unobservable": list(self.unobservable),
+            "body": {name: None if value == np.inf else value for name, value in vars(self.body).items()},
+        }
+
+
+def compute_response(
+    body: Body, layout: Layout, symmetry: str = "full", meshes: int = 3, progress: Progress | None = None
+) -> Response:
+    """Response of a layout in a body on `meshes` meshes, 1 to 3; the last, finest one is the result.
+
+    progress(done, total, what) is called before every solve and at the end. Raises ElasticError when pads overlap or the mesh
+    would not fit into memory, SymmetryError when the layout does not have the symmetry.
+    """
+    start = time.perf_counter()
+    structure = find_structure(layout, symmetry)
+    if not 1 <= meshes <= 3:
+        raise ElasticError(f"{meshes} meshes are asked for; 1, 2 or 3 are possible")
+    _check_pads(layout)
+    levels = _PLANE_MESHES if layout.planar else _SPACE_MESHES
+    grids = [_mesh(body, layout, level) for level in levels[:meshes]]
+    _check_memory(grids[-1].nvertices * (16 if layout.planar else 8))
+    total, done = meshes * 2 ** len(_axes(layout)), itertools.count()
+
+    def report(what: str) -> None:
+        if progress is not None:
+            progress(next(done), total, what)
+
+    matrices, rows = [], []
+    for number, grid in enumerate(grids, 1):
+        began = time.perf_counter()
+        matrix, size = _matrix(body, layout, grid, lambda what, n=number: report(f"mesh {n} of {meshes}, {what}"))
+        matrices.append(matrix)
+        rows.append({"mesh": number, "unknowns": size, "seconds": time.perf_counter() - began})
+        rows[-1]["coefficients"] = project(structure, matrix)[0]
+    for row, matrix, finer in zip(rows, matrices, matrices[1:] + [None]):
+        row["change"] = None if finer is None else float(np.abs(matrix - finer).max() / np.abs(finer).max())
+    report("done")
+    matrix = matrices[-1]
+    coefficients, residual = project(structure, matrix)
+    left = matrix - np.tensordot(list(coefficients.values()), structure.basis, axes=1)
+    names = structure.modes.names
+    norms = np.linalg.norm(matrix, axis=0)
+    rank, unseen = _observable(matrix, names)
+    return Response(
+        body=body,
+        layout=layout,
+        symmetry=symmetry,
+        modes=names,
+        matrix=matrix,
+        coefficients=coefficients,
+        structure_residual=residual,
+        mode_residual=dict(zip(names, (np.linalg.norm(left, axis=0) / np.where(norms > 0, norms, 1.0)).tolist())),
+        rank=rank,
+        unobservable=unseen,
+        convergence=tuple(rows),
+        seconds=time.perf_counter() - start,
+    )
+
+
+def calibration_from_fem(
+    result: Response,
+    whole_matrix: bool = False,
+    rest_frequency: float = 100e3,
+    beta: float = 0.3,
+    modulus: float = 0.3e6,
+    noise: float | None = None,
+    source: str = "",
+) -> Calibration:
+    """Calibration of a cube with the computed response: its symmetric coefficients, or the whole matrix.
+
+    rest_frequency Hz, beta and modulus Pa (of the pads' foam) are not computed: measure them, or tare.
+    noise: standard deviation of a pad's stress in Pa; by default that of counting 1 ms of periods, 8 ppm.
+    """
+    content: dict[str, Any] = {"matrix": result.matrix} if whole_matrix else {"coefficients": result.coefficients}
+    return Calibration(
+        layout=result.layout,
+        symmetry=result.symmetry,
+        half_side=result.body.side / 2,
+        rest_frequency=np.array(rest_frequency),
+        beta=np.array(beta),
+        modulus=np.array(modulus),
+        noise=np.array(8e-6 * modulus * (1 + beta) if noise is None else noise),
+        source=source,
+        **content,
+    )
+
+
+def strip_layout(layout: Layout, width: float, centre: float = 0.5) -> Layout:
+    """The same layout with pads of another width at another distance from the middle of the face, in units of d0.
+
+    The halves of each face are width = 1, centre = 0.5. Raises LayoutError when a pad leaves its face.
+    """
+    normals = layout.normals
+    across = layout.positions - normals
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    return Layout(layout.name, normals + centre * across / np.where(length > 0, length, 1.0), normals, width)
+
+
+def _axes(layout: Layout) -> tuple[int, ...]:
+    return (0, 2) if layout.planar else (0, 1, 2)
+
+
+def _check_pads(layout: Layout) -> None:
+    """Pads of one face must not share area: square ones overlap when both distances are below their side."""
+    for i, j in itertools.combinations(range(layout.n_pads), 2):
+        gap = np.abs(layout.positions[i] - layout.positions[j]).max()
+        if np.array_equal(layout.normals[i], layout.normals[j]) and gap < layout.pad_size * (1 - 1e-9):
+            raise ElasticError(
+                f"pads {layout.pads[i]} and {layout.pads[j]} are {layout.pad_size:g} d0 wide but {gap:g} d0 apart, "
+                "so they overlap; make them narrower or move them apart"
+            )
+
+
+def _check_memory(nodes: int) -> None:
+    need, have = nodes * _SPACE_BYTES, _available_memory()
+    if have is not None and need > have:
+        raise ElasticError(
+            f"this needs about {need / 1e9:.1f} GB of memory and {have / 1e9:.1f} GB are available; "
+            "ask for fewer meshes or wider pads"
+        )
+
+
+def _available_memory() -> float | None:
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return None  # not Linux: nothing is known, so nothing is refused
+
+
+def _mesh(body: Body, layout: Layout, level: Any) -> Any:
+    axes = _axes(layout)
+    half = [(body.width, body.depth, body.height)[k] / body.side for k in axes]
+    edges = [
+        abs(float(x[k]) + s)
+        for x, n in zip(layout.positions, layout.normals)
+        for k in axes
+        for s in (-layout.pad_size / 2, layout.pad_size / 2)
+        if n[k] == 0
+    ]
+    stops = np.unique(np.round(edges, 9))
+    steps = np.diff(np.unique([0.0, *stops[stops < 1], 1.0]))
+    if steps.min() < 1e-3:
+        raise ElasticError(
+            f"pad edges are {steps.min():.2g} d0 apart, the mesh resolves 0.001; move the edges together or apart"
+        )
+    return section(half, stops, level) if layout.planar else block(half, stops, *level)
+
+
+def _matrix(body: Body, layout: Layout, grid: Any, report: Callable[[str], None]) -> tuple[Array, int]:
+    """Response matrix (pads, modes) on one mesh, and the mesh's number of unknowns."""
+    axes, modes = _axes(layout), default_modes(layout)
+    plane = body.plane if layout.planar else "strain"
+    cube = None if np.isinf(body.cube_young) else lame(body.cube_young / body.young, body.cube_poisson, plane)
+    solid = Solid(grid, lame(1.0, body.poisson, plane), cube)
+    every = range(modes.n_modes)
+    stress, gradient = modes.stress[np.ix_(every, axes, axes)], modes.gradient[np.ix_(every, axes, axes, axes)]
+    matrix = np.zeros((layout.n_pads, modes.n_modes))
+    for parity in itertools.product((1, -1), repeat=len(axes)):
+        s, g = _part(stress, parity), _part(gradient, parity)
+        used = np.flatnonzero(np.any(s != 0, axis=(1, 2)) | np.any(g != 0, axis=(1, 2, 3)))
+        report(", ".join(modes.names[m] for m in used))
+        if len(used) == 0:
+            continue
+        reactions = solid.reactions(solid.solve(parity, [(s[m], g[m]) for m in used]))
+        for pad in range(layout.n_pads):
+            matrix[pad, used] += _pad_stress(solid, reactions, parity, layout, pad)
+    return matrix, int(solid.basis.N)
+
+
+def _part(field: Array, parity: Parity) -> Array:
+    """The components of a tensor field (modes, dim, ..., dim) that have this parity: each index k flips axis k."""
+    indices = np.indices(field.shape[1:])
+    odd = np.stack([np.sum(indices == k, axis=0) % 2 == 1 for k in range(len(parity))], axis=-1)
+    return field * np.all(odd == (np.array(parity) < 0), axis=-1)
+
+
+def _pad_stress(solid: Solid, reactions: Array, parity: Parity, layout: Layout, pad: int) -> Array:
+    axes, half = list(_axes(layout)), layout.pad_size / 2
+    centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
+    axis = int(np.argmax(np.abs(normal)))
+    intervals = [(max(c - half, -1.0), min(c + half, 1.0)) for k, c in enumerate(centre) if k != axis]
+    sign = parity[axis] if normal[axis] < 0 else 1
+    return sign * solid.mean_stress(reactions, parity, axis, intervals)
+
+
+def _observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
+    """Rank, and the modes with a part in the null space."""
+    _, singular, rows = np.linalg.svd(matrix)
+    rank = int(np.sum(singular > RANK_TOLERANCE * singular[0]))
+    part = np.linalg.norm(rows[rank:], axis=0)
+    return rank, tuple(name for name, size in zip(names, part) if size > LEAK_TOLERANCE)

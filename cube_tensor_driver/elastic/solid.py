@@ -40,14 +40,19 @@ def lame(young: float, poisson: float, plane: str = "strain") -> tuple[float, fl
     return (2.0 * lam * mu / (lam + 2.0 * mu) if plane == "stress" else lam), mu
 
 
+def stiffness(basis: skfem.Basis, lame_: tuple[float, float]) -> sp.csr_matrix:
+    """K_ij = int lambda div w_i div w_j + 2 mu eps(w_i) : eps(w_j) dV over the elements of the basis."""
+    return _virtual_work.assemble(basis, lam=lame_[0], mu=lame_[1]).tocsr()
+
+
 @skfem.BilinearForm
-def _virtual_work(u, w, p):  # type: ignore[no-untyped-def]
+def _virtual_work(u, w, p):
     e, d = sym_grad(u), sym_grad(w)
     return p.lam * trace(e) * trace(d) + 2.0 * p.mu * ddot(e, d)
 
 
 @skfem.LinearForm
-def _load_work(w, p):  # type: ignore[no-untyped-def]
+def _load_work(w, p):
     return ddot(p.sigma, sym_grad(w))
 
 
@@ -70,8 +75,8 @@ class Solid:
         for k in range(self.dim):
             self.component[self.basis.get_dofs(elements=True).all(f"u^{k + 1}")] = k
         self.rigid = cube is None
-        self.body = self._stiffness(inside == 0, body)
-        self.total = self.body if cube is None else self.body + self._stiffness(inside, cube)
+        self.body = stiffness(self._part(~inside), body)
+        self.total = self.body if cube is None else self.body + stiffness(self._part(inside), cube)
 
     def solve(self, parity: Parity, loads: Sequence[tuple[Array, Array]]) -> Array:
         """Displacements (dofs, n) under n loads of one parity.
@@ -106,11 +111,9 @@ class Solid:
             weights *= w[index] / (stop - start)
         return np.asarray(-weights @ reactions[dofs])
 
-    def _stiffness(self, elements: NDArray[np.bool_], lame_: tuple[float, float]) -> sp.csr_matrix:
-        part = skfem.Basis(
-            self.basis.mesh, self.basis.elem, elements=np.flatnonzero(elements), intorder=2 * self.order
-        )
-        return _virtual_work.assemble(part, lam=lame_[0], mu=lame_[1]).tocsr()
+    def _part(self, elements: NDArray[np.bool_]) -> skfem.Basis:
+        whole = self.basis
+        return skfem.Basis(whole.mesh, whole.elem, elements=np.flatnonzero(elements), intorder=2 * self.order)
 
     def _forces(self, stress: Array, gradient: Array) -> Array:
         x = self.basis.default_parameters()["x"]

@@ -158,6 +158,8 @@ def read_skin(path: Path) -> Skin:
     _check_unique(((cube.uid,) for cube in cubes if cube.uid is not None), path, "cubes", "uid")
     _check_unique(((cube.link, cube.index) for cube in cubes if cube.index is not None), path, "cubes", "link and index")
     rate = data.get("rate")
+    if rate is not None and not math.isfinite(rate):
+        raise ConfigError(f"{path}: rate: found {rate}, allowed: {SCHEMA['properties']['rate']['description']}")
     return Skin(data["name"], data["parent_frame"], None if rate is None else float(rate), links, tuple(cubes))
 
 

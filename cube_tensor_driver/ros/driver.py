@@ -13,7 +13,7 @@ from ..core.errors import ConfigError, LinkError
 from ..core.pipeline import Pipeline
 from ..device.clock import ClockMap
 from ..device.link import LinkConfig, LinkState
-from ..device.protocol import Frame, Hello, Sample, Stats
+from ..device.protocol import VERSION, Frame, Hello, Sample, Stats
 from ..device.reader import Reader
 from ..device.scan import Place, Scan
 from ..files.skin import Skin, read_skin
@@ -42,7 +42,7 @@ class Driver(CubeNode):
         self._reader: Reader | None = None
 
     def configure(self) -> None:
-        skin = read_skin(Path(self.value("config")))
+        skin = read_skin(self.config())
         self._skin = skin
         self._rate = float(self.value("rate")) or skin.rate
         self._links = self._link_configs(skin)
@@ -55,6 +55,7 @@ class Driver(CubeNode):
         self._scan = Scan(len(names), places)
         self._clocks = [ClockMap() for _ in names]
         self._stats: list[Stats | None] = [None] * len(names)
+        self._other_versions: list[int | None] = [None] * len(names)
         self._problems: list[list[str]] = [[] for _ in names]
         self._published = self._published_before = 0
         quality = queue(self._rate, self.value("qos_reliability"))
@@ -153,7 +154,12 @@ class Driver(CubeNode):
             other = link.decoder.other_version
             notes = [*self._problems[number]]
             if other is not None:
-                notes.append(f"the hub speaks protocol version {other}, this driver version 1: update the hub's firmware")
+                notes.append(
+                    f"the hub speaks protocol version {other}, this driver version {VERSION}: update the older one"
+                )
+                if other != self._other_versions[number]:
+                    self._other_versions[number] = other
+                    self.get_logger().error(f"link {link.config.name}: {notes[-1]}")
             if link.error is not None:
                 notes.insert(0, str(link.error))
             level = max(LEVELS[link.state], DiagnosticStatus.WARN if notes else DiagnosticStatus.OK)

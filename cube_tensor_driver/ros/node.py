@@ -7,6 +7,7 @@ import math
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -18,7 +19,7 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from ..core.errors import CubeError
+from ..core.errors import ConfigError, CubeError
 
 PAUSE_S = 0.5
 """The longest pause of a reader that no message is lost in: queue depths are rate times this."""
@@ -28,10 +29,15 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def queue(rate: float | None, reliability: str = "reliable") -> QoSProfile:
-    """Quality of service of the batch topics at `rate` messages per second, None when it is not known."""
+    """Quality of service of the batch topics at `rate` messages per second, None when it is not known.
+
+    ConfigError: no such reliability.
+    """
     depth = min(max(10, math.ceil((rate or UNKNOWN_RATE) * PAUSE_S)), 1000)
-    policy = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}[reliability]
-    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=policy)
+    policies = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
+    if reliability not in policies:
+        raise ConfigError(f"parameter qos_reliability is {reliability!r}, allowed: {', '.join(policies)}")
+    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=policies[reliability])
 
 
 class CubeNode(LifecycleNode):
@@ -46,6 +52,12 @@ class CubeNode(LifecycleNode):
         if span is not None:
             descriptor.floating_point_range = [FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)]
         self.declare_parameter(name, default, descriptor)
+
+    def config(self) -> Path:
+        """The skin file of parameter config. ConfigError: not given."""
+        if not self.value("config"):
+            raise ConfigError("parameter config is empty: name a skin file, -p config:=skin.yaml")
+        return Path(self.value("config")).expanduser()
 
     def value(self, name: str) -> Any:
         return self.get_parameter(name).value

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
@@ -34,7 +32,7 @@ class Reconstruction(CubeNode):
         self._active = False
 
     def configure(self) -> None:
-        skin = self._skin = read_skin(Path(self.value("config")))
+        skin = self._skin = read_skin(self.config())
         self._pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
         self._covariances: dict[tuple[int, int], np.ndarray] = {}
         self._rows = self._rows_before = self._invalid = self._bad_messages = 0

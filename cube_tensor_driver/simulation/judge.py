@@ -66,6 +66,11 @@ class Judge:
 
         self._time_ns = time_ns
 
+    @property
+    def sampled(self) -> bool:
+        """Whether any frequencies have arrived."""
+        return bool(self._samples)
+
     def complete(self) -> bool:
         """Whether a tensor of every sample sent has arrived."""
         return len(self._received()[0]) >= self._sent

@@ -47,6 +47,6 @@ class MovingLoad:
         """Centre of the disc (3,) in m and force on the skin (3,) in N, in the skin's parent frame."""
         turn = 2 * np.pi * seconds / CIRCUIT_S
         path = np.array([np.sin(turn), np.sin(2 * turn + 0.5), 0.0])
-        press = (1 - np.cos(2 * np.pi * seconds / PRESS_S)) / 2
+        press = 0.55 - 0.45 * np.cos(2 * np.pi * seconds / PRESS_S)
         rub = FRICTION * np.array([np.cos(turn), np.sin(turn)])
         return self._centre + path * self._span, FORCE * press * np.array([rub[0], rub[1], -1.0])

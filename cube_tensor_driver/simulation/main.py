@@ -75,6 +75,7 @@ class Simulator:
     def __init__(self, skin: Skin, ports: Path, noise: float = 0.0, drift: float = 0.0) -> None:
         """ConfigError: cubes of one hub have different numbers of pads, or the folder for the ports cannot be used."""
         self._load = MovingLoad(skin)
+        self._ports = ports
         self._field: tuple[int, tuple[np.ndarray, np.ndarray]] | None = None
         self._start_ns = time.monotonic_ns()
         self.start_time_ns = time.time_ns()
@@ -152,6 +153,9 @@ class Simulator:
     def close(self) -> None:
         for line in self.lines.values():
             line.close()
+        # Ours to remove when nobody else put anything there.
+        with contextlib.suppress(OSError):
+            self._ports.rmdir()
 
 
 class Stop:

@@ -18,8 +18,9 @@ from ..files.skin import Skin
 
 REFRESH_S = 0.1
 RATE_S = 1.0
-SHOWN = ("zz", "zx", "yz", "zz_x", "zz_y", "zz_z")
-"""Components with a column of their own: pressure, the shear on the skin's surface, how the pressure varies."""
+SHOWN = ("xx", "zz", "zx", "yz", "zz_x", "zz_y", "zz_z")
+"""Components with a column of their own where a cube observes them: normal stress, shear on the skin's surface, how the
+pressure varies."""
 BAR = 12
 
 
@@ -78,7 +79,8 @@ class LiveTable:
         table = Table(title=f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed")
         table.add_column("cube")
         table.add_column("pressure", width=BAR)
-        for name in SHOWN:
+        names = [name for name in SHOWN if np.isfinite(self._values[:, COMPONENTS.index(name)]).any()]
+        for name in names:
             unit = "kPa/mm" if "_" in name else "kPa"
             label = f"∂{name[:2]}/∂{name[3]}" if "_" in name else name
             table.add_column(f"{label}\n{unit}", justify="right", min_width=7)
@@ -91,7 +93,7 @@ class LiveTable:
         if len(shown) > most:
             shown = np.sort(np.argsort(-np.abs(pressure), kind="stable")[:most])
             table.caption = f"the {most} cubes under the greatest normal stress of {len(pressure)}"
-        columns = [COMPONENTS.index(name) for name in SHOWN]
+        columns = [COMPONENTS.index(name) for name in names]
         for number in shown.tolist():
             bar = "█" * int(BAR * min(1.0, max(0.0, pressure[number] / self._peak)))
             values = [_kilo(self._values[number, column], 1e-6 if column > 5 else 1e-3) for column in columns]

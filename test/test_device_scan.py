@@ -1,0 +1,114 @@
+"""From samples to rows: which cube a value belongs to, what is left out and counted, when a scan is complete."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.device.protocol import Hello, Sample
+from cube_tensor_driver.device.scan import Place, Scan
+
+
+def hello(uids, n_pads=2):
+    return Hello(1, 1, n_pads, 1000, np.array(uids, "<u8"))
+
+
+def sample(sequence, hertz, first=0, fault=0, celsius=-32768):
+    frequency = np.rint(np.array(hertz) * 1e3).astype("<u4")
+    n = len(frequency)
+    return Sample(sequence, first, 0, frequency, np.full(n, fault, "<u4"), np.full(n, celsius, "<i2"))
+
+
+def two_links():
+    # cube 0 on link 1 index 0; cube 1 on link 0 index 1; cube 2 by uid 77 anywhere; cube 3 on link 1 index 1
+    scan = Scan(2, [Place("a", 1, 0, None, 2), Place("b", 0, 1, None, 2), Place("c", None, None, 77, 2), Place("d", 1, 1, None, 2)])
+    assert scan.hello(0, hello([77, 5])) == []
+    assert scan.hello(1, hello([6, 7])) == []
+    return scan
+
+
+def test_rows_carry_the_cubes_of_the_skin():
+    scan = two_links()
+    scan.add(0, sample(10, [[1.0, 2.0], [3.0, 4.0]], celsius=2150), 1000)
+    assert scan.complete()  # link 1 has never delivered: nobody waits for it
+    scan.add(1, sample(20, [[5.0, 6.0], [7.0, 8.0]], fault=2), 3000)
+    rows = scan.take()
+    assert rows.cube.tolist() == [2, 1, 0, 3]
+    assert rows.sequence.tolist() == [10, 10, 20, 20]
+    assert rows.stamp_ns.tolist() == [1000, 1000, 3000, 3000]
+    assert rows.frequency.tolist() == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]]
+    assert rows.pad_fault.tolist() == [0, 0, 2, 2]
+    np.testing.assert_allclose(rows.temperature, [21.5, 21.5, np.nan, np.nan], rtol=1e-6)  # float32
+    assert scan.rows == 4
+    assert scan.take() is None
+
+
+def test_a_scan_waits_for_live_links_but_not_twice():
+    scan = two_links()
+    for link in (0, 1):
+        scan.add(link, sample(0, [[1.0, 1.0]]), 0)
+    scan.take()
+    scan.add(0, sample(1, [[1.0, 1.0]]), 1)
+    assert not scan.complete()
+    scan.add(0, sample(2, [[1.0, 1.0]]), 2)
+    assert scan.complete()
+    scan.take()
+    scan.add(0, sample(3, [[1.0, 1.0]]), 3)
+    scan.live(1, False)
+    assert scan.complete()
+
+
+def test_not_measured_is_nan_and_millihertz_survive():
+    scan = Scan(1, [Place("a", 0, 0, None, 2)])
+    scan.hello(0, hello([1]))
+    scan.add(0, sample(0, [[0.0, 100_000.001]]), 0)
+    frequency = scan.take().frequency
+    # 1 mHz is below float32's spacing at 100 kHz (7.8 mHz): the nearest float32 is what must come out
+    assert np.isnan(frequency[0, 0]) and frequency[0, 1] == np.float32(100_000.001)
+
+
+def test_strangers_are_counted_and_left_out():
+    scan = Scan(1, [Place("a", 0, 1, None, 2)])
+    assert scan.hello(0, hello([1, 2, 3])) == [
+        "the hub's cube 0 (uid 0x1) is not in the skin file",
+        "the hub's cube 2 (uid 0x3) is not in the skin file",
+    ]
+    scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]]), 0)
+    rows = scan.take()
+    assert rows.cube.tolist() == [0] and rows.frequency.tolist() == [[2.0, 2.0]]
+    assert (scan.rows, scan.unknown_cube, scan.wrong_pads) == (1, 3, 0)
+
+
+def test_another_number_of_pads_names_both_and_invents_nothing():
+    scan = Scan(1, [Place("a", 0, 0, None, 8), Place("b", 0, 1, None, 2)])
+    (problem,) = scan.hello(0, hello([1, 2]))
+    assert "cube a" in problem and "reports 2 pads" in problem and "layout has 8" in problem
+    scan.add(0, sample(0, [[1.0, 2.0], [3.0, 4.0]]), 0)
+    rows = scan.take()
+    assert rows.cube.tolist() == [1] and scan.wrong_pads == 1
+    # narrower than the skin's widest cube: the rest is not measured
+    assert rows.frequency[0, :2].tolist() == [3.0, 4.0] and np.isnan(rows.frequency[0, 2:]).all()
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        (Place("a", 0, 5, None, 2), ["index 5", "2 cubes"]),
+        (Place("a", 0, None, 99, 2), ["no cube with uid 0x63"]),
+        (Place("a", 1, None, 5, 2), ["uid 0x5 is on this link", "another one"]),
+    ],
+)
+def test_what_does_not_fit_is_said(place, words):
+    scan = Scan(2, [place])
+    text = scan.hello(0, hello([5, 6]))[0]
+    for word in words:
+        assert word in text
+
+
+def test_a_repeated_hello_says_nothing_and_a_changed_one_counts():
+    scan = Scan(1, [Place("a", None, None, 5, 2)])
+    assert scan.hello(0, hello([5])) == []
+    assert scan.hello(0, hello([5])) is None
+    assert scan.hello(0, hello([4, 5])) == ["the hub's cube 0 (uid 0x4) is not in the skin file"]
+    scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0]]), 0)
+    assert scan.take().frequency.tolist() == [[2.0, 2.0]]

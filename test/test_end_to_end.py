@@ -1,0 +1,385 @@
+"""The main job in real processes: simulator, pseudo-terminal, driver, DDS, reconstruction, DDS, subscriber."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tty
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from conftest import ROOT
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from cube_tensor_driver.core.calibration import Calibration
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.device.protocol import Decoder, Hello, Request, Sample, encode
+from cube_tensor_driver.files.share import share
+from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.files.yaml import parse_yaml
+from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
+from cube_tensor_driver.ros.children import Children, ros_arguments
+from cube_tensor_driver.ros.messages import read_frequencies, read_stress
+from cube_tensor_driver.ros.start import skin_processes
+
+SKIN = share() / "config" / "skin_demo.yaml"
+SINGLE = share() / "config" / "cube.yaml"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def demo(*arguments: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "cube_tensor_driver.cli", "demo", *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
+    )  # fmt: skip
+
+
+def test_demo_loses_nothing_and_is_right(domain, tmp_path):
+    path = tmp_path / "demo.json"
+    process = demo("--headless", "--cubes", "16", "--rate", "100", "--duration", "3", "--json", str(path))
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, output + errors
+    result = json.loads(path.read_text())
+    assert result["cubes"] == 16 and result["rate_hz"] == 100
+    assert result["samples_sent"] == 16 * 100 * 3
+    assert result["tensors_received"] == result["samples_received"] == result["samples_sent"]
+    assert result["lost"] == 0 and result["crc_errors"] == 0
+    # float32 carries 6e-8; pads at a strain of 0.1 have 1e-6 of their stress, times what the inversion adds
+    assert result["error_rel_rms"] < 1e-5
+    assert 0 < result["latency_p50_ms"] <= result["latency_p99_ms"]
+    for name in ("driver", "reconstruction"):
+        assert 0 < result[f"rss_{name}_mb"] < 150
+        assert result[f"cpu_{name}_percent"] >= 0
+
+
+def test_interrupted_demo_leaves_no_process(domain, tmp_path):
+    process = demo("--cubes", "4")
+    family = psutil.Process(process.pid)
+    until = time.monotonic() + 30
+    while len(family.children()) < 3:  # simulator, reconstruction, driver
+        assert time.monotonic() < until and process.poll() is None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.05)
+    children = family.children(recursive=True)
+    start = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=10)
+    assert time.monotonic() - start < 2.0  # what the README promises
+    assert process.returncode == 0
+    assert not [child for child in children if child.is_running()]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--config", "none.yaml"], ["none.yaml", "No such file"]),
+        (["--cubes", "0"], ["--cubes is 0", "1 to 4096"]),
+        (["--headless", "--duration", "0.2", "--json", "/nowhere/x.json"], ["/nowhere/x.json", "can be written"]),
+    ],
+)
+def test_demo_says_what_is_wrong_in_one_line(domain, arguments, words):
+    process = demo(*arguments)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "Traceback" not in errors
+    for word in words:
+        assert word in errors
+
+
+def test_every_topic_of_a_skin(ros, tmp_path):
+    skin = read_skin(SKIN)
+    batches = ros.listen(SkinStress, "stress")
+    raw = ros.listen(SkinFrequencies, "frequencies")
+    tensors = ros.listen(StressTensorStamped, "cubes/c05/stress")
+    wrenches = ros.listen(WrenchStamped, "cubes/c05/wrench")
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    with Children(tmp_path) as children:
+        for process in skin_processes(SKIN, simulated_ports=tmp_path / "ports"):
+            children.start(process)
+        ros.wait(lambda: len(batches) > 50 and len(raw) > 80 and len(tensors) > 20 and len(wrenches) > 20)
+        ros.wait(lambda: {status.name for array in diagnostics for status in array.status} >= {
+            "/driver", "/driver: link hub0", "/driver: link hub1", "/reconstruction"})  # fmt: skip
+        # who comes late still gets the latched info, of both nodes
+        infos = ros.listen(SkinInfo, "info", LATCHED)
+        ros.wait(lambda: len(infos) == 2)
+        children.check()
+
+    # one message per scan of both hubs, cubes in order
+    times, rows = read_stress(batches[-1])
+    assert times.header.frame_id == "skin_base"
+    assert sorted(times.cube.tolist()) == list(range(16))
+    assert (rows.status == 0).all()
+    names = ("xx", "yy", "zz", "yz", "zx", "xy")
+    seen = [name for k, name in enumerate(names) if rows.observed[0] >> k & 1]
+    assert seen == ["xx", "zz", "zx"]
+    assert np.isnan(rows.stress[:, [1, 3, 5]]).all() and np.isfinite(rows.stress[:, [0, 2, 4]]).all()
+
+    # what the batch says of a cube, its own topic says too, with the covariance of the core
+    by_time = {}
+    for message in batches:
+        times, rows = read_stress(message)
+        row = times.cube.tolist().index(5)
+        by_time[int(times.stamp_ns[row])] = rows.stress[row], rows.gradient[row]
+    tensor = tensors[-1]
+    stamp = tensor.header.stamp.sec * 10**9 + tensor.header.stamp.nanosec
+    stress, gradient = by_time[stamp]
+    normal, shear = tensor.tensor.normal, tensor.tensor.shear
+    np.testing.assert_array_equal([normal.x, normal.y, normal.z, shear.x, shear.y, shear.z], stress)
+    np.testing.assert_array_equal(tensor.tensor.normal_gradient, gradient)
+    assert tensor.header.frame_id == "skin_c05"
+    expected = Pipeline([cube.calibration for cube in skin.cubes]).covariance(5)
+    np.testing.assert_allclose(np.reshape(tensor.tensor.covariance, (15, 15)), expected, rtol=1e-5)  # noise in float32
+
+    # force = w² σ·n on the cube's own face of 4 mm, what is not observed counts as 0; always finite
+    wrench = wrenches[-1]
+    stress, gradient = by_time[wrench.header.stamp.sec * 10**9 + wrench.header.stamp.nanosec]
+    force, torque = wrench.wrench.force, wrench.wrench.torque
+    np.testing.assert_allclose([force.x, force.y, force.z], 0.004**2 * np.array([stress[4], 0, stress[2]]), rtol=1e-6)
+    np.testing.assert_allclose(
+        [torque.x, torque.y, torque.z], [0, -(0.004**4) / 12 * gradient[6], 0], rtol=1e-6, atol=1e-30
+    )
+
+    # the latched info holds all that makes the same tensors of the recorded frequencies again
+    info = infos[0]
+    assert info.version == SkinInfo.VERSION and [cube.name for cube in info.cubes] == [cube.name for cube in skin.cubes]
+    texts = dict(zip(info.calibration_ids, info.calibrations, strict=True))
+    calibrations = [Calibration.from_dict(parse_yaml(texts[cube.calibration_id], "info")) for cube in info.cubes]
+    replay = Pipeline(calibrations, np.float32)
+    stored = {tuple(read_stress(m)[0].sequence): read_stress(m)[1] for m in batches}
+    compared = 0
+    for message in raw:
+        times, frequency, pad_fault, temperature = read_frequencies(message)
+        if tuple(times.sequence) in stored:
+            again = replay.process(times.cube, frequency, pad_fault, temperature)
+            np.testing.assert_array_equal(again.stress, stored[tuple(times.sequence)].stress)
+            compared += 1
+    assert compared > 40
+
+
+def test_driver_waits_for_a_port_that_is_not_there_yet(ros, tmp_path):
+    frequencies = ros.listen(SkinFrequencies, "frequencies")
+    ports = tmp_path / "ports"
+    simulator, _, driver = (skin_processes(SINGLE, simulated_ports=ports)[i] for i in (0, 1, 2))
+    with Children(tmp_path) as children:
+        children.start(driver)
+        ros.wait(lambda: "No such file" in children.log("driver"))
+        assert "plug the hub in" in children.log("driver")
+        children.start(simulator)
+        ros.wait(lambda: frequencies, 10)
+        children.check()
+        assert "Traceback" not in children.log("driver")
+
+
+class Hub:
+    """A hub under the test's control: the near end of a pseudo-terminal whose far end is the driver's port."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        folder.mkdir(exist_ok=True)
+        self.fd, self._far = os.openpty()
+        tty.setraw(self._far)
+        os.set_blocking(self.fd, False)
+        (folder / name).symlink_to(os.ttyname(self._far))
+        self._decoder = Decoder()
+        self.requests: list[int] = []
+
+    def send(self, data: bytes) -> None:
+        os.write(self.fd, data)
+
+    def listen(self) -> list[int]:
+        with contextlib.suppress(BlockingIOError):
+            frames = self._decoder.feed(os.read(self.fd, 65536))
+            self.requests += [frame.request for frame in frames if isinstance(frame, Request)]
+        return self.requests
+
+    def close(self) -> None:
+        os.close(self.fd)
+        os.close(self._far)
+
+
+@pytest.fixture
+def hub(tmp_path):
+    hub = Hub(tmp_path / "ports", "hub0")
+    yield hub
+    hub.close()
+
+
+def one_sample(sequence: int, hertz: float = 100_000.0, n_pads: int = 8) -> bytes:
+    frequency = np.full((1, n_pads), round(hertz * 1e3), "<u4")
+    return encode(Sample(sequence, 0, 10_000 * sequence, frequency, np.zeros(1, "<u4"), np.full(1, -32768, "<i2")))
+
+
+def greet(n_pads: int = 8) -> bytes:
+    return encode(Hello(0xAB, 1, n_pads, 10_000, np.array([0xCD], "<u8")))
+
+
+def sequences(frequencies: list) -> list[int]:
+    return [number for message in frequencies for number in message.sequence]
+
+
+def start_single(children: Children, tmp_path: Path) -> None:
+    for process in skin_processes(SINGLE, simulated_ports=tmp_path / "ports")[1:]:
+        children.start(process)
+
+
+def link_status(diagnostics: list) -> dict[str, str]:
+    """The newest diagnostics of link hub0: its values, and its message under ''."""
+    for array in reversed(diagnostics):
+        for status in array.status:
+            if status.name == "/driver: link hub0":
+                return {pair.key: pair.value for pair in status.values} | {"": status.message}
+    return {}
+
+
+def test_damaged_bytes_are_counted_and_the_next_good_frame_arrives(ros, hub, tmp_path):
+    frequencies = ros.listen(SkinFrequencies, "frequencies")
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    flipped = bytearray(one_sample(1001))
+    flipped[20] ^= 0x10
+    with Children(tmp_path) as children:
+        start_single(children, tmp_path)
+        ros.wait(lambda: 1 in hub.listen())
+        hub.send(greet())
+        ros.wait(lambda: 2 in hub.listen())
+        first = itertools.count()
+
+        def arrived() -> bool:
+            hub.send(one_sample(next(first)))
+            return bool(frequencies)
+
+        ros.wait(arrived)
+        for data in (bytes(flipped), b"\x07garbage\x00\xff\xff", one_sample(1002), one_sample(1003)[:-9], one_sample(1004)):
+            hub.send(data)
+        ros.wait(lambda: 1004 in sequences(frequencies))
+        assert [number for number in sequences(frequencies) if number > 1000] == [1002, 1004]
+        ros.wait(lambda: int(link_status(diagnostics).get("crc", 0)) >= 1)
+        counted = link_status(diagnostics)
+        # the flipped frame; the garbage, the run before the next zero, and the frame cut short
+        assert sum(int(counted[name]) for name in ("crc", "framing", "length")) == 4
+        children.check()
+
+
+def test_beyond_the_law_is_a_fault_and_no_number(ros, hub, tmp_path):
+    batches = ros.listen(SkinStress, "stress")
+    with Children(tmp_path) as children:
+        start_single(children, tmp_path)
+        ros.wait(lambda: 1 in hub.listen())
+        hub.send(greet())
+        ros.wait(lambda: 2 in hub.listen())
+        ros.wait(lambda: ros.node.count_publishers("stress") and ros.node.count_subscribers("frequencies"))
+        frequency = np.full((1, 8), 100_000_000, "<u4")
+        frequency[0, 3] = 0  # not measured
+        frequency[0, 5] = 4_000_000_000  # 4 MHz; the law ends at f0 (1 + β)/β = 433 kHz
+        sequence = itertools.count()
+
+        def arrived() -> bool:
+            number = next(sequence)
+            hub.send(encode(Sample(number, 0, 10_000 * number, frequency, np.zeros(1, "<u4"), np.zeros(1, "<i2"))))
+            return bool(batches)
+
+        ros.wait(arrived)
+        _, rows = read_stress(batches[0])
+        assert rows.status[0] & SkinStress.PAD_FAULT
+        # six pads cannot tell seven unknowns apart: something is missing, and what is there is at rest
+        assert np.isnan(rows.stress[0]).any()
+        seen = rows.stress[0][np.isfinite(rows.stress[0])]
+        assert np.abs(seen).max(initial=0) < 1e-3
+
+
+def test_another_number_of_pads_is_an_error_that_names_both(ros, hub, tmp_path):
+    frequencies = ros.listen(SkinFrequencies, "frequencies")
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    with Children(tmp_path) as children:
+        start_single(children, tmp_path)
+        ros.wait(lambda: 1 in hub.listen())
+        hub.send(greet(n_pads=4))
+        ros.wait(lambda: 2 in hub.listen())
+        hub.send(one_sample(0, n_pads=4))
+        ros.wait(lambda: "reports 4 pads, its layout has 8" in link_status(diagnostics).get("", ""))
+        assert "reports 4 pads, its layout has 8" in children.log("driver")
+        assert not frequencies
+        children.check()
+
+
+def test_another_protocol_version_is_an_error_that_names_both(ros, hub, tmp_path):
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    with Children(tmp_path) as children:
+        start_single(children, tmp_path)
+        ros.wait(lambda: 1 in hub.listen())
+        hub.send(of_version(2))
+        ros.wait(lambda: "protocol version 2, this driver version 1" in link_status(diagnostics).get("", ""))
+        ros.wait(lambda: "protocol version 2, this driver version 1" in children.log("driver"))
+        children.check()
+
+
+def of_version(version: int) -> bytes:
+    """A sound STATS frame of another protocol version."""
+    import zlib
+
+    from cobs import cobs
+
+    body = bytes([3, version, 0, 0])
+    return b"\0" + cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
+
+
+@pytest.mark.parametrize("executable", ["driver", "reconstruction"])
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"config": "none.yaml"}, ["none.yaml", "No such file"]),
+        ({"config": ""}, ["parameter config is empty"]),
+        ({"config": str(SKIN), "qos_reliability": "maybe"}, ["maybe", "reliable, best_effort"]),
+    ],
+)
+def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, parameters, words):
+    command = [sys.executable, "-m", f"cube_tensor_driver.ros.{executable}", "--ros-args", *ros_arguments(parameters)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 1
+    text = done.stdout + done.stderr
+    assert "Traceback" not in text
+    for word in words:
+        assert word in text
+
+
+def test_lifecycle_by_hand(ros, tmp_path):
+    frequencies = ros.listen(SkinFrequencies, "frequencies")
+    ports = tmp_path / "ports"
+    simulator, _, driver = skin_processes(SINGLE, simulated_ports=ports)
+    driver.parameters["autostart"] = False
+
+    def change(number: int) -> None:
+        answer = ros.call(ChangeState, "/driver/change_state", ChangeState.Request(transition=Transition(id=number)))
+        assert answer.success
+
+    def state() -> int:
+        return ros.call(GetState, "/driver/get_state", GetState.Request()).current_state.id
+
+    with Children(tmp_path) as children:
+        children.start(simulator)
+        children.start(driver)
+        assert state() == State.PRIMARY_STATE_UNCONFIGURED
+        for _ in range(2):
+            change(Transition.TRANSITION_CONFIGURE)
+            assert state() == State.PRIMARY_STATE_INACTIVE
+            frequencies.clear()
+            change(Transition.TRANSITION_ACTIVATE)
+            ros.wait(lambda: len(frequencies) > 5)
+            change(Transition.TRANSITION_DEACTIVATE)
+            ros.wait(lambda: children.log("driver").rstrip().endswith("link hub0: closed"), 5)
+            change(Transition.TRANSITION_CLEANUP)
+        assert state() == State.PRIMARY_STATE_UNCONFIGURED
+        children.check()

@@ -1,0 +1,145 @@
+"""Skin files: what is read, and that every mistake gives one message with file, key, what was found, what is allowed."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.files.calibration import read_calibration
+from cube_tensor_driver.files.grid import grid
+from cube_tensor_driver.files.share import share
+from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.files.yaml import parse_yaml, write_yaml
+
+GOOD = grid("skin", 3, 2, 0.012, 2, "planar_illustrative", "planar", 100.0, "/dev/ttyACM{}")
+
+
+def read(tmp_path: Path, data: object):
+    path = tmp_path / "skin.yaml"
+    path.write_text(data if isinstance(data, str) else yaml.safe_dump(data))
+    return read_skin(path)
+
+
+@pytest.mark.parametrize("name", ["skin_demo.yaml", "cube.yaml"])
+def test_shipped_skins(name):
+    skin = read_skin(share() / "config" / name)
+    assert len(skin.cubes) == {"skin_demo.yaml": 16, "cube.yaml": 1}[name]
+    assert skin.n_pads == 8
+
+
+def test_shipped_calibrations_have_their_id():
+    paths = sorted((share() / "config" / "calibration").glob("*.yaml"))
+    assert paths
+    for path in paths:
+        assert read_calibration(path).id in path.read_text()
+
+
+def test_grid_deals_every_cube_once():
+    # 7 cubes on 3 links: 3, 2, 2, indices from 0 on each link, positions centred and one pitch apart
+    data = grid("skin", 7, 1, 0.5, 3, "planar_illustrative", "planar", 10.0, "p{}")
+    assert [(cube["link"], cube["index"]) for cube in data["cubes"]] == [
+        ("hub0", 0), ("hub0", 1), ("hub0", 2), ("hub1", 0), ("hub1", 1), ("hub2", 0), ("hub2", 1),
+    ]  # fmt: skip
+    assert [cube["pose"]["xyz"][0] for cube in data["cubes"]] == [-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5]
+
+
+def test_pose_and_uid(tmp_path):
+    data = copy.deepcopy(GOOD)
+    del data["cubes"][4]["index"]
+    data["cubes"][4].update(uid="0xc0be", pose={"xyz": [1, 2, 3], "rpy": [0.1, 0.2, 0.3]})
+    cube = read(tmp_path, data).cubes[4]
+    assert (cube.uid, cube.index, cube.xyz, cube.rpy) == (0xC0BE, None, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
+
+
+def change(*path, to=None, remove=False):
+    def apply(data):
+        for part in path[:-1]:
+            data = data[part]
+        if remove:
+            del data[path[-1]]
+        else:
+            data[path[-1]] = to
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("break_it", "words"),
+    [
+        (change("speed", to=3), ["top level", "unknown key 'speed'", "allowed: name, parent_frame"]),
+        (change("links", 0, "prot", to="x"), ["links[0]", "'prot'", "name, port, baud"]),
+        (change("cubes", 3, "pose", "xyz", to=[1, 2]), ["cubes[3].pose.xyz", "found [1, 2]", "three numbers"]),
+        (change("cubes", 1, "index", to="two"), ["cubes[1].index", "'two'", "integer from 0 to 65535"]),
+        (change("cubes", 1, "index", to=-1), ["cubes[1].index", "found -1", "0 to 65535"]),
+        (change("cubes", 2, "name", to="c 2"), ["cubes[2].name", "'c 2'", "letters, digits"]),
+        (change("cubes", 2, "name", to="c1"), ["cubes", "name 'c1' is there twice"]),
+        (change("cubes", 2, "link", to="hub9"), ["cubes[2].link", "'hub9'", "hub0, hub1"]),
+        (change("cubes", 2, "index", to=1), ["link and index 'hub0', 1 is there twice"]),
+        (change("cubes", 2, "uid", to=5), ["cubes[2]", "both uid and index"]),
+        (change("cubes", 2, "index", remove=True), ["cubes[2]", "neither uid nor both link and index"]),
+        (change("cubes", 0, "layout", to="cube"), ["cubes[0].layout", "'cube'", "'planar'"]),
+        (change("cubes", 0, "calibration", to="nope"), ["cubes[0].calibration", "'nope'", "planar_illustrative"]),
+        (change("links", to=[]), ["links", "at least one"]),
+        (change("parent_frame", remove=True), ["'parent_frame' is missing"]),
+        (change("rate", to=0), ["rate", "found 0", "0.1 to 10000"]),
+        (change("rate", to=float("nan")), ["rate", "found nan"]),
+        (change("cubes", 0, "pose", "rpy", to=[0.0, float("inf"), 0.0]), ["cubes[0].pose", "finite"]),
+    ],
+)  # fmt: skip
+def test_one_message_per_mistake(tmp_path, break_it, words):
+    data = copy.deepcopy(GOOD)
+    break_it(data)
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path, data)
+    text = str(caught.value)
+    assert str(tmp_path / "skin.yaml") in text
+    for word in words:
+        assert word in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a: 1\nb: 2\na: 3\n", ["line 3", "'a' is there twice"]),
+        ("a: [1, 2", ["line", "expected"]),
+        ("!!python/object/apply:os.system ['true']", ["line 1"]),
+        ("", ["top level", "found None"]),
+        ("[1, 2]", ["top level", "found [1, 2]"]),
+        ("\x00\x01", ["not YAML"]),
+        ("? [1]\n: 2\n", ["line 1", "unhashable key"]),
+    ],
+)
+def test_what_is_not_a_skin_at_all(tmp_path, text, words):
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path, text)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_missing_file_and_folder_and_size(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match="No such file"):
+        read_skin(tmp_path / "none.yaml")
+    with pytest.raises(ConfigError, match="Is a directory"):
+        read_skin(tmp_path)
+    monkeypatch.setattr("cube_tensor_driver.files.yaml.MAX_BYTES", 10)
+    with pytest.raises(ConfigError, match="the limit is 10"):
+        read(tmp_path, GOOD)
+
+
+def test_merge_keys_are_not_twice():
+    assert parse_yaml("a: &a {x: 1, y: 2}\nb: {<<: *a, x: 3}", "t")["b"] == {"x": 3, "y": 2}
+
+
+def test_written_files_read_back_and_leave_nothing_partial(tmp_path):
+    path = tmp_path / "s.yaml"
+    write_yaml(path, GOOD, "two\nlines")
+    assert path.read_text().startswith("# two\n# lines\n")
+    assert yaml.safe_load(path.read_text()) == GOOD
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(ConfigError, match="can be written"):
+        write_yaml(tmp_path / "none" / "s.yaml", GOOD)
