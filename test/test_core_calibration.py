@@ -16,9 +16,16 @@ def full_of_everything() -> Calibration:
     c = illustrative("planar")
     rng = np.random.default_rng(0)
     return dataclasses.replace(
-        c, gain=1 + 0.05 * rng.normal(size=8), rest_frequency=1e5 + rng.normal(size=8), covariance=np.eye(7) * 1e-6,
-        temperature=TemperatureModel(25, rng.normal(size=(8, 2)) * 1e-5), neglect=("xx_x",), uid=2**64 - 1,
-        created="2024-05-01T12:00:00Z", source="loads.csv")
+        c,
+        gain=1 + 0.05 * rng.normal(size=8),
+        rest_frequency=1e5 + rng.normal(size=8),
+        covariance=np.eye(7) * 1e-6,
+        temperature=TemperatureModel(25, rng.normal(size=(8, 2)) * 1e-5),
+        neglect=("xx_x",),
+        uid=2**64 - 1,
+        created="2024-05-01T12:00:00Z",
+        source="loads.csv",
+    )
 
 
 @pytest.mark.parametrize("calibration", [illustrative("quad"), illustrative("planar"), illustrative("cube"),
@@ -113,7 +120,7 @@ def test_the_wrong_layout_or_cube_is_refused():
     c.check(LAYOUTS["planar"], 0xA1)
     c.check()
     illustrative("planar").check(uid=7)  # for any cube
-    with pytest.raises(CalibrationError, match="'planar' .8 pads.*'quad' .4 pads"):
+    with pytest.raises(CalibrationError, match=r"'planar' .8 pads.*'quad' .4 pads"):
         c.check(LAYOUTS["quad"])
-    with pytest.raises(CalibrationError, match="0x00000000000000a1.*0x00000000000000a2"):
+    with pytest.raises(CalibrationError, match=r"0x00000000000000a1.*0x00000000000000a2"):
         c.check(uid=0xA2)

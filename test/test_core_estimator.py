@@ -14,8 +14,9 @@ from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE
 from cube_tensor_driver.core.response import response
 from cube_tensor_driver.core.symmetry import find_structure
 
-PAIRS = [("quad", "slab"), ("quad", "mirrors"), ("quad", "none"),
-         *((layout, g) for layout in ("planar", "cube") for g in ("full", "slab", "mirrors", "none"))]  # fmt: skip
+PAIRS = [(layout, g) for layout in ("quad", "planar", "cube") for g in ("full", "slab", "mirrors", "none")][
+    1:
+]
 
 
 def random_case(layout: str, symmetry: str, seed: int = 0):
@@ -41,12 +42,16 @@ def test_recovers_what_was_put_in(layout, symmetry):
     assert np.all(estimator.chi2(states @ a.T) < 1e-18)
     assert estimator.dof == len(a) - np.linalg.matrix_rank(a)
     # exactly the components that no hidden combination of modes can change are observed
-    hidden = np.linalg.svd(a)[2][np.linalg.matrix_rank(a):]
+    hidden = np.linalg.svd(a)[2][np.linalg.matrix_rank(a) :]
     nonzero = np.any(modes.components, axis=1)
-    np.testing.assert_array_equal(seen, nonzero & (np.abs(modes.components @ hidden.T).max(axis=1, initial=0) < 1e-9))
+    np.testing.assert_array_equal(
+        seen, nonzero & (np.abs(modes.components @ hidden.T).max(axis=1, initial=0) < 1e-9)
+    )
 
 
-@pytest.mark.parametrize("layout, symmetry", [p for p in PAIRS if p != ("quad", "none")])  # which sees nothing alone
+@pytest.mark.parametrize(
+    "layout, symmetry", [p for p in PAIRS if p != ("quad", "none")]
+)  # which sees nothing alone
 def test_scatter_is_as_stated(layout, symmetry):
     modes, a, rng = random_case(layout, symmetry, 1)
     noise = rng.uniform(0.5, 2, len(a))
@@ -64,7 +69,9 @@ def test_scatter_is_as_stated(layout, symmetry):
     if estimator.dof:
         chi2 = estimator.chi2(v)
         assert chi2.mean() == pytest.approx(estimator.dof, rel=0.06)
-        assert np.mean(chi2 > estimator.limit) == pytest.approx(FALSE_ALARM, abs=5 * np.sqrt(FALSE_ALARM / 1e4))
+        assert np.mean(chi2 > estimator.limit) == pytest.approx(
+            FALSE_ALARM, abs=5 * np.sqrt(FALSE_ALARM / 1e4)
+        )
 
 
 def test_unequal_noise_weighs_the_pads():
@@ -79,7 +86,10 @@ def test_unequal_noise_weighs_the_pads():
 
 def test_what_the_layouts_see():
     quad, planar, cube = (illustrative(n) for n in ("quad", "planar", "cube"))
-    see = {c.layout.name: components_seen(make_estimator(c.response, c.noise, c.modes)) for c in (quad, planar, cube)}
+    see = {
+        c.layout.name: components_seen(make_estimator(c.response, c.noise, c.modes))
+        for c in (quad, planar, cube)
+    }
     assert see["quad"] == {"zx", "zz_z"}  # zz_z only because the illustrative f is 0
     assert see["planar"] == set(PLANE.names)
     assert see["cube"] == set(COMPONENTS)
@@ -94,8 +104,8 @@ def test_what_the_layouts_see():
 def test_the_summary_of_a_layout():
     c = illustrative("cube")
     s = summary(c.structure, c.response)
-    assert list(s) == ["pads", "modes", "n_coefficients", "rank_uniform", "condition_uniform", "rank_gradient",
-                       "condition_gradient", "unobservable", "noise"]  # fmt: skip
+    keys = "pads modes n_coefficients rank_uniform condition_uniform rank_gradient condition_gradient"
+    assert list(s) == [*keys.split(), "unobservable", "noise"]
     assert (s["n_coefficients"], s["rank_uniform"], s["rank_gradient"]) == (12, 6, 12)
     assert s["unobservable"] == ["yz_x", "zx_y", "xy_z"] and s["noise"]["yz_x"] is None
     whole = make_estimator(c.response, np.ones(24), SPACE)
@@ -114,7 +124,9 @@ def test_missing_pads_cost_what_they_must():
     assert components_seen(one) == set(PLANE.names) and one.dof == 0 and np.isnan(one.limit)
     assert np.all(one.matrix[one.observed, 2] == 0)
     whole = make_estimator(c.response, c.noise, c.modes)
-    assert np.all(np.diag(one.covariance)[one.observed] >= np.diag(whole.covariance)[one.observed] * (1 - 1e-12))
+    assert np.all(
+        np.diag(one.covariance)[one.observed] >= np.diag(whole.covariance)[one.observed] * (1 - 1e-12)
+    )
     none = make_estimator(c.response, c.noise, c.modes, missing=np.arange(8))
     assert not none.observed.any() and none.dof == 0 and none.rank == 0
 
@@ -139,7 +151,8 @@ def opposite(layout) -> np.ndarray:
 
 
 def suspects_after(sigmas: float, draws: int = 2000):
-    """How often the residual rings, the suspects are exactly the broken pad and its opposite, miss the broken pad."""
+    """How often the residual rings, the suspects are exactly the broken pad and its opposite, miss the
+    broken pad."""
     rng = np.random.default_rng(7)
     c = illustrative("cube")
     estimator = make_estimator(c.response, c.noise, c.modes)
@@ -148,8 +161,11 @@ def suspects_after(sigmas: float, draws: int = 2000):
     v[row, pad] += sigmas * c.noise[pad]
     marked = estimator.suspects(v)
     pair = marked[row, pad] & marked[row, opposite(c.layout)[pad]] & (marked.sum(axis=1) == 2)
-    return (np.mean(estimator.chi2(v) > estimator.limit), np.mean(pair),
-            np.mean(marked.any(axis=1) & ~marked[row, pad]))
+    return (
+        np.mean(estimator.chi2(v) > estimator.limit),
+        np.mean(pair),
+        np.mean(marked.any(axis=1) & ~marked[row, pad]),
+    )
 
 
 def test_on_the_cube_a_broken_pad_is_named_up_to_its_opposite():

@@ -23,13 +23,20 @@ def individual(layout: str, seed: int, **changes):
     rng, c = np.random.default_rng(seed), illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
     n = c.layout.n_pads
     return dataclasses.replace(
-        c, gain=1 + 0.05 * rng.normal(size=n), beta=0.3 + 0.05 * rng.normal(size=n), noise=3 * rng.uniform(1, 2, size=n),
-        rest_frequency=1e5 + 100 * rng.normal(size=n), modulus=3e5 * (1 + 0.1 * rng.normal(size=n)), **changes)
+        c,
+        gain=1 + 0.05 * rng.normal(size=n),
+        beta=0.3 + 0.05 * rng.normal(size=n),
+        noise=3 * rng.uniform(1, 2, size=n),
+        rest_frequency=1e5 + 100 * rng.normal(size=n),
+        modulus=3e5 * (1 + 0.1 * rng.normal(size=n)),
+        **changes,
+    )
 
 
 def frequencies(calibration, states):
-    return pad_frequency(states @ calibration.response.T, calibration.rest_frequency, calibration.beta,
-                         calibration.modulus)
+    return pad_frequency(
+        states @ calibration.response.T, calibration.rest_frequency, calibration.beta, calibration.modulus
+    )
 
 
 def truth(calibration, states):
@@ -50,15 +57,23 @@ def check_rows(rows, expected, tolerance):
     got, seen = joined(rows), (rows.observed[:, None] >> np.arange(15)) & 1 > 0
     np.testing.assert_array_equal(np.isnan(got), ~seen)
     scale = np.abs(expected).max(axis=0)
-    np.testing.assert_allclose(np.where(seen, got, 0) / scale.clip(1), np.where(seen, expected, 0) / scale.clip(1),
-                               rtol=0, atol=tolerance)
+    np.testing.assert_allclose(
+        np.where(seen, got, 0) / scale.clip(1),
+        np.where(seen, expected, 0) / scale.clip(1),
+        rtol=0,
+        atol=tolerance,
+    )
 
 
 @pytest.mark.parametrize("dtype, tolerance", DTYPES)
 @pytest.mark.parametrize("layout", ["quad", "planar", "cube"])
 @pytest.mark.parametrize("make", [illustrative, individual])
 def test_recovers_the_applied_fields(layout, make, dtype, tolerance):
-    c = make(layout, 3) if make is individual else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+    c = (
+        make(layout, 3)
+        if make is individual
+        else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+    )
     states = states_of(c, 50)
     rows = Pipeline([c] * 50, dtype).process(np.arange(50), frequencies(c, states), np.zeros(50, np.uint32))
     check_rows(rows, truth(c, states), tolerance)
@@ -85,12 +100,17 @@ def test_cubes_of_all_kinds_in_one_batch(dtype, tolerance):
         rows = pipeline.process(cube, frequency)
         check_rows(rows, expected, tolerance)
         assert not rows.status.any()
-    assert np.isnan(rows.residual[cube == 4]).all() and np.all(rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1)
+    assert np.isnan(rows.residual[cube == 4]).all() and np.all(
+        rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1
+    )
     pads = pipeline.pad_stress(cube, frequency)
     assert np.isnan(pads[0, 4:]).all() and np.isfinite(pads[2]).all()
     k = kinds[0]
-    np.testing.assert_allclose(pads[1, :8], pad_stress(frequency[1, :8], k.rest_frequency, k.beta, k.modulus),
-                               atol=0.2 if dtype == np.float32 else 1e-8)
+    np.testing.assert_allclose(
+        pads[1, :8],
+        pad_stress(frequency[1, :8], k.rest_frequency, k.beta, k.modulus),
+        atol=0.2 if dtype == np.float32 else 1e-8,
+    )
 
 
 @pytest.mark.parametrize("dtype, tolerance", DTYPES)
@@ -98,7 +118,13 @@ def test_bad_pads_are_left_out(dtype, tolerance):
     c = individual("cube", 1)
     states = states_of(c, 8)
     frequency = frequencies(c, states)
-    frequency[0, 3], frequency[1, 4], frequency[2, 5], frequency[3, 6], frequency[4, 7] = np.nan, np.inf, 0, -5, 1e9
+    frequency[0, 3], frequency[1, 4], frequency[2, 5], frequency[3, 6], frequency[4, 7] = (
+        np.nan,
+        np.inf,
+        0,
+        -5,
+        1e9,
+    )
     fault = np.zeros(8, np.uint32)
     fault[5], fault[6] = 0b11, 0xFFFFFFFF
     rows = Pipeline([c] * 8, dtype).process(np.arange(8), frequency, fault)
@@ -130,7 +156,9 @@ def test_strange_rows_end_in_their_status_never_in_an_error():
     wild = rng.choice([0, -1, np.nan, np.inf, -np.inf, 1e300, 1e-300, 1e5, 4.4e5], size=(500, 8))
     with np.errstate(all="raise"):
         for dtype in (np.float32, np.float64):
-            rows = Pipeline([c] * 3, dtype).process(rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500))
+            rows = Pipeline([c] * 3, dtype).process(
+                rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500)
+            )
             assert not np.isinf(joined(rows)).any()
     empty = pipeline.process(np.empty(0, int), np.empty((0, 8)), np.empty(0, np.uint32))
     assert empty.stress.shape == (0, 6) and empty.gradient.shape == (0, 9) and empty.status.shape == (0,)
@@ -164,7 +192,10 @@ def test_the_residual_rings_for_what_no_field_explains():
     v[1, 5] += 50 * cube.noise[5]
     pipeline = Pipeline([cube])
     marked = pipeline.suspects(np.zeros(2, int), pad_frequency(v, 1e5, cube.beta, cube.modulus))
-    assert not marked[0].any() and {cube.layout.pads[i] for i in np.flatnonzero(marked[1])} == {"+x+z", "-x-z"}
+    assert not marked[0].any() and {cube.layout.pads[i] for i in np.flatnonzero(marked[1])} == {
+        "+x+z",
+        "-x-z",
+    }
 
 
 def test_false_alarms_are_as_stated():
@@ -217,29 +248,31 @@ def test_covariance_of_a_cube_with_a_bad_pad():
     np.testing.assert_allclose(whole[6:], np.diag(alone)[6:] / c.half_side**2)
 
 
+def cost_of(count: int, dtype) -> np.ndarray:
+    """Least of interleaved timings: bare numpy with the same law and product, the pipeline."""
+    c = illustrative("planar")
+    f = (1e5 + 10 * np.random.default_rng(0).normal(size=(count, 8))).astype(dtype)
+    f0, cube, fault = np.full((count, 8), 1e5, dtype), np.arange(count), np.zeros(count, np.uint32)
+    one, beta, modulus, matrix = dtype(1), dtype(0.3), dtype(3e5), np.zeros((8, 16), dtype)
+    pipeline = Pipeline([c] * count, dtype)
+
+    def bare():
+        r = f / f0
+        return (modulus * (r / (one + beta * (one - r)) - one)) @ matrix
+
+    def ours():
+        return pipeline.process(cube, f, fault)
+
+    return np.min(
+        [[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)], axis=0
+    )
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_speed_against_bare_numpy(dtype):
-    """Least of interleaved timings; the bounds are the issue's, measured ratios are well below."""
-    c = illustrative("planar")
-    k = np.zeros((8, 16), dtype)
-    cost = {}
-    for count in (64, 1024, 1260):
-        f = (1e5 + 10 * np.random.default_rng(0).normal(size=(count, 8))).astype(dtype)
-        f0, cube, fault = np.full((count, 8), 1e5, dtype), np.arange(count), np.zeros(count, np.uint32)
-        one, beta, modulus = dtype(1), dtype(0.3), dtype(3e5)
-        pipeline = Pipeline([c] * count, dtype)
-
-        def bare():
-            r = f / f0
-            return (modulus * (r / (one + beta * (one - r)) - one)) @ k
-
-        def ours():
-            return pipeline.process(cube, f, fault)
-
-        times = np.array([[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)])
-        cost[count] = np.min(times, axis=0)
-    assert cost[1260][1] < 2 * cost[1260][0], cost
-    assert cost[1024][1] < 12 * cost[64][1], cost
+    bare, ours = cost_of(1260, dtype)
+    assert ours < 2 * bare, (ours, bare)
+    assert cost_of(1024, dtype)[1] < 12 * cost_of(64, dtype)[1]
 
 
 def test_no_loop_over_rows():

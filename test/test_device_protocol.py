@@ -178,6 +178,8 @@ BAD = {
     "length says less": (wire(bytes([0x03, 1, 17, 0]) + STATS_PAYLOAD), "length"),
     "length says more": (wire(bytes([0x03, 1, 19, 0]) + STATS_PAYLOAD), "length"),
     "stats too long": (wire(bytes([0x03, 1, 19, 0]) + STATS_PAYLOAD + b"\0"), "length"),
+    "byte after the payload": (wire(bytes([0x03, 1, 18, 0]) + STATS_PAYLOAD + b"\0"), "length"),
+    "sample with a byte too many": (wire(bytes([2, 1, 21, 0]) + bytes(21)), "length"),
     "empty hello": (wire(bytes([0x01, 1, 0, 0])), "length"),
     "hello says 1 cube, has none": (wire(bytes([1, 1, 20, 0]) + bytes(12) + b"\1" + bytes(7)), "length"),
     "empty sample": (wire(bytes([0x02, 1, 0, 0])), "length"),
@@ -205,6 +207,29 @@ def test_other_version_is_remembered() -> None:
     assert decoder.other_version is None
     decoder.feed(BAD["version 2"][0])
     assert decoder.other_version == 2
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        Hello(2**64 - 1, 2**32 - 1, 255, 2**32 - 1, np.array([2**64 - 1], "<u8"), 255),
+        Sample(
+            2**32 - 1,
+            2**16 - 1,
+            2**64 - 1,
+            np.full((1, 255), 2**32 - 1, "<u4"),
+            np.full(1, 2**32 - 1, "<u4"),
+            np.full(1, -(2**15), "<i2"),
+        ),
+        Stats(2**64 - 1, 2**32 - 1, 2**32 - 1, 2**16 - 1),
+        Request(255, 2**32 - 1),
+        Ack(255, 255, 2**32 - 1),
+    ],
+    ids=CASES,
+)
+def test_every_field_holds_its_whole_range(frame: Frame) -> None:
+    (got,) = Decoder().feed(encode(frame))
+    assert repr(got) == repr(frame)
 
 
 def test_longest_frame_passes() -> None:

@@ -1,4 +1,4 @@
-"""Contact fields against mechanics: balance, compatibility, boundary, total force, printed formulas, Hertz."""
+"""Contact fields against mechanics: balance, compatibility, boundary, total force, Hertz."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_gradient_is_the_derivative_of_the_stress(x, f, nu):
 
 @given(point, force, st.floats(0.0, 0.49))
 def test_compatibility_beltrami_michell(x, f, nu):
-    """Laplace sigma_ij + trace_,ij / (1 + nu) = 0: with balance and a free surface, the answer is the only one."""
+    """Laplace sigma_ij + trace_,ij / (1 + nu) = 0: with balance and a free surface there is one answer."""
     h = 1e-4
     second = np.stack(
         [(one(x + h * e, f, nu)[1] - one(x - h * e, f, nu)[1]) / (2 * h) for e in np.eye(3)], axis=-1

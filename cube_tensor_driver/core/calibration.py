@@ -1,4 +1,4 @@
-"""Calibration: all that turns one cube's frequencies into stress, as one frozen value with an id of its content."""
+"""Calibration: all that turns a cube's frequencies into stress, one frozen value with an id."""
 
 from __future__ import annotations
 
@@ -73,8 +73,10 @@ class Calibration:
             raise CalibrationError(f"calibration: {error}") from error
         put("neglect", tuple(self.neglect))
         if (self.coefficients is None) == (self.matrix is None):
-            raise CalibrationError("a calibration holds either coefficients or a matrix; found "
-                                   f"{'neither' if self.matrix is None else 'both'}")
+            raise CalibrationError(
+                "a calibration holds either coefficients or a matrix; found "
+                f"{'neither' if self.matrix is None else 'both'}"
+            )
         if self.coefficients is not None:
             response(structure, _coefficients(self.coefficients))  # raises when it does not fit
             put("coefficients", {name: float(self.coefficients[name]) for name in structure.names})
@@ -84,21 +86,28 @@ class Calibration:
             k = structure.n_coefficients
             put("covariance", _array(self.covariance, (k, k), "covariance"))
         if self.temperature is not None and len(self.temperature.coefficients) != self.layout.n_pads:
-            raise CalibrationError(f"temperature has {len(self.temperature.coefficients)} lists of coefficients; "
-                                   f"layout {self.layout.name!r} has {self.layout.n_pads} pads")
-        if self.uid is not None and (isinstance(self.uid, bool) or not isinstance(self.uid, int)
-                                     or not 0 <= self.uid < 2**64):
+            raise CalibrationError(
+                f"temperature has {len(self.temperature.coefficients)} lists of coefficients; "
+                f"layout {self.layout.name!r} has {self.layout.n_pads} pads"
+            )
+        if self.uid is not None and (
+            isinstance(self.uid, bool) or not isinstance(self.uid, int) or not 0 <= self.uid < 2**64
+        ):
             raise CalibrationError(f"uid is {self.uid!r}; it must be a whole number from 0 to 2^64 - 1")
 
     def _per_pad(self, name: str) -> np.ndarray:
         n, value = self.layout.n_pads, getattr(self, name)
         array = _array(value, None, name)
         if array.shape not in ((), (n,)):
-            raise CalibrationError(f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n} pads: "
-                                   f"give one number or {n}")
+            raise CalibrationError(
+                f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n} pads: "
+                f"give one number or {n}"
+            )
         low = 0.0 if name == "beta" else np.nextafter(0, 1)
         if np.any(array < low):
-            raise CalibrationError(f"{name} holds {array.min():g}; it must be {'at least' if low == 0 else 'above'} 0")
+            raise CalibrationError(
+                f"{name} holds {array.min():g}; it must be {'at least' if low == 0 else 'above'} 0"
+            )
         array = np.broadcast_to(array, (n,)).copy()
         array.flags.writeable = False
         return array
@@ -128,12 +137,16 @@ class Calibration:
     def check(self, layout: Layout | None = None, uid: int | None = None) -> None:
         """Raises CalibrationError when this was made for another layout or another cube."""
         if layout is not None and not self.layout.same_as(layout):
-            raise CalibrationError(f"calibration {self.id} is for layout {self.layout.name!r} "
-                                   f"({self.layout.n_pads} pads), the cube has layout {layout.name!r} "
-                                   f"({layout.n_pads} pads); use a calibration made for that layout")
+            raise CalibrationError(
+                f"calibration {self.id} is for layout {self.layout.name!r} "
+                f"({self.layout.n_pads} pads), the cube has layout {layout.name!r} "
+                f"({layout.n_pads} pads); use a calibration made for that layout"
+            )
         if uid is not None and self.uid is not None and uid != self.uid:
-            raise CalibrationError(f"calibration {self.id} is for the cube with uid {self.uid:#018x}, this one has "
-                                   f"{uid:#018x}; use the calibration of this cube")
+            raise CalibrationError(
+                f"calibration {self.id} is for the cube with uid {self.uid:#018x}, this one has "
+                f"{uid:#018x}; use the calibration of this cube"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types, the id first; from_dict gives the same calibration back."""
@@ -144,7 +157,8 @@ class Calibration:
         content: dict[str, Any] = {
             "schema": SCHEMA,
             "layout": self.layout.name if known and known.same_as(self.layout) else self.layout.to_dict(),
-            "symmetry": self.symmetry}
+            "symmetry": self.symmetry,
+        }
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name in content or value is None or (item.name == "neglect" and not value):
@@ -162,7 +176,7 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Calibration:
-        """A calibration from plain types. CalibrationError names unknown and missing keys, wrong shapes, a wrong id.
+        """A calibration from plain types. CalibrationError names the wrong key, type, shape or id.
 
         Without an id it is taken as it is: a hand-written start. With one, the id must match the content.
         """
@@ -172,18 +186,26 @@ class Calibration:
         needed = {"layout", "rest_frequency", "noise", "modulus", "half_side", "schema"}
         unknown, missing = set(data) - allowed - {"id", "schema"}, needed - set(data)
         if unknown or missing:
-            raise CalibrationError(f"calibration: unknown keys {sorted(map(str, unknown))}, missing keys "
-                                   f"{sorted(missing)}; allowed are {', '.join(sorted(allowed | {'id', 'schema'}))}")
+            raise CalibrationError(
+                f"calibration: unknown keys {sorted(map(str, unknown))}, missing keys "
+                f"{sorted(missing)}; allowed are {', '.join(sorted(allowed | {'id', 'schema'}))}"
+            )
         if data["schema"] != SCHEMA:
-            raise CalibrationError(f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}")
+            raise CalibrationError(
+                f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}"
+            )
         values = {key: value for key, value in data.items() if key in allowed}
         layout, neglect, model = values["layout"], values.get("neglect", ()), values.get("temperature")
         try:
-            values["layout"] = Layout.from_dict(layout) if isinstance(layout, Mapping) else find_layout(layout)
+            values["layout"] = (
+                Layout.from_dict(layout) if isinstance(layout, Mapping) else find_layout(layout)
+            )
         except LayoutError as error:
             raise CalibrationError(f"calibration: {error}") from error
         if isinstance(neglect, str) or not isinstance(neglect, Sequence):
-            raise CalibrationError(f"calibration: neglect is {neglect!r}; it must be a list of names of modes")
+            raise CalibrationError(
+                f"calibration: neglect is {neglect!r}; it must be a list of names of modes"
+            )
         values["neglect"] = tuple(neglect)
         values["temperature"] = None if model is None else TemperatureModel.from_dict(model)
         for key in ("symmetry", "created", "source"):
@@ -191,8 +213,10 @@ class Calibration:
                 raise CalibrationError(f"calibration: {key} is {values[key]!r}; it must be text")
         calibration = cls(**values)
         if "id" in data and data["id"] != calibration.id:
-            raise CalibrationError(f"calibration: the id says {data['id']!r} but the content gives {calibration.id!r}: "
-                                   "it was edited by hand or damaged. Restore the file, or remove the id to accept it")
+            raise CalibrationError(
+                f"calibration: the id says {data['id']!r} but the content gives {calibration.id!r}: "
+                "it was edited by hand or damaged. Restore the file, or remove the id to accept it"
+            )
         return calibration
 
 
@@ -204,10 +228,18 @@ def illustrative(layout_name: str, neglect: Sequence[str] = (), uid: int | None 
     layout = find_layout(layout_name)
     symmetry = "slab" if layout_name == "quad" else "full"
     return Calibration(
-        layout=layout, symmetry=symmetry, neglect=tuple(neglect), uid=uid, half_side=_HALF_SIDE,
+        layout=layout,
+        symmetry=symmetry,
+        neglect=tuple(neglect),
+        uid=uid,
+        half_side=_HALF_SIDE,
         coefficients=illustrative_coefficients(find_structure(layout, symmetry)),
-        rest_frequency=np.array(_REST_FREQUENCY), beta=np.array(_BETA), modulus=np.array(_MODULUS),
-        noise=np.array(_MODULUS * (1 + _BETA) * _FREQUENCY_NOISE), source="illustrative")
+        rest_frequency=np.array(_REST_FREQUENCY),
+        beta=np.array(_BETA),
+        modulus=np.array(_MODULUS),
+        noise=np.array(_MODULUS * (1 + _BETA) * _FREQUENCY_NOISE),
+        source="illustrative",
+    )
 
 
 def _number(value: Any, name: str) -> float:

@@ -1,4 +1,4 @@
-"""Inversion of a response by weighted least squares: what the present pads see, how well, and what does not fit.
+"""Inversion of a response by weighted least squares: what the pads see, how well, and what does not fit.
 
 With W = diag(1 / noise) and W A = U1 S V1' (the singular values above RANK_TOLERANCE of the largest):
 
@@ -6,7 +6,7 @@ With W = diag(1 / noise) and W A = U1 S V1' (the singular values above RANK_TOLE
     covariance    T V1 S^-2 V1' T'
     chi-square    |U2' W v|^2                 U2: the rest of U, with as many columns as there is redundancy
 
-Source: the paper's eqs. 2 to 5 are its closed forms for one layout (4 and 5 after correction, see docs/physics.md).
+Source: the paper's eqs. 2 to 5 are the closed forms for one layout; docs/physics.md corrects 4 and 5.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from .modes import Modes
 from .symmetry import Structure
 
-# A combination of modes counts as unseen when the pads answer it with less than this part of the strongest answer.
+# A combination of modes counts as unseen when the pads answer it with less than this part of the strongest.
 RANK_TOLERANCE = 1e-4
 # A component counts as observed when at most this part of it lies along unseen combinations of modes.
 LEAK_TOLERANCE = 1e-3
@@ -63,10 +63,11 @@ class Estimator:
     def suspects(self, pad_stress: np.ndarray) -> np.ndarray:
         """(N, P) bool: the pads of which one broken alone explains a bad chi-square of (N, P) pad stresses.
 
-        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, z = null v, u_p its column of U2'. A row marks
-        pads when chi-square is above its limit and what is left without the best pad is below the limit of one degree
-        less; marked are the best and all that explain as much within SUSPECT_MARGIN. None when that is every pad.
-        Pads opposite through the centre of a symmetric cube always come as a pair: gradients take up their difference.
+        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, z = null v, u_p its column of U2'. A row
+        marks pads when chi-square is above its limit and what is left without the best pad is below the limit
+        of one degree less; marked are the best and all that explain as much within SUSPECT_MARGIN, none when
+        that is every pad. Pads opposite through the centre of a symmetric cube always come as a pair: a
+        gradient takes up their difference.
         """
         v = np.atleast_2d(np.asarray(pad_stress, dtype=float))
         if self.dof < 2:
@@ -82,8 +83,14 @@ class Estimator:
         return marked & (explained & (marked.sum(axis=1) < checked.sum()))[:, None]
 
 
-def make_estimator(response: np.ndarray, noise: np.ndarray, modes: Modes, missing: Sequence[int] | np.ndarray = (),
-                   neglect: Sequence[str] = (), targets: np.ndarray | None = None) -> Estimator:
+def make_estimator(
+    response: np.ndarray,
+    noise: np.ndarray,
+    modes: Modes,
+    missing: Sequence[int] | np.ndarray = (),
+    neglect: Sequence[str] = (),
+    targets: np.ndarray | None = None,
+) -> Estimator:
     """The estimator of the COMPONENTS (or of targets @ state) from the pads that are not missing.
 
     response: (P, M) in Pa per Pa; noise: (P,) standard deviation of each pad's stress in Pa
@@ -100,7 +107,9 @@ def make_estimator(response: np.ndarray, noise: np.ndarray, modes: Modes, missin
     v1 = vt[:rank].T
     t = targets[:, kept]
     size = np.linalg.norm(targets, axis=1)
-    leak = np.linalg.norm(t - (t @ v1) @ v1.T, axis=1) + np.linalg.norm(np.delete(targets, kept, axis=1), axis=1)
+    leak = np.linalg.norm(t - (t @ v1) @ v1.T, axis=1) + np.linalg.norm(
+        np.delete(targets, kept, axis=1), axis=1
+    )
     observed = (size > 0) & (leak <= LEAK_TOLERANCE * size)
 
     half = t @ v1 / s[:rank]
@@ -115,7 +124,7 @@ def make_estimator(response: np.ndarray, noise: np.ndarray, modes: Modes, missin
 
 
 def chi2_tail(x: float, dof: int) -> float:
-    """Probability that a chi-square of dof degrees of freedom exceeds x: Q(dof/2, x/2) by its recurrence in dof/2."""
+    """Probability that a chi-square of dof degrees of freedom exceeds x: Q(dof/2, x/2) by recurrence."""
     if x <= 0:
         return 1.0
     h = x / 2
@@ -129,14 +138,20 @@ def chi2_tail(x: float, dof: int) -> float:
 def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] = ()) -> dict[str, Any]:
     """What a response (P, M) lets a layout see, in plain types.
 
-    rank_uniform, rank_gradient: of the columns of uniform and gradient modes, and their condition numbers (None for 0)
-    unobservable: modes hidden from the pads; noise: {mode: standard deviation per unit of pad noise}, None if hidden
+    rank_uniform, rank_gradient: of the columns of uniform and gradient modes, and their condition
+    unobservable: modes hidden from the pads; noise: {mode: standard deviation per unit of pad noise}
+    None stands for what there is not.
     """
     modes, n_pads = structure.modes, structure.layout.n_pads
-    estimator = make_estimator(response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes))
+    estimator = make_estimator(
+        response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes)
+    )
     deviations = np.sqrt(np.diag(estimator.covariance))
-    result: dict[str, Any] = {"pads": list(structure.layout.pads), "modes": list(modes.names),
-                              "n_coefficients": structure.n_coefficients}
+    result: dict[str, Any] = {
+        "pads": list(structure.layout.pads),
+        "modes": list(modes.names),
+        "n_coefficients": structure.n_coefficients,
+    }
     uniform = np.any(modes.stress, axis=(1, 2)) & ~np.isin(modes.names, neglect)
     gradient = np.any(modes.gradient, axis=(1, 2, 3)) & ~np.isin(modes.names, neglect)
     for part, columns in (("uniform", uniform), ("gradient", gradient)):
@@ -144,15 +159,19 @@ def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] =
         s = s[s > RANK_TOLERANCE * s[0]] if s.size else s
         result[f"rank_{part}"] = len(s)
         result[f"condition_{part}"] = float(s[0] / s[-1]) if s.size else None
-    result["unobservable"] = [name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen]
-    result["noise"] = {name: float(d) if seen else None
-                       for name, d, seen in zip(modes.names, deviations, estimator.observed, strict=True)}
+    result["unobservable"] = [
+        name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen
+    ]
+    result["noise"] = {
+        name: float(d) if seen else None
+        for name, d, seen in zip(modes.names, deviations, estimator.observed, strict=True)
+    }
     return result
 
 
 @lru_cache
 def chi2_limit(dof: int, probability: float) -> float:
-    """The x that a chi-square of dof degrees of freedom exceeds with the given probability; NaN for dof = 0."""
+    """The x that chi-square of dof degrees of freedom exceeds with this probability; NaN for dof = 0."""
     if dof < 1:
         return math.nan
     low, high = 0.0, 1.0

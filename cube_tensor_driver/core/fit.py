@@ -2,9 +2,10 @@
 
     v_np = g_p sum_k c_k (B_k s_n)_p + noise
 
-s_n: known state of load n, v_np: stress that pad p showed, B_k: basis of the structure. The product of g and c is
-settled by gains that average 1 over each set of pads that the symmetry carries onto each other. Solved by
-Gauss-Newton steps on weighted residuals: Huber's weights first, then Tukey's, which forget outliers altogether.
+s_n: known state of load n, v_np: stress that pad p showed, B_k: basis of the structure. The product of g and
+c is settled by gains that average 1 over each set of pads that the symmetry carries onto each other. Solved
+by Gauss-Newton steps on weighted residuals: Huber's weights first, then Tukey's, which forget outliers
+altogether.
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """
 
@@ -23,8 +24,14 @@ from .symmetry import Structure
 
 HUBER, TUKEY = 1.345, 4.685  # 95 % efficient on normal noise
 STEPS = 100  # Gauss-Newton steps of one stage at most
-STILL = {"plain": 1e-10, "huber": 1e-3, "tukey": 1e-9}  # relative change that ends a stage; Huber's only leads on
-DIRECTION_TOLERANCE = 1e-6  # a direction of coefficients and gains below this part of the strongest is not determined
+STILL = {
+    "plain": 1e-10,
+    "huber": 1e-3,
+    "tukey": 1e-9,
+}  # relative change that ends a stage; Huber's only leads on
+DIRECTION_TOLERANCE = (
+    1e-6  # a direction of coefficients and gains below this part of the strongest is not determined
+)
 FOLDS = 10  # of the cross-validation
 
 
@@ -61,53 +68,78 @@ class Fit:
         FitError when coefficients are undetermined: add the loads of `advice`, or give them as `fixed`.
         """
         if self.undetermined:
-            raise FitError(f"no calibration: {'; '.join(self.advice)}. Or give the open coefficients as fixed")
-        return replace(base, layout=self.structure.layout, symmetry=self.structure.symmetry, matrix=None,
-                       coefficients=self.coefficients, gain=self.gain, covariance=self.covariance,
-                       noise=base.noise * max(1.0, self.scale), created=created, source=source)
+            raise FitError(
+                f"no calibration: {'; '.join(self.advice)}. Or give the open coefficients as fixed"
+            )
+        return replace(
+            base,
+            layout=self.structure.layout,
+            symmetry=self.structure.symmetry,
+            matrix=None,
+            coefficients=self.coefficients,
+            gain=self.gain,
+            covariance=self.covariance,
+            noise=base.noise * max(1.0, self.scale),
+            created=created,
+            source=source,
+        )
 
 
-def measured_stress(base: Calibration, frequency: np.ndarray, temperature: np.ndarray | None = None) -> np.ndarray:
-    """(N, P) Pa from frequencies (N, P) by the pad law of a calibration; FitError names a frequency out of range."""
+def measured_stress(
+    base: Calibration, frequency: np.ndarray, temperature: np.ndarray | None = None
+) -> np.ndarray:
+    """(N, P) Pa from frequencies (N, P) by a calibration's pad law; FitError names one out of range."""
     f = np.asarray(frequency, dtype=float)
     if f.ndim != 2 or f.shape[1] != base.layout.n_pads:
-        raise FitError(f"frequencies have shape {f.shape}; layout {base.layout.name!r} needs (loads, "
-                       f"{base.layout.n_pads})")
+        raise FitError(
+            f"frequencies have shape {f.shape}; layout {base.layout.name!r} needs (loads, "
+            f"{base.layout.n_pads})"
+        )
     rest = base.rest_frequency
     if base.temperature is not None and temperature is not None:
         rest = rest * base.temperature.factor(temperature)
     v = pad_stress(f, rest, base.beta, base.modulus)
     if not np.all(np.isfinite(v)):
         n, p = np.argwhere(~np.isfinite(v))[0]
-        raise FitError(f"load {n + 1}, pad {base.layout.pads[p]}: {f[n, p]:g} Hz is outside the pad's range; "
-                       "correct or remove this row")
+        raise FitError(
+            f"load {n + 1}, pad {base.layout.pads[p]}: {f[n, p]:g} Hz is outside the pad's range; "
+            "correct or remove this row"
+        )
     return v
 
 
 def traction_loads(modes: Modes, force: np.ndarray, area: float) -> np.ndarray:
     """(N, M) states for forces (N, 3) in N of a reference sensor over an area in m^2 of the face +z.
 
-    Uniform zz, yz and zx; the stresses along the skin are taken as 0, as under a free, laterally unheld layer.
+    Uniform zz, yz and zx; the stresses along the skin are taken as 0: nothing holds the layer sideways.
     """
     f = np.asarray(force, dtype=float)
     if f.ndim != 2 or f.shape[1] != 3 or not area > 0:
-        raise FitError(f"forces have shape {f.shape} and the area is {area} m^2; needed are (loads, 3) and above 0")
+        raise FitError(
+            f"forces have shape {f.shape} and the area is {area} m^2; needed are (loads, 3) and above 0"
+        )
     stress = np.zeros((len(f), 6))
     stress[:, [4, 3, 2]] = f / area
     return modes.state(stress)
 
 
-def fit(structure: Structure, loads: np.ndarray, measured: np.ndarray, noise: np.ndarray | float = 1.0,
-        fixed: Mapping[str, float] | None = None, gains: bool = True) -> Fit:
+def fit(
+    structure: Structure,
+    loads: np.ndarray,
+    measured: np.ndarray,
+    noise: np.ndarray | float = 1.0,
+    fixed: Mapping[str, float] | None = None,
+    gains: bool = True,
+) -> Fit:
     """Coefficients and gains from loads (N, M) in Pa and measured pad stresses (N, P) in Pa.
 
-    noise: standard deviation of readings in Pa, one or (P,); fixed: coefficients that are known from elsewhere
+    noise: standard deviation of readings in Pa, one or (P,); fixed: coefficients known from elsewhere
     gains: False takes every gain as 1, for loads that reach too few pads to tell gains from coefficients
     FitError for wrong shapes, NaN, loads of zero, and loads that determine no coefficient at all.
     """
     fixed = dict(fixed or {})
-    x, y, noise = _check(structure, loads, measured, noise, fixed)
-    model = _Model(structure, noise, fixed, gains)
+    x, y, sigma = _check(structure, loads, measured, noise, fixed)
+    model = _Model(structure, sigma, fixed, gains)
     design = model.design(x)
     theta, weights, scale = model.solve(design, y)
     jacobian = model.jacobian(theta, design)
@@ -115,28 +147,42 @@ def fit(structure: Structure, loads: np.ndarray, measured: np.ndarray, noise: np
     open_ = _open(hidden, len(model.free))
     names = [structure.names[k] for k in model.free]
     if len(names) and open_.all():
-        raise FitError("these loads determine no coefficient: " + "; ".join(_advise(model, theta, x, hidden, open_)))
+        raise FitError(
+            "these loads determine no coefficient: " + "; ".join(_advise(model, theta, x, hidden, open_))
+        )
     covariance = _covariance(jacobian, model.residuals(theta, design, y) / scale, scale)
     covariance[: len(names)][open_] = covariance[:, : len(names)][:, open_] = np.nan
     k = np.full((structure.n_coefficients,) * 2, 0.0)
     k[np.ix_(model.free, model.free)] = covariance[: len(names), : len(names)]
     c, g = model.unpack(theta)
     c[np.array(model.free, dtype=int)[open_]] = np.nan
-    spread = model.gains @ covariance[len(names):, len(names):] @ model.gains.T
+    spread = model.gains @ covariance[len(names) :, len(names) :] @ model.gains.T
     fitted = model.predict(theta, design)
     kept = weights > 0
     return Fit(
-        structure, dict(zip(structure.names, c.tolist(), strict=True)), dict(zip(structure.names, np.sqrt(np.diag(k)).tolist(), strict=True)),
-        k, g, np.sqrt(np.diag(spread).clip(0)), float(scale), float(np.sum(((y - fitted) / noise)[kept] ** 2)),
-        int(kept.sum()) - (jacobian.shape[1] - hidden.shape[1]), _held_out(model, design, y), fitted, ~kept,
-        tuple(n for n, o in zip(names, open_, strict=True) if o), tuple(_advise(model, theta, x, hidden, open_)))
+        structure,
+        dict(zip(structure.names, c.tolist(), strict=True)),
+        dict(zip(structure.names, np.sqrt(np.diag(k)).tolist(), strict=True)),
+        k,
+        g,
+        np.sqrt(np.diag(spread).clip(0)),
+        float(scale),
+        float(np.sum(((y - fitted) / sigma)[kept] ** 2)),
+        int(kept.sum()) - (jacobian.shape[1] - hidden.shape[1]),
+        _held_out(model, design, y),
+        fitted,
+        ~kept,
+        tuple(n for n, o in zip(names, open_, strict=True) if o),
+        tuple(_advise(model, theta, x, hidden, open_)),
+    )
 
 
 class _Model:
     """theta = free coefficients, then coordinates of the gains around 1."""
 
-    def __init__(self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float],
-                 gains: bool) -> None:
+    def __init__(
+        self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float], gains: bool
+    ) -> None:
         self.structure, self.noise = structure, noise
         self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
         self.start = np.array([fixed.get(name, 0.0) for name in structure.names], dtype=float)
@@ -151,7 +197,7 @@ class _Model:
     def unpack(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         c = self.start.copy()
         c[self.free] = theta[: len(self.free)]
-        return c, 1 + self.gains @ theta[len(self.free):]
+        return c, 1 + self.gains @ theta[len(self.free) :]
 
     def design(self, x: np.ndarray) -> np.ndarray:
         """(N, P, K): what each coefficient adds to each reading at gain 1, for loads (N, M)."""
@@ -197,8 +243,10 @@ def _check(structure, loads, measured, noise, fixed):
     except (TypeError, ValueError):
         raise FitError("loads, measured stresses and noise must be numbers") from None
     if x.ndim != 2 or x.shape[1] != n_modes or y.shape != (len(x), n_pads) or not len(x):
-        raise FitError(f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} needs "
-                       f"(loads, {n_modes}) and (loads, {n_pads}) with at least one load")
+        raise FitError(
+            f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} needs "
+            f"(loads, {n_modes}) and (loads, {n_pads}) with at least one load"
+        )
     for what, array, columns in (("load", x, structure.modes.names), ("reading", y, structure.layout.pads)):
         if not np.all(np.isfinite(array)):
             n, i = np.argwhere(~np.isfinite(array))[0]
@@ -209,8 +257,9 @@ def _check(structure, loads, measured, noise, fixed):
         raise FitError("all loads are zero; record loads that press, shear or bend the skin")
     unknown = set(fixed) - set(structure.names)
     if unknown:
-        raise FitError(f"unknown fixed coefficients {sorted(unknown)}; the coefficients are "
-                       f"{', '.join(structure.names)}")
+        raise FitError(
+            f"unknown fixed coefficients {sorted(unknown)}; the coefficients are {', '.join(structure.names)}"
+        )
     return x, y, np.broadcast_to(noise, (n_pads,))
 
 
@@ -237,7 +286,7 @@ def _hidden(jacobian: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(jacobian, axis=0)
     size[size == 0] = 1
     _, s, vt = np.linalg.svd(jacobian / size, full_matrices=True)
-    return vt[int(np.sum(s > DIRECTION_TOLERANCE * s[0])):].T if s[0] > 0 else vt.T
+    return vt[int(np.sum(s > DIRECTION_TOLERANCE * s[0])) :].T if s[0] > 0 else vt.T
 
 
 def _open(hidden: np.ndarray, count: int) -> np.ndarray:
@@ -252,8 +301,12 @@ def _covariance(jacobian: np.ndarray, r: np.ndarray, scale: float) -> np.ndarray
     factor = psi2 / slope**2 * len(r) / max(len(r) - rank, 1)
     size = np.linalg.norm(jacobian, axis=0)
     size[size == 0] = 1
-    return scale**2 * factor * np.linalg.pinv((jacobian / size).T @ (jacobian / size),
-                                              rcond=DIRECTION_TOLERANCE**2) / np.outer(size, size)
+    return (
+        scale**2
+        * factor
+        * np.linalg.pinv((jacobian / size).T @ (jacobian / size), rcond=DIRECTION_TOLERANCE**2)
+        / np.outer(size, size)
+    )
 
 
 def _held_out(model: _Model, design: np.ndarray, y: np.ndarray) -> float:
@@ -267,8 +320,10 @@ def _held_out(model: _Model, design: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2) / np.mean(y**2))) if np.any(y) else float("nan")
 
 
-def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray) -> list[str]:
-    """Sentences that name the fewest single-mode loads, found greedily, which would determine what is open."""
+def _advise(
+    model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray
+) -> list[str]:
+    """Sentences that name single-mode loads, found greedily, which would determine what is open."""
     advice = []
     theta = theta.copy()
     theta[: len(open_)][open_] = 0.5  # any value: without one, the new load's gains would seem undetermined
@@ -281,17 +336,27 @@ def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray,
         still = _open(hiddens[best], len(open_))
         names = [model.structure.names[k] for k, o in zip(model.free, open_, strict=True) if o]
         if hiddens[best].shape[1] >= hidden.shape[1]:
-            advice.append(f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry")
+            advice.append(
+                f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry"
+            )
             break
-        settled = [model.structure.names[k] for k, now, then in zip(model.free, open_, still, strict=True) if now and not then]
+        settled = [
+            model.structure.names[k]
+            for k, now, then in zip(model.free, open_, still, strict=True)
+            if now and not then
+        ]
         mode = model.structure.modes.names[best]
-        advice.append(f"these loads do not determine {', '.join(settled or names)}: add a load of {mode} alone, "
-                      f"{describe_mode(mode)}, of about {size:.3g} Pa")
+        advice.append(
+            f"these loads do not determine {', '.join(settled or names)}: add a load of {mode} alone, "
+            f"{describe_mode(mode)}, of about {size:.3g} Pa"
+        )
         loads, hidden, open_ = trials[best], hiddens[best], still
     return advice
 
 
 def describe_mode(name: str) -> str:
     """A mode's name in words, such as "sigma_zz growing along x"."""
-    return " against ".join(f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform")
-                            for part in name.split("-"))
+    return " against ".join(
+        f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform")
+        for part in name.split("-")
+    )

@@ -1,4 +1,4 @@
-"""Layouts: where the pads of a cube sit. Frame: z out of the skin, x and y along it; lengths in units of d0."""
+"""Layouts: where the pads of a cube sit. Frame: z out of the skin, x and y along it; lengths in d0."""
 
 from __future__ import annotations
 
@@ -43,18 +43,26 @@ class Layout:
             raise LayoutError(f"layout {self.name!r}: pad_size {self.pad_size}; allowed is above 0, up to 2")
         for i, (x, n) in enumerate(zip(positions, normals, strict=True)):
             if sorted(np.abs(n)) != [0, 0, 1]:
-                raise LayoutError(f"layout {self.name!r}: pad {i + 1} has normal {n.tolist()}; "
-                                  "a normal is one axis, such as [0, 0, -1]")
+                raise LayoutError(
+                    f"layout {self.name!r}: pad {i + 1} has normal {n.tolist()}; "
+                    "a normal is one axis, such as [0, 0, -1]"
+                )
             if abs(x @ n - 1) > 1e-9:
-                raise LayoutError(f"layout {self.name!r}: pad {i + 1} at {x.tolist()} is not on the face "
-                                  f"{n.tolist()}; its coordinate along the normal must be 1")
+                raise LayoutError(
+                    f"layout {self.name!r}: pad {i + 1} at {x.tolist()} is not on the face "
+                    f"{n.tolist()}; its coordinate along the normal must be 1"
+                )
             edge = np.max(np.abs(x - n * (x @ n))) + self.pad_size / 2
             if edge > 1 + 1e-9:
-                raise LayoutError(f"layout {self.name!r}: pad {i + 1} reaches {edge:.3g} from the face's centre; "
-                                  "the face ends at 1")
+                raise LayoutError(
+                    f"layout {self.name!r}: pad {i + 1} reaches {edge:.3g} from the face's centre; "
+                    "the face ends at 1"
+                )
             for j in range(i):
                 if np.allclose(x, positions[j], atol=1e-9) and np.array_equal(n, normals[j]):
-                    raise LayoutError(f"layout {self.name!r}: pads {j + 1} and {i + 1} coincide at {x.tolist()}")
+                    raise LayoutError(
+                        f"layout {self.name!r}: pads {j + 1} and {i + 1} coincide at {x.tolist()}"
+                    )
         positions.flags.writeable = normals.flags.writeable = False
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "normals", normals)
@@ -67,7 +75,10 @@ class Layout:
     @property
     def pads(self) -> tuple[str, ...]:
         """Stable names: face, then side of the face, such as "+z-x"; a second pad there is "+z-x#2"."""
-        plain = [_signed_axes(n) + _signed_axes(x - n * (x @ n)) for x, n in zip(self.positions, self.normals, strict=True)]
+        plain = [
+            _signed_axes(n) + _signed_axes(x - n * (x @ n))
+            for x, n in zip(self.positions, self.normals, strict=True)
+        ]
         repeats = [plain[:i].count(name) for i, name in enumerate(plain)]
         return tuple(f"{name}#{k + 1}" if k else name for name, k in zip(plain, repeats, strict=True))
 
@@ -81,29 +92,40 @@ class Layout:
         try:
             return self.pads.index(pad)
         except ValueError:
-            raise LayoutError(f"layout {self.name!r} has no pad {pad!r}; its pads are {', '.join(self.pads)}") from None
+            raise LayoutError(
+                f"layout {self.name!r} has no pad {pad!r}; its pads are {', '.join(self.pads)}"
+            ) from None
 
     def same_as(self, other: Layout) -> bool:
         """True when both have the same pads in the same order."""
-        return (self.positions.shape == other.positions.shape and self.pad_size == other.pad_size
-                and np.allclose(self.positions, other.positions, atol=1e-9)
-                and np.array_equal(self.normals, other.normals))
+        return (
+            self.positions.shape == other.positions.shape
+            and self.pad_size == other.pad_size
+            and np.allclose(self.positions, other.positions, atol=1e-9)
+            and np.array_equal(self.normals, other.normals)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types, as from_dict takes them."""
-        return {"name": self.name, "pad_size": self.pad_size,
-                "positions": self.positions.tolist(), "normals": self.normals.tolist()}
+        return {
+            "name": self.name,
+            "pad_size": self.pad_size,
+            "positions": self.positions.tolist(),
+            "normals": self.normals.tolist(),
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Layout:
-        """A layout from plain types: name, positions, normals, optional pad_size. LayoutError says what is wrong."""
+        """A layout from plain types: name, positions, normals, optional pad_size; LayoutError if wrong."""
         if not isinstance(data, Mapping):
             raise LayoutError(f"a layout is a table with name, positions, normals; found {data!r}")
         unknown = set(data) - {"name", "positions", "normals", "pad_size"}
         missing = {"name", "positions", "normals"} - set(data)
         if unknown or missing:
-            raise LayoutError(f"layout: unknown keys {sorted(unknown)}, missing keys {sorted(missing)}; "
-                              "allowed are name, positions, normals, pad_size")
+            raise LayoutError(
+                f"layout: unknown keys {sorted(unknown)}, missing keys {sorted(missing)}; "
+                "allowed are name, positions, normals, pad_size"
+            )
         size = data.get("pad_size", PAD_SIZE)
         if isinstance(size, bool) or not isinstance(size, (int, float)):
             raise LayoutError(f"layout: pad_size is {size!r}; it must be a number in units of the half side")
@@ -116,7 +138,9 @@ def _vectors(value: Any, what: str) -> np.ndarray:
     except (TypeError, ValueError):
         raise LayoutError(f"layout: {what} must be a list of [x, y, z] numbers; found {value!r}") from None
     if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.all(np.isfinite(vectors)):
-        raise LayoutError(f"layout: {what} must be a list of [x, y, z] finite numbers; found shape {vectors.shape}")
+        raise LayoutError(
+            f"layout: {what} must be a list of [x, y, z] finite numbers; found shape {vectors.shape}"
+        )
     return vectors
 
 
@@ -126,6 +150,7 @@ def _signed_axes(vector: np.ndarray) -> str:
 
 def _section(sides: str, name: str, offset: float = PAD_OFFSET) -> Layout:
     """Layout from a text such as "+z-x +z+x": face and side of each pad."""
+
     def axis(text: str) -> np.ndarray:
         return (1.0 if text[0] == "+" else -1.0) * np.eye(3)[AXES.index(text[1])]
 
@@ -137,7 +162,7 @@ _PLANAR = "+z-x +z+x -z-x -z+x +x-z +x+z -x-z -x+z"  # V1 .. V8 of the paper
 _CYCLE = str.maketrans("xyz", "yzx")
 _CUBE = " ".join([_PLANAR, _PLANAR.translate(_CYCLE), _PLANAR.translate(_CYCLE).translate(_CYCLE)])
 
-# cube: the planar section in the planes z-x, x-y, y-z in this order, each from the one before by x -> y -> z -> x
+# cube: the planar section in the planes z-x, x-y, y-z in this order, each from the last by x -> y -> z -> x
 LAYOUTS: dict[str, Layout] = {
     "quad": _section(" ".join(_PLANAR.split()[:4]), "quad"),
     "planar": _section(_PLANAR, "planar"),

@@ -2,10 +2,10 @@
 
     r = f / f0,   strain d/d0 = r / (1 + beta (1 - r)),   v = E (d/d0 - 1)
 
-which with u = r - 1 is v = E (1 + beta) u / (1 - beta u). v: Pa, tension positive; f, f0: Hz; beta: parasitic over
-active capacitance at rest; E: modulus in Pa. Source: the paper's eq. 6, f = k d / (R (eps S + C' d)), solved for d
-against the rest state. Frequencies outside 0 < f < f0 (1 + beta) / beta belong to no thickness: they give NaN.
-All functions broadcast.
+which with u = r - 1 is v = E (1 + beta) u / (1 - beta u). v: Pa, tension positive; f, f0: Hz; beta: parasitic
+over active capacitance at rest; E: modulus in Pa. Source: the paper's eq. 6, f = k d / (R (eps S + C' d)),
+solved for d against the rest state. Frequencies outside 0 < f < f0 (1 + beta) / beta belong to no thickness:
+they give NaN. All functions broadcast.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def pad_stress(frequency, rest_frequency, beta, modulus):
 
 
 def pad_frequency(stress, rest_frequency, beta, modulus):
-    """The inverse of pad_stress: Hz from Pa; NaN at or below -E, where the pad would be squeezed to nothing."""
+    """The inverse of pad_stress: Hz from Pa; NaN at or below -E, where no thickness is left."""
     strain = 1 + np.asarray(stress) / modulus
     with np.errstate(all="ignore"):
         f = rest_frequency * strain * (1 + beta) / (1 + beta * strain)
@@ -46,13 +46,13 @@ def stress_slope(frequency, rest_frequency, beta, modulus):
 
 
 def highest_frequency(rest_frequency, beta):
-    """f0 (1 + beta) / beta in Hz, which an infinitely thick pad would have; inf without parasitic capacitance."""
+    """f0 (1 + beta) / beta in Hz, of an infinitely thick pad; inf without parasitic capacitance."""
     with np.errstate(divide="ignore", over="ignore"):
         return rest_frequency * (1 + beta) / np.asarray(beta, dtype=float)
 
 
 def linear_pad_stress(frequency, rest_frequency, beta, modulus):
-    """v = E (1 + beta) (f - f0) / f0: the paper's eq. 7 with R/k in place of k/R and tension positive. A check only."""
+    """v = E (1 + beta) (f - f0) / f0: the paper's eq. 7 with R/k for k/R, tension positive. A check."""
     f0 = np.asarray(rest_frequency)
     return modulus * (1 + beta) * (np.asarray(frequency) - f0) / f0
 
@@ -71,11 +71,15 @@ class TemperatureModel:
         try:
             reference, coefficients = float(self.reference), np.array(self.coefficients, dtype=float)
         except (TypeError, ValueError):
-            raise CalibrationError(f"temperature: reference {self.reference!r} and coefficients "
-                                   f"{self.coefficients!r} must be numbers") from None
+            raise CalibrationError(
+                f"temperature: reference {self.reference!r} and coefficients "
+                f"{self.coefficients!r} must be numbers"
+            ) from None
         if coefficients.ndim != 2 or coefficients.shape[1] == 0:
-            raise CalibrationError(f"temperature: coefficients have shape {coefficients.shape}; "
-                                   "they must be one list per pad, the linear term first")
+            raise CalibrationError(
+                f"temperature: coefficients have shape {coefficients.shape}; "
+                "they must be one list per pad, the linear term first"
+            )
         if not (np.isfinite(reference) and np.all(np.isfinite(coefficients))):
             raise CalibrationError("temperature: reference and coefficients must be finite")
         coefficients.flags.writeable = False
@@ -85,7 +89,8 @@ class TemperatureModel:
     def factor(self, temperature) -> np.ndarray:
         """f0(T) / f0, shape (N, P) for temperatures (N,) in degrees Celsius."""
         dt = np.asarray(temperature, dtype=float)[..., None] - self.reference
-        return 1 + sum(self.coefficients[:, d] * dt ** (d + 1) for d in range(self.coefficients.shape[1]))
+        powers = dt[..., None] ** np.arange(1, self.coefficients.shape[1] + 1)
+        return 1 + np.sum(self.coefficients * powers, axis=-1)
 
     def to_dict(self) -> dict[str, Any]:
         return {"reference": self.reference, "coefficients": self.coefficients.tolist()}
@@ -93,5 +98,7 @@ class TemperatureModel:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TemperatureModel:
         if not isinstance(data, Mapping) or set(data) != {"reference", "coefficients"}:
-            raise CalibrationError(f"temperature: found {data!r}; it is a table of reference and coefficients")
+            raise CalibrationError(
+                f"temperature: found {data!r}; it is a table of reference and coefficients"
+            )
         return cls(data["reference"], data["coefficients"])

@@ -1,8 +1,9 @@
-"""Pipeline: frequencies of many cubes in, stress and gradients out, row by row, without a loop over rows or cubes.
+"""Pipeline: frequencies of many cubes in, stress and gradients out, without a loop over rows or cubes.
 
-One table per calibration holds a stacked matrix: 15 rows that give the components, then the whitened null-space rows
-of the residual. Rows with all pads good are one pad law and one matrix product. Rows with bad pads are done again
-with the estimator of their mask, one product per distinct (calibration, mask). Nothing a row holds raises an error.
+One table per calibration holds a stacked matrix: 15 rows that give the components, then the whitened
+null-space rows of the residual. Rows with all pads good are one pad law and one matrix product. Rows with
+bad pads are done again with the estimator of their mask, one product per distinct (calibration, mask).
+Nothing a row holds raises an error.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class StressRows(NamedTuple):
     stress: (N, 6) Pa, tension positive, order xx yy zz yz zx xy, in the cube's frame
     gradient: (N, 9) Pa/m, rows xx yy zz, columns d/dx d/dy d/dz
     residual: (N,) sqrt(chi-square / degrees of freedom), about 1 for noise alone; NaN without redundancy
-    status: (N,) uint16 of the bits above; observed: (N,) uint16, bit i for component i (6 stresses, 9 gradients)
+    status: (N,) uint16 of the bits above; observed: (N,) uint16, bit i for component i of COMPONENTS
     """
 
     stress: np.ndarray
@@ -46,7 +47,7 @@ class StressRows(NamedTuple):
 
 
 class _Table(NamedTuple):
-    """An estimator laid out for rows: (15 + D, P) matrix in units of v / (E (1 + beta)), scaled residual rows."""
+    """An estimator laid out for rows: (15 + D, P) matrix on v / (E (1 + beta)), scaled residual rows."""
 
     matrix: np.ndarray
     limit: float  # of the residual
@@ -62,13 +63,15 @@ class _Rows(NamedTuple):
     kind: np.ndarray  # (N,) which calibration
     rest: np.ndarray  # (N, P)
     beta: np.ndarray  # (N, P), or one number
-    matrix: np.ndarray  # (P, 15 + D) when all rows share it, else (P, seen rows, N): the rows' axis last is fastest
+    matrix: (
+        np.ndarray
+    )  # (P, 15 + D) when all rows share it, else (P, seen rows, N): the rows' axis last is fastest
     limit: np.ndarray  # (N,), or one number
     observed: np.ndarray
 
 
 class Pipeline:
-    """process() for cubes 0 .. len(calibrations) - 1; layouts may differ, pads are then padded to the widest."""
+    """process() for cubes 0 .. len(calibrations) - 1; layouts may differ, columns fill up to the widest."""
 
     def __init__(self, calibrations: Sequence[Calibration], dtype=np.float64) -> None:
         self.dtype = np.dtype(dtype)
@@ -113,16 +116,23 @@ class Pipeline:
         if rest.shape != exists.shape:
             raise LayoutError(f"rest_frequency has shape {rest.shape}; this skin needs {exists.shape}")
         if not np.all(rest[exists] > 0) or not np.all(np.isfinite(rest[exists])):
-            raise CubeError(f"rest_frequency holds {rest[exists].min():g} Hz; every pad's must be finite and above 0")
+            raise CubeError(
+                f"rest_frequency holds {rest[exists].min():g} Hz; every pad's must be finite and above 0"
+            )
         self._rest = np.where(exists, rest, np.nan)
         self._kept.clear()
 
     def temperature_factor(self, cube: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-        """(N, P) f0(T) / f0 of rows; 1 without a model or a temperature. Tare divides what it measures by it."""
+        """(N, P) f0(T) / f0 of rows; 1 without a model or a temperature. Tare divides by it."""
         return self._factor(self._kind[cube], np.asarray(temperature, dtype=float))
 
-    def process(self, cube: np.ndarray, frequency: np.ndarray, pad_fault: np.ndarray | None = None,
-                temperature: np.ndarray | None = None) -> StressRows:
+    def process(
+        self,
+        cube: np.ndarray,
+        frequency: np.ndarray,
+        pad_fault: np.ndarray | None = None,
+        temperature: np.ndarray | None = None,
+    ) -> StressRows:
         """Stress rows of samples.
 
         cube: (N,) index; frequency: (N, P) Hz; pad_fault: (N,) bits of pads that the device reports broken
@@ -150,10 +160,15 @@ class Pipeline:
             rest = out[:, N:]
             residual = np.abs(rest[:, 0]) if self._depth == 1 else np.sqrt(np.einsum("nd,nd->n", rest, rest))
             status += (residual > limit) * np.uint16(RESIDUAL)  # arithmetic: cheaper than an index
-        return StressRows(out[:, :len(STRESS)], out[:, len(STRESS):N], residual, status, observed)
+        return StressRows(out[:, : len(STRESS)], out[:, len(STRESS) : N], residual, status, observed)
 
-    def pad_stress(self, cube: np.ndarray, frequency: np.ndarray, pad_fault: np.ndarray | None = None,
-                   temperature: np.ndarray | None = None) -> np.ndarray:
+    def pad_stress(
+        self,
+        cube: np.ndarray,
+        frequency: np.ndarray,
+        pad_fault: np.ndarray | None = None,
+        temperature: np.ndarray | None = None,
+    ) -> np.ndarray:
         """(N, P) pad stresses in Pa as the law gives them, before gains; NaN for bad and missing pads."""
         with np.errstate(all="ignore"):
             rows, v, mask, _ = self._law(cube, frequency, pad_fault, temperature)
@@ -161,9 +176,14 @@ class Pipeline:
         bad = ~self._exists[rows.kind] | rows.strange[:, None]
         return np.where(bad if mask is None else bad | _bits(mask, self.n_pads), np.nan, pads)
 
-    def suspects(self, cube: np.ndarray, frequency: np.ndarray, pad_fault: np.ndarray | None = None,
-                 temperature: np.ndarray | None = None) -> np.ndarray:
-        """(N, P) bool, pads of which one alone explains a bad residual; see Estimator.suspects. For diagnostics."""
+    def suspects(
+        self,
+        cube: np.ndarray,
+        frequency: np.ndarray,
+        pad_fault: np.ndarray | None = None,
+        temperature: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """(N, P) bool, pads of which one alone explains a bad residual; see Estimator.suspects."""
         with np.errstate(all="ignore"):
             rows, v, mask, _ = self._law(cube, frequency, pad_fault, temperature)
         result = np.zeros(v.shape, dtype=bool)
@@ -185,8 +205,10 @@ class Pipeline:
         """Rows, v / (E (1 + beta)) with bad pads 0, masks of bad pads (None when all are good), status."""
         f, cube = np.asarray(frequency, dtype=self.dtype), np.asarray(cube)
         if cube.ndim != 1 or f.shape != (len(cube), self.n_pads):
-            raise LayoutError(f"pipeline: cube has shape {cube.shape} and frequency {f.shape}; "
-                              f"this skin needs (N,) and (N, {self.n_pads})")
+            raise LayoutError(
+                f"pipeline: cube has shape {cube.shape} and frequency {f.shape}; "
+                f"this skin needs (N,) and (N, {self.n_pads})"
+            )
         rows = self._rows(cube)
         rest, status = rows.rest, np.zeros(len(f), dtype=np.uint16)
         if self._any_thermal:
@@ -199,8 +221,13 @@ class Pipeline:
         np.subtract(rest, bottom, out=bottom)
         v /= bottom
         # NaN, Inf and frequencies beyond the law's range all fail one of the two comparisons
-        if len(f) and f.min() > 0 and bottom.min() > 0 and rows.all_known and (
-                pad_fault is None or not np.count_nonzero(pad_fault)):
+        if (
+            len(f)
+            and f.min() > 0
+            and bottom.min() > 0
+            and rows.all_known
+            and (pad_fault is None or not np.count_nonzero(pad_fault))
+        ):
             return rows, v, None, status
         good = (f > 0) & (bottom > 0)
         if pad_fault is not None:
@@ -209,7 +236,9 @@ class Pipeline:
         return rows, v, _mask(self._exists[rows.kind] & ~good), status
 
     def _rows(self, cube: np.ndarray) -> _Rows:
-        key = (len(cube), cube[0], cube[-1]) if len(cube) else (0,)  # cheap; the comparison below makes it sure
+        key = (
+            (len(cube), cube[0], cube[-1]) if len(cube) else (0,)
+        )  # cheap; the comparison below makes it sure
         kept = self._kept.get(key)
         if kept is not None and (kept.cube == cube).all():
             return kept
@@ -221,17 +250,29 @@ class Pipeline:
         if len(kind) and (kind == kind[0]).all():
             matrix, limit = np.ascontiguousarray(self._matrices[kind[0]].T), self._limits[kind[0]]
         else:
-            matrix, limit = np.ascontiguousarray(self._matrices[:, self._seen][kind].transpose(2, 1, 0)), self._limits[kind]
+            matrix, limit = (
+                np.ascontiguousarray(self._matrices[:, self._seen][kind].transpose(2, 1, 0)),
+                self._limits[kind],
+            )
         rows = self._kept[key] = _Rows(
-            cube.copy(), strange, not strange.any(), kind, self._rest[index].astype(self.dtype),
-            beta[kind] if np.ptp(beta) else beta[0, 0], matrix, limit, self._observed[kind])
+            cube.copy(),
+            strange,
+            not strange.any(),
+            kind,
+            self._rest[index].astype(self.dtype),
+            beta[kind] if np.ptp(beta) else beta[0, 0],
+            matrix,
+            limit,
+            self._observed[kind],
+        )
         return rows
 
     def _factor(self, kind: np.ndarray, temperature: np.ndarray) -> np.ndarray:
         factor = np.ones((len(kind), self.n_pads))
-        for k in np.flatnonzero(self._thermal):
-            rows, calibration = (kind == k) & np.isfinite(temperature), self._kinds[k]
-            factor[rows, : calibration.layout.n_pads] = calibration.temperature.factor(temperature[rows])
+        for k, calibration in enumerate(self._kinds):
+            if calibration.temperature is not None:
+                rows = (kind == k) & np.isfinite(temperature)
+                factor[rows, : calibration.layout.n_pads] = calibration.temperature.factor(temperature[rows])
         return factor
 
     def _scale(self, kind: int) -> np.ndarray:
@@ -239,7 +280,9 @@ class Pipeline:
 
     def _make_estimator(self, kind: int, mask: int) -> Estimator:
         c = self._kinds[kind]
-        return make_estimator(c.response, c.noise, c.modes, np.flatnonzero(_bits(mask, c.layout.n_pads)), c.neglect)
+        return make_estimator(
+            c.response, c.noise, c.modes, np.flatnonzero(_bits(mask, c.layout.n_pads)), c.neglect
+        )
 
     def _make_table(self, kind: int, mask: int) -> _Table:
         e, c = self._estimator(kind, mask), self._kinds[kind]
@@ -251,7 +294,9 @@ class Pipeline:
             matrix[N:, :n] = 0
             matrix[N : N + e.dof, :n] = e.null / np.sqrt(e.dof)
         matrix *= self._stiffness[kind]
-        return _Table(matrix.astype(self.dtype), np.sqrt(e.limit / e.dof) if e.dof else np.nan, int(_mask(e.observed)))
+        return _Table(
+            matrix.astype(self.dtype), np.sqrt(e.limit / e.dof) if e.dof else np.nan, int(_mask(e.observed))
+        )
 
 
 def _bits(mask, count: int) -> np.ndarray:

@@ -20,8 +20,9 @@ from .modes import PLANE, SPACE, Modes
 
 _TURN_Z = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
 _CYCLE = ((0, 0, 1), (1, 0, 0), (0, 1, 0))
-_MIRRORS = tuple(tuple(tuple(-1 if i == j == k else int(i == j) for j in range(3)) for i in range(3))
-                 for k in range(3))
+_MIRRORS = tuple(
+    tuple(tuple(-1 if i == j == k else int(i == j) for j in range(3)) for i in range(3)) for k in range(3)
+)
 GENERATORS: dict[str, tuple] = {
     "full": (_TURN_Z, _CYCLE, *_MIRRORS),  # 48: the cube alone in a wide body
     "slab": (_TURN_Z, *_MIRRORS),  # 16: z differs from x and y, but up and down are alike
@@ -30,8 +31,15 @@ GENERATORS: dict[str, tuple] = {
 }
 
 # The paper's letters, as entries of row V1 with its signs; used where all pads are images of V1.
-_LETTERS = {"zz": ("a", 1), "xx": ("b", -1), "zx": ("c_plus_d", -1), "zz_x": ("e", -1),
-            "xx_z": ("f", 1), "zz_z": ("g", -1), "xx_x": ("h", 1)}
+_LETTERS = {
+    "zz": ("a", 1),
+    "xx": ("b", -1),
+    "zx": ("c_plus_d", -1),
+    "zz_x": ("e", -1),
+    "xx_z": ("f", 1),
+    "zz_z": ("g", -1),
+    "xx_x": ("h", 1),
+}
 _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
 
 
@@ -67,15 +75,19 @@ def layout_group(layout: Layout, name: str) -> np.ndarray:
 
 
 def pad_images(layout: Layout, rotation: np.ndarray) -> np.ndarray:
-    """(P,) the pad onto which each pad is carried by a rotation or mirror; SymmetryError names one without image."""
+    """(P,) the pad onto which a rotation or mirror carries each; SymmetryError names one without image."""
     r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
     for pad, (x, n) in enumerate(zip(layout.positions @ r.T, layout.normals @ r.T, strict=True)):
-        same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(np.abs(layout.normals - n) < 1e-6, axis=1)
+        same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(
+            np.abs(layout.normals - n) < 1e-6, axis=1
+        )
         if not same.any():
-            raise SymmetryError(f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be carried "
-                                f"to {x.round(6).tolist()} on face {n.astype(int).tolist()}, where there is no pad; "
-                                f"choose a smaller group of {', '.join(GENERATORS)}")
+            raise SymmetryError(
+                f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be carried "
+                f"to {x.round(6).tolist()} on face {n.astype(int).tolist()}, where there is no pad; "
+                f"choose a smaller group of {', '.join(GENERATORS)}"
+            )
         images[pad] = np.flatnonzero(same)[0]
     return images
 
@@ -150,14 +162,16 @@ def _structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
             names.append(name)
             basis.append(member)
     if letters:
-        names, basis = map(list, zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True))
+        names, basis = map(
+            list, zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True)
+        )
     stacked = np.array(basis).reshape(-1, n_pads, n_modes)
     stacked.flags.writeable = False
     return Structure(layout, modes, symmetry, tuple(names), stacked)
 
 
 def count_by_characters(layout: Layout, symmetry: str, modes: Modes | None = None) -> int:
-    """Number of coefficients as the mean over the group of (pads kept) x (trace on modes); checks the basis."""
+    """Number of coefficients as the mean over the group of (pads kept) x (trace on modes)."""
     modes = modes or default_modes(layout)
     elements = layout_group(layout, symmetry)
     total = sum(np.trace(pad_action(layout, r)) * np.trace(modes.action(r)) for r in elements)

@@ -1,7 +1,7 @@
-"""Tensor algebra over rows. Stress (..., 6) in the order xx, yy, zz, yz, zx, xy; tension positive; any unit unless said.
+"""Tensor algebra over rows. Stress (..., 6) in the order xx, yy, zz, yz, zx, xy, tension positive.
 
-Gradients are (..., 3, 3, 3), G_ijk = d(sigma_ij)/dx_k. Source: textbook continuum mechanics; rotations by transforms3d,
-quaternions in ROS order x, y, z, w.
+Gradients are (..., 3, 3, 3), G_ijk = d(sigma_ij)/dx_k. Any unit unless said. Source: textbook continuum
+mechanics; rotations by transforms3d, quaternions in ROS order x, y, z, w.
 """
 
 from __future__ import annotations
@@ -41,16 +41,18 @@ def von_mises(stress: np.ndarray) -> np.ndarray:
 
 
 def traction(stress: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(..., 3) sigma n on planes with normals (..., 3), which are made unit vectors. CubeError for a zero normal."""
+    """(..., 3) sigma n on planes with normals (..., 3), made unit vectors; CubeError for a zero one."""
     n = np.asarray(normal, dtype=float)
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     if not np.all(length > 0):
-        raise CubeError(f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal")
+        raise CubeError(
+            f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal"
+        )
     return np.einsum("...ij,...j->...i", to_matrix(stress), n / length)
 
 
 def rotate_stress(stress: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """(..., 6) of R s R' : the stress in a frame whose coordinates are R x. A NaN spreads to what it enters."""
+    """(..., 6) of R s R' : the stress in a frame of coordinates R x. NaN spreads."""
     r = np.asarray(rotation, dtype=float)
     return to_six(r @ to_matrix(stress) @ np.swapaxes(r, -1, -2))
 
@@ -65,7 +67,7 @@ def rotate_gradient(gradient: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll), angles in rad about fixed axes as in URDF: cube coordinates to parent's."""
+    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll), rad, fixed axes as in URDF: cube coordinates to parent's."""
     return euler.euler2mat(roll, pitch, yaw, "sxyz")
 
 
@@ -88,8 +90,8 @@ def contact_wrench(stress: np.ndarray, gradient: np.ndarray, side: float) -> tup
     """Force (N, 3) in N and torque (N, 3) in N m on the square face +z of a reference side in m.
 
     stress: (N, 6) Pa; gradient: (N, 9) Pa/m of the normal stresses, as in StressRows
-    force = w^2 sigma n; torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0). The twist needs gradients of shear, which
-    pads of normal stress do not see, so it is 0. Components that are not observed count as 0.
+    force = w^2 sigma n; torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0). The twist needs gradients of shear,
+    which pads of normal stress do not see, so it is 0. Components that are not observed count as 0.
     """
     s, g = np.nan_to_num(stress), np.nan_to_num(gradient)
     force = side**2 * s[..., [4, 3, 2]]

@@ -38,8 +38,8 @@ def field(points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: flo
     poisson  Poisson's ratio, -1 < nu <= 0.5; Young's modulus does not enter
 
     Returns stress (..., N, 6) in Pa, order xx yy zz yz zx xy, tension positive, and its gradient
-    (..., N, 6, 3) in Pa/m: the last axis is the direction of the derivative. Leading axes broadcast (time, say);
-    memory is about 500 bytes per pair of point and force.
+    (..., N, 6, 3) in Pa/m: the last axis is the direction of the derivative. Leading axes broadcast (time,
+    say); memory is about 500 bytes per pair of point and force.
 
     Raises ElasticError for a point above the surface or on a source, a source off the surface, or a
     Poisson's ratio out of range.
@@ -77,7 +77,7 @@ def disc(
 def hertz(
     radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6
 ) -> tuple[Array, Array]:
-    """Traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2) on a disc: a sphere that presses, or slides with friction.
+    """Traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2) on a disc: a sphere that presses or slides.
 
     Same result and errors as `disc`; Johnson 4.2 (normal) and 7.1 (sliding).
     """
@@ -91,7 +91,7 @@ def rectangle(
     """Uniform traction on a rectangle of sides (x, y) m as point forces, L = order^2; see `disc`."""
     length = np.asarray(sides, dtype=np.float64)
     if length.shape != (2,) or not np.all(length > 0.0):
-        raise ElasticError(f"rectangle sides are {sides}; give two positive lengths in m")
+        raise ElasticError(f"rectangle sides are {sides!r}; give two positive lengths in m")
     t, weight = _gauss(order)
     x, y = np.meshgrid((t - 0.5) * length[0], (t - 0.5) * length[1], indexing="ij")
     return _patch(x.ravel(), y.ravel(), np.outer(weight, weight).ravel(), force, centre)
@@ -116,7 +116,7 @@ def _check(points: Array, sources: Array, forces: Array, poisson: float) -> None
 
 
 def _radial(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
-    """The term of an incompressible body, -3/(2 pi) d_i d_j (F . d) / R^5, and its gradient, summed over forces."""
+    """The first term, all there is in an incompressible body, and its gradient; summed over forces."""
     k = -3.0 / (2.0 * np.pi)
     pair = np.stack([d[..., i] * d[..., j] for i, j in _PAIRS], axis=-2)  # (..., N, 6, L)
     weight = k * np.einsum("...i,...i->...", d, f) / radius**5

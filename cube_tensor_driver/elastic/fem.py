@@ -10,6 +10,7 @@ import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -61,8 +62,8 @@ class Body:
             value = getattr(self, name)
             if not 0 <= value < 0.5:
                 raise ElasticError(
-                    f"{name} is {value}; it must lie in [0, 0.5). For rubber take 0.48 to 0.4999: these elements "
-                    "do not lock, but at 0.5 pressure is no longer a function of strain"
+                    f"{name} is {value}; it must lie in [0, 0.5). For rubber take 0.48 to 0.4999: the "
+                    "elements do not lock, but at 0.5 pressure is no longer a function of strain"
                 )
         for name in ("width", "depth", "height"):
             if not getattr(self, name) > 1.1 * self.side:
@@ -82,8 +83,8 @@ class Response:
     coefficients, structure_residual: its projection on the matrices that `symmetry` allows, and the relative
     part that is left; mode_residual: that part for each mode
     rank: number of independent states the pads see; unobservable: modes that cannot be told, by name
-    convergence: one row per mesh: unknowns, seconds, coefficients, and `change`, the largest change of an entry to
-    the next finer mesh relative to the largest entry (None for the last)
+    convergence: one row per mesh: unknowns, seconds, coefficients, and `change`, the largest change of an
+    entry to the next finer mesh relative to the largest entry (None for the last)
     """
 
     body: Body
@@ -122,8 +123,8 @@ def compute_response(
 ) -> Response:
     """Response of a layout in a body on `meshes` meshes, 1 to 3; the last, finest one is the result.
 
-    progress(done, total, what) is called before every solve and at the end. Raises ElasticError when pads overlap or the mesh
-    would not fit into memory, SymmetryError when the layout does not have the symmetry.
+    progress(done, total, what) is called before every solve and at the end. Raises ElasticError when pads
+    overlap or the mesh would not fit into memory, SymmetryError when the layout does not have the symmetry.
     """
     start = time.perf_counter()
     structure = find_structure(layout, symmetry)
@@ -139,21 +140,29 @@ def compute_response(
         if progress is not None:
             progress(next(done), total, what)
 
-    matrices, rows = [], []
-    for number, grid in enumerate(grids, 1):
+    matrices: list[Array] = []
+    rows: list[dict[str, Any]] = []
+    for grid in grids:
         began = time.perf_counter()
-        matrix, size = _matrix(body, layout, grid, lambda what, n=number: report(f"mesh {n} of {meshes}, {what}"))
+        matrix, unknowns = _matrix(body, layout, grid, report)
+        if rows:
+            rows[-1]["change"] = float(np.abs(matrix - matrices[-1]).max() / np.abs(matrix).max())
         matrices.append(matrix)
-        rows.append({"mesh": number, "unknowns": size, "seconds": time.perf_counter() - began})
-        rows[-1]["coefficients"] = project(structure, matrix)[0]
-    for row, matrix, finer in zip(rows, matrices, matrices[1:] + [None]):
-        row["change"] = None if finer is None else float(np.abs(matrix - finer).max() / np.abs(finer).max())
+        rows.append(
+            {
+                "unknowns": unknowns,
+                "seconds": time.perf_counter() - began,
+                "coefficients": project(structure, matrix)[0],
+                "change": None,
+            }
+        )
     report("done")
     matrix = matrices[-1]
     coefficients, residual = project(structure, matrix)
     left = matrix - np.tensordot(list(coefficients.values()), structure.basis, axes=1)
     names = structure.modes.names
     norms = np.linalg.norm(matrix, axis=0)
+    per_mode = np.linalg.norm(left, axis=0) / np.where(norms > 0, norms, 1.0)
     rank, unseen = _observable(matrix, names)
     return Response(
         body=body,
@@ -163,7 +172,7 @@ def compute_response(
         matrix=matrix,
         coefficients=coefficients,
         structure_residual=residual,
-        mode_residual=dict(zip(names, (np.linalg.norm(left, axis=0) / np.where(norms > 0, norms, 1.0)).tolist())),
+        mode_residual=dict(zip(names, per_mode.tolist(), strict=True)),
         rank=rank,
         unobservable=unseen,
         convergence=tuple(rows),
@@ -185,7 +194,9 @@ def calibration_from_fem(
     rest_frequency Hz, beta and modulus Pa (of the pads' foam) are not computed: measure them, or tare.
     noise: standard deviation of a pad's stress in Pa; by default that of counting 1 ms of periods, 8 ppm.
     """
-    content: dict[str, Any] = {"matrix": result.matrix} if whole_matrix else {"coefficients": result.coefficients}
+    content: dict[str, Any] = {"coefficients": result.coefficients}
+    if whole_matrix:
+        content = {"matrix": result.matrix}
     return Calibration(
         layout=result.layout,
         symmetry=result.symmetry,
@@ -200,7 +211,7 @@ def calibration_from_fem(
 
 
 def strip_layout(layout: Layout, width: float, centre: float = 0.5) -> Layout:
-    """The same layout with pads of another width at another distance from the middle of the face, in units of d0.
+    """The same layout with pads of another width and distance from the middle of the face, in units of d0.
 
     The halves of each face are width = 1, centre = 0.5. Raises LayoutError when a pad leaves its face.
     """
@@ -220,8 +231,8 @@ def _check_pads(layout: Layout) -> None:
         gap = np.abs(layout.positions[i] - layout.positions[j]).max()
         if np.array_equal(layout.normals[i], layout.normals[j]) and gap < layout.pad_size * (1 - 1e-9):
             raise ElasticError(
-                f"pads {layout.pads[i]} and {layout.pads[j]} are {layout.pad_size:g} d0 wide but {gap:g} d0 apart, "
-                "so they overlap; make them narrower or move them apart"
+                f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {layout.pad_size:g} d0 wide, {gap:g} "
+                "d0 apart; make them narrower or move them apart"
             )
 
 
@@ -236,8 +247,8 @@ def _check_memory(nodes: int) -> None:
 
 def _available_memory() -> float | None:
     try:
-        with open("/proc/meminfo", encoding="ascii") as lines:
-            return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
     except (OSError, StopIteration):
         return None  # not Linux: nothing is known, so nothing is refused
 
@@ -247,7 +258,7 @@ def _mesh(body: Body, layout: Layout, level: Any) -> Any:
     half = [(body.width, body.depth, body.height)[k] / body.side for k in axes]
     edges = [
         abs(float(x[k]) + s)
-        for x, n in zip(layout.positions, layout.normals)
+        for x, n in zip(layout.positions, layout.normals, strict=True)
         for k in axes
         for s in (-layout.pad_size / 2, layout.pad_size / 2)
         if n[k] == 0
@@ -256,7 +267,8 @@ def _mesh(body: Body, layout: Layout, level: Any) -> Any:
     steps = np.diff(np.unique([0.0, *stops[stops < 1], 1.0]))
     if steps.min() < 1e-3:
         raise ElasticError(
-            f"pad edges are {steps.min():.2g} d0 apart, the mesh resolves 0.001; move the edges together or apart"
+            f"pad edges are {steps.min():.2g} d0 apart and the mesh resolves 0.001; "
+            "move them together or apart"
         )
     return section(half, stops, level) if layout.planar else block(half, stops, *level)
 
@@ -268,25 +280,34 @@ def _matrix(body: Body, layout: Layout, grid: Any, report: Callable[[str], None]
     cube = None if np.isinf(body.cube_young) else lame(body.cube_young / body.young, body.cube_poisson, plane)
     solid = Solid(grid, lame(1.0, body.poisson, plane), cube)
     every = range(modes.n_modes)
-    stress, gradient = modes.stress[np.ix_(every, axes, axes)], modes.gradient[np.ix_(every, axes, axes, axes)]
+    stress = modes.stress[np.ix_(every, axes, axes)]
+    gradient = modes.gradient[np.ix_(every, axes, axes, axes)]
     matrix = np.zeros((layout.n_pads, modes.n_modes))
     for parity in itertools.product((1, -1), repeat=len(axes)):
         s, g = _part(stress, parity), _part(gradient, parity)
         used = np.flatnonzero(np.any(s != 0, axis=(1, 2)) | np.any(g != 0, axis=(1, 2, 3)))
         report(", ".join(modes.names[m] for m in used))
-        if len(used) == 0:
+        pads = [pad for pad in range(layout.n_pads) if _sees(layout, pad, parity)]
+        if len(used) == 0 or not pads:
             continue
         reactions = solid.reactions(solid.solve(parity, [(s[m], g[m]) for m in used]))
-        for pad in range(layout.n_pads):
+        for pad in pads:
             matrix[pad, used] += _pad_stress(solid, reactions, parity, layout, pad)
     return matrix, int(solid.basis.N)
 
 
 def _part(field: Array, parity: Parity) -> Array:
-    """The components of a tensor field (modes, dim, ..., dim) that have this parity: each index k flips axis k."""
+    """The components of a tensor field (modes, dim, ..., dim) of one parity: each index k flips axis k."""
     indices = np.indices(field.shape[1:])
     odd = np.stack([np.sum(indices == k, axis=0) % 2 == 1 for k in range(len(parity))], axis=-1)
     return field * np.all(odd == (np.array(parity) < 0), axis=-1)
+
+
+def _sees(layout: Layout, pad: int, parity: Parity) -> bool:
+    """False for a pad in the middle of its face along an axis in which the field is odd: its mean is zero."""
+    axes = list(_axes(layout))
+    centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
+    return bool(np.all((np.array(parity) > 0) | (np.abs(centre) > 1e-9) | (normal != 0)))
 
 
 def _pad_stress(solid: Solid, reactions: Array, parity: Parity, layout: Layout, pad: int) -> Array:
@@ -303,4 +324,4 @@ def _observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[str, 
     _, singular, rows = np.linalg.svd(matrix)
     rank = int(np.sum(singular > RANK_TOLERANCE * singular[0]))
     part = np.linalg.norm(rows[rank:], axis=0)
-    return rank, tuple(name for name, size in zip(names, part) if size > LEAK_TOLERANCE)
+    return rank, tuple(name for name, size in zip(names, part, strict=True) if size > LEAK_TOLERANCE)

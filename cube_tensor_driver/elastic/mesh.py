@@ -7,6 +7,7 @@ are element ends. Everything is symmetric under exchange of axes where the box a
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
 import numpy as np
 import skfem
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_RINGS = 26  # the corner element of half(0.5, 26 times) is 7e-9 d0: what it leaves out is below 1e-4 of any entry
+_RINGS = 26  # the last is 7e-9 d0 wide; what it leaves out is below 1e-4 of any entry
 _DIRECTIONS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float)
 
 
@@ -25,7 +26,8 @@ def section(half: Sequence[float], stops: Iterable[float], refine: int = 0) -> s
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     rho = min(0.5, 1.0 - inner[-1], *(h - 1.0 for h in half))
-    lines = [np.concatenate([_inner(inner, 1.0 - rho, 0.5), [1.0], _outer(1.0 + rho, h, rho, 2.0)]) for h in half]
+    face = np.append(_inner(inner, 1.0 - rho, 0.5), 1.0)
+    lines = [np.concatenate([face, _outer(1.0 + rho, h, rho, 2.0)]) for h in half]
     base = skfem.MeshTri.init_tensor(*lines)
     away = np.any(np.abs(base.p[:, base.t].mean(axis=1) - 1.0) > rho, axis=0)
     ring, corner = _rings(rho)
@@ -36,19 +38,21 @@ def section(half: Sequence[float], stops: Iterable[float], refine: int = 0) -> s
     return mesh.refined(refine) if refine else mesh
 
 
-def block(half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float) -> skfem.MeshHex:
-    """Bricks on the product of [0, half[k]]: size on the face, shrinking to `smallest` at the cube's edges."""
+def block(
+    half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float
+) -> skfem.MeshHex:
+    """Bricks on the product of [0, half[k]]: `size` on a face, shrinking to `smallest` at its edges."""
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
-    return skfem.MeshHex.init_tensor(
-        *(np.concatenate([_inner(inner, inner[-1], size), fine[1:], 1.0 + _graded(h - 1.0, smallest, growth)[1:]]) for h in half)
-    )
+    face = np.concatenate([_inner(inner, inner[-1], size), fine[1:]])
+    lines = [np.concatenate([face, 1.0 + _graded(h - 1.0, smallest, growth)[1:]]) for h in half]
+    return skfem.MeshHex.init_tensor(*lines)
 
 
 def _inner(stops: Sequence[float], end: float, size: float) -> Array:
     """Points through all stops to end, no further apart than size."""
     stops = sorted({*stops, end})
-    steps = [np.linspace(a, b, int(np.ceil((b - a) / size - 1e-9)) + 1)[1:] for a, b in zip(stops, stops[1:])]
+    steps = [np.linspace(a, b, int(np.ceil((b - a) / size - 1e-9)) + 1)[1:] for a, b in pairwise(stops)]
     return np.concatenate([[stops[0]], *steps])
 
 
@@ -67,7 +71,7 @@ def _graded(length: float, first: float, growth: float) -> Array:
 
 
 def _rings(rho: float) -> tuple[Array, NDArray[np.int64]]:
-    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1), each half the size of the last."""
+    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1), each half the last one."""
     radii = rho * 0.5 ** np.arange(_RINGS + 1)
     points = np.concatenate([1.0 + np.multiply.outer(radii, _DIRECTIONS).reshape(-1, 2), [[1.0, 1.0]]])
     triangles = []
@@ -75,7 +79,8 @@ def _rings(rho: float) -> tuple[Array, NDArray[np.int64]]:
         for j in range(0, 8, 2):  # j: mid of a side; its neighbours are corners
             for i in ((j + 1) % 8, (j - 1) % 8):
                 out, out_corner, into, into_corner = 8 * k + j, 8 * k + i, 8 * k + 8 + j, 8 * k + 8 + i
-                triangles += [(out, out_corner, into_corner), (out, into_corner, into)]  # the shorter diagonal
+                # cut along the shorter diagonal
+                triangles += [(out, out_corner, into_corner), (out, into_corner, into)]
     last = 8 * _RINGS
     triangles += [(last + j, last + (j + 1) % 8, len(points) - 1) for j in range(8)]
     return points, np.array(triangles)

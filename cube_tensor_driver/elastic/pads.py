@@ -1,14 +1,14 @@
 """Mean stress on a pad from the nodal reactions of a finite element solution.
 
-A bonded interface transmits to node i the reaction r_i = int phi_i t ds, with the nodal function phi_i and the
-traction t; finite elements give r exactly as well as they give the energy, while t = sigma n read off at the
+A bonded interface transmits to node i the reaction r_i = int phi_i t ds, with the nodal function phi_i and
+the traction t. Finite elements give r as well as they give the energy, while t = sigma n read off at the
 interface is poor, worst at the corner of the cube where it is infinite. Here t is recovered from r:
 
     find t in T with  int phi_i t ds = r_i  for every node i but the corner's,
 
 T being the element's own polynomials, continued in the last element to the corner (whose reaction also holds
-the neighbour face's shear). The integral of t over a pad is then w . r with weights w that depend on the nodes
-alone. On a face with two tangential directions, r and w are products of those along each.
+the neighbour face's shear). The integral of t over a pad is then w . r with weights w that depend on the
+nodes alone. On a face with two tangential directions the weights are products of those along each.
 Linear tractions are returned exactly. Source: M. F. Wheeler, Comp. Meth. Appl. Mech. Eng. 2 (1973) 123
 (consistent fluxes); the treatment of the corner is ours.
 """
@@ -28,10 +28,12 @@ def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: 
     parity  +1 when the traction is even about the middle, -1 when it is odd (so zero there)
     Pad edges must be ends of elements.
     """
-    flip = -parity  # the integral from 0 to -s is that from 0 to s, times this
-    return _from_middle(nodes, order, parity, abs(stop)) * (1 if stop >= 0 else flip) - _from_middle(
-        nodes, order, parity, abs(start)
-    ) * (1 if start >= 0 else flip)
+
+    def signed(s: float) -> Array:
+        """Weights of the integral from the middle to s; on the other side its sign is that of the parity."""
+        return _from_middle(nodes, order, parity, abs(s)) * (1 if s >= 0 else -parity)
+
+    return signed(stop) - signed(start)
 
 
 def _from_middle(nodes: Array, order: int, parity: int, stop: float) -> Array:
@@ -44,7 +46,8 @@ def _from_middle(nodes: Array, order: int, parity: int, stop: float) -> Array:
         mass[i : i + order + 1, i : i + order + 1] += length * element_mass
         if nodes[i + order] <= stop * (1 + 1e-12):
             integral[i : i + order + 1] += length * element_integral
-    keep = slice(0 if parity > 0 else 1, n - 1)  # an odd traction is zero in the middle, and a plane holds the node
+    # an odd traction is zero in the middle, and the mirror plane holds the node there
+    keep = slice(0 if parity > 0 else 1, n - 1)
     trial = np.eye(n)[:, keep]
     trial[-1, -order:] = _continuation(order)
     weights = np.zeros(n)

@@ -1,8 +1,8 @@
 """Linear elasticity of a box with a bonded cube in its middle, solved in its positive quarter or eighth.
 
 Box and cube are symmetric under the mirrors x_k -> -x_k, so every load splits into parts of one *parity* (+1
-even or -1 odd for each axis), and each part is solved where all coordinates are positive. On the plane x_k = 0
-an even field has u_k = 0; an odd one has the other components zero. Lengths in units of d0.
+even or -1 odd for each axis), and each part is solved where all coordinates are positive. On the plane
+x_k = 0 an even field has u_k = 0; an odd one has the other components zero. Lengths in units of d0.
 
     int sigma(u) : eps(w) dV = int_outer w . (sigma_load n) dS = int sigma_load : eps(w) dV   for all w
 
@@ -96,16 +96,19 @@ class Solid:
         return u
 
     def reactions(self, u: Array) -> Array:
-        """Nodal forces (dofs, n) of the body on whatever holds it: on the cube's surface, those on the cube, reversed."""
+        """Nodal forces (dofs, n) on the body by whatever holds it: on the cube's surface, by the cube."""
         return np.asarray(self.body @ u)
 
-    def mean_stress(self, reactions: Array, parity: Parity, axis: int, intervals: Sequence[tuple[float, float]]) -> Array:
+    def mean_stress(
+        self, reactions: Array, parity: Parity, axis: int, intervals: Sequence[tuple[float, float]]
+    ) -> Array:
         """Mean normal stress (n,) on a pad of the face x_axis = 1, one interval in [-1, 1] per other axis."""
         others = [k for k in range(self.dim) if k != axis]
         x = self.place
-        dofs = np.flatnonzero((self.component == axis) & _at(x[axis], 1.0) & np.all(x[others] < 1.0 + _SAME, axis=0))
+        on_face = _at(x[axis], 1.0) & np.all(x[others] < 1.0 + _SAME, axis=0)
+        dofs = np.flatnonzero(on_face & (self.component == axis))
         weights = np.ones(len(dofs))
-        for k, (start, stop) in zip(others, intervals):
+        for k, (start, stop) in zip(others, intervals, strict=True):
             nodes, index = np.unique(np.round(x[k, dofs], 14), return_inverse=True)
             w = interval_weights(nodes, self.order, parity[k], start, stop)
             weights *= w[index] / (stop - start)
@@ -123,7 +126,7 @@ class Solid:
     def _held(self, parity: Parity) -> NDArray[np.bool_]:
         """Which dofs are zero: by the mirrors, in a rigid cube, or to stop the one rigid motion that is left.
 
-        A rigid cube can be held altogether: the motion that its parity allows it is the body's own rigid motion.
+        A rigid cube can be held altogether: the one motion that its parity leaves is free for the body too.
         """
         x, c = self.place, self.component
         held = np.zeros(len(c), dtype=bool)
@@ -142,7 +145,7 @@ class Solid:
 
 
 def nested_dissection(place: Array) -> NDArray[np.int64]:
-    """Elimination order (n,) of nodes (dim, n) on a product grid of quadratic elements: halves first, cuts last.
+    """Elimination order (n,) of nodes (dim, n) on a product grid of quadratic elements: halves, then the cut.
 
     Source: A. George, SIAM J. Numer. Anal. 10 (1973) 345.
     """
