@@ -18,9 +18,7 @@ def demo(options: argparse.Namespace) -> int:
     duration = options.duration
     if duration is None and (options.headless or options.json):
         duration = 10.0
-    return run_demo(
-        Options(options.config, options.cubes, options.rate, duration, options.headless, options.json)
-    )
+    return run_demo(Options(options.config, options.cubes, options.rate, duration, options.headless, options.json))
 
 
 def test(options: argparse.Namespace) -> int:
@@ -30,7 +28,9 @@ def test(options: argparse.Namespace) -> int:
 
 def lint(options: argparse.Namespace) -> int:
     commands = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
-    return max(subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode for command in commands)
+    return max(
+        subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode for command in commands
+    )
 
 
 def positive(text: str) -> float:
@@ -50,11 +50,17 @@ def parser() -> argparse.ArgumentParser:
         return added
 
     sub = command("demo", demo, "run simulated cubes, driver and reconstruction, with a live table")
-    sub.add_argument("--config", type=Path, metavar="FILE", help="skin file to simulate (default: sixteen planar cubes)")
+    sub.add_argument(
+        "--config", type=Path, metavar="FILE", help="skin file to simulate (default: sixteen planar cubes)"
+    )
     sub.add_argument("--cubes", type=int, metavar="N", help="simulate a grid of N planar cubes instead")
     sub.add_argument("--rate", type=positive, metavar="HZ", help="samples per second (default: the skin file's, 100)")
-    sub.add_argument("--duration", type=positive, metavar="S", help="end after S seconds and print the figures (default: "
-                     "until Ctrl-C; 10 with --headless or --json)")  # fmt: skip
+    sub.add_argument(
+        "--duration",
+        type=positive,
+        metavar="S",
+        help="end after S seconds and print the figures (default: until Ctrl-C; 10 with --headless or --json)",
+    )
     sub.add_argument("--headless", action="store_true", help="no live table")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE instead of printing them")
 

@@ -9,16 +9,18 @@ from cube_tensor_driver.ros.launching import start_skin
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("port", default_value="", description="Serial port of the hub, such as /dev/ttyACM0, or "
-                                  "socket://host:port; empty: as the skin file says."),
-            DeclareLaunchArgument("config", default_value=str(share() / "config" / "cube.yaml"),
-                                  description="Skin file (YAML) with one link."),
-            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
-            OpaqueFunction(
-                function=start_skin,
-                kwargs={name: LaunchConfiguration(name) for name in ("config", "port", "namespace")},
-            ),
-        ]
-    )  # fmt: skip
+    arguments = [
+        DeclareLaunchArgument(
+            "port",
+            default_value="",
+            description="Port of the hub, such as /dev/ttyACM0 or socket://host:port; empty: as the skin file says.",
+        ),
+        DeclareLaunchArgument(
+            "config",
+            default_value=str(share() / "config" / "cube.yaml"),
+            description="Skin file (YAML) with one link.",
+        ),
+        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+    ]
+    values = {name: LaunchConfiguration(name) for name in ("config", "port", "namespace")}
+    return LaunchDescription([*arguments, OpaqueFunction(function=start_skin, kwargs=values)])

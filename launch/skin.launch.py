@@ -8,18 +8,18 @@ from cube_tensor_driver.ros.launching import start_skin
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("config", description="Skin file (YAML): links, cubes, poses, calibrations."),
-            DeclareLaunchArgument(
-                "simulate", default_value="false", choices=["true", "false"],
-                description="Simulate the hubs of the skin file on pseudo-terminals instead of opening its ports.",
-            ),
-            DeclareLaunchArgument("rate", default_value="0.0", description="Samples per second; 0.0: as the skin file says."),
-            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
-            OpaqueFunction(
-                function=start_skin,
-                kwargs={name: LaunchConfiguration(name) for name in ("config", "simulate", "rate", "namespace")},
-            ),
-        ]
-    )  # fmt: skip
+    arguments = [
+        DeclareLaunchArgument("config", description="Skin file (YAML): links, cubes, poses, calibrations."),
+        DeclareLaunchArgument(
+            "simulate",
+            default_value="false",
+            choices=["true", "false"],
+            description="Simulate the hubs of the skin file on pseudo-terminals instead of opening its ports.",
+        ),
+        DeclareLaunchArgument(
+            "rate", default_value="0.0", description="Samples per second; 0.0: as the skin file says."
+        ),
+        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+    ]
+    values = {name: LaunchConfiguration(name) for name in ("config", "simulate", "rate", "namespace")}
+    return LaunchDescription([*arguments, OpaqueFunction(function=start_skin, kwargs=values)])

@@ -14,9 +14,7 @@ from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE
 from cube_tensor_driver.core.response import response
 from cube_tensor_driver.core.symmetry import find_structure
 
-PAIRS = [(layout, g) for layout in ("quad", "planar", "cube") for g in ("full", "slab", "mirrors", "none")][
-    1:
-]
+PAIRS = [(layout, g) for layout in ("quad", "planar", "cube") for g in ("full", "slab", "mirrors", "none")][1:]
 
 
 def random_case(layout: str, symmetry: str, seed: int = 0):
@@ -44,14 +42,10 @@ def test_recovers_what_was_put_in(layout, symmetry):
     # exactly the components that no hidden combination of modes can change are observed
     hidden = np.linalg.svd(a)[2][np.linalg.matrix_rank(a) :]
     nonzero = np.any(modes.components, axis=1)
-    np.testing.assert_array_equal(
-        seen, nonzero & (np.abs(modes.components @ hidden.T).max(axis=1, initial=0) < 1e-9)
-    )
+    np.testing.assert_array_equal(seen, nonzero & (np.abs(modes.components @ hidden.T).max(axis=1, initial=0) < 1e-9))
 
 
-@pytest.mark.parametrize(
-    "layout, symmetry", [p for p in PAIRS if p != ("quad", "none")]
-)  # which sees nothing alone
+@pytest.mark.parametrize("layout, symmetry", [p for p in PAIRS if p != ("quad", "none")])  # which sees nothing alone
 def test_scatter_is_as_stated(layout, symmetry):
     modes, a, rng = random_case(layout, symmetry, 1)
     noise = rng.uniform(0.5, 2, len(a))
@@ -69,9 +63,7 @@ def test_scatter_is_as_stated(layout, symmetry):
     if estimator.dof:
         chi2 = estimator.chi2(v)
         assert chi2.mean() == pytest.approx(estimator.dof, rel=0.06)
-        assert np.mean(chi2 > estimator.limit) == pytest.approx(
-            FALSE_ALARM, abs=5 * np.sqrt(FALSE_ALARM / 1e4)
-        )
+        assert np.mean(chi2 > estimator.limit) == pytest.approx(FALSE_ALARM, abs=5 * np.sqrt(FALSE_ALARM / 1e4))
 
 
 def test_unequal_noise_weighs_the_pads():
@@ -86,10 +78,7 @@ def test_unequal_noise_weighs_the_pads():
 
 def test_what_the_layouts_see():
     quad, planar, cube = (illustrative(n) for n in ("quad", "planar", "cube"))
-    see = {
-        c.layout.name: components_seen(make_estimator(c.response, c.noise, c.modes))
-        for c in (quad, planar, cube)
-    }
+    see = {c.layout.name: components_seen(make_estimator(c.response, c.noise, c.modes)) for c in (quad, planar, cube)}
     assert see["quad"] == {"zx", "zz_z"}  # zz_z only because the illustrative f is 0
     assert see["planar"] == set(PLANE.names)
     assert see["cube"] == set(COMPONENTS)
@@ -124,9 +113,7 @@ def test_missing_pads_cost_what_they_must():
     assert components_seen(one) == set(PLANE.names) and one.dof == 0 and np.isnan(one.limit)
     assert np.all(one.matrix[one.observed, 2] == 0)
     whole = make_estimator(c.response, c.noise, c.modes)
-    assert np.all(
-        np.diag(one.covariance)[one.observed] >= np.diag(whole.covariance)[one.observed] * (1 - 1e-12)
-    )
+    assert np.all(np.diag(one.covariance)[one.observed] >= np.diag(whole.covariance)[one.observed] * (1 - 1e-12))
     none = make_estimator(c.response, c.noise, c.modes, missing=np.arange(8))
     assert not none.observed.any() and none.dof == 0 and none.rank == 0
 

@@ -35,9 +35,7 @@ class Bench:
 
     def errors(self, result) -> np.ndarray:
         """Errors of the coefficients in units of their stated deviations."""
-        return np.array(
-            [(result.coefficients[n] - c) / result.deviations[n] for n, c in self.coefficients.items()]
-        )
+        return np.array([(result.coefficients[n] - c) / result.deviations[n] for n, c in self.coefficients.items()])
 
 
 @pytest.mark.parametrize("layout, symmetry", [("planar", "full"), ("planar", "mirrors"), ("quad", "mirrors")])
@@ -87,9 +85,7 @@ def test_outliers_are_forgotten():
 def test_noise_of_another_size_is_found():
     bench = Bench("planar", "full", 3)
     result = fit(bench.structure, bench.loads, bench.readings, bench.noise / 10)
-    assert result.scale == pytest.approx(10, rel=0.3) and result.chi2 / result.dof == pytest.approx(
-        100, rel=0.4
-    )
+    assert result.scale == pytest.approx(10, rel=0.3) and result.chi2 / result.dof == pytest.approx(100, rel=0.4)
     assert np.abs(bench.errors(result)).max() < 4  # deviations follow the scatter found
 
 
@@ -103,9 +99,7 @@ def test_what_the_loads_leave_open_is_said_and_following_the_advice_settles_it()
     assert result.undetermined == ("e", "f", "g", "h")
     assert np.isnan([result.coefficients[n] for n in "efgh"] + [result.deviations[n] for n in "efgh"]).all()
     assert np.abs(bench.errors(result)[:3]).max() < 4
-    assert (
-        len(result.advice) == 2 and "add a load of zz_x alone, sigma_zz growing along x" in result.advice[0]
-    )
+    assert len(result.advice) == 2 and "add a load of zz_x alone, sigma_zz growing along x" in result.advice[0]
     with pytest.raises(FitError, match=r"do not determine e, f.*fixed"):
         result.calibration(bench.base)
     advised = [text.split("a load of ")[1].split()[0] for text in result.advice]
@@ -132,9 +126,7 @@ def test_a_fit_becomes_a_calibration():
     bench = Bench("planar", "mirrors", 6)
     result = bench.fit()
     c = result.calibration(bench.base, created="2024-05-01T12:00:00Z", source="loads.csv")
-    assert (
-        c.symmetry == "mirrors" and c.source == "loads.csv" and Calibration.from_dict(c.to_dict()).id == c.id
-    )
+    assert c.symmetry == "mirrors" and c.source == "loads.csv" and Calibration.from_dict(c.to_dict()).id == c.id
     np.testing.assert_allclose(bench.loads @ c.response.T, result.fitted, rtol=1e-9, atol=1e-6)
     assert np.all(c.noise >= bench.base.noise)
 

@@ -69,11 +69,7 @@ def check_rows(rows, expected, tolerance):
 @pytest.mark.parametrize("layout", ["quad", "planar", "cube"])
 @pytest.mark.parametrize("make", [illustrative, individual])
 def test_recovers_the_applied_fields(layout, make, dtype, tolerance):
-    c = (
-        make(layout, 3)
-        if make is individual
-        else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
-    )
+    c = make(layout, 3) if make is individual else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
     states = states_of(c, 50)
     rows = Pipeline([c] * 50, dtype).process(np.arange(50), frequencies(c, states), np.zeros(50, np.uint32))
     check_rows(rows, truth(c, states), tolerance)
@@ -100,9 +96,7 @@ def test_cubes_of_all_kinds_in_one_batch(dtype, tolerance):
         rows = pipeline.process(cube, frequency)
         check_rows(rows, expected, tolerance)
         assert not rows.status.any()
-    assert np.isnan(rows.residual[cube == 4]).all() and np.all(
-        rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1
-    )
+    assert np.isnan(rows.residual[cube == 4]).all() and np.all(rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1)
     pads = pipeline.pad_stress(cube, frequency)
     assert np.isnan(pads[0, 4:]).all() and np.isfinite(pads[2]).all()
     k = kinds[0]
@@ -156,9 +150,7 @@ def test_strange_rows_end_in_their_status_never_in_an_error():
     wild = rng.choice([0, -1, np.nan, np.inf, -np.inf, 1e300, 1e-300, 1e5, 4.4e5], size=(500, 8))
     with np.errstate(all="raise"):
         for dtype in (np.float32, np.float64):
-            rows = Pipeline([c] * 3, dtype).process(
-                rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500)
-            )
+            rows = Pipeline([c] * 3, dtype).process(rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500))
             assert not np.isinf(joined(rows)).any()
     empty = pipeline.process(np.empty(0, int), np.empty((0, 8)), np.empty(0, np.uint32))
     assert empty.stress.shape == (0, 6) and empty.gradient.shape == (0, 9) and empty.status.shape == (0,)
@@ -263,9 +255,7 @@ def cost_of(count: int, dtype) -> np.ndarray:
     def ours():
         return pipeline.process(cube, f, fault)
 
-    return np.min(
-        [[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)], axis=0
-    )
+    return np.min([[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)], axis=0)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -14,6 +14,7 @@ from cube_tensor_driver.core.response import (
     ILLUSTRATIVE_CUBE,
     illustrative_coefficients,
     project,
+    prototype,
     response,
 )
 from cube_tensor_driver.core.symmetry import (
@@ -167,9 +168,7 @@ def test_the_action_on_modes_composes(i, j):
 @pytest.mark.parametrize("layout, symmetry", PAIRS)
 def test_the_number_of_coefficients(layout, symmetry):
     structure = find_structure(LAYOUTS[layout], symmetry)
-    assert (
-        structure.n_coefficients == COUNTS[layout, symmetry] == count_by_characters(LAYOUTS[layout], symmetry)
-    )
+    assert structure.n_coefficients == COUNTS[layout, symmetry] == count_by_characters(LAYOUTS[layout], symmetry)
     flat = structure.basis.reshape(structure.n_coefficients, -1)
     assert np.linalg.matrix_rank(flat) == structure.n_coefficients
     assert set(np.unique(flat)) <= {-1.0, 0.0, 1.0}
@@ -198,9 +197,7 @@ def test_projection_averages_over_the_group(layout, symmetry):
     structure = find_structure(LAYOUTS[layout], symmetry)
     a = np.random.default_rng(3).normal(size=structure.basis.shape[1:])
     elements = layout_group(structure.layout, symmetry)
-    mean = np.mean(
-        [pad_action(structure.layout, r).T @ a @ structure.modes.action(r) for r in elements], axis=0
-    )
+    mean = np.mean([pad_action(structure.layout, r).T @ a @ structure.modes.action(r) for r in elements], axis=0)
     coefficients, unexplained = project(structure, a)
     np.testing.assert_allclose(response(structure, coefficients), mean, atol=1e-12)
     assert unexplained == pytest.approx(np.linalg.norm(a - mean) / np.linalg.norm(a))
@@ -246,11 +243,13 @@ def test_the_prototypes_readings_are_sums_of_the_response():
     """Eqs. 8 to 10 with V for the frequency shift: P_grad is the true gradient only where xx_x is known."""
     structure = find_structure(LAYOUTS["quad"], "slab")
     a = response(structure, ILLUSTRATIVE)
-    normal, shear, gradient = -a.sum(axis=0), a.T @ [-1, 1, 1, -1], a.T @ [-1, 1, -1, 1]
-    at = dict(zip(PLANE.names, range(7), strict=True))
-    assert np.flatnonzero(normal).tolist() == [at["zz"], at["xx"]]
-    assert np.flatnonzero(shear).tolist() == [at["zx"]] and shear[at["zx"]] == pytest.approx(4 * 0.5)
-    assert np.flatnonzero(gradient).tolist() == [at["zz_x"], at["xx_x"]]
+    shown = {"zz": (0, -4 * 1.4), "xx": (0, 4 * 0.3), "zx": (1, 4 * 0.5), "zz_x": (2, -4 * 0.9), "xx_x": (2, 4 * 0.3)}
+    expected = np.zeros((7, 3))
+    for mode, (reading, value) in shown.items():
+        expected[PLANE.names.index(mode), reading] = value
+    np.testing.assert_allclose(prototype(a.T), expected, atol=1e-14)
+    v1, v2, v3, v4 = shift = np.array([1.0, 20, 300, 4000])
+    np.testing.assert_array_equal(prototype(shift), [-v1 - v2 - v3 - v4, -v1 + v2 + v3 - v4, v1 - v2 + v3 - v4])
 
 
 def test_a_symmetry_that_the_layout_lacks_names_the_pad():
@@ -273,9 +272,7 @@ def test_the_illustrative_responses_agree_with_each_other():
     np.testing.assert_allclose(a["cube"][:8] @ plane_in_space, a["planar"], atol=1e-15)
     for name, symmetry in (("planar", "mirrors"), ("cube", "slab"), ("cube", "none")):
         structure = find_structure(LAYOUTS[name], symmetry)
-        np.testing.assert_allclose(
-            response(structure, illustrative_coefficients(structure)), a[name], atol=1e-15
-        )
+        np.testing.assert_allclose(response(structure, illustrative_coefficients(structure)), a[name], atol=1e-15)
     # as many combinations as any response of this symmetry has: only yz_x, zx_y and xy_z stay hidden
     assert (
         np.linalg.matrix_rank(a["cube"])

@@ -33,9 +33,7 @@ def test_principal_stresses_are_tractions_along_their_directions():
         np.testing.assert_allclose(
             traction(STRESS, directions[:, k]), values[:, k, None] * directions[:, k], atol=1e-12
         )
-    np.testing.assert_allclose(
-        directions @ directions.transpose(0, 2, 1), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12
-    )
+    np.testing.assert_allclose(directions @ directions.transpose(0, 2, 1), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12)
     values, directions = principal_stresses(np.array([[np.nan, 0, 0, 0, 0, 0], [1, 2, 3, 0, 0, 0]]))
     assert np.isnan(values[0]).all() and np.isnan(directions[0]).all() and values[1].tolist() == [3, 2, 1]
 
@@ -45,9 +43,7 @@ def test_invariants_are_those_of_the_principal_stresses():
     np.testing.assert_allclose(
         invariants(STRESS), np.stack([a + b + c, a * b + b * c + c * a, a * b * c], 1), atol=1e-12
     )
-    np.testing.assert_allclose(
-        von_mises(STRESS), np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2), atol=1e-12
-    )
+    np.testing.assert_allclose(von_mises(STRESS), np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2), atol=1e-12)
     assert von_mises(np.array([5.0, 0, 0, 0, 0, 0])) == 5  # uniaxial
     assert von_mises(np.array([0, 0, 0, 0, 2.0, 0])) == pytest.approx(2 * np.sqrt(3))  # shear
 
@@ -64,9 +60,7 @@ def test_traction_on_the_faces_is_a_column():
 def test_rotations_compose(one, two):
     r1, r2 = rotation_from_rpy(*one), rotation_from_rpy(*two)
     gradient = SPACE.gradient
-    np.testing.assert_allclose(
-        rotate_stress(rotate_stress(STRESS, r1), r2), rotate_stress(STRESS, r2 @ r1), atol=1e-12
-    )
+    np.testing.assert_allclose(rotate_stress(rotate_stress(STRESS, r1), r2), rotate_stress(STRESS, r2 @ r1), atol=1e-12)
     np.testing.assert_allclose(
         rotate_gradient(rotate_gradient(gradient, r1), r2), rotate_gradient(gradient, r2 @ r1), atol=1e-12
     )
@@ -112,9 +106,7 @@ def test_rpy_and_quaternions_agree(rpy):
 
 
 def test_quaternions_are_in_ros_order():
-    np.testing.assert_allclose(
-        quaternion_from_rpy(0, 0, np.pi / 2), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15
-    )
+    np.testing.assert_allclose(quaternion_from_rpy(0, 0, np.pi / 2), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
     for bad in ([0, 0, 0, 0], [np.nan, 0, 0, 1]):
         with pytest.raises(CubeError, match="quaternion"):
             rotation_from_quaternion(bad)

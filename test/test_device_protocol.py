@@ -168,7 +168,8 @@ def test_junk_around_loses_no_frame(name: str, feed) -> None:
 HEADER_1 = bytes([0x03, 1, 18, 0])
 STATS_PAYLOAD = bytes(18)
 BAD = {
-    "not COBS": (b"\0\x05ab\0", "framing"),
+    "not COBS": (b"\0\x0bab345678\0", "framing"),
+    "eight bytes on the wire": (b"\0\x08abcdefg\0", "length"),
     "too short": (wire(b"\x03\x01\x00"), "length"),
     "seven bytes": (b"\0" + cobs_of(b"1234567") + b"\0", "length"),
     "checksum": (b"\0" + cobs_of(HEADER_1 + STATS_PAYLOAD + b"\0\0\0\0") + b"\0", "crc"),

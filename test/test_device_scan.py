@@ -21,7 +21,15 @@ def sample(sequence, hertz, first=0, fault=0, celsius=-32768):
 
 def two_links():
     # cube 0 on link 1 index 0; cube 1 on link 0 index 1; cube 2 by uid 77 anywhere; cube 3 on link 1 index 1
-    scan = Scan(2, [Place("a", 1, 0, None, 2), Place("b", 0, 1, None, 2), Place("c", None, None, 77, 2), Place("d", 1, 1, None, 2)])
+    scan = Scan(
+        2,
+        [
+            Place("a", 1, 0, None, 2),
+            Place("b", 0, 1, None, 2),
+            Place("c", None, None, 77, 2),
+            Place("d", 1, 1, None, 2),
+        ],
+    )
     assert scan.hello(0, hello([77, 5])) == []
     assert scan.hello(1, hello([6, 7])) == []
     return scan

@@ -145,8 +145,8 @@ def test_nothing_holds_the_cube(cube):
         ((-1, -1), (stress, np.zeros((2, 2, 2))), np.where(c == 0, x[1], -x[0])),
         ((-1, 1), (np.zeros((2, 2)), gradient), np.where(c == 0, 1.0, 0.0)),
     ):
-        inside = np.all(x < 1 + 1e-12, axis=0)
-        residual = (body.total @ body.solve(parity, [load]))[:, 0] - body._forces(*load)
+        inside, force = np.all(x < 1 + 1e-12, axis=0), body.linear_forces(*load)
+        residual = (body.total @ body.solve(parity, force[:, None]))[:, 0] - force
         left = residual[inside] @ motion[inside]
         assert abs(left) < 1e-8 * np.abs(residual[inside]).sum()
 
@@ -215,6 +215,22 @@ def test_space_without_a_cube(coarse):
     result = compute_response(body, LAYOUTS["cube"], "mirrors", meshes=1)
     structure = fem.find_structure(LAYOUTS["cube"], "mirrors")
     assert np.abs(result.matrix - applied(LAYOUTS["cube"], structure.modes)).max() < 1e-6
+
+
+def test_any_field_as_outer_tractions(coarse):
+    """A field given as a function acts as the modes it is made of, whatever its parities."""
+    layout, body = LAYOUTS["cube"], Body(12e-3, 10e-3, 11e-3, cube_young=RIGID)
+    modes = fem.find_structure(layout, "none").modes
+    state = np.random.default_rng(4).normal(size=(modes.n_modes, 2))
+    stress, gradient = modes.field(state.T)
+    solid = fem.make_solid(body, layout, (1.0, 0.3, 6.0))
+
+    def field(x):
+        return stress + np.einsum("nijk,qk->qnij", gradient, x)
+
+    pads = fem.pad_stresses(solid, layout, lambda parity: solid.outer_forces(parity, field))
+    matrix = compute_response(body, layout, "none", meshes=1).matrix
+    assert np.abs(pads - matrix @ state).max() < 1e-6 * np.abs(pads).max()
 
 
 def test_cubic_body_has_the_full_structure(coarse):

@@ -19,13 +19,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
-from conftest import ROOT
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from conftest import ROOT
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.device.protocol import Decoder, Hello, Request, Sample, encode
@@ -262,7 +262,13 @@ def test_damaged_bytes_are_counted_and_the_next_good_frame_arrives(ros, hub, tmp
             return bool(frequencies)
 
         ros.wait(arrived)
-        for data in (bytes(flipped), b"\x07garbage\x00\xff\xff", one_sample(1002), one_sample(1003)[:-9], one_sample(1004)):
+        for data in (
+            bytes(flipped),
+            b"\x07garbage\x00\xff\xff",
+            one_sample(1002),
+            one_sample(1003)[:-9],
+            one_sample(1004),
+        ):
             hub.send(data)
         ros.wait(lambda: 1004 in sequences(frequencies))
         assert [number for number in sequences(frequencies) if number > 1000] == [1002, 1004]

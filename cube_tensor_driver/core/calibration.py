@@ -100,14 +100,11 @@ class Calibration:
         array = _array(value, None, name)
         if array.shape not in ((), (n,)):
             raise CalibrationError(
-                f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n} pads: "
-                f"give one number or {n}"
+                f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n} pads: give one number or {n}"
             )
         low = 0.0 if name == "beta" else np.nextafter(0, 1)
         if np.any(array < low):
-            raise CalibrationError(
-                f"{name} holds {array.min():g}; it must be {'at least' if low == 0 else 'above'} 0"
-            )
+            raise CalibrationError(f"{name} holds {array.min():g}; it must be {'at least' if low == 0 else 'above'} 0")
         array = np.broadcast_to(array, (n,)).copy()
         array.flags.writeable = False
         return array
@@ -191,21 +188,15 @@ class Calibration:
                 f"{sorted(missing)}; allowed are {', '.join(sorted(allowed | {'id', 'schema'}))}"
             )
         if data["schema"] != SCHEMA:
-            raise CalibrationError(
-                f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}"
-            )
+            raise CalibrationError(f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}")
         values = {key: value for key, value in data.items() if key in allowed}
         layout, neglect, model = values["layout"], values.get("neglect", ()), values.get("temperature")
         try:
-            values["layout"] = (
-                Layout.from_dict(layout) if isinstance(layout, Mapping) else find_layout(layout)
-            )
+            values["layout"] = Layout.from_dict(layout) if isinstance(layout, Mapping) else find_layout(layout)
         except LayoutError as error:
             raise CalibrationError(f"calibration: {error}") from error
         if isinstance(neglect, str) or not isinstance(neglect, Sequence):
-            raise CalibrationError(
-                f"calibration: neglect is {neglect!r}; it must be a list of names of modes"
-            )
+            raise CalibrationError(f"calibration: neglect is {neglect!r}; it must be a list of names of modes")
         values["neglect"] = tuple(neglect)
         values["temperature"] = None if model is None else TemperatureModel.from_dict(model)
         for key in ("symmetry", "created", "source"):

@@ -107,9 +107,7 @@ def make_estimator(
     v1 = vt[:rank].T
     t = targets[:, kept]
     size = np.linalg.norm(targets, axis=1)
-    leak = np.linalg.norm(t - (t @ v1) @ v1.T, axis=1) + np.linalg.norm(
-        np.delete(targets, kept, axis=1), axis=1
-    )
+    leak = np.linalg.norm(t - (t @ v1) @ v1.T, axis=1) + np.linalg.norm(np.delete(targets, kept, axis=1), axis=1)
     observed = (size > 0) & (leak <= LEAK_TOLERANCE * size)
 
     half = t @ v1 / s[:rank]
@@ -143,9 +141,7 @@ def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] =
     None stands for what there is not.
     """
     modes, n_pads = structure.modes, structure.layout.n_pads
-    estimator = make_estimator(
-        response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes)
-    )
+    estimator = make_estimator(response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes))
     deviations = np.sqrt(np.diag(estimator.covariance))
     result: dict[str, Any] = {
         "pads": list(structure.layout.pads),
@@ -159,9 +155,7 @@ def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] =
         s = s[s > RANK_TOLERANCE * s[0]] if s.size else s
         result[f"rank_{part}"] = len(s)
         result[f"condition_{part}"] = float(s[0] / s[-1]) if s.size else None
-    result["unobservable"] = [
-        name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen
-    ]
+    result["unobservable"] = [name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen]
     result["noise"] = {
         name: float(d) if seen else None
         for name, d, seen in zip(modes.names, deviations, estimator.observed, strict=True)

@@ -29,9 +29,7 @@ STILL = {
     "huber": 1e-3,
     "tukey": 1e-9,
 }  # relative change that ends a stage; Huber's only leads on
-DIRECTION_TOLERANCE = (
-    1e-6  # a direction of coefficients and gains below this part of the strongest is not determined
-)
+DIRECTION_TOLERANCE = 1e-6  # a direction of coefficients and gains below this part of the strongest is not determined
 FOLDS = 10  # of the cross-validation
 
 
@@ -68,9 +66,7 @@ class Fit:
         FitError when coefficients are undetermined: add the loads of `advice`, or give them as `fixed`.
         """
         if self.undetermined:
-            raise FitError(
-                f"no calibration: {'; '.join(self.advice)}. Or give the open coefficients as fixed"
-            )
+            raise FitError(f"no calibration: {'; '.join(self.advice)}. Or give the open coefficients as fixed")
         return replace(
             base,
             layout=self.structure.layout,
@@ -85,15 +81,12 @@ class Fit:
         )
 
 
-def measured_stress(
-    base: Calibration, frequency: np.ndarray, temperature: np.ndarray | None = None
-) -> np.ndarray:
+def measured_stress(base: Calibration, frequency: np.ndarray, temperature: np.ndarray | None = None) -> np.ndarray:
     """(N, P) Pa from frequencies (N, P) by a calibration's pad law; FitError names one out of range."""
     f = np.asarray(frequency, dtype=float)
     if f.ndim != 2 or f.shape[1] != base.layout.n_pads:
         raise FitError(
-            f"frequencies have shape {f.shape}; layout {base.layout.name!r} needs (loads, "
-            f"{base.layout.n_pads})"
+            f"frequencies have shape {f.shape}; layout {base.layout.name!r} needs (loads, {base.layout.n_pads})"
         )
     rest = base.rest_frequency
     if base.temperature is not None and temperature is not None:
@@ -115,9 +108,7 @@ def traction_loads(modes: Modes, force: np.ndarray, area: float) -> np.ndarray:
     """
     f = np.asarray(force, dtype=float)
     if f.ndim != 2 or f.shape[1] != 3 or not area > 0:
-        raise FitError(
-            f"forces have shape {f.shape} and the area is {area} m^2; needed are (loads, 3) and above 0"
-        )
+        raise FitError(f"forces have shape {f.shape} and the area is {area} m^2; needed are (loads, 3) and above 0")
     stress = np.zeros((len(f), 6))
     stress[:, [4, 3, 2]] = f / area
     return modes.state(stress)
@@ -147,9 +138,7 @@ def fit(
     open_ = _open(hidden, len(model.free))
     names = [structure.names[k] for k in model.free]
     if len(names) and open_.all():
-        raise FitError(
-            "these loads determine no coefficient: " + "; ".join(_advise(model, theta, x, hidden, open_))
-        )
+        raise FitError("these loads determine no coefficient: " + "; ".join(_advise(model, theta, x, hidden, open_)))
     covariance = _covariance(jacobian, model.residuals(theta, design, y) / scale, scale)
     covariance[: len(names)][open_] = covariance[:, : len(names)][:, open_] = np.nan
     k = np.full((structure.n_coefficients,) * 2, 0.0)
@@ -180,9 +169,7 @@ def fit(
 class _Model:
     """theta = free coefficients, then coordinates of the gains around 1."""
 
-    def __init__(
-        self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float], gains: bool
-    ) -> None:
+    def __init__(self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float], gains: bool) -> None:
         self.structure, self.noise = structure, noise
         self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
         self.start = np.array([fixed.get(name, 0.0) for name in structure.names], dtype=float)
@@ -320,9 +307,7 @@ def _held_out(model: _Model, design: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2) / np.mean(y**2))) if np.any(y) else float("nan")
 
 
-def _advise(
-    model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray
-) -> list[str]:
+def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray) -> list[str]:
     """Sentences that name single-mode loads, found greedily, which would determine what is open."""
     advice = []
     theta = theta.copy()
@@ -336,14 +321,10 @@ def _advise(
         still = _open(hiddens[best], len(open_))
         names = [model.structure.names[k] for k, o in zip(model.free, open_, strict=True) if o]
         if hiddens[best].shape[1] >= hidden.shape[1]:
-            advice.append(
-                f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry"
-            )
+            advice.append(f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry")
             break
         settled = [
-            model.structure.names[k]
-            for k, now, then in zip(model.free, open_, still, strict=True)
-            if now and not then
+            model.structure.names[k] for k, now, then in zip(model.free, open_, still, strict=True) if now and not then
         ]
         mode = model.structure.modes.names[best]
         advice.append(
@@ -357,6 +338,5 @@ def _advise(
 def describe_mode(name: str) -> str:
     """A mode's name in words, such as "sigma_zz growing along x"."""
     return " against ".join(
-        f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform")
-        for part in name.split("-")
+        f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform") for part in name.split("-")
     )

@@ -55,14 +55,11 @@ class Layout:
             edge = np.max(np.abs(x - n * (x @ n))) + self.pad_size / 2
             if edge > 1 + 1e-9:
                 raise LayoutError(
-                    f"layout {self.name!r}: pad {i + 1} reaches {edge:.3g} from the face's centre; "
-                    "the face ends at 1"
+                    f"layout {self.name!r}: pad {i + 1} reaches {edge:.3g} from the face's centre; the face ends at 1"
                 )
             for j in range(i):
                 if np.allclose(x, positions[j], atol=1e-9) and np.array_equal(n, normals[j]):
-                    raise LayoutError(
-                        f"layout {self.name!r}: pads {j + 1} and {i + 1} coincide at {x.tolist()}"
-                    )
+                    raise LayoutError(f"layout {self.name!r}: pads {j + 1} and {i + 1} coincide at {x.tolist()}")
         positions.flags.writeable = normals.flags.writeable = False
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "normals", normals)
@@ -76,8 +73,7 @@ class Layout:
     def pads(self) -> tuple[str, ...]:
         """Stable names: face, then side of the face, such as "+z-x"; a second pad there is "+z-x#2"."""
         plain = [
-            _signed_axes(n) + _signed_axes(x - n * (x @ n))
-            for x, n in zip(self.positions, self.normals, strict=True)
+            _signed_axes(n) + _signed_axes(x - n * (x @ n)) for x, n in zip(self.positions, self.normals, strict=True)
         ]
         repeats = [plain[:i].count(name) for i, name in enumerate(plain)]
         return tuple(f"{name}#{k + 1}" if k else name for name, k in zip(plain, repeats, strict=True))
@@ -92,9 +88,7 @@ class Layout:
         try:
             return self.pads.index(pad)
         except ValueError:
-            raise LayoutError(
-                f"layout {self.name!r} has no pad {pad!r}; its pads are {', '.join(self.pads)}"
-            ) from None
+            raise LayoutError(f"layout {self.name!r} has no pad {pad!r}; its pads are {', '.join(self.pads)}") from None
 
     def same_as(self, other: Layout) -> bool:
         """True when both have the same pads in the same order."""
@@ -138,9 +132,7 @@ def _vectors(value: Any, what: str) -> np.ndarray:
     except (TypeError, ValueError):
         raise LayoutError(f"layout: {what} must be a list of [x, y, z] numbers; found {value!r}") from None
     if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.all(np.isfinite(vectors)):
-        raise LayoutError(
-            f"layout: {what} must be a list of [x, y, z] finite numbers; found shape {vectors.shape}"
-        )
+        raise LayoutError(f"layout: {what} must be a list of [x, y, z] finite numbers; found shape {vectors.shape}")
     return vectors
 
 

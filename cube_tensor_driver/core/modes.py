@@ -103,9 +103,7 @@ class Modes:
         turned[9:] = np.kron(np.kron(r, r), r) @ turned[9:]
         action = self.reading @ turned
         if not np.allclose(self.fields @ action, turned, atol=1e-9):
-            raise SymmetryError(
-                f"the modes {', '.join(self.names)} do not stay among themselves under {r.tolist()}"
-            )
+            raise SymmetryError(f"the modes {', '.join(self.names)} do not stay among themselves under {r.tolist()}")
         return action
 
     def index(self, names: Sequence[str]) -> list[int]:
@@ -137,9 +135,7 @@ def _modes(names: Sequence[str], shears: str, symmetric: bool = True) -> Modes:
         stress = stress + np.where(stress == 0, stress.transpose(0, 2, 1), 0)
         gradient = gradient + np.where(gradient == 0, gradient.transpose(0, 2, 1, 3), 0)
     for g, name in zip(gradient, names, strict=True):
-        if (
-            name in GRADIENT and name[0] == name[3]
-        ):  # equilibrium: the shears' divergence cancels the normal one's
+        if name in GRADIENT and name[0] == name[3]:  # equilibrium: the shears' divergence cancels the normal one's
             i = AXES.index(name[0])
             for j in (AXES.index(a) for a in shears if a != name[0]):
                 g[i, j, j] = g[j, i, j] = -1 / (len(shears) - 1)

@@ -72,8 +72,7 @@ class TemperatureModel:
             reference, coefficients = float(self.reference), np.array(self.coefficients, dtype=float)
         except (TypeError, ValueError):
             raise CalibrationError(
-                f"temperature: reference {self.reference!r} and coefficients "
-                f"{self.coefficients!r} must be numbers"
+                f"temperature: reference {self.reference!r} and coefficients {self.coefficients!r} must be numbers"
             ) from None
         if coefficients.ndim != 2 or coefficients.shape[1] == 0:
             raise CalibrationError(
@@ -98,7 +97,5 @@ class TemperatureModel:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TemperatureModel:
         if not isinstance(data, Mapping) or set(data) != {"reference", "coefficients"}:
-            raise CalibrationError(
-                f"temperature: found {data!r}; it is a table of reference and coefficients"
-            )
+            raise CalibrationError(f"temperature: found {data!r}; it is a table of reference and coefficients")
         return cls(data["reference"], data["coefficients"])

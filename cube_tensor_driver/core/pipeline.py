@@ -16,7 +16,7 @@ import numpy as np
 
 from .calibration import Calibration
 from .errors import CalibrationError, CubeError, LayoutError
-from .estimator import Estimator, make_estimator
+from .estimator import FALSE_ALARM, Estimator, chi2_limit, make_estimator
 from .modes import COMPONENTS, STRESS
 
 PAD_FAULT = 1  # at least one pad was left out: fault bit of the device, or a frequency that no pad can have
@@ -63,9 +63,7 @@ class _Rows(NamedTuple):
     kind: np.ndarray  # (N,) which calibration
     rest: np.ndarray  # (N, P)
     beta: np.ndarray  # (N, P), or one number
-    matrix: (
-        np.ndarray
-    )  # (P, 15 + D) when all rows share it, else (P, seen rows, N): the rows' axis last is fastest
+    matrix: np.ndarray  # (P, 15 + D) when all rows share it, else (P, seen rows, N): the rows' axis last is fastest
     limit: np.ndarray  # (N,), or one number
     observed: np.ndarray
 
@@ -116,9 +114,7 @@ class Pipeline:
         if rest.shape != exists.shape:
             raise LayoutError(f"rest_frequency has shape {rest.shape}; this skin needs {exists.shape}")
         if not np.all(rest[exists] > 0) or not np.all(np.isfinite(rest[exists])):
-            raise CubeError(
-                f"rest_frequency holds {rest[exists].min():g} Hz; every pad's must be finite and above 0"
-            )
+            raise CubeError(f"rest_frequency holds {rest[exists].min():g} Hz; every pad's must be finite and above 0")
         self._rest = np.where(exists, rest, np.nan)
         self._kept.clear()
 
@@ -236,9 +232,7 @@ class Pipeline:
         return rows, v, _mask(self._exists[rows.kind] & ~good), status
 
     def _rows(self, cube: np.ndarray) -> _Rows:
-        key = (
-            (len(cube), cube[0], cube[-1]) if len(cube) else (0,)
-        )  # cheap; the comparison below makes it sure
+        key = (len(cube), cube[0], cube[-1]) if len(cube) else (0,)  # cheap; the comparison below makes it sure
         kept = self._kept.get(key)
         if kept is not None and (kept.cube == cube).all():
             return kept
@@ -280,9 +274,7 @@ class Pipeline:
 
     def _make_estimator(self, kind: int, mask: int) -> Estimator:
         c = self._kinds[kind]
-        return make_estimator(
-            c.response, c.noise, c.modes, np.flatnonzero(_bits(mask, c.layout.n_pads)), c.neglect
-        )
+        return make_estimator(c.response, c.noise, c.modes, np.flatnonzero(_bits(mask, c.layout.n_pads)), c.neglect)
 
     def _make_table(self, kind: int, mask: int) -> _Table:
         e, c = self._estimator(kind, mask), self._kinds[kind]
@@ -290,13 +282,14 @@ class Pipeline:
         n = c.layout.n_pads
         matrix[:N, :n] = e.matrix * self._scale(kind)[:, None]
         matrix[N:, :n] = np.nan
-        if e.dof:
+        null = e.null[: self._depth]  # a mask that lowers the rank by more than a pad could have more rows
+        dof = len(null)
+        if dof:
             matrix[N:, :n] = 0
-            matrix[N : N + e.dof, :n] = e.null / np.sqrt(e.dof)
+            matrix[N : N + dof, :n] = null / np.sqrt(dof)
         matrix *= self._stiffness[kind]
-        return _Table(
-            matrix.astype(self.dtype), np.sqrt(e.limit / e.dof) if e.dof else np.nan, int(_mask(e.observed))
-        )
+        limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof) if dof else np.nan
+        return _Table(matrix.astype(self.dtype), limit, int(_mask(e.observed)))
 
 
 def _bits(mask, count: int) -> np.ndarray:

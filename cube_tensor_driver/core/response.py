@@ -80,13 +80,21 @@ def project(structure: Structure, matrix: np.ndarray) -> tuple[dict[str, float],
             f"the response matrix has shape {matrix.shape}; layout {structure.layout.name!r} "
             f"with its modes needs {structure.basis.shape[1:]}"
         )
-    values = np.einsum("kpm,pm->k", structure.basis, matrix) / np.einsum(
-        "kpm,kpm->k", structure.basis, structure.basis
-    )
+    values = np.einsum("kpm,pm->k", structure.basis, matrix) / np.einsum("kpm,kpm->k", structure.basis, structure.basis)
     left = matrix - np.tensordot(values, structure.basis, axes=1)
     size = np.linalg.norm(matrix)
     unexplained = float(np.linalg.norm(left) / size) if size else 0.0
     return dict(zip(structure.names, values.tolist(), strict=True)), unexplained
+
+
+def prototype(shift: np.ndarray) -> np.ndarray:
+    """Readings (N, 3) of the paper's prototype, normal, shear, gradient, from frequency shifts (N, 4) of V1 .. V4.
+
+    The paper's eqs. 8 to 10 as they are, in the unit of the shifts and uncalibrated. In terms of eq. 1 they are
+    -4 (a zz - b xx), 4 (c + d) zx and -4 (e zz_x - h xx_x): the normal reading holds sigma_xx too, and the third
+    shows the true gradient only where that of sigma_xx is known.
+    """
+    return np.asarray(shift) @ np.array([[-1, -1, 1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1]])
 
 
 def _illustrative_response(structure: Structure) -> np.ndarray:
@@ -97,8 +105,4 @@ def _illustrative_response(structure: Structure) -> np.ndarray:
 
 def _some(names) -> str:
     names = sorted(names)
-    return (
-        "none"
-        if not names
-        else ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-    )
+    return "none" if not names else ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

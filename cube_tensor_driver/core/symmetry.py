@@ -20,9 +20,7 @@ from .modes import PLANE, SPACE, Modes
 
 _TURN_Z = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
 _CYCLE = ((0, 0, 1), (1, 0, 0), (0, 1, 0))
-_MIRRORS = tuple(
-    tuple(tuple(-1 if i == j == k else int(i == j) for j in range(3)) for i in range(3)) for k in range(3)
-)
+_MIRRORS = tuple(tuple(tuple(-1 if i == j == k else int(i == j) for j in range(3)) for i in range(3)) for k in range(3))
 GENERATORS: dict[str, tuple] = {
     "full": (_TURN_Z, _CYCLE, *_MIRRORS),  # 48: the cube alone in a wide body
     "slab": (_TURN_Z, *_MIRRORS),  # 16: z differs from x and y, but up and down are alike
@@ -79,9 +77,7 @@ def pad_images(layout: Layout, rotation: np.ndarray) -> np.ndarray:
     r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
     for pad, (x, n) in enumerate(zip(layout.positions @ r.T, layout.normals @ r.T, strict=True)):
-        same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(
-            np.abs(layout.normals - n) < 1e-6, axis=1
-        )
+        same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(np.abs(layout.normals - n) < 1e-6, axis=1)
         if not same.any():
             raise SymmetryError(
                 f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be carried "
@@ -162,9 +158,7 @@ def _structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
             names.append(name)
             basis.append(member)
     if letters:
-        names, basis = map(
-            list, zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True)
-        )
+        names, basis = map(list, zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True))
     stacked = np.array(basis).reshape(-1, n_pads, n_modes)
     stacked.flags.writeable = False
     return Structure(layout, modes, symmetry, tuple(names), stacked)

@@ -45,9 +45,7 @@ def traction(stress: np.ndarray, normal: np.ndarray) -> np.ndarray:
     n = np.asarray(normal, dtype=float)
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     if not np.all(length > 0):
-        raise CubeError(
-            f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal"
-        )
+        raise CubeError(f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal")
     return np.einsum("...ij,...j->...i", to_matrix(stress), n / length)
 
 

@@ -83,9 +83,7 @@ class ClockMap:
         times: list[int] = np.atleast_1d(np.asarray(device_us)).tolist()
         for k in range(1, len(times)):
             if times[k] < times[k - 1] - RESTART_US:
-                return np.concatenate(
-                    (self.update(times[:k], arrival_ns), self.update(times[k:], arrival_ns))
-                )
+                return np.concatenate((self.update(times[:k], arrival_ns), self.update(times[k:], arrival_ns)))
         return np.array(self._stamps(times, arrival_ns) if times else [], np.int64)
 
     def _stamps(self, times: list[int], arrival_ns: int) -> list[int]:

@@ -241,9 +241,7 @@ class Link:
 
     def _open_serial(self) -> None:
         paths = self._candidates()
-        error = LinkError(
-            f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port"
-        )
+        error = LinkError(f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port")
         for i in range(len(paths)):
             self.path = paths[(self._turn + i) % len(paths)]
             try:

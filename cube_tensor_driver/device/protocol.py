@@ -44,6 +44,8 @@ _REQUEST = struct.Struct("<BI")
 _ACK = struct.Struct("<BBI")
 _U16, _U32, _U64, _I16 = (np.dtype(code) for code in ("<u2", "<u4", "<u8", "<i2"))
 _OVERHEAD = _HEADER.size + 4
+MIN_RUN = _OVERHEAD + 1
+"""Shortest run that can be a frame; all longer ones decode to 8 bytes at least."""
 # CRC-32 over data followed by its own CRC is this constant: no slice, no second look at the frame's end.
 _CRC_RESIDUE = 0x2144DF1C
 
@@ -131,9 +133,7 @@ class Sample:
 
     def _pack(self) -> bytes:
         if self.frequency.ndim != 2:
-            raise ProtocolError(
-                f"frequency has {self.frequency.ndim} dimensions, must have 2: (n_cubes, n_pads)"
-            )
+            raise ProtocolError(f"frequency has {self.frequency.ndim} dimensions, must have 2: (n_cubes, n_pads)")
         n_cubes, n_pads = self.frequency.shape
         frequency = _array("frequency", self.frequency, _U32, (n_cubes, n_pads))
         pad_fault = _array("pad_fault", self.pad_fault, _U32, (n_cubes,))
@@ -213,9 +213,7 @@ Frame = Hello | Sample | Stats | Request | Ack
 
 _TYPES: dict[int, type[Frame]] = {0x01: Hello, 0x02: Sample, 0x03: Stats, 0x10: Request, 0x11: Ack}
 _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
-_UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
-    code: kind._unpack for code, kind in _TYPES.items()
-}
+_UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {code: kind._unpack for code, kind in _TYPES.items()}
 
 
 def encode(frame: Frame) -> bytes:
@@ -228,15 +226,12 @@ def encode(frame: Frame) -> bytes:
     code = _CODES.get(type(frame))
     if code is None:
         raise ProtocolError(
-            f"cannot encode {type(frame).__name__}; a frame is one of "
-            + ", ".join(k.__name__ for k in _CODES)
+            f"cannot encode {type(frame).__name__}; a frame is one of " + ", ".join(k.__name__ for k in _CODES)
         )
     try:
         payload = frame._pack()
     except struct.error as error:
-        raise ProtocolError(
-            f"{type(frame).__name__}: {error}; see the field ranges in its docstring"
-        ) from error
+        raise ProtocolError(f"{type(frame).__name__}: {error}; see the field ranges in its docstring") from error
     if len(payload) > MAX_PAYLOAD:
         raise ProtocolError(
             f"{type(frame).__name__} payload has {len(payload)} bytes, the limit is {MAX_PAYLOAD}: "
@@ -255,7 +250,7 @@ class Counters:
     frames: int = 0
     crc: int = 0  # checksum wrong
     framing: int = 0  # not COBS, or cut off by the end of the stream
-    length: int = 0  # shorter than a frame, or the length does not fit the contents
+    length: int = 0  # too short for a frame, or the length does not fit the contents
     version: int = 0  # sound, but of another protocol version: see Decoder.other_version
     unknown_type: int = 0  # sound, but of a type that version 1 does not have
     overrun: int = 0  # longer than any frame can be, thrown away up to the next zero
@@ -288,11 +283,15 @@ class Decoder:
                 runs[0] = b"" if self._discarding else bytes(self._tail + runs[0])
                 self._tail.clear()
                 self._discarding = False
-            for run in runs:
-                if run:
+            short = 0
+            for run in filter(None, runs):
+                if len(run) >= MIN_RUN:
                     frame = self._decode(run)
                     if frame is not None:
                         frames.append(frame)
+                else:
+                    short += 1
+            self.counters.length += short
         if not self._discarding:
             self._tail += rest
             if len(self._tail) > MAX_RUN:
@@ -317,9 +316,6 @@ class Decoder:
         except cobs.DecodeError:
             counters.framing += 1
             return None
-        if len(raw) < _OVERHEAD:
-            counters.length += 1
-            return None
         if zlib.crc32(raw) != _CRC_RESIDUE:
             counters.crc += 1
             return None
@@ -343,7 +339,5 @@ class Decoder:
 def _array(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != shape:
         found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-        raise ProtocolError(
-            f"{name} is {found}, must be an array of {dtype.name} {shape}; convert and round it first"
-        )
+        raise ProtocolError(f"{name} is {found}, must be an array of {dtype.name} {shape}; convert and round it first")
     return value

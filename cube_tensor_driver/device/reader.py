@@ -103,9 +103,7 @@ class Reader:
         target = self.links[link]
         remembered = request.request in (Command.START, Command.STOP, Command.SET_PERIOD)
         if not remembered and not target.is_open:
-            raise LinkError(
-                f"link {target.config.name!r} is {target.state.value}: wait until it opens", "closed"
-            )
+            raise LinkError(f"link {target.config.name!r} is {target.state.value}: wait until it opens", "closed")
         self._requests.append((link, request))
         self._wake()
 
@@ -232,18 +230,10 @@ class Reader:
             if not link.is_open:
                 self._try_open(selector, i, now)
                 return
-            if (
-                session.started
-                and link.state is LinkState.OPEN
-                and now - session.last_sample > session.silent_after()
-            ):
+            if session.started and link.state is LinkState.OPEN and now - session.last_sample > session.silent_after():
                 link.silences += 1
                 session.hello_at = now
-                period = (
-                    f"sample period {session.actual_us} µs"
-                    if session.actual_us
-                    else "sample period not known yet"
-                )
+                period = f"sample period {session.actual_us} µs" if session.actual_us else "sample period not known yet"
                 self._set_state(
                     i,
                     LinkState.SILENT,

@@ -7,6 +7,7 @@ counted and left out. Nothing here looks at a value.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 from .protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Hello, Sample
 
 
-class Place(NamedTuple):
+@dataclass(frozen=True)
+class Place:
     """Where the skin says a cube is: by uid on any link or on `link`, or by link and index. n_pads: of its layout."""
 
     name: str
@@ -28,8 +30,8 @@ class Place(NamedTuple):
 class Rows(NamedTuple):
     """Rows of one scan, earliest first within a link.
 
-    cube (N,) uint16 index in the skin; sequence (N,) uint32; stamp_ns (N,) int64, node clock; frequency (N, P) float32 Hz,
-    NaN not measured; temperature (N,) float32 °C, NaN unknown; pad_fault (N,) uint32.
+    cube (N,) uint16 index in the skin; sequence (N,) uint32; stamp_ns (N,) int64, node clock;
+    frequency (N, P) float32 Hz, NaN not measured; temperature (N,) float32 °C, NaN unknown; pad_fault (N,) uint32.
     """
 
     cube: NDArray[np.uint16]
@@ -60,11 +62,7 @@ class Scan:
     def hello(self, link: int, frame: Hello) -> list[str] | None:
         """Learn which cubes a link carries. Returns what does not fit the skin, in words; None if nothing changed."""
         last = self._hellos[link]
-        if (
-            last is not None
-            and last.n_pads == frame.n_pads
-            and np.array_equal(last.cube_uids, frame.cube_uids)
-        ):
+        if last is not None and last.n_pads == frame.n_pads and np.array_equal(last.cube_uids, frame.cube_uids):
             return None
         self._hellos[link] = frame
         cubes = np.full(frame.n_cubes, -1, np.int32)
@@ -76,16 +74,12 @@ class Scan:
                 if index is None and place.link == link:
                     problems.append(f"cube {place.name}: the hub has no cube with uid {place.uid:#x}")
                 elif index is not None and place.link not in (None, link):
-                    problems.append(
-                        f"cube {place.name}: uid {place.uid:#x} is on this link, the skin says another one"
-                    )
+                    problems.append(f"cube {place.name}: uid {place.uid:#x} is on this link, the skin says another one")
                     index = None
             else:
                 index = place.index if place.link == link else None
                 if index is not None and index >= frame.n_cubes:
-                    problems.append(
-                        f"cube {place.name}: index {index}, but the hub has {frame.n_cubes} cubes"
-                    )
+                    problems.append(f"cube {place.name}: index {index}, but the hub has {frame.n_cubes} cubes")
                     index = None
             if index is None:
                 continue
@@ -95,10 +89,9 @@ class Scan:
                     f"cube {place.name}: the hub reports {frame.n_pads} pads, its layout has {place.n_pads}; "
                     "correct the layout and calibration in the skin file"
                 )
-        for index in np.flatnonzero(cubes < 0):
-            problems.append(
-                f"the hub's cube {index} (uid {int(frame.cube_uids[index]):#x}) is not in the skin file"
-            )
+        for stranger in np.flatnonzero(cubes < 0).tolist():
+            uid = int(frame.cube_uids[stranger])
+            problems.append(f"the hub's cube {stranger} (uid {uid:#x}) is not in the skin file")
         self._cubes[link] = cubes
         return problems
 
@@ -114,9 +107,7 @@ class Scan:
     def complete(self) -> bool:
         """Whether every live link has given a sample, or one has given a second before another gave its first."""
         counts = [len(samples) for samples in self._gathered]
-        return max(counts) > 1 or all(
-            count or not live for count, live in zip(counts, self._live, strict=True)
-        )
+        return max(counts) > 1 or all(count or not live for count, live in zip(counts, self._live, strict=True))
 
     def take(self) -> Rows | None:
         """The rows gathered since the last time; None if there are none."""

@@ -44,9 +44,7 @@ class SequenceTracker:
 
     def __init__(self) -> None:
         self.counters = SequenceCounters()
-        self._seen: OrderedDict[int, int] = (
-            OrderedDict()
-        )  # unwrapped sequence -> device time, the last MEMORY
+        self._seen: OrderedDict[int, int] = OrderedDict()  # unwrapped sequence -> device time, the last MEMORY
         self._first = self._next = 0  # unwrapped: they count on past 2**32
         self._newest_us = 0
 
@@ -81,9 +79,7 @@ class SequenceTracker:
             return False
         if number < self._first:
             return 0 <= self._newest_us - device_us < RESTART_US
-        return all(
-            (us <= device_us) if other < number else (us >= device_us) for other, us in self._seen.items()
-        )
+        return all((us <= device_us) if other < number else (us >= device_us) for other, us in self._seen.items())
 
     def _restart(self, sequence: int, device_us: int) -> Verdict:
         self.counters.resets += 1

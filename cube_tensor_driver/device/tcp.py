@@ -30,9 +30,7 @@ def parse_url(url: str) -> tuple[str, int]:
     except ValueError:
         host, port = None, None
     if not host or not port:
-        raise LinkError(
-            f"{url!r} is no TCP address: write socket://host:port with a port from 1 to 65535", "bad_port"
-        )
+        raise LinkError(f"{url!r} is no TCP address: write socket://host:port with a port from 1 to 65535", "bad_port")
     return host, port
 
 

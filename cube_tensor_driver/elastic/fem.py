@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 _PLANE_MESHES = (0, 1, 2)  # how often the triangles of the coarsest mesh are cut in four
-_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.5, 0.1, 2.0), (0.25, 0.05, 2.0))  # brick on a face, at an edge, growth
+_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.1, 3.0), (0.25, 0.05, 2.5))  # brick on a face, at an edge, growth
 _SPACE_BYTES = 30e3  # of memory per node at the peak, measured
 
 
@@ -282,18 +282,32 @@ def _matrix(body: Body, layout: Layout, grid: Any, report: Callable[[str], None]
     every = range(modes.n_modes)
     stress = modes.stress[np.ix_(every, axes, axes)]
     gradient = modes.gradient[np.ix_(every, axes, axes, axes)]
-    matrix = np.zeros((layout.n_pads, modes.n_modes))
-    for parity in itertools.product((1, -1), repeat=len(axes)):
-        s, g = _part(stress, parity), _part(gradient, parity)
-        used = np.flatnonzero(np.any(s != 0, axis=(1, 2)) | np.any(g != 0, axis=(1, 2, 3)))
-        report(", ".join(modes.names[m] for m in used))
+
+    def forces(parity: Parity) -> Array:
+        parts = zip(_part(stress, parity), _part(gradient, parity), strict=True)
+        zero = np.zeros(solid.basis.N)
+        return np.stack([solid.linear_forces(s, g) if s.any() or g.any() else zero for s, g in parts], axis=1)
+
+    return pad_stresses(solid, layout, forces, report), int(solid.basis.N)
+
+
+def pad_stresses(
+    solid: Solid, layout: Layout, forces: Callable[[Parity], Array], report: Callable[[str], None] = lambda _: None
+) -> Array:
+    """Mean normal stress (pads, n) under n loads; forces(parity) are their nodal forces (dofs, n) of a parity."""
+    stresses: Array | float = 0.0
+    for parity in itertools.product((1, -1), repeat=solid.dim):
+        report("parity " + "".join("+" if sign > 0 else "-" for sign in parity))
         pads = [pad for pad in range(layout.n_pads) if _sees(layout, pad, parity)]
-        if len(used) == 0 or not pads:
-            continue
-        reactions = solid.reactions(solid.solve(parity, [(s[m], g[m]) for m in used]))
-        for pad in pads:
-            matrix[pad, used] += _pad_stress(solid, reactions, parity, layout, pad)
-    return matrix, int(solid.basis.N)
+        load = forces(parity)
+        part = np.zeros((layout.n_pads, load.shape[1]))
+        used = np.flatnonzero(np.any(load != 0, axis=0))
+        if pads and len(used):
+            reactions = solid.reactions(solid.solve(parity, load[:, used]))
+            for pad in pads:
+                part[pad, used] = _pad_stress(solid, reactions, parity, layout, pad)
+        stresses = stresses + part
+    return np.asarray(stresses)
 
 
 def _part(field: Array, parity: Parity) -> Array:

@@ -12,14 +12,15 @@ Source: T. J. R. Hughes, The Finite Element Method (1987), chapters 2 and 4.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.sparse as sp
 import skfem
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
-from skfem.helpers import ddot, sym_grad, trace
+from skfem.helpers import ddot, dot, sym_grad, trace
 
 from .pads import interval_weights
 
@@ -56,6 +57,11 @@ def _load_work(w, p):
     return ddot(p.sigma, sym_grad(w))
 
 
+@skfem.LinearForm
+def _traction_work(w, p):
+    return dot(p.t, w)
+
+
 class Solid:
     """A meshed body with a cube; triangles of order 4 in the plane, 27-node bricks in space.
 
@@ -78,17 +84,37 @@ class Solid:
         self.body = stiffness(self._part(~inside), body)
         self.total = self.body if cube is None else self.body + stiffness(self._part(inside), cube)
 
-    def solve(self, parity: Parity, loads: Sequence[tuple[Array, Array]]) -> Array:
-        """Displacements (dofs, n) under n loads of one parity.
+    def linear_forces(self, stress: Array, gradient: Array) -> Array:
+        """Nodal forces (dofs,) of the field sigma_ij = S_ij + G_ijk x_k: S (dim, dim), G (dim, dim, dim)."""
+        x = self.basis.default_parameters()["x"]
+        sigma = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, np.asarray(x))
+        return _load_work.assemble(self.basis, sigma=sigma)
 
-        A load is the field sigma_ij = S_ij + G_ijk x_k: S (dim, dim), G (dim, dim, dim).
+    def outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
+        """Nodal forces (dofs, n) of the part of one parity of any n fields, as tractions on the outer faces.
+
+        field: from points (q, dim) to stress (q, n, dim, dim); it should be in equilibrium.
         """
+        total = np.zeros((self.basis.N, 0))
+        for axis in range(self.dim):
+            end = self.basis.mesh.p[axis].max()
+            facets = self.basis.mesh.facets_satisfying(lambda x, k=axis, e=end: _at(x[k], e), boundaries_only=True)
+            face = skfem.FacetBasis(self.basis.mesh, self.basis.elem, facets=facets, intorder=6)
+            x = np.asarray(face.default_parameters()["x"])
+            traction = _parity_part(field, x.reshape(self.dim, -1).T, parity)[:, :, axis, :]
+            columns = [
+                _traction_work.assemble(face, t=t.T.reshape(x.shape)) for t in np.moveaxis(traction, 1, 0)
+            ]
+            total = np.stack(columns, axis=1) + (total if total.size else 0.0)
+        return total
+
+    def solve(self, parity: Parity, forces: Array) -> Array:
+        """Displacements (dofs, n) under nodal forces (dofs, n) of one parity."""
         free = np.flatnonzero(~self._held(parity))
         order = {"permc_spec": "MMD_AT_PLUS_A"}
         if self.dim == 3:  # five times faster and half the memory of SuperLU's own ordering
             free = free[nested_dissection(self.place[:, free])]
             order = {"permc_spec": "NATURAL"}
-        forces = np.stack([self._forces(*load) for load in loads], axis=1)
         matrix = self.total[free][:, free].tocsc()
         factor = splu(matrix, diag_pivot_thresh=0.0, options={"SymmetricMode": True}, **order)
         u = np.zeros_like(forces)
@@ -118,11 +144,6 @@ class Solid:
         whole = self.basis
         return skfem.Basis(whole.mesh, whole.elem, elements=np.flatnonzero(elements), intorder=2 * self.order)
 
-    def _forces(self, stress: Array, gradient: Array) -> Array:
-        x = self.basis.default_parameters()["x"]
-        sigma = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, np.asarray(x))
-        return _load_work.assemble(self.basis, sigma=sigma)
-
     def _held(self, parity: Parity) -> NDArray[np.bool_]:
         """Which dofs are zero: by the mirrors, in a rigid cube, or to stop the one rigid motion that is left.
 
@@ -142,6 +163,16 @@ class Solid:
             at[odd[1]] = 1.0
             held |= (c == odd[0]) & np.all(_at(x, at[:, None]), axis=0)
         return held
+
+
+def _parity_part(field: Callable[[Array], Array], x: Array, parity: Parity) -> Array:
+    """The part of one parity of a field of stress at x (q, dim), by averaging over the mirrored points."""
+    signs = list(itertools.product((1.0, -1.0), repeat=len(parity)))
+    part = 0.0
+    for mirror in map(np.array, signs):
+        weight = np.prod(np.where(mirror < 0, parity, 1)) / len(signs)
+        part = part + weight * np.outer(mirror, mirror) * field(x * mirror)
+    return np.asarray(part)
 
 
 def nested_dissection(place: Array) -> NDArray[np.int64]:

@@ -18,4 +18,6 @@ def share() -> Path:
         for folder in (parent, parent / "share" / _NAME):
             if (folder / "package.xml").is_file() and (folder / "config").is_dir():
                 return folder
-    raise ConfigError(f"the data files of {_NAME} are not beside {Path(__file__).parent}: install the package again (colcon build)")
+    raise ConfigError(
+        f"the data files of {_NAME} are not beside {Path(__file__).parent}: install the package again (colcon build)"
+    )

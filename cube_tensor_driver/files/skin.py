@@ -1,7 +1,7 @@
 """Skin files: which links there are, which cubes they carry, where the cubes sit, how they are calibrated.
 
-docs/config.md describes the keys. A file is checked whole before anything starts: `ConfigError` gives file, key, what was
-found and what is allowed.
+docs/config.md describes the keys. A file is checked whole before anything starts: `ConfigError` gives file, key, what
+was found and what is allowed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,16 @@ from ..core.errors import ConfigError
 from .calibration import find_calibration, read_calibration
 from .yaml import read_yaml
 
-_NAME = {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_]*$", "description": "a name of letters, digits and _, a letter first"}
-_FRAME = {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_/]*$", "description": "a frame id of letters, digits, _ and /"}
+_NAME = {
+    "type": "string",
+    "pattern": "^[A-Za-z][A-Za-z0-9_]*$",
+    "description": "a name of letters, digits and _, a letter first",
+}
+_FRAME = {
+    "type": "string",
+    "pattern": "^[A-Za-z][A-Za-z0-9_/]*$",
+    "description": "a frame id of letters, digits, _ and /",
+}
 _TEXT = {"type": "string", "minLength": 1, "description": "a text that is not empty"}
 _TRIPLE = {
     "type": "array",
@@ -31,7 +39,10 @@ _TRIPLE = {
 }
 # An integer, or a text such as 0x1f because uids are hexadecimal on labels.
 _UID = {
-    "anyOf": [{"type": "integer", "minimum": 1, "maximum": 2**64 - 1}, {"type": "string", "pattern": "^0x[0-9a-fA-F]{1,16}$"}],
+    "anyOf": [
+        {"type": "integer", "minimum": 1, "maximum": 2**64 - 1},
+        {"type": "string", "pattern": "^0x[0-9a-fA-F]{1,16}$"},
+    ],
     "description": "a uid: 1 to 2^64 - 1, or hexadecimal as in 0x1f",
 }
 
@@ -55,14 +66,24 @@ SCHEMA = _object(
     {
         "name": _NAME,
         "parent_frame": _FRAME,
-        "rate": {"type": "number", "minimum": 0.1, "maximum": 10_000, "description": "samples per second, 0.1 to 10000"},
+        "rate": {
+            "type": "number",
+            "minimum": 0.1,
+            "maximum": 10_000,
+            "description": "samples per second, 0.1 to 10000",
+        },
         "links": _several(
             _object(
                 ("name", "port"),
                 {
                     "name": _NAME,
                     "port": _TEXT,
-                    "baud": {"type": "integer", "minimum": 1200, "maximum": 20_000_000, "description": "1200 to 20000000"},
+                    "baud": {
+                        "type": "integer",
+                        "minimum": 1200,
+                        "maximum": 20_000_000,
+                        "description": "1200 to 20000000",
+                    },
                     "hub_uid": _UID,
                 },
             ),
@@ -74,7 +95,12 @@ SCHEMA = _object(
                 {
                     "name": _NAME,
                     "link": _NAME,
-                    "index": {"type": "integer", "minimum": 0, "maximum": 65535, "description": "an integer from 0 to 65535"},
+                    "index": {
+                        "type": "integer",
+                        "minimum": 0,
+                        "maximum": 65535,
+                        "description": "an integer from 0 to 65535",
+                    },
                     "uid": _UID,
                     "pose": _object(("xyz", "rpy"), {"xyz": _TRIPLE, "rpy": _TRIPLE}),
                     "layout": _TEXT,
@@ -140,7 +166,8 @@ def read_skin(path: Path) -> Skin:
     data = read_yaml(path)
     _check_schema(data, path)
     links = tuple(
-        SkinLink(link["name"], link["port"], link.get("baud", 921_600), _uid(link.get("hub_uid"))) for link in data["links"]
+        SkinLink(link["name"], link["port"], link.get("baud", 921_600), _uid(link.get("hub_uid")))
+        for link in data["links"]
     )
     _check_unique(((link.name,) for link in links), path, "links", "name")
     calibrations: dict[str, Calibration] = {}
@@ -156,7 +183,9 @@ def read_skin(path: Path) -> Skin:
         cubes.append(_cube(item, calibrations[name], links, f"{path}: {key}"))
     _check_unique(((cube.name,) for cube in cubes), path, "cubes", "name")
     _check_unique(((cube.uid,) for cube in cubes if cube.uid is not None), path, "cubes", "uid")
-    _check_unique(((cube.link, cube.index) for cube in cubes if cube.index is not None), path, "cubes", "link and index")
+    _check_unique(
+        ((cube.link, cube.index) for cube in cubes if cube.index is not None), path, "cubes", "link and index"
+    )
     rate = data.get("rate")
     if rate is not None and not math.isfinite(rate):
         raise ConfigError(f"{path}: rate: found {rate}, allowed: {SCHEMA['properties']['rate']['description']}")
@@ -169,7 +198,9 @@ def _cube(item: dict[str, Any], calibration: Calibration, links: tuple[SkinLink,
     if link is not None and link not in names:
         raise ConfigError(f"{place}.link: found {link!r}, allowed: one of the links {', '.join(names)}")
     if uid is None and (link is None or index is None):
-        raise ConfigError(f"{place}: found neither uid nor both link and index, which say where the cube is; add one of them")
+        raise ConfigError(
+            f"{place}: found neither uid nor both link and index, which say where the cube is; add one of them"
+        )
     if uid is not None and index is not None:
         raise ConfigError(f"{place}: found both uid and index; keep one, they might contradict each other")
     if item["layout"] != calibration.layout.name:
@@ -200,13 +231,17 @@ def _check_schema(data: Any, path: Path) -> None:
     schema = error.schema
     if error.validator == "additionalProperties":
         unknown = ", ".join(repr(name) for name in error.instance if name not in schema["properties"])
-        raise ConfigError(f"{path}: {key or 'top level'}: unknown key {unknown}, allowed: {', '.join(schema['properties'])}")
+        raise ConfigError(
+            f"{path}: {key or 'top level'}: unknown key {unknown}, allowed: {', '.join(schema['properties'])}"
+        )
     if error.validator == "required":
         missing = ", ".join(repr(name) for name in schema["required"] if name not in error.instance)
         raise ConfigError(f"{path}: {key or 'top level'}: the key {missing} is missing")
     found = repr(error.instance)
     found = found if len(found) <= 60 else found[:57] + "..."
-    raise ConfigError(f"{path}: {key or 'top level'}: found {found}, allowed: {schema.get('description', error.message)}")
+    raise ConfigError(
+        f"{path}: {key or 'top level'}: found {found}, allowed: {schema.get('description', error.message)}"
+    )
 
 
 def _check_unique(values: Iterable[tuple[Any, ...]], path: Path, where: str, what: str) -> None:

@@ -23,7 +23,9 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         for key in own:
             name = self.construct_object(key, deep=True)
             if name in seen:
-                raise yaml.MarkedYAMLError(problem=f"the key {name!r} is there twice; keep one", problem_mark=key.start_mark)
+                raise yaml.MarkedYAMLError(
+                    problem=f"the key {name!r} is there twice; keep one", problem_mark=key.start_mark
+                )
             seen.add(name)
         return mapping
 
@@ -40,7 +42,9 @@ def parse_yaml(text: str | bytes, origin: str) -> Any:
         place = f"{origin}, line {mark.line + 1}, column {mark.column + 1}" if mark else origin
         raise ConfigError(f"{place}: {error.problem or 'not YAML'}") from None
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise ConfigError(f"{origin}: not YAML: {str(error).splitlines()[0] if str(error) else type(error).__name__}") from None
+        raise ConfigError(
+            f"{origin}: not YAML: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
+        ) from None
 
 
 def read_yaml(path: Path) -> Any:

@@ -75,7 +75,9 @@ class Children:
 
 def ros_arguments(parameters: dict[str, Value]) -> list[str]:
     """-p name:=value of each parameter, spelled as YAML so that a text stays a text."""
-    spelled = {name: f"'{value}'" if isinstance(value, str) else str(value).lower() for name, value in parameters.items()}
+    spelled = {
+        name: f"'{value}'" if isinstance(value, str) else str(value).lower() for name, value in parameters.items()
+    }
     return [word for name, value in spelled.items() for word in ("-p", f"{name}:={value}")]
 
 

@@ -16,6 +16,7 @@ from ..device.link import LinkConfig, LinkState
 from ..device.protocol import VERSION, Frame, Hello, Sample, Stats
 from ..device.reader import Reader
 from ..device.scan import Place, Scan
+from ..device.sequence import SequenceCounters, SequenceTracker, Verdict
 from ..files.skin import Skin, read_skin
 from .messages import frequencies_message, info_message, to_time
 from .node import LATCHED, CubeNode, queue, run
@@ -53,6 +54,7 @@ class Driver(CubeNode):
             for cube in skin.cubes
         ]  # fmt: skip
         self._scan = Scan(len(names), places)
+        self._sequences: dict[tuple[int, int], SequenceTracker] = {}
         self._clocks = [ClockMap() for _ in names]
         self._stats: list[Stats | None] = [None] * len(names)
         self._other_versions: list[int | None] = [None] * len(names)
@@ -94,7 +96,9 @@ class Driver(CubeNode):
                 "write the ports into the skin file"
             )
         return [
-            LinkConfig(link.name, port or (str(Path(folder) / link.name) if folder else link.port), link.baud, link.hub_uid)
+            LinkConfig(
+                link.name, port or (str(Path(folder) / link.name) if folder else link.port), link.baud, link.hub_uid
+            )
             for link in skin.links
         ]
 
@@ -103,7 +107,15 @@ class Driver(CubeNode):
         samples: dict[int, tuple[int, list[Sample]]] = {}
         for link, arrival_ns, frame in frames:
             if isinstance(frame, Sample):
-                samples.setdefault(link, (arrival_ns, []))[1].append(frame)
+                # A hub with many cubes spreads a sample over frames of the same number: each part has its own count.
+                key = link, frame.first_cube
+                if key not in self._sequences:
+                    self._sequences[key] = SequenceTracker()
+                verdict = self._sequences[key].update(frame.sequence, frame.device_us)
+                if verdict is Verdict.RESET:
+                    self._clocks[link].reset()
+                if verdict is not Verdict.DUPLICATE:
+                    samples.setdefault(link, (arrival_ns, []))[1].append(frame)
             elif isinstance(frame, Hello):
                 self._learn(link, frame)
             elif isinstance(frame, Stats):
@@ -146,9 +158,15 @@ class Driver(CubeNode):
         message = DiagnosticArray()
         message.header.stamp = to_time(self.get_clock().now().nanoseconds)
         rate, self._published_before = self._published - self._published_before, self._published
-        totals = {"rows published": self._published, "rows per second": rate, "rows of unknown cubes": self._scan.unknown_cube,
-                  "rows with another number of pads": self._scan.wrong_pads}  # fmt: skip
-        message.status.append(_status(self.get_fully_qualified_name(), self._skin.name, DiagnosticStatus.OK, "", totals))
+        totals: dict[str, object] = {
+            "rows published": self._published,
+            "rows per second": rate,
+            "rows of unknown cubes": self._scan.unknown_cube,
+            "rows with another number of pads": self._scan.wrong_pads,
+        }
+        message.status.append(
+            _status(self.get_fully_qualified_name(), self._skin.name, DiagnosticStatus.OK, "", totals)
+        )
         reader = self._reader
         for number, link in enumerate(reader.links if reader else ()):
             other = link.decoder.other_version
@@ -163,7 +181,7 @@ class Driver(CubeNode):
             if link.error is not None:
                 notes.insert(0, str(link.error))
             level = max(LEVELS[link.state], DiagnosticStatus.WARN if notes else DiagnosticStatus.OK)
-            values: dict[str, object] = dict(link.counters)
+            values: dict[str, object] = {**link.counters, **self._sequence_counters(number)}
             clock = self._clocks[number]
             values |= {"clock drift ppm": f"{clock.drift_ppm:.2f}", "clock jitter us": f"{clock.jitter_ns / 1e3:.1f}"}
             stats = self._stats[number]
@@ -173,6 +191,11 @@ class Driver(CubeNode):
             name = f"{self.get_fully_qualified_name()}: link {link.config.name}"
             message.status.append(_status(name, uid, level, "; ".join(notes) or link.state.value, values))
         self._diagnostics.publish(message)
+
+    def _sequence_counters(self, link: int) -> dict[str, int]:
+        """Of all parts of the link's samples together."""
+        parts = [tracker.counters.as_dict() for (of, _), tracker in list(self._sequences.items()) if of == link]
+        return {name: sum(part[name] for part in parts) for name in SequenceCounters().as_dict()}
 
 
 def _status(name: str, hardware_id: str, level: bytes, text: str, values: dict[str, object]) -> DiagnosticStatus:

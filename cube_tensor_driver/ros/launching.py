@@ -24,7 +24,7 @@ def start_skin(
     rate: LaunchConfiguration | None = None,
     simulate: LaunchConfiguration | None = None,
 ) -> list[LaunchDescriptionEntity]:
-    """For an OpaqueFunction: what `skin_processes` says, as actions. ConfigError: the skin file is wrong, before any start."""
+    """For an OpaqueFunction: what `skin_processes` says, as actions. ConfigError: the skin file is wrong."""
 
     def value(argument: LaunchConfiguration | None) -> str:
         return "" if argument is None else str(argument.perform(context))

@@ -76,7 +76,9 @@ def frequencies_message(rows: Rows, frame_id: str) -> SkinFrequencies:
     )
 
 
-def read_frequencies(message: SkinFrequencies) -> tuple[Times, NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32]]:
+def read_frequencies(
+    message: SkinFrequencies,
+) -> tuple[Times, NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32]]:
     """Times, frequency (N, n_pads), pad_fault (N,), temperature (N,): views. MessageError: lengths that do not fit."""
     rows = len(message.cube)
     width = message.n_pads
@@ -151,7 +153,9 @@ def info_message(skin: Skin, pipeline: Pipeline, stamp_ns: int) -> SkinInfo:
     for number, cube in enumerate(skin.cubes):
         calibration = cube.calibration
         x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
-        pose = Pose(position=Point(x=cube.xyz[0], y=cube.xyz[1], z=cube.xyz[2]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+        pose = Pose(
+            position=Point(x=cube.xyz[0], y=cube.xyz[1], z=cube.xyz[2]), orientation=Quaternion(x=x, y=y, z=z, w=w)
+        )
         message.cubes.append(
             CubeInfo(
                 name=cube.name,
@@ -190,4 +194,6 @@ def _times(message: SkinFrequencies | SkinStress) -> Times:
 def _check_length(message: Any, name: str, expected: int) -> None:
     found = len(getattr(message, name))
     if found != expected:
-        raise MessageError(f"{type(message).__name__}.{name} has {found} values, {len(message.cube)} rows need {expected}")
+        raise MessageError(
+            f"{type(message).__name__}.{name} has {found} values, {len(message.cube)} rows need {expected}"
+        )

@@ -47,7 +47,9 @@ class CubeNode(LifecycleNode):
         self, name: str, default: Any, description: str, span: tuple[float, float] | None = None, choices: str = ""
     ) -> None:
         """Declare a parameter; span bounds a number, choices (words separated by commas) a text."""
-        descriptor = ParameterDescriptor(description=description, additional_constraints=choices and f"one of: {choices}")
+        descriptor = ParameterDescriptor(
+            description=description, additional_constraints=choices and f"one of: {choices}"
+        )
         descriptor.read_only = False
         if span is not None:
             descriptor.floating_point_range = [FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)]

@@ -40,7 +40,9 @@ class Reconstruction(CubeNode):
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._tensors = [self.create_publisher(StressTensorStamped, f"cubes/{cube.name}/stress", 10) for cube in skin.cubes]
+        self._tensors = [
+            self.create_publisher(StressTensorStamped, f"cubes/{cube.name}/stress", 10) for cube in skin.cubes
+        ]
         self._wrenches = [self.create_publisher(WrenchStamped, f"cubes/{cube.name}/wrench", 10) for cube in skin.cubes]
         self._listened: tuple[list[int], list[int]] = ([], [])
         side = float(self.value("wrench_side"))

@@ -12,7 +12,7 @@ Value = str | float | bool
 class Process:
     """One process of a running skin.
 
-    executable: its name in the package, also the module that `python -m` runs. node: whether it is a ROS node and takes
+    executable: its name in the package; module: what `python -m` runs. node: whether it is a ROS node and takes
     parameters; otherwise it takes arguments.
     """
 
@@ -28,8 +28,8 @@ def skin_processes(
 ) -> list[Process]:
     """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
 
-    port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0 for
-    the file's. book: where the simulator writes what it sampled.
+    port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
+    for the file's. book: where the simulator writes what it sampled.
     """
     skin: dict[str, Value] = {"config": str(config)}
     driver: dict[str, Value] = {**skin, "port": port, "rate": rate, "port_directory": str(simulated_ports or "")}
@@ -41,5 +41,7 @@ def skin_processes(
         arguments = ["--config", str(config), "--ports", str(simulated_ports)]
         if book is not None:
             arguments += ["--book", str(book)]
-        processes.insert(0, Process("simulator", "cube_tensor_driver.simulation.main", False, arguments=tuple(arguments)))
+        processes.insert(
+            0, Process("simulator", "cube_tensor_driver.simulation.main", False, arguments=tuple(arguments))
+        )
     return processes

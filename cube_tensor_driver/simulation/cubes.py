@@ -20,7 +20,9 @@ class SimulatedCubes:
     frequency per second.
     """
 
-    def __init__(self, calibrations: Sequence[Calibration], noise: float = 0.0, drift: float = 0.0, seed: int = 0) -> None:
+    def __init__(
+        self, calibrations: Sequence[Calibration], noise: float = 0.0, drift: float = 0.0, seed: int = 0
+    ) -> None:
         self.n_pads = calibrations[0].layout.n_pads
         self._noise, self._drift, self._random = noise, drift, np.random.default_rng(seed)
         kinds: dict[str, list[int]] = {}

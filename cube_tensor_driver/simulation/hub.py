@@ -16,7 +16,7 @@ PERIOD_LIMITS_US = (100, 10_000_000)
 
 @dataclass
 class Run:
-    """Samples first … last (counted from power-up) were taken at start_us, start_us + period_us, … of simulated time."""
+    """Samples first … last (from power-up) were taken at start_us, start_us + period_us, … of simulated time."""
 
     first: int
     last: int
@@ -28,8 +28,8 @@ class Run:
 class SimulatedHub:
     """The device side of the protocol.
 
-    boot_us: what the hub's clock shows at simulated time 0; period_us: sample period; next_us: simulated time of the next
-    sample; runs: the book of what was sampled; dropped: samples taken that found no room on the line.
+    boot_us: what the hub's clock shows at simulated time 0; period_us: sample period; next_us: simulated time of the
+    next sample; runs: the book of what was sampled; dropped: samples taken that found no room on the line.
     """
 
     uid: int
@@ -60,7 +60,11 @@ class SimulatedHub:
     def sample(self, frequency: NDArray[np.uint32]) -> bytes:
         """Take the sample of next_us: bytes of its SAMPLE frame. frequency: (cubes, pads) in mHz."""
         run = self.runs[-1] if self.runs else None
-        if run and run.period_us == self.period_us and self.next_us == run.start_us + (run.last + 1 - run.first) * run.period_us:
+        if (
+            run
+            and run.period_us == self.period_us
+            and self.next_us == run.start_us + (run.last + 1 - run.first) * run.period_us
+        ):
             run.last = self.sequence
         else:
             self.runs.append(Run(self.sequence, self.sequence, self.next_us, self.period_us))

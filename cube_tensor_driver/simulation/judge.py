@@ -54,14 +54,18 @@ class Judge:
             link_of[members] = number
             for run in link["runs"]:
                 runs.append((number, run["first"], run["last"], run["start_us"], run["period_us"]))
-                times = self._book_start + 1000 * (run["start_us"] + np.arange(run["last"] - run["first"] + 1) * run["period_us"])
+                times = self._book_start + 1000 * (
+                    run["start_us"] + np.arange(run["last"] - run["first"] + 1) * run["period_us"]
+                )
                 self._sent += len(members) * int(np.count_nonzero((times >= start_ns) & (times < end_ns)))
 
         def time_ns(cube: NDArray[Any], sequence: NDArray[Any]) -> NDArray[np.int64]:
             result = np.full(len(cube), -1, np.int64)
             for number, first, last, start_us, period_us in runs:
                 there = (link_of[cube] == number) & (sequence >= first) & (sequence <= last)
-                result[there] = self._book_start + 1000 * (start_us + (sequence[there].astype(np.int64) - first) * period_us)
+                result[there] = self._book_start + 1000 * (
+                    start_us + (sequence[there].astype(np.int64) - first) * period_us
+                )
             return result
 
         self._time_ns = time_ns
@@ -76,7 +80,7 @@ class Judge:
         return len(self._received()[0]) >= self._sent
 
     def result(self) -> dict[str, object]:
-        """Figures of the span: counts in rows (one cube, one instant), times in ms, errors relative to the applied range."""
+        """Figures of the span: counts in rows (one cube, one instant), times in ms, errors relative to the range."""
         cube, _, stamp_ns, values, received_ns, true_ns = self._received()
         samples = self._in_span(*_joined(self._samples, 2))[0]
         latency = (received_ns - true_ns) * 1e-6
@@ -111,7 +115,7 @@ class Judge:
         return self._in_span(cube, sequence, stamp_ns, values, received_ns)
 
     def _errors(self, cube: NDArray[Any], values: NDArray[Any], true_ns: NDArray[Any]) -> tuple[float, float]:
-        """Root mean square and worst deviation of the observed components, each relative to the range that was applied."""
+        """Root mean square and worst deviation of the observed components, relative to the range that was applied."""
         load = MovingLoad(self._skin)
         calibrations = {c.calibration.id: c.calibration for c in self._skin.cubes}
         kind = np.array([c.calibration.id for c in self._skin.cubes])

@@ -35,7 +35,7 @@ class MovingLoad:
         self._disc, self._share = contact.disc(RADIUS, (0.0, 0.0, 1.0), order=3)
 
     def at(self, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Stress (cubes, 6) in Pa, order xx yy zz yz zx xy, and gradient (cubes, 6, 3) in Pa/m, in the cubes' frames."""
+        """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in the cubes' frames."""
         place, force = self.contact(seconds)
         local = np.einsum("nij,nj->ni", self._to_cube, place - self._position)
         sources = local[:, None, :] * (1.0, 1.0, 0.0) + self._disc

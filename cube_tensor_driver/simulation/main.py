@@ -1,7 +1,7 @@
 """The simulator: one process that plays all hubs of a skin on pseudo-terminals, under a load that moves over the skin.
 
-Each link's port appears as PORT_DIRECTORY/<link name>. On SIGINT or SIGTERM it ends and writes its book: what was sampled
-when, so that others can tell what should have arrived.
+Each link's port appears as PORTS/<link name>. On SIGINT or SIGTERM it ends and writes its book: what was sampled when,
+so that others can tell what should have arrived.
 """
 
 from __future__ import annotations
@@ -89,7 +89,9 @@ class Simulator:
                     continue
                 widths = {cube.calibration.layout.n_pads for cube in cubes}
                 if len(widths) > 1:
-                    raise ConfigError(f"link {link.name}: its cubes have {sorted(widths)} pads; a hub carries one kind only")
+                    raise ConfigError(
+                        f"link {link.name}: its cubes have {sorted(widths)} pads; a hub carries one kind only"
+                    )
                 uids = [skin.cubes[m].uid or FIRST_UID + int(m) if m != ABSENT else FIRST_UID + 0xFFFF - i
                         for i, m in enumerate(members)]  # fmt: skip
                 # Clocks that started at different times, as those of real hubs.
@@ -97,7 +99,9 @@ class Simulator:
                 simulated = SimulatedCubes([cube.calibration for cube in cubes], noise, drift, seed=number)
                 self.lines[link.name] = Line(ports / link.name, hub, members, simulated)
         except OSError as error:
-            raise ConfigError(f"{ports}: {error.strerror}; name a folder that can be written for the simulated ports") from None
+            raise ConfigError(
+                f"{ports}: {error.strerror}; name a folder that can be written for the simulated ports"
+            ) from None
 
     def now_us(self) -> int:
         """Simulated time: µs since the start."""
@@ -178,7 +182,9 @@ def hub_members(skin: Skin, link: str) -> np.ndarray:
 
     Cubes that are known by uid alone take the free places; without a link they sit on the first one.
     """
-    fixed = {cube.index: number for number, cube in enumerate(skin.cubes) if cube.link == link and cube.index is not None}
+    fixed = {
+        cube.index: number for number, cube in enumerate(skin.cubes) if cube.link == link and cube.index is not None
+    }
     first = skin.links[0].name
     loose = [number for number, cube in enumerate(skin.cubes) if cube.index is None and (cube.link or first) == link]
     size = max([len(fixed) + len(loose), *(index + 1 for index in fixed)], default=0)
@@ -193,7 +199,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="simulator", description="Simulated hubs of a skin on pseudo-terminals.")
     parser.add_argument("--config", type=Path, required=True, help="skin file")
     parser.add_argument("--ports", type=Path, required=True, help="folder in which the links' ports appear by name")
-    parser.add_argument("--noise", type=float, default=0.0, help="relative standard deviation of a frequency (8e-6 is usual)")
+    parser.add_argument(
+        "--noise", type=float, default=0.0, help="relative standard deviation of a frequency (8e-6 is usual)"
+    )
     parser.add_argument("--drift", type=float, default=0.0, help="relative drift of the rest frequencies per second")
     parser.add_argument("--book", type=Path, help="file for the book of what was sampled (JSON), written at the end")
     options = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""./cube demo: simulated hubs, driver and reconstruction as real processes, watched over DDS and judged against truth."""
+"""./cube demo: simulated hubs, driver and reconstruction in real processes, watched over DDS, judged against truth."""
 
 from __future__ import annotations
 
@@ -118,7 +118,9 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
 
         def on_diagnostics(message: DiagnosticArray) -> None:
             for status in message.status:
-                crc.update({status.name: int(pair.value) for pair in status.values if pair.key == "crc"})
+                counted = [int(pair.value) for pair in status.values if pair.key == "crc"]
+                if counted:
+                    crc[status.name] = counted[0]
 
         node.create_subscription(SkinStress, "stress", on_stress, queue(rate))
         if options.duration is not None:
@@ -129,13 +131,14 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
         spin = _spinner(executor, children, table, interrupted)
         try:
             # What is measured starts when every topic has reached us: discovery takes up to seconds.
-            spin(FIRST_TENSORS_S, lambda: table.seen_all and (options.duration is None or (judge.sampled and crc)))
+            live = options.duration is None
+            spin(FIRST_TENSORS_S, lambda: table.seen_all and (live or (judge.sampled and bool(crc))))
             if not table.seen_all:
                 raise CubeError(
                     f"after {FIRST_TENSORS_S:g} s only {table.seen} of {len(skin.cubes)} cubes have a tensor.\n"
                     + "\n".join(children.log(name)[-1500:] for name in ("driver", "reconstruction"))
                 )
-            if options.duration is None:
+            if live:
                 spin(math.inf, lambda: False)
             spin(0.1, lambda: False)
             start_ns, processes = time.time_ns(), _processes(children)
@@ -196,4 +199,6 @@ def _report(result: dict[str, object], options: Options) -> None:
     try:
         options.json.write_text(text + "\n")
     except OSError as error:
-        raise ConfigError(f"--json {options.json}: {error.strerror}; name a file in a folder that can be written") from None
+        raise ConfigError(
+            f"--json {options.json}: {error.strerror}; name a file in a folder that can be written"
+        ) from None

@@ -98,7 +98,9 @@ class LiveTable:
             bar = "█" * int(BAR * min(1.0, max(0.0, pressure[number] / self._peak)))
             values = [_kilo(self._values[number, column], 1e-6 if column > 5 else 1e-3) for column in columns]
             words = [word.lower().replace("_", " ") for word, bit in STATUS.items() if self._status[number] & bit]
-            state = Text(", ".join(words), "red") if words else Text("ok" if self._count[number] else "waiting", "green")
+            state = (
+                Text(", ".join(words), "red") if words else Text("ok" if self._count[number] else "waiting", "green")
+            )
             rate = "·" if np.isnan(self._rate[number]) else f"{self._rate[number]:.0f}"
             residual = "·" if np.isnan(self._residual[number]) else f"{self._residual[number]:.2f}"
             table.add_row(self._skin.cubes[number].name, Text(bar, "blue"), *values, residual, rate, state)
