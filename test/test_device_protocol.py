@@ -155,9 +155,7 @@ def test_junk_around_loses_no_frame(name: str, feed) -> None:
     good = FRAMES[name]
     cut = encode(good)[:-5]  # no closing zero: the next frame's opening zero ends it
     decoder = Decoder()
-    stream = (
-        JUNK + encode(good) + JUNK + encode(good) + cut + encode(good) + b"\0\0\0" + encode(good)[1:] + JUNK
-    )
+    stream = JUNK + encode(good) + JUNK + encode(good) + cut + encode(good) + b"\0\0\0" + encode(good)[1:] + JUNK
     assert same(feed(stream, decoder), [good] * 4)
     assert decoder.counters.frames == 4
     assert sum(errors(decoder).values()) == 3
@@ -236,9 +234,7 @@ def test_every_field_holds_its_whole_range(frame: Frame) -> None:
 def test_longest_frame_passes() -> None:
     """65530 of 65535 bytes of payload, without a zero byte in the arrays: the worst case of COBS."""
     n = (65535 - 20) // 10
-    ones = Sample(
-        1, 0, 1, np.full((n, 1), 0x01010101, "<u4"), np.full(n, 0x01010101, "<u4"), np.full(n, 0x101, "<i2")
-    )
+    ones = Sample(1, 0, 1, np.full((n, 1), 0x01010101, "<u4"), np.full(n, 0x01010101, "<u4"), np.full(n, 0x101, "<i2"))
     assert same(Decoder().feed(encode(ones)), [ones])
     too_long = Sample(1, 0, 1, np.ones((n + 1, 1), "<u4"), np.ones(n + 1, "<u4"), np.ones(n + 1, "<i2"))
     with pytest.raises(ProtocolError, match=r"65540 bytes, the limit is 65535"):

@@ -332,6 +332,7 @@ def test_hub_that_does_not_answer_is_asked_again(start: Start, hub: PtyHub, monk
 
 def test_answer_of_the_hub_resets_the_pause(start: Start, hub: PtyHub) -> None:
     watch = start(LinkConfig("a", hub.port))
+    watch.state(LinkState.OPEN)
     for _ in range(5):
         watch.reader.links[0].next_pause()
     hub.greet()
@@ -525,9 +526,7 @@ def test_slow_links_delay_nobody(start: Start, hub: PtyHub, monkeypatch) -> None
     deaf_hub.unplug()
 
 
-@pytest.mark.parametrize(
-    "port", ["/nowhere/tty", "/nowhere/*", "socket://127.0.0.1:1", "socket://192.0.2.1:5"]
-)
+@pytest.mark.parametrize("port", ["/nowhere/tty", "/nowhere/*", "socket://127.0.0.1:1", "socket://192.0.2.1:5"])
 def test_close_in_the_middle_of_a_reconnect(start: Start, port: str) -> None:
     watch = start(LinkConfig("a", port))
     watch.state(LinkState.WAITING)

@@ -10,7 +10,6 @@ import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,57 +21,12 @@ from ..core.estimator import LEAK_TOLERANCE, RANK_TOLERANCE
 from ..core.layout import Layout
 from ..core.response import project
 from ..core.symmetry import default_modes, find_structure
-from .mesh import block, section
+from .body import Body, check_memory, check_pads, field_axes, make_mesh
 from .solid import Parity, Solid, lame
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
-_PLANE_MESHES = (0, 1, 2)  # how often the triangles of the coarsest mesh are cut in four
-_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.1, 3.0), (0.25, 0.05, 2.5))  # brick on a face, at an edge, growth
-_SPACE_BYTES = 30e3  # of memory per node at the peak, measured
-
-
-@dataclass(frozen=True)
-class Body:
-    """A box of elastomer with a cube bonded in its middle; lengths in m, moduli in Pa.
-
-    width, depth, height: along x, y and z (depth in 3-D only); side: of the cube
-    young, poisson: of the body; cube_young, cube_poisson: of the cube, cube_young = inf makes it rigid
-    plane: "strain" or "stress", for layouts in a plane
-    Raises ElasticError when no such body can be computed.
-    """
-
-    width: float = 60e-3
-    depth: float = 60e-3
-    height: float = 11e-3
-    side: float = 4e-3
-    young: float = 0.3e6
-    poisson: float = 0.48
-    cube_young: float = 200e9
-    cube_poisson: float = 0.30
-    plane: str = "strain"
-
-    def __post_init__(self) -> None:
-        for name in ("width", "depth", "height", "side", "young", "cube_young"):
-            value = getattr(self, name)
-            if not value > 0 or (np.isinf(value) and name != "cube_young"):
-                raise ElasticError(f"{name} is {value}; it must be a positive number in SI units")
-        for name in ("poisson", "cube_poisson"):
-            value = getattr(self, name)
-            if not 0 <= value < 0.5:
-                raise ElasticError(
-                    f"{name} is {value}; it must lie in [0, 0.5). For rubber take 0.48 to 0.4999: the "
-                    "elements do not lock, but at 0.5 pressure is no longer a function of strain"
-                )
-        for name in ("width", "depth", "height"):
-            if not getattr(self, name) > 1.1 * self.side:
-                raise ElasticError(
-                    f"the cube's side is {self.side * 1e3:g} mm but the body's {name} is "
-                    f"{getattr(self, name) * 1e3:g} mm; the body must be at least 1.1 times as large"
-                )
-        if self.plane not in ("strain", "stress"):
-            raise ElasticError(f"plane is {self.plane!r}; it must be 'strain' or 'stress'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +84,10 @@ def compute_response(
     structure = find_structure(layout, symmetry)
     if not 1 <= meshes <= 3:
         raise ElasticError(f"{meshes} meshes are asked for; 1, 2 or 3 are possible")
-    _check_pads(layout)
-    levels = _PLANE_MESHES if layout.planar else _SPACE_MESHES
-    grids = [_mesh(body, layout, level) for level in levels[:meshes]]
-    _check_memory(grids[-1].nvertices * (16 if layout.planar else 8))
-    total, done = meshes * 2 ** len(_axes(layout)), itertools.count()
+    check_pads(layout)
+    grids = [make_mesh(body, layout, level) for level in range(meshes)]
+    check_memory(grids[-1])
+    total, done = meshes * 2 ** len(field_axes(layout)), itertools.count()
 
     def report(what: str) -> None:
         if progress is not None:
@@ -144,13 +97,14 @@ def compute_response(
     rows: list[dict[str, Any]] = []
     for grid in grids:
         began = time.perf_counter()
-        matrix, unknowns = _matrix(body, layout, grid, report)
+        solid = make_solid(body, layout, grid)
+        matrix = _matrix(solid, layout, report)
         if rows:
             rows[-1]["change"] = float(np.abs(matrix - matrices[-1]).max() / np.abs(matrix).max())
         matrices.append(matrix)
         rows.append(
             {
-                "unknowns": unknowns,
+                "unknowns": int(solid.basis.N),
                 "seconds": time.perf_counter() - began,
                 "coefficients": project(structure, matrix)[0],
                 "change": None,
@@ -210,75 +164,16 @@ def calibration_from_fem(
     )
 
 
-def strip_layout(layout: Layout, width: float, centre: float = 0.5) -> Layout:
-    """The same layout with pads of another width and distance from the middle of the face, in units of d0.
-
-    The halves of each face are width = 1, centre = 0.5. Raises LayoutError when a pad leaves its face.
-    """
-    normals = layout.normals
-    across = layout.positions - normals
-    length = np.linalg.norm(across, axis=1, keepdims=True)
-    return Layout(layout.name, normals + centre * across / np.where(length > 0, length, 1.0), normals, width)
-
-
-def _axes(layout: Layout) -> tuple[int, ...]:
-    return (0, 2) if layout.planar else (0, 1, 2)
-
-
-def _check_pads(layout: Layout) -> None:
-    """Pads of one face must not share area: square ones overlap when both distances are below their side."""
-    for i, j in itertools.combinations(range(layout.n_pads), 2):
-        gap = np.abs(layout.positions[i] - layout.positions[j]).max()
-        if np.array_equal(layout.normals[i], layout.normals[j]) and gap < layout.pad_size * (1 - 1e-9):
-            raise ElasticError(
-                f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {layout.pad_size:g} d0 wide, {gap:g} "
-                "d0 apart; make them narrower or move them apart"
-            )
-
-
-def _check_memory(nodes: int) -> None:
-    need, have = nodes * _SPACE_BYTES, _available_memory()
-    if have is not None and need > have:
-        raise ElasticError(
-            f"this needs about {need / 1e9:.1f} GB of memory and {have / 1e9:.1f} GB are available; "
-            "ask for fewer meshes or wider pads"
-        )
-
-
-def _available_memory() -> float | None:
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return None  # not Linux: nothing is known, so nothing is refused
-
-
-def _mesh(body: Body, layout: Layout, level: Any) -> Any:
-    axes = _axes(layout)
-    half = [(body.width, body.depth, body.height)[k] / body.side for k in axes]
-    edges = [
-        abs(float(x[k]) + s)
-        for x, n in zip(layout.positions, layout.normals, strict=True)
-        for k in axes
-        for s in (-layout.pad_size / 2, layout.pad_size / 2)
-        if n[k] == 0
-    ]
-    stops = np.unique(np.round(edges, 9))
-    steps = np.diff(np.unique([0.0, *stops[stops < 1], 1.0]))
-    if steps.min() < 1e-3:
-        raise ElasticError(
-            f"pad edges are {steps.min():.2g} d0 apart and the mesh resolves 0.001; "
-            "move them together or apart"
-        )
-    return section(half, stops, level) if layout.planar else block(half, stops, *level)
-
-
-def _matrix(body: Body, layout: Layout, grid: Any, report: Callable[[str], None]) -> tuple[Array, int]:
-    """Response matrix (pads, modes) on one mesh, and the mesh's number of unknowns."""
-    axes, modes = _axes(layout), default_modes(layout)
+def make_solid(body: Body, layout: Layout, grid: Any = None) -> Solid:
+    """The meshed body; `grid` is a mesh from elastic.mesh, by default the finest that compute_response uses."""
     plane = body.plane if layout.planar else "strain"
     cube = None if np.isinf(body.cube_young) else lame(body.cube_young / body.young, body.cube_poisson, plane)
-    solid = Solid(grid, lame(1.0, body.poisson, plane), cube)
+    return Solid(grid or make_mesh(body, layout, 2), lame(1.0, body.poisson, plane), cube)
+
+
+def _matrix(solid: Solid, layout: Layout, report: Callable[[str], None]) -> Array:
+    """Response matrix (pads, modes)."""
+    axes, modes = field_axes(layout), default_modes(layout)
     every = range(modes.n_modes)
     stress = modes.stress[np.ix_(every, axes, axes)]
     gradient = modes.gradient[np.ix_(every, axes, axes, axes)]
@@ -288,11 +183,14 @@ def _matrix(body: Body, layout: Layout, grid: Any, report: Callable[[str], None]
         zero = np.zeros(solid.basis.N)
         return np.stack([solid.linear_forces(s, g) if s.any() or g.any() else zero for s, g in parts], axis=1)
 
-    return pad_stresses(solid, layout, forces, report), int(solid.basis.N)
+    return pad_stresses(solid, layout, forces, report)
 
 
 def pad_stresses(
-    solid: Solid, layout: Layout, forces: Callable[[Parity], Array], report: Callable[[str], None] = lambda _: None
+    solid: Solid,
+    layout: Layout,
+    forces: Callable[[Parity], Array],
+    report: Callable[[str], None] = lambda _: None,
 ) -> Array:
     """Mean normal stress (pads, n) under n loads; forces(parity) are their nodal forces (dofs, n) of a parity."""
     stresses: Array | float = 0.0
@@ -319,13 +217,13 @@ def _part(field: Array, parity: Parity) -> Array:
 
 def _sees(layout: Layout, pad: int, parity: Parity) -> bool:
     """False for a pad in the middle of its face along an axis in which the field is odd: its mean is zero."""
-    axes = list(_axes(layout))
+    axes = list(field_axes(layout))
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
     return bool(np.all((np.array(parity) > 0) | (np.abs(centre) > 1e-9) | (normal != 0)))
 
 
 def _pad_stress(solid: Solid, reactions: Array, parity: Parity, layout: Layout, pad: int) -> Array:
-    axes, half = list(_axes(layout)), layout.pad_size / 2
+    axes, half = list(field_axes(layout)), layout.pad_size / 2
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
     axis = int(np.argmax(np.abs(normal)))
     intervals = [(max(c - half, -1.0), min(c + half, 1.0)) for k, c in enumerate(centre) if k != axis]

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_RINGS = 26  # the last is 7e-9 d0 wide; what it leaves out is below 1e-4 of any entry
+_SMALLEST = 1e-8  # the last ring to the first; what it leaves out is below 1e-4 of any entry
 _DIRECTIONS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float)
 
 
-def section(half: Sequence[float], stops: Iterable[float], refine: int = 0) -> skfem.MeshTri:
+def section(half: Sequence[float], stops: Iterable[float], level: int = 1) -> skfem.MeshTri:
     """Triangles on [0, half[0]] x [0, half[1]], with self-similar rings around the cube's corner (1, 1).
 
-    stops: pad edges on [0, 1]; refine: how many times each triangle is cut in four.
+    stops: pad edges on [0, 1]; level: 0 coarse, 1 with twice as many rings, then all triangles cut in four.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     rho = min(0.5, 1.0 - inner[-1], *(h - 1.0 for h in half))
@@ -30,12 +30,12 @@ def section(half: Sequence[float], stops: Iterable[float], refine: int = 0) -> s
     lines = [np.concatenate([face, _outer(1.0 + rho, h, rho, 2.0)]) for h in half]
     base = skfem.MeshTri.init_tensor(*lines)
     away = np.any(np.abs(base.p[:, base.t].mean(axis=1) - 1.0) > rho, axis=0)
-    ring, corner = _rings(rho)
+    ring, corner = _rings(rho, 0.25 if level == 0 else 0.5)
     points = np.concatenate([base.p.T, ring])
     triangles = np.concatenate([base.t.T[away], corner + base.p.shape[1]])
     unique, inverse = np.unique(points[triangles.ravel()], axis=0, return_inverse=True)
     mesh = skfem.MeshTri(unique.T.copy(), inverse.reshape(-1, 3).T.copy())
-    return mesh.refined(refine) if refine else mesh
+    return mesh.refined(level - 1) if level > 1 else mesh
 
 
 def block(
@@ -70,17 +70,18 @@ def _graded(length: float, first: float, growth: float) -> Array:
     return points
 
 
-def _rings(rho: float) -> tuple[Array, NDArray[np.int64]]:
-    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1), each half the last one."""
-    radii = rho * 0.5 ** np.arange(_RINGS + 1)
+def _rings(rho: float, ratio: float) -> tuple[Array, NDArray[np.int64]]:
+    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1), each a ratio of the last."""
+    n = int(np.ceil(np.log(_SMALLEST) / np.log(ratio)))
+    radii = rho * ratio ** np.arange(n + 1)
     points = np.concatenate([1.0 + np.multiply.outer(radii, _DIRECTIONS).reshape(-1, 2), [[1.0, 1.0]]])
     triangles = []
-    for k in range(_RINGS):
+    for k in range(n):
         for j in range(0, 8, 2):  # j: mid of a side; its neighbours are corners
             for i in ((j + 1) % 8, (j - 1) % 8):
                 out, out_corner, into, into_corner = 8 * k + j, 8 * k + i, 8 * k + 8 + j, 8 * k + 8 + i
                 # cut along the shorter diagonal
                 triangles += [(out, out_corner, into_corner), (out, into_corner, into)]
-    last = 8 * _RINGS
+    last = 8 * n
     triangles += [(last + j, last + (j + 1) % 8, len(points) - 1) for j in range(8)]
     return points, np.array(triangles)

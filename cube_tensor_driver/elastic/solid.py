@@ -95,18 +95,19 @@ class Solid:
 
         field: from points (q, dim) to stress (q, n, dim, dim); it should be in equilibrium.
         """
-        total = np.zeros((self.basis.N, 0))
+        mesh = self.basis.mesh
+        edges = mesh.boundary_facets()
+        middle = mesh.p[:, mesh.facets[:, edges]].mean(axis=1)
+        total: Array | float = 0.0
         for axis in range(self.dim):
-            end = self.basis.mesh.p[axis].max()
-            facets = self.basis.mesh.facets_satisfying(lambda x, k=axis, e=end: _at(x[k], e), boundaries_only=True)
-            face = skfem.FacetBasis(self.basis.mesh, self.basis.elem, facets=facets, intorder=6)
+            face = skfem.FacetBasis(
+                mesh, self.basis.elem, facets=edges[_at(middle[axis], mesh.p[axis].max())], intorder=6
+            )
             x = np.asarray(face.default_parameters()["x"])
-            traction = _parity_part(field, x.reshape(self.dim, -1).T, parity)[:, :, axis, :]
-            columns = [
-                _traction_work.assemble(face, t=t.T.reshape(x.shape)) for t in np.moveaxis(traction, 1, 0)
-            ]
-            total = np.stack(columns, axis=1) + (total if total.size else 0.0)
-        return total
+            traction = _parity_part(field, x.reshape(self.dim, -1).T, parity)[..., axis]  # (q, n, dim)
+            loads = np.moveaxis(traction, (1, 2), (0, 1)).reshape(-1, *x.shape)
+            total = total + np.stack([_traction_work.assemble(face, t=t) for t in loads], axis=1)
+        return np.asarray(total)
 
     def solve(self, parity: Parity, forces: Array) -> Array:
         """Displacements (dofs, n) under nodal forces (dofs, n) of one parity."""
@@ -168,11 +169,11 @@ class Solid:
 def _parity_part(field: Callable[[Array], Array], x: Array, parity: Parity) -> Array:
     """The part of one parity of a field of stress at x (q, dim), by averaging over the mirrored points."""
     signs = list(itertools.product((1.0, -1.0), repeat=len(parity)))
-    part = 0.0
+    part = np.zeros(())
     for mirror in map(np.array, signs):
         weight = np.prod(np.where(mirror < 0, parity, 1)) / len(signs)
         part = part + weight * np.outer(mirror, mirror) * field(x * mirror)
-    return np.asarray(part)
+    return part
 
 
 def nested_dissection(place: Array) -> NDArray[np.int64]:
