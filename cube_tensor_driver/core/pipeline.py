@@ -18,6 +18,7 @@ from .calibration import Calibration
 from .errors import CalibrationError, CubeError, LayoutError
 from .estimator import FALSE_ALARM, Estimator, chi2_limit, make_estimator
 from .modes import COMPONENTS, STRESS
+from .oscillator import highest_frequency
 
 PAD_FAULT = 1  # at least one pad was left out: fault bit of the device, or a frequency that no pad can have
 RESIDUAL = 2  # chi-square above its false-alarm limit: a load outside the modes, or a broken pad
@@ -27,6 +28,7 @@ STATUS = {"PAD_FAULT": PAD_FAULT, "RESIDUAL": RESIDUAL, "INVALID": INVALID, "TEM
 
 N = len(COMPONENTS)
 MASKS_KEPT = 1024  # estimators of pad masks remembered at a time
+BETA_FLOOR = 1e-12  # so that every pad has a highest frequency; changes the law by 1e-12 of a strain
 PATTERNS_KEPT = 64  # cube columns remembered at a time: one per hub
 
 
@@ -47,7 +49,7 @@ class StressRows(NamedTuple):
 
 
 class _Table(NamedTuple):
-    """An estimator laid out for rows: (15 + D, P) matrix on v / (E (1 + beta)), scaled residual rows."""
+    """An estimator laid out for rows: (15 + D, P) matrix on v / stiffness, scaled residual rows."""
 
     matrix: np.ndarray
     limit: float  # of the residual
@@ -62,7 +64,7 @@ class _Rows(NamedTuple):
     all_known: bool
     kind: np.ndarray  # (N,) which calibration
     rest: np.ndarray  # (N, P)
-    beta: np.ndarray  # (N, P), or one number
+    top: np.ndarray  # (N, P) highest frequency of the law
     matrix: np.ndarray  # (P, 15 + D) when all rows share it, else (P, seen rows, N): the rows' axis last is fastest
     limit: np.ndarray  # (N,), or one number
     observed: np.ndarray
@@ -83,8 +85,8 @@ class Pipeline:
         self._kinds = tuple(kinds.values())
         number = {key: i for i, key in enumerate(kinds)}
         self._kind = np.array([number[c.id] for c in self.calibrations])
-        self._beta = self._per_pad([c.beta for c in self._kinds], 0).astype(self.dtype)
-        self._stiffness = self._per_pad([c.modulus * (1 + c.beta) for c in self._kinds], 0)
+        self._beta = self._per_pad([np.maximum(c.beta, BETA_FLOOR) for c in self._kinds], 1)
+        self._stiffness = self._per_pad([c.modulus for c in self._kinds], 0) * (1 + self._beta) / self._beta
         self._exists = self._per_pad([np.ones(c.layout.n_pads) for c in self._kinds], 0) > 0
         self._thermal = np.array([c.temperature is not None for c in self._kinds])
         self._any_thermal = bool(self._thermal.any())
@@ -136,7 +138,7 @@ class Pipeline:
         Raises LayoutError for arrays of the wrong shape; all that a row can hold ends in its status.
         """
         with np.errstate(all="ignore"):
-            rows, v, mask, status = self._law(cube, frequency, pad_fault, temperature)
+            rows, v, mask, cold = self._law(cube, frequency, pad_fault, temperature)
             if rows.matrix.ndim == 2:
                 out = v @ rows.matrix
             else:
@@ -151,11 +153,14 @@ class Pipeline:
                     out[chosen] = v[chosen] @ table.matrix.T
                     limit[chosen], observed[chosen] = table.limit, table.observed
                 out[rows.strange], observed[rows.strange] = np.nan, 0
-                status[mask != 0] |= PAD_FAULT
-                status[observed == 0] |= INVALID
             rest = out[:, N:]
             residual = np.abs(rest[:, 0]) if self._depth == 1 else np.sqrt(np.einsum("nd,nd->n", rest, rest))
-            status += (residual > limit) * np.uint16(RESIDUAL)  # arithmetic: cheaper than an index
+            status = (residual > limit).astype(np.uint16) * np.uint16(RESIDUAL)
+        if mask is not None:
+            status[mask != 0] |= PAD_FAULT
+            status[observed == 0] |= INVALID
+        if cold is not None:
+            status[cold] |= TEMPERATURE
         return StressRows(out[:, : len(STRESS)], out[:, len(STRESS) : N], residual, status, observed)
 
     def pad_stress(
@@ -198,7 +203,7 @@ class Pipeline:
         return self._estimator(kind, mask).covariance * np.outer(scale, scale)
 
     def _law(self, cube, frequency, pad_fault, temperature):
-        """Rows, v / (E (1 + beta)) with bad pads 0, masks of bad pads (None when all are good), status."""
+        """Rows, v / stiffness (bad pads 0), and, or None, masks of bad pads and rows that lack their temperature."""
         f, cube = np.asarray(frequency, dtype=self.dtype), np.asarray(cube)
         if cube.ndim != 1 or f.shape != (len(cube), self.n_pads):
             raise LayoutError(
@@ -206,30 +211,30 @@ class Pipeline:
                 f"this skin needs (N,) and (N, {self.n_pads})"
             )
         rows = self._rows(cube)
-        rest, status = rows.rest, np.zeros(len(f), dtype=np.uint16)
+        rest, top, cold = rows.rest, rows.top, None
         if self._any_thermal:
             known = np.full(len(f), np.nan) if temperature is None else np.asarray(temperature, dtype=float)
-            status[self._thermal[rows.kind] & ~np.isfinite(known)] |= TEMPERATURE
-            rest = (rest * self._factor(rows.kind, known)).astype(self.dtype)
-        # v = E (1 + beta) (f - f0) / (f0 + beta (f0 - f)): the law of oscillator.py with one division
+            cold = self._thermal[rows.kind] & ~np.isfinite(known)
+            factor = self._factor(rows.kind, known)
+            rest, top = (rest * factor).astype(self.dtype), (top * factor).astype(self.dtype)
+        # the law of oscillator.py in three passes: v = E (1 + beta) / beta (f - f0) / (top - f)
         v = f - rest
-        bottom = v * rows.beta
-        np.subtract(rest, bottom, out=bottom)
-        v /= bottom
+        below = top - f
+        v /= below
         # NaN, Inf and frequencies beyond the law's range all fail one of the two comparisons
         if (
             len(f)
             and f.min() > 0
-            and bottom.min() > 0
+            and below.min() > 0
             and rows.all_known
             and (pad_fault is None or not np.count_nonzero(pad_fault))
         ):
-            return rows, v, None, status
-        good = (f > 0) & (bottom > 0)
+            return rows, v, None, cold
+        good = (f > 0) & (below > 0)
         if pad_fault is not None:
             good &= ~_bits(np.asarray(pad_fault), self.n_pads)
         v[~good] = 0
-        return rows, v, _mask(self._exists[rows.kind] & ~good), status
+        return rows, v, _mask(self._exists[rows.kind] & ~good), cold
 
     def _rows(self, cube: np.ndarray) -> _Rows:
         key = (len(cube), cube[0], cube[-1]) if len(cube) else (0,)  # cheap; the comparison below makes it sure
@@ -240,7 +245,7 @@ class Pipeline:
             self._kept.clear()
         strange = (cube < 0) | (cube >= len(self.calibrations))
         index = np.where(strange, 0, cube).astype(int)
-        kind, beta = self._kind[index], self._beta
+        kind, rest = self._kind[index], self._rest[index]
         if len(kind) and (kind == kind[0]).all():
             matrix, limit = np.ascontiguousarray(self._matrices[kind[0]].T), self._limits[kind[0]]
         else:
@@ -253,8 +258,8 @@ class Pipeline:
             strange,
             not strange.any(),
             kind,
-            self._rest[index].astype(self.dtype),
-            beta[kind] if np.ptp(beta) else beta[0, 0],
+            rest.astype(self.dtype),
+            highest_frequency(rest, self._beta[kind]).astype(self.dtype),
             matrix,
             limit,
             self._observed[kind],

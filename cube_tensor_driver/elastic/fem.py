@@ -98,7 +98,7 @@ def compute_response(
     for grid in grids:
         began = time.perf_counter()
         solid = make_solid(body, layout, grid)
-        matrix = _matrix(solid, layout, report)
+        matrix = linear_response(solid, layout, report)
         if rows:
             rows[-1]["change"] = float(np.abs(matrix - matrices[-1]).max() / np.abs(matrix).max())
         matrices.append(matrix)
@@ -141,12 +141,14 @@ def calibration_from_fem(
     beta: float = 0.3,
     modulus: float = 0.3e6,
     noise: float | None = None,
+    neglect: tuple[str, ...] = (),
     source: str = "",
 ) -> Calibration:
     """Calibration of a cube with the computed response: its symmetric coefficients, or the whole matrix.
 
     rest_frequency Hz, beta and modulus Pa (of the pads' foam) are not computed: measure them, or tare.
     noise: standard deviation of a pad's stress in Pa; by default that of counting 1 ms of periods, 8 ppm.
+    neglect: modes stated to be zero, so that few pads can tell the others.
     """
     content: dict[str, Any] = {"coefficients": result.coefficients}
     if whole_matrix:
@@ -159,6 +161,7 @@ def calibration_from_fem(
         beta=np.array(beta),
         modulus=np.array(modulus),
         noise=np.array(8e-6 * modulus * (1 + beta) if noise is None else noise),
+        neglect=neglect,
         source=source,
         **content,
     )
@@ -171,8 +174,8 @@ def make_solid(body: Body, layout: Layout, grid: Any = None) -> Solid:
     return Solid(grid or make_mesh(body, layout, 2), lame(1.0, body.poisson, plane), cube)
 
 
-def _matrix(solid: Solid, layout: Layout, report: Callable[[str], None]) -> Array:
-    """Response matrix (pads, modes)."""
+def linear_response(solid: Solid, layout: Layout, report: Callable[[str], None] = lambda _: None) -> Array:
+    """Response matrix (pads, modes) on one mesh; report(what) is called before every solve."""
     axes, modes = field_axes(layout), default_modes(layout)
     every = range(modes.n_modes)
     stress = modes.stress[np.ix_(every, axes, axes)]

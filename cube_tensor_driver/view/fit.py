@@ -1,0 +1,120 @@
+"""./cube fit: a calibration from a table of known loads, with what the loads say about it."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ..core.calibration import illustrative
+from ..core.errors import ConfigError
+from ..core.fit import Fit, fit, measured_stress
+from ..core.symmetry import find_structure
+from ..files.calibration import find_calibration, read_calibration, write_calibration
+from ..files.loads import read_loads, unloaded
+from .layout import named_layout
+from .plots import draw_fit, save
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """As on the command line. area in m² for loads given as forces; base: calibration with the pad law's constants."""
+
+    loads: Path
+    layout: str
+    symmetry: str
+    output: Path
+    base: str | None
+    area: float | None
+    uid: int | None
+    figure: Path | None
+    json: Path | None
+
+
+def run_fit(options: Options) -> int:
+    """Fit, report, write. CubeError: what is wrong; nothing is written then."""
+    layout = named_layout(options.layout)
+    if options.base is not None:
+        base = read_calibration(find_calibration(options.base, Path()))
+        base.check(layout, options.uid)
+    else:
+        base = illustrative(layout.name)
+    loads = read_loads(options.loads, layout, options.area)
+    rest = unloaded(loads)
+    rest_source = "of the rows without load"
+    if rest is None:
+        rest, rest_source = base.rest_frequency, "of the base calibration: the table has no row without load"
+    base = dataclasses.replace(base, rest_frequency=rest, uid=options.uid)
+    loaded = loads.state.any(axis=1)
+    temperature = None if loads.temperature is None else loads.temperature[loaded]
+    measured = measured_stress(base, loads.frequency[loaded], temperature)
+    structure = find_structure(layout, options.symmetry)
+    result = fit(structure, loads.state[loaded], measured, base.noise)
+    _show(result, f"rest frequencies {rest_source}")
+    if options.json is not None:
+        _write_json(options.json, result)
+    if options.figure is not None:
+        save(draw_fit(result, measured), options.figure)
+    created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    calibration = result.calibration(base, created, f"fit of {options.loads.name}, {len(measured)} loads")
+    write_calibration(options.output, calibration, _header(options))
+    Console().print(f"wrote {options.output}: calibration {calibration.id}", highlight=False)
+    return 0
+
+
+def _header(options: Options) -> str:
+    return f"./cube fit {options.loads.name} --layout {options.layout} --symmetry {options.symmetry}"
+
+
+def _show(result: Fit, rest: str) -> None:
+    console = Console()
+    table = Table(title=f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {rest}")
+    for name in ("coefficient", "value", "standard deviation"):
+        table.add_column(name, justify="left" if name == "coefficient" else "right")
+    for name, value in result.coefficients.items():
+        known = math.isfinite(value)
+        table.add_row(
+            name, f"{value:+.5f}" if known else "open", f"{result.deviations[name]:.5f}" if known else "not determined"
+        )
+    console.print(table)
+    gains = Table(title="gains (average 1 over pads that the symmetry carries onto each other)")
+    for name in ("pad", "gain", "standard deviation"):
+        gains.add_column(name, justify="left" if name == "pad" else "right")
+    for pad, gain, deviation in zip(result.structure.layout.pads, result.gain, result.gain_deviation, strict=True):
+        gains.add_row(pad, f"{gain:.5f}", f"{deviation:.5f}")
+    console.print(gains)
+    console.print(
+        f"scatter {result.scale:.3g} × the stated noise; chi-square {result.chi2:.4g} for {result.dof} degrees of "
+        f"freedom; held-out error {100 * result.held_out:.3g} % of the readings; {int(result.outliers.sum())} outliers",
+        highlight=False,
+    )
+    for sentence in result.advice:
+        console.print(sentence, style="red", highlight=False)
+
+
+def _write_json(path: Path, result: Fit) -> None:
+    data = {
+        "coefficients": result.coefficients,
+        "deviations": result.deviations,
+        "gain": result.gain.tolist(),
+        "gain_deviation": result.gain_deviation.tolist(),
+        "scale": result.scale,
+        "chi2": result.chi2,
+        "dof": result.dof,
+        "held_out": result.held_out,
+        "outliers": np.argwhere(result.outliers).tolist(),
+        "undetermined": list(result.undetermined),
+        "advice": list(result.advice),
+    }
+    try:
+        path.write_text(json.dumps(data, indent=2) + "\n")
+    except OSError as error:
+        raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None
+
+

@@ -1,0 +1,96 @@
+"""Pictures for print: units on every axis, readable in grey, no display needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
+from ..core.errors import ConfigError
+from ..core.fit import Fit
+from ..core.layout import Layout
+
+plt.rcParams |= {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.color": "0.85",
+    "grid.linewidth": 0.5,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 200,
+}
+MARKERS = "osD^v<>pP*hX"
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure; the suffix says the format. ConfigError: cannot be written, or no such format."""
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; name a picture file in a folder that can be written") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    finally:
+        plt.close(figure)
+
+
+def draw_layout(layout: Layout) -> Figure:
+    """The cube with its pads: pads on the faces towards the viewer filled, those behind only outlined."""
+    figure = plt.figure(figsize=(5, 4.6))
+    axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
+    view = np.array([0.75, -1.0, 0.75])
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    hidden = -np.sign(view)
+    for i, a in enumerate(corners):
+        for b in corners[i + 1 :]:
+            if np.count_nonzero(a != b) == 1:
+                behind = np.array_equal(a, hidden) or np.array_equal(b, hidden)
+                axes.plot(*np.stack([a, b], axis=1), color="0.6" if behind else "0.2", ls=":" if behind else "-", lw=1)
+    for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):
+        u, w = np.eye(3)[np.flatnonzero(normal == 0)] * layout.pad_size / 2
+        outline = np.array([centre + a * u + b * w for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))])
+        front = normal @ view > 0
+        axes.plot(*outline.T, color="C0" if front else "0.55", lw=1.2, ls="-" if front else "--", zorder=3 if front else 1)
+        if front:
+            from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+            axes.add_collection3d(Poly3DCollection([outline], facecolor="C0", alpha=0.25, zorder=2))
+        place = centre + 0.12 * normal
+        axes.text(*place, name, ha="center", va="center", fontsize=7, color="black" if front else "0.45", zorder=4)
+    elevation, azimuth = np.degrees(np.arctan2(view[2], np.hypot(*view[:2]))), np.degrees(np.arctan2(view[1], view[0]))
+    axes.view_init(elev=elevation, azim=azimuth)
+    axes.set(xlabel="x / d0", ylabel="y / d0", zlabel="z / d0 (out of the skin)", title=f"layout {layout.name}")
+    axes.set_box_aspect((1, 1, 1))
+    for set_ticks in (axes.set_xticks, axes.set_yticks, axes.set_zticks):
+        set_ticks([-1, 0, 1])
+    return figure
+
+
+def draw_fit(fit: Fit, measured: NDArray[np.float64]) -> Figure:
+    """Measured against fitted pad stresses and what is left; outliers crossed. measured: (N, P) Pa."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 4))
+    for pad, name in enumerate(fit.structure.layout.pads):
+        keep = ~fit.outliers[:, pad]
+        x, y = fit.fitted[keep, pad] * 1e-3, measured[keep, pad] * 1e-3
+        grey = str(0.7 * pad / max(1, fit.structure.layout.n_pads - 1))
+        style = {"marker": MARKERS[pad % len(MARKERS)], "color": grey, "ls": "", "ms": 4, "mfc": "none"}
+        left.plot(x, y, label=name, **style)
+        right.plot(x, (y - x) * 1e3, **style)
+    out = fit.outliers
+    if out.any():
+        left.plot(fit.fitted[out] * 1e-3, measured[out] * 1e-3, "x", color="C3", ms=7, label="outlier")
+    ends = np.array([np.nanmin(fit.fitted), np.nanmax(fit.fitted)]) * 1e-3
+    left.plot(ends, ends, color="0.5", lw=0.8, zorder=0)
+    left.set(xlabel="fitted pad stress / kPa", ylabel="measured pad stress / kPa")
+    left.legend(fontsize=7, ncols=2 if fit.structure.layout.n_pads <= 12 else 3)
+    right.axhline(0, color="0.5", lw=0.8)
+    right.set(xlabel="fitted pad stress / kPa", ylabel="measured − fitted / Pa")
+    right.set_title(f"scatter {fit.scale:.2f} × stated noise, held-out error {100 * fit.held_out:.2g} %", fontsize=9)
+    return figure
