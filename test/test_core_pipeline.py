@@ -139,6 +139,17 @@ def test_bad_pads_are_left_out(dtype, tolerance):
     assert np.isnan(rows.residual[6])
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -1e5, 1e5 * 1.3 / 0.3, 5e5])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_one_bad_frequency_alone_is_found(value, dtype):
+    c = illustrative("cube")
+    frequency = np.full((3, 24), 1e5)
+    frequency[1, 2] = value
+    rows = Pipeline([c] * 3, dtype).process(np.arange(3), frequency)
+    assert rows.status.tolist() == [0, PAD_FAULT, 0]
+    np.testing.assert_allclose(joined(rows), 0, atol=1e-6)
+
+
 def test_what_the_remaining_pads_cannot_see_is_not_invented():
     c = illustrative("planar")
     frequency = frequencies(c, states_of(c, 1))

@@ -40,7 +40,7 @@ class Fit:
     coefficients, deviations: {name: value} and standard deviations in Pa per Pa, NaN where not determined
     covariance: (K, K) of the coefficients; gain, gain_deviation: (P,)
     scale: scatter found, in units of the stated noise; chi2, dof: over the readings that are not outliers
-    held_out: rms error on loads left out of the fit over rms reading (cross-validation), NaN with one load
+    held_out: rms error on loads left out of the fit over rms reading (cross-validation), outliers aside; NaN with one load
     fitted: (N, P) Pa; outliers: (N, P) bool, readings that had no weight
     undetermined: names of coefficients that these loads leave open; advice: which loads to add, in words
     """
@@ -158,7 +158,7 @@ def fit(
         float(scale),
         float(np.sum(((y - fitted) / sigma)[kept] ** 2)),
         int(kept.sum()) - (jacobian.shape[1] - hidden.shape[1]),
-        _held_out(model, design, y),
+        _held_out(model, design, y, kept),
         fitted,
         ~kept,
         tuple(n for n, o in zip(names, open_, strict=True) if o),
@@ -296,15 +296,15 @@ def _covariance(jacobian: np.ndarray, r: np.ndarray, scale: float) -> np.ndarray
     )
 
 
-def _held_out(model: _Model, design: np.ndarray, y: np.ndarray) -> float:
-    if len(y) < 2:
+def _held_out(model: _Model, design: np.ndarray, y: np.ndarray, kept: np.ndarray) -> float:
+    if len(y) < 2 or not np.any(y[kept]):
         return float("nan")
     errors = np.empty_like(y)
     fold = np.arange(len(y)) % min(FOLDS, len(y))
     for k in range(fold.max() + 1):
         theta, _, _ = model.solve(design[fold != k], y[fold != k])
         errors[fold == k] = y[fold == k] - model.predict(theta, design[fold == k])
-    return float(np.sqrt(np.mean(errors**2) / np.mean(y**2))) if np.any(y) else float("nan")
+    return float(np.sqrt(np.mean(errors[kept] ** 2) / np.mean(y[kept] ** 2)))
 
 
 def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray) -> list[str]:

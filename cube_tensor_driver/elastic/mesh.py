@@ -15,27 +15,44 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SMALLEST = 1e-8  # the last ring to the first; what it leaves out is below 1e-4 of any entry
 _DIRECTIONS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float)
 
 
-def section(half: Sequence[float], stops: Iterable[float], level: int = 1) -> skfem.MeshTri:
+def section(
+    half: Sequence[float],
+    stops: Iterable[float],
+    level: int = 1,
+    smallest: float = 1e-8,
+    largest: float = np.inf,
+) -> skfem.MeshTri:
     """Triangles on [0, half[0]] x [0, half[1]], with self-similar rings around the cube's corner (1, 1).
 
     stops: pad edges on [0, 1]; level: 0 coarse, 1 with twice as many rings, then all triangles cut in four.
+    smallest: size of the last ring over the first; what it leaves out at 1e-8 is below 1e-4 of any entry.
+    largest: the longest side of a triangle away from the cube.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     rho = min(0.5, 1.0 - inner[-1], *(h - 1.0 for h in half))
     face = np.append(_inner(inner, 1.0 - rho, 0.5), 1.0)
-    lines = [np.concatenate([face, _outer(1.0 + rho, h, rho, 2.0)]) for h in half]
+    lines = [np.concatenate([face, _outer(1.0 + rho, h, rho, 2.0, largest)]) for h in half]
     base = skfem.MeshTri.init_tensor(*lines)
     away = np.any(np.abs(base.p[:, base.t].mean(axis=1) - 1.0) > rho, axis=0)
-    ring, corner = _rings(rho, 0.25 if level == 0 else 0.5)
+    ring, corner = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
     points = np.concatenate([base.p.T, ring])
     triangles = np.concatenate([base.t.T[away], corner + base.p.shape[1]])
     unique, inverse = np.unique(points[triangles.ravel()], axis=0, return_inverse=True)
     mesh = skfem.MeshTri(unique.T.copy(), inverse.reshape(-1, 3).T.copy())
     return mesh.refined(level - 1) if level > 1 else mesh
+
+
+def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
+    """The whole section from its positive quarter."""
+    points, triangles = [], []
+    for sx, sz in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
+        points.append(quarter.p * np.array([[sx], [sz]]) + 0.0)  # + 0.0: no negative zeros
+        triangles.append(quarter.t + quarter.nvertices * len(triangles))
+    unique, inverse = np.unique(np.concatenate(points, axis=1), axis=1, return_inverse=True)
+    return skfem.MeshTri(unique, inverse.reshape(-1)[np.concatenate(triangles, axis=1)])
 
 
 def block(
@@ -56,9 +73,12 @@ def _inner(stops: Sequence[float], end: float, size: float) -> Array:
     return np.concatenate([[stops[0]], *steps])
 
 
-def _outer(start: float, end: float, first: float, growth: float) -> Array:
-    """Points from start to end, both included, with steps that grow from about `first`."""
-    return np.array([start]) if start == end else start + _graded(end - start, first * growth, growth)
+def _outer(start: float, end: float, first: float, growth: float, largest: float) -> Array:
+    """Points from start to end, both included, with steps that grow from about `first` up to `largest`."""
+    if start == end:
+        return np.array([start])
+    points = start + _graded(end - start, first * growth, growth)
+    return points if np.isinf(largest) else _inner(points.tolist(), end, largest)
 
 
 def _graded(length: float, first: float, growth: float) -> Array:
@@ -70,9 +90,9 @@ def _graded(length: float, first: float, growth: float) -> Array:
     return points
 
 
-def _rings(rho: float, ratio: float) -> tuple[Array, NDArray[np.int64]]:
+def _rings(rho: float, ratio: float, smallest: float) -> tuple[Array, NDArray[np.int64]]:
     """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1), each a ratio of the last."""
-    n = int(np.ceil(np.log(_SMALLEST) / np.log(ratio)))
+    n = int(np.ceil(np.log(smallest) / np.log(ratio)))
     radii = rho * ratio ** np.arange(n + 1)
     points = np.concatenate([1.0 + np.multiply.outer(radii, _DIRECTIONS).reshape(-1, 2), [[1.0, 1.0]]])
     triangles = []

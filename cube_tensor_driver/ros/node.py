@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from ..core.errors import ConfigError, CubeError
 
-PAUSE_S = 0.5
+PAUSE_S = 2.0
 """The longest pause of a reader that no message is lost in: queue depths are rate times this."""
 UNKNOWN_RATE = 1000.0
 SPIN_S = 0.2

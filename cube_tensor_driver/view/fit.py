@@ -74,7 +74,8 @@ def _header(options: Options) -> str:
 
 def _show(result: Fit, rest: str) -> None:
     console = Console()
-    table = Table(title=f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {rest}")
+    console.print(f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {rest}", highlight=False)
+    table = Table()
     for name in ("coefficient", "value", "standard deviation"):
         table.add_column(name, justify="left" if name == "coefficient" else "right")
     for name, value in result.coefficients.items():
@@ -83,7 +84,8 @@ def _show(result: Fit, rest: str) -> None:
             name, f"{value:+.5f}" if known else "open", f"{result.deviations[name]:.5f}" if known else "not determined"
         )
     console.print(table)
-    gains = Table(title="gains (average 1 over pads that the symmetry carries onto each other)")
+    console.print("gains (average 1 over pads that the symmetry carries onto each other)", highlight=False)
+    gains = Table()
     for name in ("pad", "gain", "standard deviation"):
         gains.add_column(name, justify="left" if name == "pad" else "right")
     for pad, gain, deviation in zip(result.structure.layout.pads, result.gain, result.gain_deviation, strict=True):

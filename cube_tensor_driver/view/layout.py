@@ -84,7 +84,8 @@ def _show(layout: Layout, symmetry: str, counts: dict[str, int | None], result: 
         text = "unknown" if condition is None else f"{condition:.3g}"
         console.print(f"{part + ':':10} rank {result[f'rank_{part}']}, condition {text}")
     console.print(f"unobservable: {', '.join(result['unobservable']) or 'nothing'}", highlight=False)
-    table = Table(title="noise of each mode per unit of pad noise (gradients times the half side)")
+    console.print("noise of each mode per unit of pad noise (gradients times the half side):")
+    table = Table()
     table.add_column("mode")
     table.add_column("noise", justify="right")
     for name in result["modes"]:

@@ -62,7 +62,7 @@ def draw_layout(layout: Layout) -> Figure:
             from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
             axes.add_collection3d(Poly3DCollection([outline], facecolor="C0", alpha=0.25, zorder=2))
-        place = centre + 0.12 * normal
+        place = centre + 0.02 * normal
         axes.text(*place, name, ha="center", va="center", fontsize=7, color="black" if front else "0.45", zorder=4)
     elevation, azimuth = np.degrees(np.arctan2(view[2], np.hypot(*view[:2]))), np.degrees(np.arctan2(view[1], view[0]))
     axes.view_init(elev=elevation, azim=azimuth)
