@@ -21,6 +21,39 @@ def demo(options: argparse.Namespace) -> int:
     return run_demo(Options(options.config, options.cubes, options.rate, duration, options.headless, options.json))
 
 
+def config_grid(options: argparse.Namespace) -> int:
+    from .files.grid import grid
+    from .files.yaml import write_yaml
+
+    skin = grid(options.name, options.nx, options.ny, options.pitch, options.links, options.calibration,
+                options.layout, options.rate, options.port)  # fmt: skip
+    text = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart, on {options.links} links"
+    write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
+    print(f"wrote {options.output}: {text}")
+    return 0
+
+
+def config_check(options: argparse.Namespace) -> int:
+    from collections import Counter
+
+    from .files.skin import read_skin
+
+    skin = read_skin(options.file)
+    layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
+    kinds = ", ".join(f"{count} {name}" for name, count in layouts.items())
+    rate = "as the hubs have it" if skin.rate is None else f"{skin.rate:g} Hz"
+    print(f"{options.file}: skin {skin.name}, {kinds} on {len(skin.links)} links, {rate}: nothing wrong")
+    return 0
+
+
+def urdf(options: argparse.Namespace) -> int:
+    from .files.skin import read_skin
+    from .files.urdf import skin_urdf
+
+    print(skin_urdf(read_skin(options.file)), end="")
+    return 0
+
+
 def layout(options: argparse.Namespace) -> int:
     from .view.layout import run_layout
 
@@ -89,6 +122,26 @@ def parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--headless", action="store_true", help="no live table")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE instead of printing them")
+
+    configs = command("config", None, "make or check skin files").add_subparsers(metavar="WHAT", required=True)
+    sub = configs.add_parser("grid", help="write the skin file of a flat grid of cubes")
+    sub.set_defaults(run=config_grid)
+    sub.add_argument("--nx", type=int, required=True, metavar="N", help="cubes along x")
+    sub.add_argument("--ny", type=int, required=True, metavar="N", help="cubes along y")
+    sub.add_argument("--pitch", type=positive, default=0.012, metavar="M", help="distance of neighbours (0.012 m)")
+    sub.add_argument("--links", type=int, default=1, metavar="N", help="hubs that share the cubes (1)")
+    sub.add_argument("--rate", type=positive, default=100.0, metavar="HZ", help="samples per second (100)")
+    sub.add_argument("--name", default="skin", help="name of the skin (skin)")
+    sub.add_argument("--port", default="/dev/ttyACM{}", help="ports, {} is the link's number (/dev/ttyACM{})")
+    sub.add_argument("--layout", default="planar", metavar="NAME", help="layout of the cubes (planar)")
+    sub.add_argument("--calibration", default="planar", metavar="FILE", help="calibration file or name (planar)")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="skin file to write")
+    sub = configs.add_parser("check", help="say what is wrong with a skin file, or what it holds")
+    sub.set_defaults(run=config_check)
+    sub.add_argument("file", type=Path, metavar="FILE")
+
+    sub = command("urdf", urdf, "print a URDF of a skin: one link per cube under its parent frame")
+    sub.add_argument("file", type=Path, metavar="FILE")
 
     sub = command("layout", layout, "what a layout's pads can tell: ranks, unobservable modes, noise; a picture")
     sub.add_argument("name", metavar="NAME", help="quad, planar, cube, or a YAML file with a layout")

@@ -40,7 +40,7 @@ class Fit:
     coefficients, deviations: {name: value} and standard deviations in Pa per Pa, NaN where not determined
     covariance: (K, K) of the coefficients; gain, gain_deviation: (P,)
     scale: scatter found, in units of the stated noise; chi2, dof: over the readings that are not outliers
-    held_out: rms error on loads left out of the fit over rms reading (cross-validation), outliers aside; NaN with one load
+    held_out: rms error on loads left out of the fit over rms reading (cross-validation), without outliers
     fitted: (N, P) Pa; outliers: (N, P) bool, readings that had no weight
     undetermined: names of coefficients that these loads leave open; advice: which loads to add, in words
     """
