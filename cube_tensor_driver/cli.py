@@ -80,6 +80,18 @@ def fit(options: argparse.Namespace) -> int:
     )
 
 
+def bench(options: argparse.Namespace) -> int:
+    from .view import bench
+
+    if options.what == "pipeline":
+        return bench.bench_pipeline(options.cubes, options.json)
+    if options.what == "echo":
+        return bench.bench_echo(options.cubes, options.rate, options.duration, options.json)
+    if options.what == "skin":
+        return bench.bench_skin(options.cubes, options.rate, options.duration, options.composed, options.json)
+    return bench.bench_scale(options.counts, options.rate, options.duration, options.json, options.figure)
+
+
 def test(options: argparse.Namespace) -> int:
     os.chdir(ROOT)
     os.execv(sys.executable, [sys.executable, "-m", "pytest", *(options.arguments or ["test"])])
@@ -160,6 +172,28 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--uid", type=lambda text: int(text, 0), metavar="UID", help="uid of the cube this holds for")
     sub.add_argument("--figure", type=Path, metavar="FILE", help="measured against fitted (default: beside -o, .png)")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+
+    benches = command("bench", bench, "measure speed against bare floors").add_subparsers(
+        dest="what", metavar="WHAT", required=True
+    )
+    for name, text in (
+        ("pipeline", "the core against the same law and matrix product in bare numpy"),
+        ("echo", "bare rclpy: publish, echo, receive messages of a skin's sizes"),
+        ("skin", "simulated hubs to received tensors, beside the echo"),
+        ("scale", "skin for growing numbers of cubes, with a picture"),
+    ):
+        sub = benches.add_parser(name, help=text)
+        sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+        if name == "scale":
+            sub.add_argument("--counts", type=int, nargs="+", default=[1, 4, 16, 64, 256, 1024, 4096], metavar="N")
+            sub.add_argument("--figure", type=Path, default=Path("scale.png"), metavar="FILE", help="(scale.png)")
+        else:
+            sub.add_argument("--cubes", type=int, default=1260 if name == "pipeline" else 64, metavar="N")
+        if name != "pipeline":
+            sub.add_argument("--rate", type=positive, default=1000.0, metavar="HZ", help="scans per second (1000)")
+            sub.add_argument("--duration", type=positive, default=10.0, metavar="S", help="seconds to measure (10)")
+        if name == "skin":
+            sub.add_argument("--composed", action="store_true", help="driver and reconstruction in one process")
 
     sub = command("test", test, "build and run the test suite; arguments go to pytest")
     sub.add_argument("arguments", nargs=argparse.REMAINDER)

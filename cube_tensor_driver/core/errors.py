@@ -43,3 +43,7 @@ class ConfigError(CubeError):
 
 class MessageError(CubeError):
     """A message whose fields contradict each other."""
+
+
+class BagError(CubeError):
+    """A bag that cannot be read or written, or that lacks what a command needs."""

@@ -283,15 +283,13 @@ class Decoder:
                 runs[0] = b"" if self._discarding else bytes(self._tail + runs[0])
                 self._tail.clear()
                 self._discarding = False
-            short = 0
-            for run in filter(None, runs):
-                if len(run) >= MIN_RUN:
-                    frame = self._decode(run)
-                    if frame is not None:
-                        frames.append(frame)
-                else:
-                    short += 1
-            self.counters.length += short
+            # Noise can be all short runs: they are counted without a step in Python each.
+            long = [run for run in runs if len(run) >= MIN_RUN]
+            self.counters.length += len(runs) - runs.count(b"") - len(long)
+            for run in long:
+                frame = self._decode(run)
+                if frame is not None:
+                    frames.append(frame)
         if not self._discarding:
             self._tail += rest
             if len(self._tail) > MAX_RUN:

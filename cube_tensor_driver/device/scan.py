@@ -46,11 +46,11 @@ class Scan:
     """Gathers the samples of all links between two messages.
 
     rows: delivered so far; unknown_cube, wrong_pads: rows left out because the skin does not have the cube, or has it
-    with another number of pads.
+    with another number of pads; added: all rows that came in.
     """
 
     def __init__(self, n_links: int, places: Sequence[Place]) -> None:
-        self.rows = self.unknown_cube = self.wrong_pads = 0
+        self.rows = self.unknown_cube = self.wrong_pads = self.added = 0
         self.n_pads = max(place.n_pads for place in places)
         self._places = tuple(places)
         self._pads = np.array([place.n_pads for place in places])
@@ -102,6 +102,7 @@ class Scan:
     def add(self, link: int, sample: Sample, stamp_ns: int) -> None:
         """One sample, with the time it was taken at in the node's clock."""
         self._live[link] = True
+        self.added += sample.n_cubes
         self._gathered[link].append((sample, stamp_ns))
 
     def complete(self) -> bool:
@@ -134,6 +135,11 @@ class Scan:
             celsius,
             np.concatenate([sample.pad_fault for _, sample, _ in parts]),
         )
+
+    def unaccounted(self) -> int:
+        """Rows that came in and are neither delivered, nor gathered, nor counted as left out: always 0."""
+        gathered = sum(sample.n_cubes for samples in self._gathered for sample, _ in samples)
+        return self.added - gathered - self.rows - self.unknown_cube - self.wrong_pads
 
     def _select(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
         """The skin's cubes of a sample, and the sample without the rows that belong to none."""

@@ -1,10 +1,12 @@
-"""Accounting of one hub's samples: which are new, which came twice or late, how many are missing."""
+"""Accounting of one hub's samples: which are new, which came twice or late, how many are missing and why."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import asdict, dataclass
 from enum import Enum
+
+from .protocol import Sample, Stats
 
 MEMORY = 64
 """Samples remembered; what arrives later than that after its turn belongs to a hub that restarted."""
@@ -27,7 +29,8 @@ class Verdict(str, Enum):
 @dataclass(slots=True)
 class SequenceCounters:
     """Samples. At any time taken by the hub since the first seen = delivered + missing; received = delivered
-    + duplicate. `out_of_order` are among the delivered; what a restart lost cannot be known."""
+    + duplicate. `out_of_order` are among the delivered. Of what a restart lost, the samples since power-up are
+    among the missing; those that the hub took last before it restarted nobody can know."""
 
     delivered: int = 0
     missing: int = 0
@@ -73,6 +76,18 @@ class SequenceTracker:
         self._first = min(self._first, number)
         return self._deliver(number, device_us, Verdict.LATE)
 
+    def book(self, taken: int) -> None:
+        """The hub says how many samples it has taken (u32): what has not come by now is missing."""
+        ahead = (taken - self._next + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
+        if self._seen and 0 < ahead <= MAX_GAP:
+            self.counters.missing += ahead
+            self._next += ahead
+
+    @property
+    def first(self) -> int:
+        """Number of the first sample that is counted, delivered or missing, of the present run."""
+        return self._first
+
     def _fits(self, number: int, device_us: int) -> bool:
         """Whether a sample from before the newest is of the same run: its time lies where its number does."""
         if number in self._seen:
@@ -84,7 +99,12 @@ class SequenceTracker:
     def _restart(self, sequence: int, device_us: int) -> Verdict:
         self.counters.resets += 1
         self._seen.clear()
-        return self._begin(sequence, device_us, Verdict.RESET)
+        verdict = self._begin(sequence, device_us, Verdict.RESET)
+        if sequence <= MAX_GAP:
+            # Numbers begin at 0 with power-up, so what came before this one is missing.
+            self.counters.missing += sequence
+            self._first = 0
+        return verdict
 
     def _begin(self, sequence: int, device_us: int, verdict: Verdict) -> Verdict:
         self._first, self._next, self._newest_us = sequence, sequence + 1, device_us
@@ -96,3 +116,63 @@ class SequenceTracker:
         if len(self._seen) > MEMORY:
             self._seen.popitem(last=False)
         return verdict
+
+
+class Account:
+    """The book of one link: every sample the hub took is delivered, dropped in the hub, or lost on the way.
+
+    A hub with many cubes spreads a sample over several frames; each counts here, for itself, as a sample.
+    """
+
+    def __init__(self) -> None:
+        self.received = 0
+        self.stats_frame: Stats | None = None
+        self._trackers: dict[int, SequenceTracker] = {}  # by first_cube
+        self._dropped = 0
+        self._dropped_before = 0
+
+    def sample(self, frame: Sample) -> Verdict:
+        """Judge and count one frame."""
+        tracker = self._trackers.get(frame.first_cube)
+        if tracker is None:
+            tracker = self._trackers[frame.first_cube] = SequenceTracker()
+        self.received += 1
+        return tracker.update(frame.sequence, frame.device_us)
+
+    def stats(self, frame: Stats) -> None:
+        """Compare with the hub's own book."""
+        last, self.stats_frame = self.stats_frame, frame
+        if last is None and all(tracker.first for tracker in self._trackers.values()):
+            self._dropped_before = frame.dropped  # we joined late: what was dropped before is not ours to count
+        elif last is not None and frame.uptime_ms < last.uptime_ms:
+            self._dropped_before = 0  # it restarted, perhaps before any sample of the new run came
+            return
+        self._dropped += (frame.dropped - self._dropped_before) % 0x1_0000_0000 * len(self._trackers)
+        self._dropped_before = frame.dropped
+        for tracker in self._trackers.values():
+            tracker.book(frame.taken)
+
+    @property
+    def resets(self) -> int:
+        return sum(tracker.counters.resets for tracker in self._trackers.values())
+
+    def counters(self) -> dict[str, int]:
+        """taken = delivered + dropped_in_hub + lost; received = delivered + duplicate; the rest are among these."""
+        parts = [tracker.counters for tracker in list(self._trackers.values())]
+        total = {name: sum(getattr(part, name) for part in parts) for name in SequenceCounters().as_dict()}
+        missing = total.pop("missing")
+        # Until the next STATS a drop looks like loss, never the other way round.
+        dropped = min(self._dropped, missing)
+        book = {"taken": total["delivered"] + missing, "dropped_in_hub": dropped, "lost": missing - dropped}
+        return {**book, **total}
+
+    def contradictions(self) -> list[str]:
+        """What does not add up, in words. Right after `stats` there must be nothing."""
+        counters = self.counters()
+        found = []
+        if self.received != counters["delivered"] + counters["duplicate"]:
+            found.append(
+                f"{self.received} samples received, {counters['delivered']} delivered and {counters['duplicate']} "
+                "duplicate: the driver lost count, please report it"
+            )
+        return found

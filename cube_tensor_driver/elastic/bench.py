@@ -93,6 +93,26 @@ class Bench:
             rows.append((self._pads(u), self._state(u), self._turn(u), d0 * u[self.basis.nodal_dofs]))
         return Run(*(np.array(column) for column in zip(*rows, strict=True)))
 
+    def loaded(self, stress: Array, gradient: Array) -> tuple[Array, Array]:
+        """Linear solution under the outer tractions of sigma_ij = S_ij + G_ijk x_k / d0, axes x and z.
+
+        Returns displacement (2, nodes) of the mesh's corners in m and sigma_zz (elements,) in Pa. The cube's
+        middle stays where it is and its x axis does not turn.
+        """
+        x = np.asarray(self.basis.default_parameters()["x"])
+        sigma = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, x)
+        force = _load.assemble(self.basis, sigma=sigma)
+        still = self.basis.interpolate(np.zeros(self.basis.N))
+        matrix = _tangent(False).assemble(self.basis, u0=still, **self._lame).tocsc()
+        middle, side = (np.argmin(np.hypot(self.mesh.p[0] - s, self.mesh.p[1])) for s in (0, 1))
+        pinned = [*self.basis.nodal_dofs[:, middle], self.basis.nodal_dofs[1, side]]
+        free = np.setdiff1d(np.arange(self.basis.N), pinned)
+        u = np.zeros(self.basis.N)
+        u[free] = splu(matrix[free][:, free], permc_spec="MMD_AT_PLUS_A").solve(force[free])
+        f = self.basis.interpolate(u).grad + np.eye(2)[:, :, None, None]
+        zz = _stress(f, False, self._lame["lam"], self._lame["mu"])[1, 1].mean(axis=1)
+        return self.body.side / 2 * u[self.basis.nodal_dofs], zz
+
     def _advance(
         self, u: Array, held: NDArray[np.bool_], prescribed: Array, number: int, halvings: int = 0
     ) -> Array:
@@ -132,7 +152,8 @@ class Bench:
         """Mean normal stress (P,) of the pads from the nodal forces on the cube, in the cube's turned frame."""
         field = self._outside.interpolate(u)
         force = -_force(self.finite).assemble(self._outside, u0=field, **self._body_lame)
-        x, c, s = self.basis.doflocs, np.cos(self._turn(u)), np.sin(self._turn(u))
+        x, turn = self.basis.doflocs, self._turn(u) if self.finite else 0.0  # linear: no second-order terms
+        c, s = np.cos(turn), np.sin(turn)
         means = np.zeros(self.layout.n_pads)
         for pad, (place, normal) in enumerate(zip(self.layout.positions, self.layout.normals, strict=True)):
             axis = 0 if normal[0] else 1
@@ -181,6 +202,11 @@ def _stress(f: Array, finite: bool, lam: Array, mu: Array) -> Array:
         return np.asarray(lam * eye(trace(e), 2) + 2 * mu * e)
     to = transpose(inv(f))
     return np.asarray(mu * (f - to) + lam * np.log(det(f)) * to)
+
+
+@skfem.LinearForm
+def _load(w, p):
+    return ddot(p.sigma, grad(w))
 
 
 def _force(finite: bool) -> skfem.LinearForm:

@@ -47,7 +47,8 @@ def section(
 
 def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
     """The whole section from its positive quarter."""
-    points, triangles = [], []
+    points: list[Array] = []
+    triangles: list[NDArray[np.int64]] = []
     for sx, sz in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
         points.append(quarter.p * np.array([[sx], [sz]]) + 0.0)  # + 0.0: no negative zeros
         triangles.append(quarter.t + quarter.nvertices * len(triangles))

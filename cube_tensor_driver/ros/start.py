@@ -24,23 +24,36 @@ class Process:
 
 
 def skin_processes(
-    config: Path, *, port: str = "", rate: float = 0.0, simulated_ports: Path | None = None, book: Path | None = None
+    config: Path,
+    *,
+    port: str = "",
+    rate: float = 0.0,
+    composed: bool = False,
+    simulated_ports: Path | None = None,
+    book: Path | None = None,
+    instants: int | None = None,
 ) -> list[Process]:
     """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
 
     port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
-    for the file's. book: where the simulator writes what it sampled.
+    for the file's. composed: driver and reconstruction in one process. book: where the simulator writes what it
+    sampled; instants: see `simulation.main.Simulator`.
     """
     skin: dict[str, Value] = {"config": str(config)}
     driver: dict[str, Value] = {**skin, "port": port, "rate": rate, "port_directory": str(simulated_ports or "")}
-    processes = [
-        Process("reconstruction", "cube_tensor_driver.ros.reconstruction", parameters=skin),
-        Process("driver", "cube_tensor_driver.ros.driver", parameters=driver),
-    ]
+    if composed:
+        processes = [Process("composed", "cube_tensor_driver.ros.composed", parameters=driver)]
+    else:
+        processes = [
+            Process("reconstruction", "cube_tensor_driver.ros.reconstruction", parameters=skin),
+            Process("driver", "cube_tensor_driver.ros.driver", parameters=driver),
+        ]
     if simulated_ports is not None:
         arguments = ["--config", str(config), "--ports", str(simulated_ports)]
         if book is not None:
             arguments += ["--book", str(book)]
+        if instants is not None:
+            arguments += ["--instants", str(instants)]
         processes.insert(
             0, Process("simulator", "cube_tensor_driver.simulation.main", False, arguments=tuple(arguments))
         )

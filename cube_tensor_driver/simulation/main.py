@@ -24,7 +24,7 @@ from ..core.errors import ConfigError, CubeError
 from ..files.skin import Skin, read_skin
 from .cubes import SimulatedCubes
 from .hub import SimulatedHub
-from .load import MovingLoad
+from .load import CIRCUIT_S, MovingLoad
 
 OUT_LIMIT = 1 << 16
 """Bytes that wait for the line at most: what is sampled beyond is dropped in the hub, and counted there."""
@@ -43,6 +43,7 @@ class Line:
         tty.setraw(self._far)
         os.set_blocking(self.fd, False)
         self._out = bytearray()
+        self.prepared: list[np.ndarray] = []
         port.unlink(missing_ok=True)
         port.symlink_to(os.ttyname(self._far))
         self.send(hub.hello())
@@ -72,8 +73,13 @@ class Line:
 class Simulator:
     """All hubs of a skin. noise and drift as in `SimulatedCubes`."""
 
-    def __init__(self, skin: Skin, ports: Path, noise: float = 0.0, drift: float = 0.0) -> None:
-        """ConfigError: cubes of one hub have different numbers of pads, or the folder for the ports cannot be used."""
+    def __init__(
+        self, skin: Skin, ports: Path, noise: float = 0.0, drift: float = 0.0, instants: int | None = None
+    ) -> None:
+        """instants: compute the load at so many instants of its circuit beforehand and go round them, one a sample.
+
+        ConfigError: cubes of one hub have different numbers of pads, or the folder for the ports cannot be used.
+        """
         self._load = MovingLoad(skin)
         self._ports = ports
         self._field: tuple[int, tuple[np.ndarray, np.ndarray]] | None = None
@@ -98,10 +104,17 @@ class Simulator:
                 hub = SimulatedHub(link.hub_uid or number + 1, uids, widths.pop(), boot_us=1_000_003 * (number + 1))
                 simulated = SimulatedCubes([cube.calibration for cube in cubes], noise, drift, seed=number)
                 self.lines[link.name] = Line(ports / link.name, hub, members, simulated)
+            self._prepare(instants or 0)
         except OSError as error:
             raise ConfigError(
                 f"{ports}: {error.strerror}; name a folder that can be written for the simulated ports"
             ) from None
+
+    def _prepare(self, instants: int) -> None:
+        for number in range(instants):
+            stress, gradient = self._load.at(number * CIRCUIT_S / instants)
+            for line in self.lines.values():
+                line.prepared.append(self._frequency(line, stress, gradient, 0.0))
 
     def now_us(self) -> int:
         """Simulated time: µs since the start."""
@@ -132,15 +145,21 @@ class Simulator:
 
     def _sample(self, line: Line) -> None:
         hub = line.hub
-        if self._field is None or self._field[0] != hub.next_us:
-            self._field = hub.next_us, self._load.at(hub.next_us * 1e-6)
-        stress, gradient = self._field[1]
-        there = line.members != ABSENT
-        frequency = np.zeros((len(there), hub.n_pads), "<u4")
-        cubes = line.members[there]
-        frequency[there] = line.cubes.frequency(stress[cubes], gradient[cubes], hub.next_us * 1e-6)
+        if line.prepared:
+            frequency = line.prepared[hub.next_us // hub.period_us % len(line.prepared)]
+        else:
+            if self._field is None or self._field[0] != hub.next_us:
+                self._field = hub.next_us, self._load.at(hub.next_us * 1e-6)
+            frequency = self._frequency(line, *self._field[1], hub.next_us * 1e-6)
         if not line.send(hub.sample(frequency)):
             hub.dropped += 1
+
+    def _frequency(self, line: Line, stress: np.ndarray, gradient: np.ndarray, seconds: float) -> np.ndarray:
+        there = line.members != ABSENT
+        frequency = np.zeros((len(there), line.hub.n_pads), "<u4")
+        cubes = line.members[there]
+        frequency[there] = line.cubes.frequency(stress[cubes], gradient[cubes], seconds)
+        return frequency
 
     def book(self) -> dict[str, object]:
         """What was sampled: start_time_ns (wall clock at simulated time 0) and per link runs, dropped, members."""
@@ -204,10 +223,11 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--drift", type=float, default=0.0, help="relative drift of the rest frequencies per second")
     parser.add_argument("--book", type=Path, help="file for the book of what was sampled (JSON), written at the end")
+    parser.add_argument("--instants", type=int, help="compute the load at so many instants only, and go round them")
     options = parser.parse_args(arguments)
     stop = Stop()
     try:
-        simulator = Simulator(read_skin(options.config), options.ports, options.noise, options.drift)
+        simulator = Simulator(read_skin(options.config), options.ports, options.noise, options.drift, options.instants)
     except CubeError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 1

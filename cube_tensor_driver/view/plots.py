@@ -94,3 +94,20 @@ def draw_fit(fit: Fit, measured: NDArray[np.float64]) -> Figure:
     right.set(xlabel="fitted pad stress / kPa", ylabel="measured − fitted / Pa")
     right.set_title(f"scatter {fit.scale:.2f} × stated noise, held-out error {100 * fit.held_out:.2g} %", fontsize=9)
     return figure
+
+
+def draw_scale(rows: list[dict[str, Any]]) -> Figure:
+    """CPU per frame of chain and floor, and latency, over the number of cubes; rows as `./cube bench skin` gives."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.6))
+    cubes = [row["cubes"] for row in rows]
+    for name, style in (("driver", "o-"), ("reconstruction", "s-"), ("echo", "^:")):
+        key = f"cpu_{name}_percent" if name != "echo" else "echo_cpu_percent"
+        used = [1e4 * row[key] / row["rate_hz"] for row in rows]
+        left.plot(cubes, used, style, color="0.55" if name == "echo" else "black", mfc="white", ms=5, label=name)
+    left.set(xscale="log", yscale="log", xlabel="cubes", ylabel="CPU per frame / µs")
+    left.legend()
+    for name, style in (("p50", "o-"), ("p99", "s--")):
+        right.plot(cubes, [row[f"latency_{name}_ms"] for row in rows], style, color="black", mfc="white", ms=5, label=name)
+    right.set(xscale="log", xlabel="cubes", ylabel="latency, pads read to tensor received / ms", ylim=(0, None))
+    right.legend()
+    return figure

@@ -1,0 +1,135 @@
+"""The paper's section 3 (Fig. 4) and section 4 (Figs. 7 and 8) on the virtual bench: numbers, no pictures.
+
+The pads are the paper's prototype, C1 .. C4 = V1 .. V4. Their foam is not given there: FOAM is ours, stiff enough that
+no pad is crushed at 27 % compression.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.estimator import make_estimator
+from ..core.layout import LAYOUTS
+from ..core.modes import PLANE
+from ..core.oscillator import pad_frequency
+from .bench import Bench, Run, plates, rod
+from .body import Body
+from .fem import Response, compute_response
+
+Array = NDArray[np.float64]
+
+FOAM = {"rest_frequency": 100e3, "beta": 0.3, "modulus": 3e6}
+_SHEAR = np.array([-1.0, 1.0, 1.0, -1.0])  # signs of P_shear and P_grad, the paper's eqs. 9 and 10
+_GRAD = np.array([1.0, -1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One experiment of section 4; a row per step, displacement in m.
+
+    pads (n, 8) Pa; frequency (n, 4) Hz of C1 .. C4; prototype (n, 3): P_normal, P_shear, P_grad, Hz
+    recovered, truth: (n, 7) plane modes in Pa, from all eight pads and from the body without the cube
+    """
+
+    name: str
+    displacement: Array
+    pads: Array
+    frequency: Array
+    prototype: Array
+    recovered: Array
+    truth: Array
+
+
+def experiments(
+    body: Body | None = None, finite: bool = False, progress: Callable[[int, int, str], None] | None = None
+) -> list[Experiment]:
+    """The three experiments, plates bonded and (where they only press) sliding."""
+    body = body or Body()
+    press = np.linspace(0.5e-3, 3e-3, 6)
+    shear = np.linspace(0.5e-3, 3e-3, 6)
+    runs = [
+        ("a, top plate pressed, bonded", press, [plates(body, p) for p in press]),
+        ("a, top plate pressed, sliding", press, [plates(body, p, bonded=False) for p in press]),
+        (
+            "b, pressed 3 mm then sheared, bonded",
+            np.concatenate([press, 3e-3 + shear]),
+            [plates(body, p) for p in press] + [plates(body, 3e-3, s) for s in shear],
+        ),
+        ("c, 5 mm rod above C2, sliding", press, [rod(body, p, body.side / 4) for p in press]),
+        ("c, 5 mm rod above C2, bonded", press, [rod(body, p, body.side / 4, bonded=True) for p in press]),
+    ]
+    calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
+    found = []
+    for number, (name, displacement, steps) in enumerate(runs):
+        if progress is not None:
+            progress(number, len(runs), name)
+        found.append(_experiment(name, displacement, steps, body, finite, calibration))
+    if progress is not None:
+        progress(len(runs), len(runs), "done")
+    return found
+
+
+def _experiment(
+    name: str, displacement: Array, steps: Sequence[Any], body: Body, finite: bool, calibration: Response
+) -> Experiment:
+    with_cube = Bench(body, finite=finite).run(steps)
+    without: Run = Bench(body, cube=False, finite=finite).run(steps)
+    frequency = pad_frequency(with_cube.pads[:, :4], FOAM["rest_frequency"], FOAM["beta"], FOAM["modulus"])
+    recover = make_estimator(calibration.matrix, np.ones(8), PLANE, targets=np.eye(7)).matrix
+    return Experiment(
+        name=name,
+        displacement=displacement,
+        pads=with_cube.pads,
+        frequency=frequency,
+        prototype=prototype(frequency),
+        recovered=with_cube.pads @ recover.T,
+        truth=without.state,
+    )
+
+
+def prototype(frequency: Array) -> Array:
+    """P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4): the paper's eqs. 8 to 10 as printed."""
+    change = frequency - FOAM["rest_frequency"]
+    return np.stack([-change.sum(axis=1), change @ _SHEAR, change @ _GRAD], axis=1)
+
+
+def rod_sweep(
+    body: Body | None = None, places: Sequence[float] = tuple(np.arange(9) * 1e-3), pressed: float = 1e-3
+) -> dict[str, list[float]]:
+    """How much of the prototype's shear signal under a sliding rod is shear; linear body, per rod position.
+
+    signal: -v1 + v2 + v3 - v4 in Pa; shear: what the true local sigma_zx would give, 4 (c+d) sigma_zx; the rest is
+    cross-talk of how the stress varies over the cube, and of the plate that holds the body.
+    """
+    body = body or Body()
+    with_cube, without = Bench(body), Bench(body, cube=False)
+    row = compute_response(body, LAYOUTS["planar"], "slab", meshes=1).matrix[:4, PLANE.names.index("zx")]
+    table: dict[str, list[float]] = {"place": [], "signal": [], "shear": [], "crosstalk": [], "true_zx": []}
+    for place in places:
+        pads = with_cube.run([rod(body, pressed, place)]).pads[0, :4]
+        zx = without.run([rod(body, pressed, place)]).state[0, 1]
+        signal, shear = float(_SHEAR @ pads), float(_SHEAR @ row * zx)
+        values = (float(place), signal, shear, signal - shear, float(zx))
+        for key, value in zip(table, values, strict=True):
+            table[key].append(value)
+    return table
+
+
+def figure_4(body: Body | None = None) -> dict[str, tuple[Bench, Array, Array]]:
+    """Section 3: the body under shear only, and under a normal stress that varies linearly along x; 10 kPa each.
+
+    {name: (bench, displacement (2, nodes) m, sigma_zz (elements,) Pa)}
+    """
+    bench = Bench(body or Body())
+    found = {}
+    for name in ("zx", "zz_x"):
+        mode = PLANE.names.index(name)
+        stress = 1e4 * PLANE.stress[mode][np.ix_((0, 2), (0, 2))]
+        gradient = 1e4 * PLANE.gradient[mode][np.ix_((0, 2), (0, 2), (0, 2))]
+        found[name] = (bench, *bench.loaded(stress, gradient))
+    return found

@@ -1,0 +1,215 @@
+"""Bags (rosbag2 folders, or one .mcap or .db3 file) read without ROS. All that can be wrong with one is a `BagError`."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import apsw
+import numpy as np
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from ..core.calibration import Calibration
+from ..core.errors import BagError, CalibrationError, ConfigError, CubeError, MessageError
+from ..core.pipeline import Pipeline
+from . import cdr
+from .share import share
+from .yaml import parse_yaml
+
+PACKAGE = "cube_tensor_driver"
+FREQUENCIES, STRESS, INFO = (f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo"))
+VERSIONS = (1,)
+"""Of SkinInfo that this package reads. An older one that is not among them has to be converted here."""
+BATCH = 64
+"""Messages at a time: what numpy costs per call no longer counts, and they fit the cache."""
+# What rosbags and the libraries below it let through where bytes are not what they should be.
+DAMAGE = (ReaderError, SerdeError, TypesysError, apsw.Error, struct.error, ValueError, LookupError, TypeError,
+          AttributeError, AssertionError, ArithmeticError, MemoryError, EOFError, RecursionError)  # fmt: skip
+
+
+@contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """What goes wrong inside with the bag `path` is a BagError; errors of our own pass."""
+    try:
+        yield
+    except CubeError:
+        raise
+    except FileNotFoundError as error:
+        if path.is_dir() and not (path / "metadata.yaml").exists():
+            raise BagError(f"{path}: no metadata.yaml: no bag, or a recording that was cut off; "
+                           f"./cube bag repair {path} makes the latter readable") from None  # fmt: skip
+        raise BagError(f"{path}: {error.strerror or 'no such file or folder'}; name a bag") from None
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
+    except DAMAGE as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise BagError(f"{path}: damaged, or no bag ({text[:200]}); ./cube bag repair may help if it was cut off") from None
+
+
+@lru_cache
+def typestore() -> Typestore:
+    """The message types of ROS 2 Jazzy and of this package, as they are today."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for path in sorted((share() / "msg").glob("*.msg")):
+        types |= get_types_from_msg(path.read_text(), f"{PACKAGE}/msg/{path.stem}")
+    store.register(types)
+    return store
+
+
+class Entry(NamedTuple):
+    """A message of a bag: topic, type, when it was recorded in ns, serialised bytes."""
+
+    topic: str
+    msgtype: str
+    time_ns: int
+    data: bytes
+
+
+class Bag:
+    """A bag open for reading; a context. Types are read as the bag itself defines them."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with damage(path):
+            self._reader = Reader(path)
+
+    def __enter__(self) -> Bag:
+        with damage(self.path):
+            self._reader.open()
+            self._types = self._own_types()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()
+
+    @property
+    def connections(self) -> list[Connection]:
+        return self._reader.connections
+
+    @property
+    def start_ns(self) -> int:
+        """When the earliest message was recorded."""
+        return self._reader.start_time
+
+    @property
+    def end_ns(self) -> int:
+        """When the latest message was recorded."""
+        return self._reader.end_time - 1
+
+    def topics(self, msgtype: str) -> list[str]:
+        """Topics of a type."""
+        return sorted({connection.topic for connection in self.connections if connection.msgtype == msgtype})
+
+    def skin(self) -> str:
+        """What its topics begin with, ending in /. BagError: no skin, or several."""
+        found = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
+        if len(found) != 1:
+            raise BagError(f"{self.path}: {len(found)} topics of {FREQUENCIES} ({', '.join(found) or 'none'}); needed is one")
+        return found[0]
+
+    def entries(self, topics: set[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[Entry]:
+        """Messages from start_ns until before stop_ns, of some topics or all, in the order of recording."""
+        wanted = [c for c in self.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        with damage(self.path):
+            for connection, time_ns, data in self._reader.messages(wanted, start_ns, stop_ns):
+                yield Entry(connection.topic, connection.msgtype, time_ns, data)
+
+    def decode(self, entry: Entry) -> Any:
+        """The message. BagError: its bytes do not fit its type."""
+        with damage(self.path):
+            return self._types.deserialize_cdr(entry.data, entry.msgtype)
+
+    def infos(self, topic: str) -> list[Any]:
+        """The SkinInfo messages of a topic. BagError: none, or a version that cannot be read."""
+        infos = [self.decode(entry) for entry in self.entries({topic})]
+        if not infos:
+            raise BagError(f"{self.path}: no message on {topic}: the bag does not say what its frequencies mean. Record "
+                           f"{topic} too, or give --skin FILE")  # fmt: skip
+        for info in infos:
+            if info.version not in VERSIONS:
+                older = "older than" if info.version < min(VERSIONS) else "newer than"
+                raise BagError(f"{self.path}: {topic} has version {info.version}, {older} the {VERSIONS} that this package "
+                               "reads; use the package it was recorded with, or a newer one")  # fmt: skip
+        return infos
+
+    def batches(self, topic: str) -> Iterator[tuple[cdr.Batch, list[Entry]]]:
+        """Frequencies or stress, in order, as many messages of one shape at a time as follow each other, at most BATCH.
+
+        MessageError: a message contradicts itself.
+        """
+        stress = topic in self.topics(STRESS)
+        find, read = (cdr.stress_shape, cdr.read_stress) if stress else (cdr.frequencies_shape, cdr.read_frequencies)
+        waiting: list[Entry] = []
+        shape = None
+        for entry in self.entries({topic}):
+            try:
+                found = find(entry.data)
+            except MessageError as error:
+                raise BagError(f"{self.path}: {topic}: {error}") from None
+            if waiting and (found != shape or len(waiting) == BATCH):
+                yield self._batch(read, waiting, shape)
+                waiting = []
+            shape = found
+            waiting.append(entry)
+        if waiting:
+            yield self._batch(read, waiting, shape)
+
+    def _batch(self, read: Any, entries: list[Entry], shape: Any) -> tuple[cdr.Batch, list[Entry]]:
+        try:
+            return read([entry.data for entry in entries], shape), entries
+        except MessageError as error:
+            raise BagError(f"{self.path}: {entries[0].topic}: {error}") from None
+
+    def _own_types(self) -> Typestore:
+        types: dict[str, Any] = {}
+        for connection in self.connections:
+            if connection.msgdef.format == MessageDefinitionFormat.MSG and connection.msgtype.startswith(PACKAGE):
+                types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
+        if not types:
+            return typestore()
+        store = get_typestore(Stores.ROS2_JAZZY)
+        store.register({name: types[name] for name in types if name.startswith(PACKAGE)})
+        return store
+
+
+def calibrations(info: Any) -> list[Calibration]:
+    """The calibration of each cube of a SkinInfo, of rclpy or of a bag. BagError: missing, or damaged."""
+    texts = dict(zip(info.calibration_ids, info.calibrations, strict=False))
+    known: dict[str, Calibration] = {}
+    try:
+        for name in {cube.calibration_id for cube in info.cubes}:
+            known[name] = Calibration.from_dict(parse_yaml(texts[name], f"calibration {name}"))
+    except (CalibrationError, ConfigError) as error:
+        raise BagError(f"info of the skin {info.name}: {error}") from None
+    except KeyError as error:
+        raise BagError(f"info of the skin {info.name}: no calibration {error}, which a cube uses") from None
+    return [known[cube.calibration_id] for cube in info.cubes]
+
+
+def pipeline(info: Any) -> Pipeline:
+    """The pipeline that made the stress under a SkinInfo, rest frequencies as they were after tare."""
+    made = Pipeline(calibrations(info), np.float32)
+    made.rest_frequency = rest_frequency(info, made)
+    return made
+
+
+def rest_frequency(info: Any, of: Pipeline) -> np.ndarray:
+    """(cubes, P) in Hz of a SkinInfo. BagError: not one per pad."""
+    rest = of.rest_frequency
+    for row, cube, calibration in zip(rest, info.cubes, of.calibrations, strict=True):
+        if len(cube.rest_frequency) != calibration.layout.n_pads:
+            raise BagError(f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} rest frequencies, "
+                           f"its layout {calibration.layout.name} has {calibration.layout.n_pads} pads")  # fmt: skip
+        row[: len(cube.rest_frequency)] = cube.rest_frequency
+    return rest

@@ -1,0 +1,151 @@
+"""Batch messages as numpy records: serialised messages of one shape are one array, read and made without a loop.
+
+A message of so many rows, pads and letters in its frame id always has the same bytes in the same places (CDR,
+little-endian, OMG DDS-XTypes 7.4.1), so a record type says where every field is. Does not import ROS.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import MessageError
+from ..core.modes import COMPONENTS, STRESS
+
+SECOND = 1_000_000_000
+LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+_START = len(LITTLE_ENDIAN)
+_FIRST_COUNT = _START + 8  # after sec and nanosec: length of the frame id
+# What follows the header: name, type, width of a row (0: one value of the message).
+_FREQUENCIES = (("cube", "u2", 1), ("sequence", "u4", 1), ("time_offset", "i4", 1), ("n_pads", "u1", 0),
+                ("frequency", "f4", -1), ("temperature", "f4", 1), ("pad_fault", "u4", 1))  # fmt: skip
+_STRESS = (("cube", "u2", 1), ("sequence", "u4", 1), ("time_offset", "i4", 1), ("stress", "f4", len(STRESS)),
+           ("gradient", "f4", len(COMPONENTS) - len(STRESS)), ("residual", "f4", 1), ("status", "u2", 1),
+           ("observed", "u2", 1))  # fmt: skip
+
+
+class Shape(NamedTuple):
+    """What fixes a message's bytes: length of the frame id with its closing zero, rows, pads of a row."""
+
+    frame: int
+    rows: int
+    pads: int
+
+
+class Batch(NamedTuple):
+    """B messages of one shape. stamp_ns (B,); fields as in the message file, (B, rows) or (B, rows, width), views."""
+
+    shape: Shape
+    stamp_ns: NDArray[np.int64]
+    field: NDArray[Any]
+
+    @property
+    def times_ns(self) -> NDArray[np.int64]:
+        """(B, rows) when each row was sampled."""
+        times: NDArray[np.int64] = self.stamp_ns[:, None] + self.field["time_offset"].astype(np.int64)
+        return times
+
+
+@lru_cache(maxsize=256)
+def _record(fields: tuple[tuple[str, str, int], ...], shape: Shape) -> np.dtype[Any]:
+    """The record type of a shape. Counts of sequences are fields named `n of` them."""
+    names, formats, offsets = ["encapsulation", "sec", "nanosec", "n of frame_id", "frame_id"], [], []
+    formats = ["S4", "<i4", "<u4", "<u4", f"V{shape.frame}"]
+    offsets = [0, _START, _START + 4, _FIRST_COUNT, _FIRST_COUNT + 4]
+    place = _FIRST_COUNT + 4 + shape.frame
+    for name, kind, width in fields:
+        item = np.dtype(f"<{kind}")
+        if width:
+            place = -(-place // 4) * 4
+            names.append(f"n of {name}")
+            formats.append("<u4")
+            offsets.append(place)
+            place += 4
+        names.append(name)
+        offsets.append(place)
+        columns = shape.pads if width < 0 else width
+        formats.append((f"<{kind}", () if not width else (shape.rows,) if width == 1 else (shape.rows, columns)))  # type: ignore[arg-type]
+        place += item.itemsize * (shape.rows * columns if width else 1)
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": place})
+
+
+def frequencies_shape(data: bytes) -> Shape:
+    """Shape of a serialised SkinFrequencies. MessageError: too short, or its fields contradict each other."""
+    frame, rows = _begin(data)
+    record = _record(_FREQUENCIES, Shape(frame, rows, 0))
+    place = record.fields["n_pads"][1]  # type: ignore[index]
+    return _checked(data, _FREQUENCIES, Shape(frame, rows, data[place] if place < len(data) else 0))
+
+
+def stress_shape(data: bytes) -> Shape:
+    """Shape of a serialised SkinStress. MessageError: too short, or its fields contradict each other."""
+    return _checked(data, _STRESS, Shape(*_begin(data), 0))
+
+
+def read_frequencies(data: Sequence[bytes], shape: Shape) -> Batch:
+    """Serialised SkinFrequencies of one shape. MessageError: fields contradict each other."""
+    return _read(data, _FREQUENCIES, shape)
+
+
+def read_stress(data: Sequence[bytes], shape: Shape) -> Batch:
+    """Serialised SkinStress of one shape. MessageError: fields contradict each other."""
+    return _read(data, _STRESS, shape)
+
+
+def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]]) -> list[bytes]:
+    """The serialised SkinStress of each SkinFrequencies of a batch.
+
+    rows: stress, gradient, residual, status, observed of all rows of the batch in order, as a pipeline gives them.
+    """
+    record = _record(_STRESS, batch.shape._replace(pads=0))
+    out = np.zeros(len(batch.field), record)
+    for name in ("encapsulation", "sec", "nanosec", "frame_id", "cube", "sequence", "time_offset"):
+        out[name] = batch.field[name]
+    out["n of frame_id"] = batch.shape.frame
+    for (name, _, width), values in zip(_STRESS[3:], rows, strict=True):
+        out[name] = np.reshape(values, out[name].shape)
+    for name, _, width in _STRESS:
+        out[f"n of {name}"] = batch.shape.rows * width
+    whole, size = out.tobytes(), record.itemsize
+    return [whole[at : at + size] for at in range(0, len(whole), size)]
+
+
+def _begin(data: bytes) -> tuple[int, int]:
+    """Length of the frame id, number of rows."""
+    if len(data) < _FIRST_COUNT + 8 or data[:2] != LITTLE_ENDIAN[:2]:
+        raise MessageError(f"a batch message of {len(data)} bytes that begin with {data[:4].hex()}: not little-endian CDR")
+    (frame,) = struct.unpack_from("<I", data, _FIRST_COUNT)
+    place = -(-(_FIRST_COUNT + 4 + frame) // 4) * 4
+    if place + 4 > len(data):
+        raise MessageError(f"a batch message of {len(data)} bytes says its frame id has {frame}: damaged")
+    return frame, struct.unpack_from("<I", data, place)[0]
+
+
+def _checked(data: bytes, fields: tuple[tuple[str, str, int], ...], shape: Shape) -> Shape:
+    # Middleware may fill up to four bytes at the end; the bound on rows comes before a record type is made.
+    if shape.rows <= len(data) and 0 <= len(data) - _record(fields, shape).itemsize < 4:
+        return shape
+    raise MessageError(
+        f"a batch message of {len(data)} bytes says it has {shape.rows} rows of {shape.pads} pads: damaged, or of another "
+        "version of the messages"
+    )
+
+
+def _read(data: Sequence[bytes], fields: tuple[tuple[str, str, int], ...], shape: Shape) -> Batch:
+    record = _record(fields, shape)
+    size = record.itemsize
+    whole = b"".join(data if len(data[0]) == size else [one[:size] for one in data])
+    field = np.frombuffer(whole, record)
+    for name, _, width in fields:
+        if width:
+            expected = shape.rows * (shape.pads if width < 0 else width)
+            wrong = field[f"n of {name}"] != expected
+            if wrong.any():
+                found = int(field[f"n of {name}"][wrong][0])
+                raise MessageError(f"a message of {shape.rows} rows has {found} values of {name}, they need {expected}")
+    return Batch(shape, field["sec"].astype(np.int64) * SECOND + field["nanosec"], field)

@@ -1,0 +1,285 @@
+"""./cube bench: what the core and the whole chain cost, against bare floors measured in the same run."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import rclpy
+from numpy.typing import NDArray
+from rclpy.signals import SignalHandlerOptions
+from rich.console import Console
+from rich.progress import Progress
+
+from cube_tensor_driver.msg import SkinStress
+
+from ..core.calibration import illustrative
+from ..core.errors import ConfigError, CubeError
+from ..core.oscillator import pad_frequency
+from ..core.pipeline import Pipeline
+from ..files.grid import grid
+from ..files.skin import Skin, read_skin
+from ..files.yaml import write_yaml
+from ..ros.children import Children
+from ..ros.node import make_executor, queue
+from ..ros.start import Process, skin_processes
+from .plots import draw_scale, save
+
+CALIBRATION, LAYOUT, PITCH, CUBES_PER_HUB, INSTANTS = "planar", "planar", 0.012, 80, 16
+ROUNDS = 400
+FIRST_S, SETTLE_S, DRAIN_S = 30.0, 1.0, 1.0
+
+
+def bench_pipeline(cubes: int, json_path: Path | None) -> int:
+    """Time the pipeline and the same law and matrix product in bare numpy, in turn."""
+    calibration = illustrative(LAYOUT)
+    rng = np.random.default_rng(0)
+    result: dict[str, object] = {"cubes": cubes}
+    for dtype in (np.float32, np.float64):
+        pipeline = Pipeline([calibration] * cubes, dtype)
+        cube = np.arange(cubes)
+        state = rng.normal(0, 5e3, (cubes, 7))
+        law = calibration.rest_frequency, calibration.beta, calibration.modulus
+        frequency = pad_frequency(state @ calibration.response.T, *law).astype(dtype)
+        rest = np.tile(calibration.rest_frequency, (cubes, 1)).astype(dtype)
+        matrix = rng.normal(size=(8, 16)).astype(dtype)
+        beta = dtype(calibration.beta[0])
+
+        def floor(frequency: Any = frequency, rest: Any = rest, beta: Any = beta, matrix: Any = matrix) -> None:
+            ratio = frequency / rest
+            ((ratio - 1) / (1 + beta * (1 - ratio))) @ matrix
+
+        def ours(pipeline: Any = pipeline, cube: Any = cube, frequency: Any = frequency) -> None:
+            pipeline.process(cube, frequency)
+
+        ours_us, floor_us = _interleaved(ours, floor)
+        result[np.dtype(dtype).name] = {"pipeline_us": ours_us, "floor_us": floor_us, "ratio": ours_us / floor_us}
+    _report(result, json_path)
+    return 0
+
+
+def _interleaved(first: Callable[[], None], second: Callable[[], None]) -> tuple[float, float]:
+    """Medians in µs of two functions called in turn."""
+    times: tuple[list[float], list[float]] = ([], [])
+    for _ in range(ROUNDS):
+        for run, kept in zip((first, second), times, strict=True):
+            start = time.perf_counter()
+            run()
+            kept.append(1e6 * (time.perf_counter() - start))
+    return statistics.median(times[0]), statistics.median(times[1])
+
+
+class Tally:
+    """Counts what arrives, per hub and sequence number, without keeping the rows."""
+
+    def __init__(self, skin: Skin) -> None:
+        links = [link.name for link in skin.links]
+        link_of = np.array([links.index(cube.link or links[0]) for cube in skin.cubes])
+        self._first = np.zeros(len(skin.cubes), bool)
+        self._first[np.unique(link_of, return_index=True)[1]] = True
+        self._link_of = link_of
+        self.rows = 0
+        self._arrived: list[tuple[NDArray[Any], NDArray[Any], int]] = []
+
+    def take(self, message: SkinStress) -> None:
+        received_ns = time.time_ns()
+        cube = np.frombuffer(message.cube, np.uint16)
+        first = self._first[cube]
+        sequence = np.frombuffer(message.sequence, np.uint32)[first]
+        self._arrived.append((self._link_of[cube[first]], sequence, received_ns))
+        self.rows += len(cube)
+
+    def result(self, book: dict[str, Any], start_ns: int, end_ns: int) -> dict[str, object]:
+        """Rows sent and received of samples taken from start_ns to end_ns (wall clock), latencies in ms."""
+        sent = received = 0
+        latency = []
+        link = np.concatenate([part[0] for part in self._arrived])
+        sequence = np.concatenate([part[1] for part in self._arrived]).astype(np.int64)
+        arrival = np.repeat([part[2] for part in self._arrived], [len(part[0]) for part in self._arrived])
+        for number, entry in enumerate(book["links"].values()):
+            members = sum(cube >= 0 for cube in entry["cubes"])
+            for run in entry["runs"]:
+                begin_ns = book["start_time_ns"] + 1000 * run["start_us"]
+                times = begin_ns + 1000 * run["period_us"] * np.arange(run["last"] - run["first"] + 1)
+                inside = (times >= start_ns) & (times < end_ns)
+                sent += members * int(inside.sum())
+                mine = (link == number) & (sequence >= run["first"]) & (sequence <= run["last"])
+                place, at = np.unique(sequence[mine] - run["first"], return_index=True)
+                kept = inside[place]
+                received += members * int(kept.sum())
+                latency.append(1e-6 * (arrival[mine][at][kept] - times[place[kept]]))
+        values = np.concatenate(latency)
+        p50, p99 = np.percentile(values, [50, 99]) if len(values) else (math.nan, math.nan)
+        return {
+            "samples_sent": sent,
+            "tensors_received": received,
+            "lost": sent - received,
+            "skipped": sum(entry["dropped"] for entry in book["links"].values()),
+            "latency_p50_ms": round(float(p50), 3),
+            "latency_p99_ms": round(float(p99), 3),
+        }
+
+
+def bench_echo(cubes: int, rate: float, duration: float, json_path: Path | None) -> int:
+    """The bare floor alone: source → echo → receive."""
+    with _ros(), Progress(console=Console(stderr=True)) as progress:
+        result = _echo(cubes, rate, duration, progress)
+    _report({"cubes": cubes, "rate_hz": rate, "duration_s": duration, **result}, json_path)
+    return 0
+
+
+def bench_skin(cubes: int, rate: float, duration: float, composed: bool, json_path: Path | None) -> int:
+    """The whole chain, the floor before and after it in the same run."""
+    with _ros(), Progress(console=Console(stderr=True)) as progress:
+        result = _skin_and_echo(cubes, rate, duration, composed, progress)
+    _report(result, json_path)
+    return 0
+
+
+def bench_scale(counts: list[int], rate: float, duration: float, json_path: Path | None, figure: Path) -> int:
+    """CPU and latency per frame for growing skins, as table and picture."""
+    with _ros(), Progress(console=Console(stderr=True)) as progress:
+        rows = [_skin_and_echo(cubes, rate, duration, False, progress) for cubes in counts]
+    _report({"rate_hz": rate, "duration_s": duration, "skins": rows}, json_path)
+    save(draw_scale(rows), figure)
+    return 0
+
+
+def _skin_and_echo(cubes: int, rate: float, duration: float, composed: bool, progress: Progress) -> dict[str, Any]:
+    before = _echo(cubes, rate, duration / 2, progress)
+    skin = _skin(cubes, rate, duration, composed, progress)
+    after = _echo(cubes, rate, duration / 2, progress)
+    echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
+    total = sum(value for name, value in skin.items() if name.startswith("cpu_") and "simulator" not in name)
+    return {
+        "cubes": cubes,
+        "rate_hz": rate,
+        "duration_s": duration,
+        **skin,
+        "echo_cpu_percent": round(echo, 1),
+        "ratio_to_echo": round(total / echo, 3),
+    }
+
+
+def _skin(cubes: int, rate: float, duration: float, composed: bool, progress: Progress) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
+        folder = Path(name)
+        path = folder / "skin.yaml"
+        hubs = math.ceil(cubes / CUBES_PER_HUB)
+        write_yaml(path, grid("skin", cubes, 1, PITCH, hubs, CALIBRATION, LAYOUT, rate, "/dev/ttyACM{}"))
+        book = folder / "book.json"
+        processes = skin_processes(
+            path, composed=composed, simulated_ports=folder / "ports", book=book, instants=INSTANTS
+        )
+        tally = Tally(read_skin(path))
+        with Children(folder) as children:
+            begun = time.monotonic()
+            cpu, memory, span = _measure(processes, children, tally, rate, duration, progress, f"skin of {cubes} cubes")
+            started = span[2] - begun
+            children.end(["simulator"])
+            result = tally.result(json.loads(book.read_text()), span[0], span[1])
+        names = [process.executable for process in processes]
+        return {
+            **result,
+            **{f"cpu_{executable}_percent": round(cpu[executable], 1) for executable in names},
+            "rss_mb": round(max(value for executable, value in memory.items() if executable != "simulator"), 1),
+            "first_tensor_s": round(started, 2),
+        }
+
+
+def _echo(cubes: int, rate: float, duration: float, progress: Progress) -> dict[str, float]:
+    parameters: dict[str, Any] = {"cubes": cubes, "rate": float(rate)}
+    processes = [
+        Process(role, "cube_tensor_driver.ros.echo", parameters=parameters, arguments=(role,))
+        for role in ("echo", "source")
+    ]
+
+    class Count:
+        rows = 0
+
+        def take(self, message: SkinStress) -> None:
+            self.rows += len(message.cube)
+
+    with tempfile.TemporaryDirectory(prefix="cube_bench_") as name, Children(Path(name)) as children:
+        count = Count()
+        cpu, _, _ = _measure(processes, children, count, rate, duration, progress, f"echo of {cubes} cubes")
+    return {"echo_cpu_percent": round(cpu["echo"] + cpu["source"], 1)}
+
+
+def _measure(
+    processes: list[Process], children: Children, tally: Any, rate: float, duration: float, progress: Progress, what: str
+) -> tuple[dict[str, float], dict[str, float], tuple[int, int, float]]:
+    """Start processes, wait for the first tensors, let them settle, measure for `duration`.
+
+    Returns CPU in percent and memory in MB per process, and (start ns, end ns, monotonic time of the first tensor).
+    """
+    for process in processes:
+        children.start(process)
+    node = rclpy.create_node("bench")
+    executor = make_executor()
+    node.create_subscription(SkinStress, "stress", tally.take, queue(rate))
+    executor.add_node(node)
+    task = progress.add_task(what, total=duration)
+
+    def spin(seconds: float, done: Callable[[], bool] = lambda: False) -> None:
+        until = time.monotonic() + seconds
+        while not done() and (left := until - time.monotonic()) > 0:
+            executor.spin_once(timeout_sec=min(left, 0.2))
+
+    try:
+        spin(FIRST_S, lambda: tally.rows > 0)
+        children.check()
+        if not tally.rows:
+            logs = "\n".join(children.log(process.executable)[-800:] for process in processes)
+            raise CubeError(f"{what}: no tensor after {FIRST_S:g} s\n{logs}")
+        first = time.monotonic()
+        spin(SETTLE_S)
+        watched = {p.executable: psutil.Process(children.pid(p.executable)) for p in processes}
+        cpu = {name: _cpu(process) for name, process in watched.items()}
+        start_ns, start = time.time_ns(), time.monotonic()
+        while time.monotonic() - start < duration:
+            spin(min(0.5, duration - (time.monotonic() - start)))
+            progress.update(task, completed=time.monotonic() - start)
+        children.check()
+        end_ns, seconds = time.time_ns(), time.monotonic() - start
+        used = {name: 100 * (_cpu(process) - cpu[name]) / seconds for name, process in watched.items()}
+        memory = {name: process.memory_info().rss / 2**20 for name, process in watched.items()}
+        spin(DRAIN_S)
+    finally:
+        executor.remove_node(node)
+        node.destroy_node()
+        progress.remove_task(task)
+    return used, memory, (start_ns, end_ns, first)
+
+
+def _cpu(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+class _ros:
+    """rclpy for the length of a block."""
+
+    def __enter__(self) -> None:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+
+    def __exit__(self, *_: object) -> None:
+        rclpy.try_shutdown()
+
+
+def _report(result: dict[str, Any], path: Path | None) -> None:
+    text = json.dumps(result, indent=2)
+    print(text)
+    if path is not None:
+        try:
+            path.write_text(text + "\n")
+        except OSError as error:
+            raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None
