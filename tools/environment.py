@@ -29,7 +29,7 @@ INSTALL = STATE / "install" / "cube_tensor_driver"
 LOCK = ROOT / "tools" / "requirements.lock"
 OLDEST_DISTRO = "jazzy"
 # Folders that are installed as links to their files: a change in a file needs no build, a new file does.
-LINKED = ("cube_tensor_driver", "launch", "config", "scripts")
+LINKED = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
 # Module to import -> rosdep key, for what a sourced ROS 2 does not bring along by itself.
 NEEDED = {
     "rclpy": "rclpy",
@@ -168,7 +168,7 @@ def make_venv() -> None:
                 print(f"\r\033[K      {text}", end="", file=sys.stderr, flush=True)
 
         pip = [str(VENV / "bin/python"), "-m", "pip", "install", "--no-deps", "--require-hashes", "--no-input",
-               "--disable-pip-version-check", "--progress-bar=off", "-r", str(LOCK)]  # fmt: skip
+               "--disable-pip-version-check", "--progress-bar=off", "--no-binary=cobs", "-r", str(LOCK)]  # fmt: skip
         run(pip, clean | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}, STATE / "pip.log", progress)
         if sys.stderr.isatty():
             print("\r\033[K", end="", file=sys.stderr, flush=True)

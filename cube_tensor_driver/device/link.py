@@ -31,6 +31,8 @@ from .protocol import Decoder, Hello
 from .tcp import Connecting, parse_url
 
 READ_CHUNK = 1 << 16
+TTY_READ = 4095
+"""The kernel gives at most so much of a tty in one read; less means that there was no more, without asking again."""
 READ_LIMIT = 1 << 18
 """Bytes taken from one link per wake-up; a link that floods leaves the others their turn."""
 OUT_LIMIT = 4096
@@ -154,6 +156,8 @@ class Link:
                     raise OSError(errno.EIO, "end of stream")
                 chunks.append(chunk)
                 size += len(chunk)
+                if len(chunk) < TTY_READ:
+                    break
         except BlockingIOError:
             pass
         except OSError as error:
