@@ -46,11 +46,12 @@ class Scan:
     """Gathers the samples of all links between two messages.
 
     rows: delivered so far; unknown_cube, wrong_pads: rows left out because the skin does not have the cube, or has it
-    with another number of pads; added: all rows that came in.
+    with another number of pads; added: all rows that came in; uids: of the skin's cubes, as the hubs say.
     """
 
     def __init__(self, n_links: int, places: Sequence[Place]) -> None:
         self.rows = self.unknown_cube = self.wrong_pads = self.added = 0
+        self.uids: dict[int, int] = {}
         self.n_pads = max(place.n_pads for place in places)
         self._places = tuple(places)
         self._pads = np.array([place.n_pads for place in places])
@@ -93,6 +94,8 @@ class Scan:
             uid = int(frame.cube_uids[stranger])
             problems.append(f"the hub's cube {stranger} (uid {uid:#x}) is not in the skin file")
         self._cubes[link] = cubes
+        found = {int(cube): int(frame.cube_uids[index]) for index, cube in enumerate(cubes) if cube >= 0}
+        self.uids = {**self.uids, **found}
         return problems
 
     def live(self, link: int, live: bool) -> None:

@@ -69,7 +69,7 @@ class Echo(CubeNode):
 def main() -> None:
     import sys
 
-    run(Source if "source" in sys.argv else Echo)
+    run(lambda: [Source() if "source" in sys.argv else Echo()])
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -144,9 +146,19 @@ def wrench_message(header: Header, force_n: NDArray[np.float64], torque_nm: NDAr
     return message
 
 
-def info_message(skin: Skin, pipeline: Pipeline, stamp_ns: int) -> SkinInfo:
-    """What is fixed about a skin, with the rest frequencies that the pipeline uses now."""
-    message = SkinInfo(version=SkinInfo.VERSION, name=skin.name)
+def info_message(
+    skin: Skin,
+    pipeline: Pipeline,
+    stamp_ns: int,
+    uids: Mapping[int, int] = MappingProxyType({}),
+    sender: str = "reconstruction",
+) -> SkinInfo:
+    """What is fixed about a skin, with the rest frequencies that the pipeline uses now.
+
+    uids: of cubes by their index in the skin, as their hubs say, where the skin file does not. sender: driver or
+    reconstruction.
+    """
+    message = SkinInfo(version=SkinInfo.VERSION, name=skin.name, sender=sender)
     message.header = Header(stamp=to_time(stamp_ns), frame_id=skin.parent_frame)
     rest_frequency = pipeline.rest_frequency
     covariance = []
@@ -163,7 +175,7 @@ def info_message(skin: Skin, pipeline: Pipeline, stamp_ns: int) -> SkinInfo:
                 pose=pose,
                 link=cube.link or "",
                 index=cube.index or 0,
-                uid=cube.uid or 0,
+                uid=cube.uid or uids.get(number, 0),
                 layout=calibration.layout.name,
                 pads=list(calibration.layout.pads),
                 half_side=calibration.half_side,

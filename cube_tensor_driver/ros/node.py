@@ -6,13 +6,13 @@ import contextlib
 import math
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from lifecycle_msgs.msg import State
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -43,10 +43,30 @@ def queue(rate: float | None, reliability: str = "reliable") -> QoSProfile:
 class CubeNode(LifecycleNode):
     """A lifecycle node whose errors are one line in the log and a transition that fails, never a traceback."""
 
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.configured = False
+        self._choices: dict[str, str] = {}
+        self._live: set[str] = set()
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
+
     def declare(
-        self, name: str, default: Any, description: str, span: tuple[float, float] | None = None, choices: str = ""
+        self,
+        name: str,
+        default: Any,
+        description: str,
+        span: tuple[float, float] | None = None,
+        choices: str = "",
+        live: bool = False,
     ) -> None:
-        """Declare a parameter; span bounds a number, choices (words separated by commas) a text."""
+        """Declare a parameter; span bounds a number, choices (words separated by commas) a text.
+
+        live: it may change while the node is configured, see `changed`; others are refused then.
+        """
+        self._choices[name] = choices
+        if live:
+            self._live.add(name)
         descriptor = ParameterDescriptor(
             description=description, additional_constraints=choices and f"one of: {choices}"
         )
@@ -63,6 +83,28 @@ class CubeNode(LifecycleNode):
 
     def value(self, name: str) -> Any:
         return self.get_parameter(name).value
+
+    def changed(self, name: str) -> None:
+        """A live parameter has a new value."""
+
+    def _check_parameters(self, parameters: list[Any]) -> SetParametersResult:
+        for parameter in parameters:
+            name, choices = parameter.name, self._choices.get(parameter.name, "")
+            if choices and parameter.value not in choices.split(", "):
+                reason = f"parameter {name} is {parameter.value!r}, allowed: {choices}"
+                return SetParametersResult(successful=False, reason=reason)
+            if isinstance(parameter.value, float) and not math.isfinite(parameter.value):
+                reason = f"parameter {name} is {parameter.value}, allowed: a finite number"
+                return SetParametersResult(successful=False, reason=reason)
+            if self.configured and name in self._choices and name not in self._live:
+                reason = f"parameter {name} cannot change while the node is configured: clean it up first (lifecycle)"
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def _take_parameters(self, parameters: list[Any]) -> None:
+        for parameter in parameters:
+            if self.configured and parameter.name in self._live:
+                self.changed(parameter.name)
 
     def attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         """Do the work of a transition; a CubeError becomes a line in the log and a failure."""
@@ -86,7 +128,9 @@ class CubeNode(LifecycleNode):
         """End what `configure` made; safe to call twice."""
 
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
-        return self.attempt(self.configure)
+        result = self.attempt(self.configure)
+        self.configured = result == TransitionCallbackReturn.SUCCESS
+        return result
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
         result: TransitionCallbackReturn = super().on_activate(state)
@@ -99,16 +143,18 @@ class CubeNode(LifecycleNode):
 
     def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
         self.cleanup()
+        self.configured = False
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
         self.deactivate()
         self.cleanup()
+        self.configured = False
         return TransitionCallbackReturn.SUCCESS
 
 
-def run(make: Callable[[], CubeNode]) -> None:
-    """Run a node until SIGINT or SIGTERM, then end it; exit code 1 when it could not be started."""
+def run(make: Callable[[], Sequence[CubeNode]]) -> None:
+    """Run nodes, started in order, until SIGINT or SIGTERM, then end them in reverse; exit code 1 when one cannot start."""
     stopping = False
 
     def stop(*_: object) -> None:
@@ -121,21 +167,22 @@ def run(make: Callable[[], CubeNode]) -> None:
     # rclpy's own handlers would end the context under a thread that publishes.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = make()
+        nodes = make()
         executor = make_executor()
-        executor.add_node(node)
-        if node.value("autostart"):
-            for transition in (node.trigger_configure, node.trigger_activate):
+        for node in nodes:
+            executor.add_node(node)
+            for transition in (node.trigger_configure, node.trigger_activate) if node.value("autostart") else ():
                 if not stopping and transition() != TransitionCallbackReturn.SUCCESS:
                     stopping, code = True, 1
         while not stopping:
             # EventsExecutor.spin() can burn a core and does not return on a signal; spin_once in the main thread does.
             with contextlib.suppress(ExternalShutdownException):
                 executor.spin_once(timeout_sec=SPIN_S)
-        node.deactivate()
-        node.cleanup()
-        executor.remove_node(node)
-        node.destroy_node()
+        for node in reversed(nodes):
+            node.deactivate()
+            node.cleanup()
+            executor.remove_node(node)
+            node.destroy_node()
     except (ParameterException, CubeError) as error:
         print(f"cube_tensor_driver: {error}", file=sys.stderr)
         code = 1

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import WrenchStamped
-from std_msgs.msg import Header
 
-from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
+from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 
 from ..core.errors import CubeError
-from ..core.pipeline import INVALID, Pipeline, StressRows
-from ..core.tensor import contact_wrench
+from ..core.pipeline import INVALID, Pipeline
 from ..files.skin import read_skin
-from .messages import Times, info_message, read_frequencies, stress_message, tensor_message, to_time, wrench_message
+from .cube_topics import CubeTopics
+from .messages import info_message, read_frequencies, stress_message, to_time
 from .node import LATCHED, CubeNode, queue, run
 
 LISTENERS_S = 0.5
@@ -23,8 +21,10 @@ LISTENERS_S = 0.5
 class Reconstruction(CubeNode):
     """Publishes `stress`, `info`, diagnostics, and per cube `cubes/<name>/stress` and `cubes/<name>/wrench`."""
 
-    def __init__(self) -> None:
+    def __init__(self, subscribes: bool = True) -> None:
+        """subscribes: False when `take` is called by a driver in the same process."""
         super().__init__("reconstruction")
+        self._subscribes = subscribes
         self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
         self.declare("config", "", "Skin file (YAML).")
         self.declare("wrench_side", 0.0, "Side of the face that wrenches refer to, m; 0: the cube's own.", (0.0, 10.0))
@@ -34,23 +34,17 @@ class Reconstruction(CubeNode):
     def configure(self) -> None:
         skin = self._skin = read_skin(self.config())
         self._pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
-        self._covariances: dict[tuple[int, int], np.ndarray] = {}
         self._rows = self._rows_before = self._invalid = self._bad_messages = 0
         quality = queue(skin.rate, self.value("qos_reliability"))
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._tensors = [
-            self.create_publisher(StressTensorStamped, f"cubes/{cube.name}/stress", 10) for cube in skin.cubes
-        ]
-        self._wrenches = [self.create_publisher(WrenchStamped, f"cubes/{cube.name}/wrench", 10) for cube in skin.cubes]
-        self._listened: tuple[list[int], list[int]] = ([], [])
-        side = float(self.value("wrench_side"))
-        self._sides = np.array([side or 2 * cube.calibration.half_side for cube in skin.cubes])
-        self._subscription = self.create_subscription(SkinFrequencies, "frequencies", self._on_frequencies, quality)
+        self._cubes = CubeTopics(self, skin, self._pipeline, self.value("wrench_side") or None)
+        if self._subscribes:
+            self._subscription = self.create_subscription(SkinFrequencies, "frequencies", self.take, quality)
         self._timers = [
             self.create_timer(1.0, self._publish_diagnostics),
-            self.create_timer(LISTENERS_S, self._find_listeners),
+            self.create_timer(LISTENERS_S, self._cubes.find_listeners),
         ]
         self._info.publish(info_message(skin, self._pipeline, self.get_clock().now().nanoseconds))
 
@@ -61,15 +55,18 @@ class Reconstruction(CubeNode):
         self._active = False
 
     def cleanup(self) -> None:
-        if hasattr(self, "_subscription"):
-            self.destroy_subscription(self._subscription)
+        if hasattr(self, "_timers"):
+            if self._subscribes:
+                self.destroy_subscription(self._subscription)
             for timer in self._timers:
                 self.destroy_timer(timer)
-            for publisher in (self._stress, self._info, self._diagnostics, *self._tensors, *self._wrenches):
+            for publisher in (self._stress, self._info, self._diagnostics):
                 self.destroy_publisher(publisher)
-            del self._subscription
+            self._cubes.close()
+            del self._timers
 
-    def _on_frequencies(self, message: SkinFrequencies) -> None:
+    def take(self, message: SkinFrequencies) -> None:
+        """Publish the tensors of one message of frequencies."""
         if not self._active:
             return
         try:
@@ -82,42 +79,7 @@ class Reconstruction(CubeNode):
         self._stress.publish(stress_message(times, rows))
         self._rows += len(times.cube)
         self._invalid += int(np.count_nonzero(rows.status & INVALID))
-        if any(self._listened):
-            self._publish_cubes(times, rows, pad_fault)
-
-    def _publish_cubes(self, times: Times, rows: StressRows, pad_fault: np.ndarray) -> None:
-        """The per-cube topics, for the cubes that somebody listens to."""
-        tensors, wrenches = self._listened
-        stamps = times.stamp_ns
-        if wrenches:
-            sent = np.isin(times.cube, wrenches) & (rows.status & INVALID == 0)
-            chosen = np.flatnonzero(sent)
-            cubes = times.cube[chosen].tolist()
-            forces, torques = contact_wrench(rows.stress[chosen], rows.gradient[chosen], self._sides[cubes][:, None])
-            for row, cube, force, torque in zip(chosen, cubes, forces, torques, strict=True):
-                self._wrenches[cube].publish(wrench_message(self._header(cube, int(stamps[row])), force, torque))
-        for row in np.flatnonzero(np.isin(times.cube, tensors)).tolist():
-            cube = int(times.cube[row])
-            header = self._header(cube, int(stamps[row]))
-            covariance = self._covariance(cube, int(pad_fault[row]))
-            self._tensors[cube].publish(tensor_message(header, rows, row, covariance))
-
-    def _header(self, cube: int, stamp_ns: int) -> Header:
-        return Header(stamp=to_time(stamp_ns), frame_id=self._skin.frame(self._skin.cubes[cube]))
-
-    def _covariance(self, cube: int, pad_fault: int) -> np.ndarray:
-        key = cube, pad_fault
-        if key not in self._covariances:
-            if len(self._covariances) > 4096:
-                self._covariances.clear()
-            self._covariances[key] = self._pipeline.covariance(cube, pad_fault)
-        return self._covariances[key]
-
-    def _find_listeners(self) -> None:
-        self._listened = tuple(  # type: ignore[assignment]
-            [number for number, publisher in enumerate(publishers) if publisher.get_subscription_count()]
-            for publishers in (self._tensors, self._wrenches)
-        )
+        self._cubes.publish(times, rows, pad_fault)
 
     def _publish_diagnostics(self) -> None:
         rate, self._rows_before = self._rows - self._rows_before, self._rows
@@ -136,7 +98,7 @@ class Reconstruction(CubeNode):
 
 
 def main() -> None:
-    run(Reconstruction)
+    run(lambda: [Reconstruction()])
 
 
 if __name__ == "__main__":

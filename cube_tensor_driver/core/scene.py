@@ -1,0 +1,186 @@
+"""What a skin looks like: quantities, colours, arrows and crosses of its cubes as plain arrays, for every viewer alike.
+
+Values are (N, 15) in the order of COMPONENTS, Pa and Pa/m, in the cubes' frames, NaN where not observed; places and
+what is drawn are in the skin's parent frame, m. Colours are (..., 3) from 0 to 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from .modes import COMPONENTS, STRESS
+from .pipeline import INVALID, StressRows
+from .tensor import principal_stresses
+
+# viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both read in grey.
+SEQUENTIAL = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
+DIVERGING = "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f"
+GREY, RED, ORANGE = (0.55, 0.55, 0.55), (0.85, 0.1, 0.1), (0.95, 0.55, 0.0)
+
+FINE, DOUBTFUL, FAULTY, STALE = range(4)
+HEALTH = ("ok", "doubtful", "no tensor", "stale")
+"""Words of `Newest.health`. Doubtful: some status bit is set; no tensor: INVALID; stale: nothing came lately."""
+MARK = np.array([GREY, ORANGE, RED, GREY])
+"""Colour of the cross over a cube by its health; a fine cube has none."""
+FALL = 0.98
+"""What an automatic range keeps of its top from one picture to the next."""
+
+
+class Places(NamedTuple):
+    """Where cubes are: position (N, 3) m, rotation (N, 3, 3) cube to parent, half_side (N,) m."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+    half_side: np.ndarray
+
+    @property
+    def pitch(self) -> float:
+        """Typical distance of neighbours in m, at least a cube's side: the measure of all that is drawn."""
+        side = 2.0 * float(np.median(self.half_side))
+        if len(self.position) < 2:
+            return 3.0 * side
+        square = (self.position**2).sum(axis=1)
+        apart = square[:, None] + square - 2 * self.position @ self.position.T
+        np.fill_diagonal(apart, np.inf)
+        return max(side, float(np.sqrt(max(0.0, np.median(apart.min(axis=1))))))
+
+
+class Newest:
+    """The newest row of each of n cubes and when it came. Time is what the caller counts, in s."""
+
+    def __init__(self, n: int) -> None:
+        self.values = np.full((n, len(COMPONENTS)), np.nan)
+        self.residual = np.full(n, np.nan)
+        self.status = np.zeros(n, np.uint16)
+        self.arrived = np.full(n, -np.inf)
+        self.count = np.zeros(n, np.int64)
+
+    def update(self, cube: np.ndarray, rows: StressRows, now: float) -> None:
+        """Take rows; of several rows of a cube the last stays, rows of cubes that we do not have are left out."""
+        ours = cube < len(self.status)
+        if not ours.all():
+            cube, rows = cube[ours], StressRows(*(column[ours] for column in rows))
+        self.values[cube, : len(STRESS)], self.values[cube, len(STRESS) :] = rows.stress, rows.gradient
+        self.residual[cube], self.status[cube], self.arrived[cube] = rows.residual, rows.status, now
+        np.add.at(self.count, cube, 1)
+
+    def health(self, now: float, stale: float) -> np.ndarray:
+        """(N,) FINE, DOUBTFUL, FAULTY or STALE; stale after so many s without a row."""
+        health = np.where(self.status != 0, DOUBTFUL, FINE)
+        health[self.status & INVALID != 0] = FAULTY
+        health[now - self.arrived > stale] = STALE
+        return health
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What can be shown as colour: name for people, unit and its size in SI, smallest top of an automatic range.
+
+    signed: colours lie about zero. of: values (N, 15), residual (N,) -> (N,) in SI.
+    """
+
+    label: str
+    unit: str
+    size: float
+    least: float
+    signed: bool
+    of: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def _component(name: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    column = COMPONENTS.index(name)
+    return lambda values, residual: values[:, column]
+
+
+def _length(*names: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    columns = [COMPONENTS.index(name) for name in names]
+
+    def of(values: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        seen = np.isfinite(values[:, columns])
+        length = np.sqrt((np.where(seen, values[:, columns], 0) ** 2).sum(axis=1))
+        return np.where(seen.any(axis=1), length, np.nan)
+
+    return of
+
+
+QUANTITIES = {
+    "pressure": Quantity("pressure −σzz", "kPa", 1e3, 500.0, False, lambda values, residual: -values[:, 2]),
+    "shear": Quantity("shear |σzx, σyz|", "kPa", 1e3, 500.0, False, _length("zx", "yz")),
+    "gradient": Quantity("gradient |∂σzz/∂x, ∂σzz/∂y|", "kPa/mm", 1e6, 1e5, False, _length("zz_x", "zz_y")),
+    **{name: Quantity(f"σ{name}", "kPa", 1e3, 500.0, True, _component(name)) for name in STRESS},
+    "residual": Quantity("residual", "σ", 1.0, 3.0, False, lambda values, residual: residual),
+}
+
+
+def automatic(quantity: Quantity, shown: np.ndarray, before: float = 0.0) -> float:
+    """Top of the range for what is shown: follows a rise at once, falls slowly from `before`, never below the least."""
+    finite = np.abs(shown[np.isfinite(shown)])
+    return max(quantity.least, FALL * before, float(finite.max(initial=0.0)))
+
+
+def colours(quantity: Quantity, shown: np.ndarray, top: float) -> np.ndarray:
+    """(N, 3) of values in SI on the range 0 .. top, or −top .. top if signed; grey where NaN."""
+    place = np.nan_to_num(shown) / top
+    table = _table(DIVERGING if quantity.signed else SEQUENTIAL)
+    at = np.clip(place / 2 + 0.5 if quantity.signed else place, 0, 1) * (len(table) - 1)
+    low = np.minimum(at.astype(int), len(table) - 2)
+    part = (at - low)[:, None]
+    return np.where(np.isfinite(shown)[:, None], (1 - part) * table[low] + part * table[low + 1], GREY)
+
+
+def _table(hexes: str) -> np.ndarray:
+    return np.array([[int(text[i : i + 2], 16) / 255 for i in (0, 2, 4)] for text in hexes.split()])
+
+
+def traction_arrows(places: Places, values: np.ndarray, length: float) -> np.ndarray:
+    """(N, 2, 3) from tail to tip: the traction σ·n on the faces +z, `length` metres per Pa; unobserved parts count as 0.
+
+    It is how the load pushes: pressing points into the skin and ends on the face, pulling begins there.
+    """
+    t = np.nan_to_num(values[:, [4, 3, 2]]) * length
+    arrow = np.einsum("nij,nj->ni", places.rotation, t)
+    face = places.position + places.rotation[:, :, 2] * places.half_side[:, None]
+    tail = np.where(t[:, 2:] < 0, face - arrow, face)
+    return np.stack([tail, tail + arrow], axis=1)
+
+
+def gradient_arrows(places: Places, values: np.ndarray, length: float) -> np.ndarray:
+    """(N, 2, 3) on the faces +z: where pressure grows, `length` metres per Pa/m; unobserved parts count as 0."""
+    g = -np.nan_to_num(values[:, [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]]) * length
+    arrow = np.einsum("nij,nj->ni", places.rotation[:, :, :2], g)
+    tail = places.position + places.rotation[:, :, 2] * (1.15 * places.half_side[:, None])
+    return np.stack([tail, tail + arrow], axis=1)
+
+
+def principal_crosses(places: Places, values: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lines (N, 3, 2, 3) along the principal stresses, `length` metres per Pa, and whether each pulls (N, 3).
+
+    Unobserved components count as 0: a planar cube shows its section's cross.
+    """
+    principal, directions = principal_stresses(np.nan_to_num(values[:, : len(STRESS)]))
+    half = np.einsum("nij,nkj->nki", places.rotation, directions) * (0.5 * length * np.abs(principal))[..., None]
+    centre = places.position[:, None] + places.rotation[:, None, :, 2] * places.half_side[:, None, None]
+    return np.stack([centre - half, centre + half], axis=2), principal > 0
+
+
+def fault_crosses(places: Places, health: np.ndarray) -> np.ndarray:
+    """(N, 2, 2, 3) two lines across the face +z of each cube that is not fine; lines of length 0 where it is."""
+    corner = np.array([[[-1, -1, 0.0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]) * 1.3
+    corner = np.where((health != FINE)[:, None, None, None], corner, 0) + (0, 0, 1.2)
+    return places.position[:, None, None] + np.einsum(
+        "nij,nabj->nabi", places.rotation, corner * places.half_side[:, None, None, None]
+    )
+
+
+def heads(arrows: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """(N, 3, 2, 3) an arrow (N, 2, 3) as shaft and two barbs, for viewers that only know lines; normal (N, 3)."""
+    tail, tip = arrows[:, 0], arrows[:, 1]
+    back = 0.25 * (tail - tip)
+    across = np.cross(back, normal + 1e-3 * np.roll(normal, 1, axis=1))  # the small part: arrows along the normal
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    across *= 0.5 * np.linalg.norm(back, axis=1, keepdims=True) / np.where(size > 0, size, 1)
+    return np.stack([arrows, np.stack([tip, tip + back + across], 1), np.stack([tip, tip + back - across], 1)], axis=1)
