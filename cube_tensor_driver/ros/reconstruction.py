@@ -42,7 +42,7 @@ class Reconstruction(CubeNode):
         self._cubes = CubeTopics(self, skin, self._pipeline, self.value("wrench_side") or None)
         if self._subscribes:
             self._subscription = self.create_subscription(SkinFrequencies, "frequencies", self.take, quality)
-        self._timers = [
+        self._own_timers = [
             self.create_timer(1.0, self._publish_diagnostics),
             self.create_timer(LISTENERS_S, self._cubes.find_listeners),
         ]
@@ -55,15 +55,15 @@ class Reconstruction(CubeNode):
         self._active = False
 
     def cleanup(self) -> None:
-        if hasattr(self, "_timers"):
+        if hasattr(self, "_own_timers"):
             if self._subscribes:
                 self.destroy_subscription(self._subscription)
-            for timer in self._timers:
+            for timer in self._own_timers:
                 self.destroy_timer(timer)
             for publisher in (self._stress, self._info, self._diagnostics):
                 self.destroy_publisher(publisher)
             self._cubes.close()
-            del self._timers
+            del self._own_timers
 
     def take(self, message: SkinFrequencies) -> None:
         """Publish the tensors of one message of frequencies."""
