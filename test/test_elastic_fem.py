@@ -2,6 +2,7 @@
 
 import json
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from cube_tensor_driver.elastic.body import Body, strip_layout
 from cube_tensor_driver.elastic.fem import calibration_from_fem, compute_response
 from cube_tensor_driver.elastic.pads import interval_weights
 from cube_tensor_driver.elastic.solid import Solid, lame, stiffness
+from cube_tensor_driver.files.calibration import read_calibration
 
 HALVES = strip_layout(LAYOUTS["planar"], 1.0)
 RIGID = float("inf")
@@ -303,3 +305,14 @@ def test_progress_counts_to_the_end():
     seen = []
     compute_response(Body(cube_young=RIGID), HALVES, meshes=2, progress=lambda *step: seen.append(step))
     assert [done for done, _, _ in seen] == list(range(9)) and seen[-1] == (8, 8, "done")
+
+
+@pytest.mark.parametrize("name, layout, body", [
+    ("planar", "planar", Body(height=60e-3)),
+    ("planar_slab", "planar", Body()),
+    ("quad", "quad", Body()),
+])  # fmt: skip
+def test_shipped_calibrations_are_what_the_code_computes(name, layout, body):
+    shipped = read_calibration(Path(__file__).parents[1] / "config" / "calibration" / f"{name}.yaml")
+    computed = compute_response(body, LAYOUTS[layout], shipped.symmetry, meshes=2).matrix
+    assert np.abs(shipped.response - computed).max() < 1e-3

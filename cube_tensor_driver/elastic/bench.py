@@ -54,16 +54,26 @@ class Run:
 
 
 class Bench:
-    """The body on the bench. cube=False replaces the cube by elastomer; finite=True is the neo-Hookean body."""
+    """The body on the bench. cube=False replaces the cube by elastomer; finite=True is the neo-Hookean body.
 
-    def __init__(self, body: Body, cube: bool = True, finite: bool = False, layout: Layout | None = None) -> None:
+    size: the longest side of an element away from the cube, in d0.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        cube: bool = True,
+        finite: bool = False,
+        layout: Layout | None = None,
+        size: float = 0.7,
+    ) -> None:
         self.body, self.cube, self.finite = body, cube, finite
         self.layout = layout or LAYOUTS["planar"]
         d0 = body.side / 2
         half = self.layout.pad_size / 2
         across = np.abs(self.layout.positions - self.layout.normals).max(axis=1)
         stops = np.unique(np.round([across - half, across + half], 9))
-        quarter = section([body.width / 2 / d0, body.height / 2 / d0], stops, 0, smallest=0.3, largest=0.7)
+        quarter = section([body.width / 2 / d0, body.height / 2 / d0], stops, 1, smallest=0.3, largest=size)
         self.mesh = mirrored(quarter)
         inside = np.all(np.abs(self.mesh.p[:, self.mesh.t].mean(axis=1)) < 1.0, axis=0)
         self.basis = skfem.Basis(self.mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=4)

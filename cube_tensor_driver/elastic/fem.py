@@ -28,7 +28,6 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 
-
 @dataclass(frozen=True, eq=False)
 class Response:
     """A computed response matrix.

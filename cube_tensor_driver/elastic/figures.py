@@ -44,23 +44,24 @@ def plot_study(result: Study, path: Path) -> None:
 
 def plot_figure_4(path: Path) -> None:
     """The z component of the normal stress around the cube, with the deformed outline and arrows of displacement."""
-    figure, axes = plt.subplots(2, 1, figsize=(9, 7), layout="constrained")
-    titles = {"zx": "(a) shear only, 10 kPa", "zz_x": "(b) normal stress that varies linearly along x, 10 kPa per d0"}
+    figure, axes = plt.subplots(2, 1, figsize=(7, 7), layout="constrained")
+    titles = {"zx": "(a) shear only, 10 kPa", "zz_x": "(b) normal stress growing along x, 10 kPa per d0"}
     for axis, (name, (bench, moved, stress)) in zip(axes, figure_4().items(), strict=True):
         d0 = bench.body.side / 2
-        window = 4 * d0
+        window = 6 * d0
         near = np.abs(bench.mesh.p[0]) * d0 < window
-        scale = 0.15 * d0 / np.hypot(*moved[:, np.all(np.abs(bench.mesh.p) < 2, axis=0)]).max()
+        scale = 0.4 * d0 / np.hypot(*moved[:, near]).max()
         at = 1e3 * (d0 * bench.mesh.p + scale * moved)
         limit = np.percentile(np.abs(stress[near[bench.mesh.t].all(axis=0)]), 98) / 1e3
         image = axis.tripcolor(at[0], at[1], bench.mesh.t.T, stress / 1e3, cmap="RdBu_r", vmin=-limit, vmax=limit)
-        few = near & (np.round(2 * bench.mesh.p) == 2 * bench.mesh.p).all(axis=0)
-        axis.quiver(*at[:, few], *moved[:, few], color="0.2", width=0.0015)
+        ring = np.abs(bench.mesh.p).max(axis=0)
+        grid = np.mgrid[-5:5.1:1, -2.5:2.6:1].reshape(2, -1, 1).swapaxes(0, 1)
+        few = [np.argmin(np.hypot(*(bench.mesh.p - point))) for point in grid]
+        axis.quiver(*at[:, few], *moved[:, few], color="0.25", width=0.002, angles="xy")
         corners = 1e3 * d0 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
         axis.plot(*corners, "k:", linewidth=0.8)
-        faces = bench.mesh.p[:, np.isclose(np.abs(bench.mesh.p).max(axis=0), 1)]
-        order = np.argsort(np.arctan2(*faces[::-1]))
-        outline = at[:, np.isclose(np.abs(bench.mesh.p).max(axis=0), 1)][:, order]
+        face = np.flatnonzero(np.isclose(ring, 1))
+        outline = at[:, face[np.argsort(np.arctan2(*bench.mesh.p[::-1, face]))]]
         axis.plot(*np.append(outline, outline[:, :1], axis=1), "k-", linewidth=1.2)
         axis.set(xlim=(-1e3 * window, 1e3 * window), aspect="equal", title=titles[name], ylabel="z, mm")
         figure.colorbar(image, ax=axis, label="sigma_zz, kPa")
@@ -81,7 +82,7 @@ def plot_experiment(result: Experiment, path: Path) -> None:
         for k, mode in enumerate(modes):
             axis.plot(x, result.recovered[:, mode] / 1e3, "o-", color=f"C{k}", label=PLANE.names[mode])
             axis.plot(x, result.truth[:, mode] / 1e3, "--", color=f"C{k}")
-        axis.set(title=f"{title}: eight pads, dashed true", ylabel="kPa")
+        axis.set(title=f"{title} (dashed: true)", ylabel="kPa")
     for axis in axes:
         axis.legend(fontsize="x-small")
         axis.set_xlabel("displacement, mm")

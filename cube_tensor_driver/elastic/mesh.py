@@ -53,7 +53,7 @@ def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
         points.append(quarter.p * np.array([[sx], [sz]]) + 0.0)  # + 0.0: no negative zeros
         triangles.append(quarter.t + quarter.nvertices * len(triangles))
     unique, inverse = np.unique(np.concatenate(points, axis=1), axis=1, return_inverse=True)
-    return skfem.MeshTri(unique, inverse.reshape(-1)[np.concatenate(triangles, axis=1)])
+    return skfem.MeshTri(np.ascontiguousarray(unique), inverse.reshape(-1)[np.concatenate(triangles, axis=1)])
 
 
 def block(
