@@ -92,6 +92,27 @@ def bench(options: argparse.Namespace) -> int:
     return bench.bench_scale(options.counts, options.rate, options.duration, options.json, options.figure)
 
 
+def record(options: argparse.Namespace) -> int:
+    from .view.record import Options, run_record
+
+    return run_record(Options(options.output, options.topics, options.duration, options.storage,
+                              round((options.split_size or 0) * 1e6), options.split_time or 0.0))  # fmt: skip
+
+
+def reprocess(options: argparse.Namespace) -> int:
+    from .view.reprocess import Options, run_reprocess
+
+    tare = tuple(options.tare_from) if options.tare_from else None
+    return run_reprocess(Options(options.bags, options.output, options.format, options.calibration, options.skin,
+                                 tare, options.jobs, options.scheduler))  # fmt: skip
+
+
+def bag_repair(options: argparse.Namespace) -> int:
+    from .view.bag import run_repair
+
+    return run_repair(options.bag)
+
+
 def test(options: argparse.Namespace) -> int:
     os.chdir(ROOT)
     os.execv(sys.executable, [sys.executable, "-m", "pytest", *(options.arguments or ["test"])])
@@ -194,6 +215,29 @@ def parser() -> argparse.ArgumentParser:
             sub.add_argument("--duration", type=positive, default=10.0, metavar="S", help="seconds to measure (10)")
         if name == "skin":
             sub.add_argument("--composed", action="store_true", help="driver and reconstruction in one process")
+
+    sub = command("record", record, "record the topics of a running skin into a bag that ros2 bag reads too")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the bag, a new one")
+    sub.add_argument("--topics", nargs="+", default=[], metavar="T", help="frequencies stress info /diagnostics if none")
+    sub.add_argument("--duration", type=positive, metavar="S", help="end after S seconds (default: Ctrl-C)")
+    sub.add_argument("--storage", choices=["mcap", "sqlite3"], default="mcap", help="(default: mcap)")
+    sub.add_argument("--split-size", type=positive, metavar="MB", help="begin a new file after so many megabytes")
+    sub.add_argument("--split-time", type=positive, metavar="S", help="begin a new file after so many seconds")
+
+    sub = command("reprocess", reprocess, "make stress of recorded frequencies again, as live but with what is known now")
+    sub.add_argument("bags", type=Path, nargs="+", metavar="BAG")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    sub.add_argument("--calibration", metavar="FILE", help="of all cubes (default: as recorded)")
+    sub.add_argument("--skin", type=Path, metavar="FILE", help="skin file whose calibrations to use, cubes by name")
+    sub.add_argument("--tare-from", type=float, nargs=2, metavar=("T0", "T1"), help="no load then, s after the start")
+    sub.add_argument("--format", choices=["bag", "parquet", "csv"], default="bag", help="(default: bag)")
+    sub.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core)")
+    sub.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster to run on, tcp://host:8786")
+
+    bags = command("bag", None, "look into a bag, or repair one").add_subparsers(metavar="WHAT", required=True)
+    sub = bags.add_parser("repair", help="make a bag readable that was cut off: killed, disk full, power lost")
+    sub.set_defaults(run=bag_repair)
+    sub.add_argument("bag", type=Path, metavar="BAG")
 
     sub = command("test", test, "build and run the test suite; arguments go to pytest")
     sub.add_argument("arguments", nargs=argparse.REMAINDER)

@@ -1,25 +1,27 @@
-"""Driver and reconstruction for all cubes of a skin file, on real hubs or on simulated ones."""
+"""All cubes of a skin file, on real hubs or simulated ones: driver, reconstruction, what there is to see and keep."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
-from cube_tensor_driver.ros.launching import start_skin
+from cube_tensor_driver.ros.launching import start_skin, switch
 
 
 def generate_launch_description() -> LaunchDescription:
     arguments = [
         DeclareLaunchArgument("config", description="Skin file (YAML): links, cubes, poses, calibrations."),
-        DeclareLaunchArgument(
-            "simulate",
-            default_value="false",
-            choices=["true", "false"],
-            description="Simulate the hubs of the skin file on pseudo-terminals instead of opening its ports.",
-        ),
+        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
         DeclareLaunchArgument(
             "rate", default_value="0.0", description="Samples per second; 0.0: as the skin file says."
         ),
-        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+        switch("simulate", "Simulate the skin's hubs on pseudo-terminals instead of opening its ports."),
+        switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
+        switch("markers", "Publish the skin as a MarkerArray on `markers`."),
+        switch(
+            "state_publisher", "Publish the cubes' frames (robot_state_publisher, URDF of the skin file)."
+        ),
+        switch("record", "Record frequencies, stress and info into a bag with ros2 bag (mcap)."),
+        switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
     ]
-    values = {name: LaunchConfiguration(name) for name in ("config", "simulate", "rate", "namespace")}
+    values = {argument.name: LaunchConfiguration(argument.name) for argument in arguments}
     return LaunchDescription([*arguments, OpaqueFunction(function=start_skin, kwargs=values)])

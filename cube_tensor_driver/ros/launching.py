@@ -6,38 +6,61 @@ import sys
 import tempfile
 from pathlib import Path
 
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import LaunchContext, LaunchDescriptionEntity
-from launch.actions import ExecuteProcess
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from ..core.errors import ConfigError
-from ..files.skin import read_skin
+from ..files.share import share
+from ..files.skin import Skin, read_skin
+from ..files.urdf import skin_urdf
 from .start import Process, skin_processes
 
+TOPICS = ("frequencies", "stress", "info")
+"""What a recording needs: `frequencies` and `info` make everything again, `stress` is what was seen."""
 
-def start_skin(
-    context: LaunchContext,
-    config: LaunchConfiguration,
-    namespace: LaunchConfiguration,
-    port: LaunchConfiguration | None = None,
-    rate: LaunchConfiguration | None = None,
-    simulate: LaunchConfiguration | None = None,
-) -> list[LaunchDescriptionEntity]:
-    """For an OpaqueFunction: what `skin_processes` says, as actions. ConfigError: the skin file is wrong."""
 
-    def value(argument: LaunchConfiguration | None) -> str:
-        return "" if argument is None else str(argument.perform(context))
+def switch(name: str, description: str) -> DeclareLaunchArgument:
+    """A launch argument that is true or false, false unless given."""
+    return DeclareLaunchArgument(name, default_value="false", choices=["true", "false"], description=description)
 
-    path = Path(value(config)).expanduser().resolve()
-    read_skin(path)
+
+def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list[LaunchDescriptionEntity]:
+    """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask for.
+
+    arguments: config and namespace; port, rate, simulate, composed, markers, record, rviz, state_publisher if the
+    launch file has them. ConfigError: the skin file or an argument is wrong.
+    """
+    given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
+    path = Path(given["config"]).expanduser().resolve()
+    skin = read_skin(path)
+    namespace = given["namespace"]
     try:
-        samples_per_second = float(value(rate) or 0)
+        rate = float(given.get("rate", 0))
     except ValueError:
-        raise ConfigError(f"rate:={value(rate)}: must be a number of samples per second") from None
-    ports = Path(tempfile.mkdtemp(prefix="cube_ports_")) if value(simulate) == "true" else None
-    processes = skin_processes(path, port=value(port), rate=samples_per_second, simulated_ports=ports)
-    return [_action(process, value(namespace)) for process in processes]
+        raise ConfigError(f"rate:={given['rate']}: must be a number of samples per second") from None
+
+    def wanted(name: str) -> bool:
+        return given.get(name) == "true"
+
+    processes = skin_processes(
+        path,
+        port=given.get("port", ""),
+        rate=rate,
+        composed=wanted("composed"),
+        markers=wanted("markers") or wanted("rviz"),
+        simulated_ports=Path(tempfile.mkdtemp(prefix="cube_ports_")) if wanted("simulate") else None,
+    )
+    actions = [_action(process, namespace) for process in processes]
+    if wanted("state_publisher") or wanted("rviz"):
+        actions.append(_state_publisher(skin, namespace))
+    if wanted("record"):
+        actions.append(_record(skin, namespace))
+    if wanted("rviz"):
+        actions.append(_rviz(namespace))
+    return actions
 
 
 def _action(process: Process, namespace: str) -> LaunchDescriptionEntity:
@@ -45,7 +68,8 @@ def _action(process: Process, namespace: str) -> LaunchDescriptionEntity:
         return Node(
             package="cube_tensor_driver",
             executable=process.executable,
-            name=process.executable,
+            # One executable may hold several nodes: they keep their own names.
+            name=None if process.executable == "composed" else process.executable,
             namespace=namespace,
             parameters=[process.parameters],
             output="screen",
@@ -54,3 +78,34 @@ def _action(process: Process, namespace: str) -> LaunchDescriptionEntity:
     return ExecuteProcess(
         cmd=[sys.executable, "-m", process.module, *process.arguments], name=process.executable, output="screen"
     )
+
+
+def _installed(package: str, action: LaunchDescriptionEntity) -> LaunchDescriptionEntity:
+    """The action, or a line that says how to get its package."""
+    try:
+        get_package_prefix(package)
+    except PackageNotFoundError:
+        name = package.replace("_", "-")
+        return LogInfo(msg=f"{package} is not installed: left out (sudo apt install ros-$ROS_DISTRO-{name})")
+    return action
+
+
+def _state_publisher(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
+    package = "robot_state_publisher"
+    parameters = [{"robot_description": skin_urdf(skin)}]
+    return _installed(
+        package, Node(package=package, executable=package, namespace=namespace, parameters=parameters, output="screen")
+    )
+
+
+def _rviz(namespace: str) -> LaunchDescriptionEntity:
+    arguments = ["-d", str(share() / "rviz" / "skin.rviz")]
+    return _installed("rviz2", Node(package="rviz2", executable="rviz2", namespace=namespace, arguments=arguments))
+
+
+def _record(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
+    prefix = f"/{namespace.strip('/')}/" if namespace else "/"
+    command = ["ros2", "bag", "record", "--storage", "mcap", "-o", f"{skin.name}_bag"]
+    overrides = share() / "config" / "record_qos.yaml"
+    command += ["--qos-profile-overrides-path", str(overrides), *(prefix + topic for topic in TOPICS)]
+    return _installed("ros2bag", ExecuteProcess(cmd=command, output="screen"))

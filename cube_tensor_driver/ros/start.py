@@ -29,6 +29,7 @@ def skin_processes(
     port: str = "",
     rate: float = 0.0,
     composed: bool = False,
+    markers: bool = False,
     simulated_ports: Path | None = None,
     book: Path | None = None,
     instants: int | None = None,
@@ -36,8 +37,8 @@ def skin_processes(
     """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
 
     port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
-    for the file's. composed: driver and reconstruction in one process. book: where the simulator writes what it
-    sampled; instants: see `simulation.main.Simulator`.
+    for the file's. composed: driver and reconstruction in one process. markers: the node that draws, too. book: where
+    the simulator writes what it sampled; instants: see `simulation.main.Simulator`.
     """
     skin: dict[str, Value] = {"config": str(config)}
     driver: dict[str, Value] = {**skin, "port": port, "rate": rate, "port_directory": str(simulated_ports or "")}
@@ -48,6 +49,8 @@ def skin_processes(
             Process("reconstruction", "cube_tensor_driver.ros.reconstruction", parameters=skin),
             Process("driver", "cube_tensor_driver.ros.driver", parameters=driver),
         ]
+    if markers:
+        processes.append(Process("markers", "cube_tensor_driver.ros.markers"))
     if simulated_ports is not None:
         arguments = ["--config", str(config), "--ports", str(simulated_ports)]
         if book is not None:

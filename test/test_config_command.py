@@ -1,0 +1,64 @@
+"""./cube config and ./cube urdf as a user runs them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from cube_tensor_driver.core.tensor import rotation_from_rpy
+from cube_tensor_driver.files.skin import read_skin
+
+
+def cube(*arguments: object) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "cube_tensor_driver.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False)
+
+
+def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
+    path = tmp_path / "skin.yaml"
+    done = cube("config", "grid", "--nx", 36, "--ny", 35, "--pitch", 0.012, "--links", 16, "-o", path)
+    assert done.returncode == 0, done.stderr
+    skin = read_skin(path)
+    assert len(skin.cubes) == 1260 and len(skin.links) == 16
+    sizes = [sum(cube.link == link.name for cube in skin.cubes) for link in skin.links]
+    assert sum(sizes) == 1260 and max(sizes) - min(sizes) <= 1
+    xyz = np.array([cube.xyz for cube in skin.cubes])
+    np.testing.assert_allclose(xyz.mean(axis=0), 0, atol=1e-9)  # coordinates are rounded to 1 nm
+    assert np.unique(xyz, axis=0).shape == (1260, 3)
+    done = cube("config", "check", path)
+    assert done.returncode == 0 and "1260 planar on 16 links" in done.stdout
+
+    robot = ElementTree.fromstring(cube("urdf", path).stdout)
+    links = {link.get("name") for link in robot.iter("link")}
+    joints = list(robot.iter("joint"))
+    assert len(links) == 1261 and len(joints) == 1260
+    assert {joint.find("child").get("link") for joint in joints} == links - {"skin_base"}
+    assert {joint.find("parent").get("link") for joint in joints} == {"skin_base"}
+    origin = joints[0].find("origin")
+    np.testing.assert_allclose(np.fromstring(origin.get("xyz"), sep=" "), skin.cubes[0].xyz)
+    # URDF's rpy and ours are one convention: fixed axes x, y, z
+    np.testing.assert_allclose(rotation_from_rpy(*np.fromstring(origin.get("rpy"), sep=" ")), np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--nx", 0, "--ny", 1], "nx is 0, must be greater than 0"),
+        (["--nx", 2, "--ny", 1, "--links", 3], "3 links for 2 cubes"),
+    ],
+)
+def test_a_grid_that_cannot_be(tmp_path, arguments, words):
+    done = cube("config", "grid", *arguments, "-o", tmp_path / "x.yaml")
+    assert done.returncode == 1 and words in done.stderr and not (tmp_path / "x.yaml").exists()
+
+
+def test_check_says_what_is_wrong(tmp_path):
+    path = tmp_path / "skin.yaml"
+    path.write_text("name: skin\nlinks: []\n")
+    done = cube("config", "check", path)
+    assert done.returncode == 1 and "Traceback" not in done.stderr and str(path) in done.stderr

@@ -1,0 +1,70 @@
+"""Launch files: every argument described, the processes those of the one shared list, and a skin that starts and ends."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+from cube_tensor_driver.files.share import share
+from cube_tensor_driver.ros.start import skin_processes
+
+SKIN = share() / "config" / "skin_demo.yaml"
+
+
+def test_one_list_serves_launch_and_demo():
+    names = [process.executable for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True)]
+    assert names == ["simulator", "reconstruction", "driver", "markers"]
+    assert [process.executable for process in skin_processes(SKIN, composed=True)] == ["composed"]
+    assert [process.executable for process in skin_processes(SKIN)] == ["reconstruction", "driver"]
+
+
+def test_every_executable_of_the_list_is_a_script_and_a_module():
+    cmake = (ROOT / "CMakeLists.txt").read_text()
+    every = skin_processes(SKIN, simulated_ports=Path("p"), markers=True) + skin_processes(SKIN, composed=True)
+    for process in every:
+        script = ROOT / "scripts" / process.executable
+        assert os.access(script, os.X_OK) and f"from {process.module} import main" in script.read_text()
+        assert f"scripts/{process.executable}" in cmake
+
+
+@pytest.mark.parametrize("name", ["skin.launch.py", "cube.launch.py"])
+def test_every_argument_is_described(name):
+    pytest.importorskip("launch", reason="needs launch and launch_ros, which the wheels lack")
+    pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
+    from launch.launch_description_sources import get_launch_description_from_python_launch_file
+
+    description = get_launch_description_from_python_launch_file(str(ROOT / "launch" / name))
+    arguments = description.get_launch_arguments()
+    assert {"config", "namespace"} <= {argument.name for argument in arguments}
+    for argument in arguments:
+        assert len(argument.description) > 15 and "no description" not in argument.description, argument.name
+
+
+def test_a_simulated_skin_starts_and_ends(domain):
+    pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
+    if shutil.which("ros2") is None:
+        pytest.skip("needs the command ros2 (ros2cli and ros2launch), which the wheels lack")
+    command = ["ros2", "launch", "cube_tensor_driver", "skin.launch.py", f"config:={SKIN}", "simulate:=true"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    try:
+        lines = []
+        for line in process.stdout:
+            lines.append(line)
+            if "link hub1: hub 0x2 with 8 cubes of 8 pads" in line:
+                break
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=10)
+        assert process.returncode == 0, "".join(lines) + output
+        assert output.count("process has finished cleanly") == 3
+    finally:
+        process.kill()
+
