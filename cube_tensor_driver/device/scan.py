@@ -56,6 +56,8 @@ class Scan:
         self._places = tuple(places)
         self._pads = np.array([place.n_pads for place in places])
         self._cubes: list[NDArray[np.int32]] = [np.empty(0, np.int32) for _ in range(n_links)]
+        # Per link: the skin's cubes and their pads where every cube of the hub fits; what each sample would find again.
+        self._whole: list[tuple[NDArray[np.uint16], int] | None] = [None] * n_links
         self._hellos: list[Hello | None] = [None] * n_links
         self._live = [False] * n_links
         self._gathered: list[list[tuple[Sample, int]]] = [[] for _ in range(n_links)]
@@ -94,6 +96,8 @@ class Scan:
             uid = int(frame.cube_uids[stranger])
             problems.append(f"the hub's cube {stranger} (uid {uid:#x}) is not in the skin file")
         self._cubes[link] = cubes
+        fits = (cubes >= 0).all() and (self._pads[cubes] == frame.n_pads).all()
+        self._whole[link] = (cubes.astype(np.uint16), frame.n_pads) if fits else None
         found = {int(cube): int(frame.cube_uids[index]) for index, cube in enumerate(cubes) if cube >= 0}
         self.uids = {**self.uids, **found}
         return problems
@@ -146,6 +150,9 @@ class Scan:
 
     def _select(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
         """The skin's cubes of a sample, and the sample without the rows that belong to none."""
+        whole = self._whole[link]
+        if whole is not None and (len(whole[0]), whole[1]) == sample.frequency.shape and sample.first_cube == 0:
+            return whole[0], sample
         cubes = self._cubes[link][sample.first_cube : sample.first_cube + sample.n_cubes]
         known = cubes >= 0
         fits = known & (self._pads[cubes] == sample.n_pads)
