@@ -18,7 +18,9 @@ def demo(options: argparse.Namespace) -> int:
     duration = options.duration
     if duration is None and (options.headless or options.json):
         duration = 10.0
-    return run_demo(Options(options.config, options.cubes, options.rate, duration, options.headless, options.json))
+    return run_demo(
+        Options(options.config, options.cubes, options.rate, duration, options.headless, options.json, options.view)
+    )
 
 
 def config_grid(options: argparse.Namespace) -> int:
@@ -54,6 +56,19 @@ def urdf(options: argparse.Namespace) -> int:
     return 0
 
 
+def torture(options: argparse.Namespace) -> int:
+    from .view.torture import Options, run_torture
+
+    return run_torture(Options(options.duration, options.seed, options.json))
+
+
+def inject(options: argparse.Namespace) -> int:
+    from .simulation.inject import inject
+
+    inject(options.ports, options.fault)
+    return 0
+
+
 def layout(options: argparse.Namespace) -> int:
     from .view.layout import run_layout
 
@@ -76,8 +91,29 @@ def fit(options: argparse.Namespace) -> int:
             options.uid,
             figure,
             options.json,
+            options.reference,
+            options.cube,
         )
     )
+
+
+def fem(options: argparse.Namespace) -> int:
+    from .view.elastic import Options, run_fem
+
+    given = {name: value for name, value in vars(options).items() if name not in ("command", "run")}
+    return run_fem(Options(**given | {"neglect": tuple(given.get("neglect", ()))}))
+
+
+def study(options: argparse.Namespace) -> int:
+    from .view.elastic import run_study
+
+    return run_study(options.json, options.figure)
+
+
+def paper(options: argparse.Namespace) -> int:
+    from .view.elastic import run_paper
+
+    return run_paper(options.out)
 
 
 def bench(options: argparse.Namespace) -> int:
@@ -99,6 +135,14 @@ def record(options: argparse.Namespace) -> int:
                               round((options.split_size or 0) * 1e6), options.split_time or 0.0))  # fmt: skip
 
 
+def replay(options: argparse.Namespace) -> int:
+    from .view.replay import Options, run_replay
+
+    return run_replay(
+        Options(options.bag, options.rate, options.loop, options.start, options.clock, options.stress)
+    )
+
+
 def reprocess(options: argparse.Namespace) -> int:
     from .view.reprocess import Options, run_reprocess
 
@@ -107,10 +151,40 @@ def reprocess(options: argparse.Namespace) -> int:
                                  tare, options.jobs, options.scheduler))  # fmt: skip
 
 
+def plot(options: argparse.Namespace) -> int:
+    from .view.bag_plots import Options, run_plot
+
+    return run_plot(Options(options.bag, options.cube, options.start, options.to, options.output))
+
+
+def bag_info(options: argparse.Namespace) -> int:
+    from .view.bag import run_info
+
+    return run_info(options.bag)
+
+
 def bag_repair(options: argparse.Namespace) -> int:
     from .view.bag import run_repair
 
     return run_repair(options.bag)
+
+
+def view(options: argparse.Namespace) -> int:
+    from .view.browser import run_view
+
+    return run_view(options.port, options.depth)
+
+
+def pictures(options: argparse.Namespace) -> int:
+    from .view.pictures import run_pictures
+
+    return run_pictures(options.output)
+
+
+def docs(options: argparse.Namespace) -> int:
+    """Sphinx, every warning an error."""
+    command = ["sphinx", "-W", "--keep-going", "-q", "docs", str(options.output)]
+    return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode
 
 
 def test(options: argparse.Namespace) -> int:
@@ -129,6 +203,13 @@ def positive(text: str) -> float:
     value = float(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not greater than 0")
+    return value
+
+
+def not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is less than 0")
     return value
 
 
@@ -154,6 +235,7 @@ def parser() -> argparse.ArgumentParser:
         help="end after S seconds and print the figures (default: until Ctrl-C; 10 with --headless or --json)",
     )
     sub.add_argument("--headless", action="store_true", help="no live table")
+    sub.add_argument("--view", action="store_true", help="show it in the browser too, as ./cube view does")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE instead of printing them")
 
     configs = command("config", None, "make or check skin files").add_subparsers(metavar="WHAT", required=True)
@@ -173,26 +255,64 @@ def parser() -> argparse.ArgumentParser:
     sub.set_defaults(run=config_check)
     sub.add_argument("file", type=Path, metavar="FILE")
 
+    sub = command("torture", torture, "32 simulated cubes at 500 Hz under a random mix of all faults, judged")
+    sub.add_argument("--duration", type=positive, default=60.0, metavar="S", help="of the faults, s (60)")
+    sub.add_argument("--seed", type=int, default=0, metavar="N", help="of the mix (0)")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+
+    sub = command("inject", inject, "inject a fault into running simulated hubs: kind=unplug link=hub0 seconds=2")
+    sub.add_argument("fault", nargs="+", metavar="KEY=VALUE", help="kind=… and what it needs; docs/reliability.md")
+    sub.add_argument("--ports", type=Path, metavar="FOLDER", help="of the simulated ports (the newest demo's)")
+
     sub = command("urdf", urdf, "print a URDF of a skin: one link per cube under its parent frame")
     sub.add_argument("file", type=Path, metavar="FILE")
 
     sub = command("layout", layout, "what a layout's pads can tell: ranks, unobservable modes, noise; a picture")
     sub.add_argument("name", metavar="NAME", help="quad, planar, cube, or a YAML file with a layout")
     sub.add_argument("--symmetry", metavar="G", help="full, slab, mirrors or none (default: the calibration's)")
-    sub.add_argument("--calibration", metavar="FILE", help="calibration file or name (default: illustrative)")
+    sub.add_argument("--calibration", metavar="FILE", help="calibration file or name (default: the computed one)")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
     sub.add_argument("--figure", type=Path, metavar="FILE", help="picture of the cube (default: NAME.png)")
 
     sub = command("fit", fit, "calibrate from a table of known loads and measured frequencies")
-    sub.add_argument("loads", type=Path, metavar="LOADS.csv", help="columns: pads (Hz), modes (Pa) or fx fy fz (N)")
+    sub.add_argument("loads", type=Path, metavar="LOADS", help="CSV: pads (Hz), modes (Pa) or fx fy fz (N); or a bag")
+    sub.add_argument("--reference", metavar="TOPIC", help="of a bag: WrenchStamped (with --area) or stress to fit to")
+    sub.add_argument("--cube", metavar="NAME", help="of a bag: which cube, if there are several")
     sub.add_argument("--layout", required=True, metavar="NAME", help="quad, planar, cube, or a YAML file")
     sub.add_argument("--symmetry", default="full", metavar="G", help="full, slab, mirrors or none (default: full)")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="calibration file to write")
-    sub.add_argument("--base", metavar="FILE", help="calibration with beta, modulus, half side (default: illustrative)")
+    sub.add_argument("--base", metavar="FILE", help="calibration with beta, modulus, half side (default: shipped)")
     sub.add_argument("--area", type=positive, metavar="M2", help="area that the forces fx fy fz act on, m²")
     sub.add_argument("--uid", type=lambda text: int(text, 0), metavar="UID", help="uid of the cube this holds for")
     sub.add_argument("--figure", type=Path, metavar="FILE", help="measured against fitted (default: beside -o, .png)")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+
+    sub = command("fem", fem, "compute a cube's response matrix by finite elements; lengths in mm")
+    sub.argument_default = argparse.SUPPRESS  # what is not given is left to view.elastic.Options
+    sub.add_argument("--3d", dest="space", action="store_true", help="in space: 24 pads; minutes, and up to 6 GB")
+    sub.add_argument("--layout", metavar="NAME", help="quad, planar, cube, or a YAML file (planar; cube with --3d)")
+    sub.add_argument("--symmetry", metavar="G", help="full, slab, mirrors or none (the first that the layout has)")
+    sub.add_argument("--plane", choices=["strain", "stress"], help="of a layout in a plane (strain)")
+    sub.add_argument("--width", type=positive, metavar="MM", help="of the body along x, and y in space (60)")
+    sub.add_argument("--height", type=positive, metavar="MM", help="of the body along z (11)")
+    sub.add_argument("--side", type=positive, metavar="MM", help="of the cube (4)")
+    sub.add_argument("--young", type=positive, metavar="PA", help="Young's modulus of the body, Pa (0.3e6)")
+    sub.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio of the body (0.48)")
+    sub.add_argument("--rigid", action="store_true", help="a rigid cube (default: steel, 200 GPa, 0.30)")
+    sub.add_argument("--pad", metavar="half|MM", help="pads: the halves of each face, or so wide (the layout's own)")
+    sub.add_argument("--pad-centre", type=positive, metavar="MM", help="from the middle of the face (1 with --pad MM)")
+    sub.add_argument("--neglect", nargs="+", metavar="MODE", help="modes that the calibration states to be zero")
+    sub.add_argument("--meshes", type=int, choices=[1, 2, 3], help="fewer need less memory and say less (3)")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+    sub.add_argument("--figures", type=Path, metavar="DIR", help="pictures: convergence, response, stress of each load")
+    sub.add_argument("-o", "--output", type=Path, metavar="FILE", help="calibration file to write")
+
+    sub = command("study", study, "how wide a contact must be for each layout to be right, by indenter sweeps")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+    sub.add_argument("--figure", type=Path, default=Path("study.png"), metavar="FILE", help="(study.png)")
+
+    sub = command("paper", paper, "the source paper's simulation and experiments on a virtual bench, as pictures")
+    sub.add_argument("--out", type=Path, default=Path("paper"), metavar="DIR", help="folder to write to (paper)")
 
     benches = command("bench", bench, "measure speed against bare floors").add_subparsers(
         dest="what", metavar="WHAT", required=True
@@ -224,6 +344,14 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--split-size", type=positive, metavar="MB", help="begin a new file after so many megabytes")
     sub.add_argument("--split-time", type=positive, metavar="S", help="begin a new file after so many seconds")
 
+    sub = command("replay", replay, "publish a bag: what was recorded but the stress, which a reconstruction makes anew")
+    sub.add_argument("bag", type=Path, metavar="BAG")
+    sub.add_argument("--rate", type=positive, default=1.0, metavar="R", help="times the recorded speed (1)")
+    sub.add_argument("--loop", action="store_true", help="begin anew at the end")
+    sub.add_argument("--start", type=not_negative, default=0.0, metavar="S", help="begin S seconds into the bag")
+    sub.add_argument("--clock", action="store_true", help="publish /clock for nodes with use_sim_time")
+    sub.add_argument("--stress", action="store_true", help="publish the recorded stress too")
+
     sub = command("reprocess", reprocess, "make stress of recorded frequencies again, as live but with what is known now")
     sub.add_argument("bags", type=Path, nargs="+", metavar="BAG")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
@@ -234,10 +362,29 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core)")
     sub.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster to run on, tcp://host:8786")
 
+    sub = command("plot", plot, "draw frequencies, stress, gradient and residual of one cube of a bag")
+    sub.add_argument("bag", type=Path, metavar="BAG")
+    sub.add_argument("--cube", metavar="NAME", help="(default: the first)")
+    sub.add_argument("--from", dest="start", type=float, metavar="S", help="seconds after the start of the bag")
+    sub.add_argument("--to", type=float, metavar="S", help="seconds after the start of the bag")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.png", help="picture to write")
+
     bags = command("bag", None, "look into a bag, or repair one").add_subparsers(metavar="WHAT", required=True)
+    sub = bags.add_parser("info", help="print skin, cubes, calibrations, rates, gaps and counters")
+    sub.set_defaults(run=bag_info)
+    sub.add_argument("bag", type=Path, metavar="BAG")
     sub = bags.add_parser("repair", help="make a bag readable that was cut off: killed, disk full, power lost")
     sub.set_defaults(run=bag_repair)
     sub.add_argument("bag", type=Path, metavar="BAG")
+
+    sub = command("view", view, "show a running skin in the browser: 3-D, plots, tare, recording")
+    sub.add_argument("--port", type=int, default=8080, metavar="N", help="of the page on 127.0.0.1 (8080, or the next free)")
+    sub.add_argument("--depth", type=positive, default=0.004, metavar="M", help="cubes below the surface (0.004 m)")
+
+    sub = command("pictures", pictures, "make the pictures of the documentation anew")
+    sub.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "pictures", metavar="DIR")
+    sub = command("docs", docs, "build the documentation as HTML; a warning is an error")
+    sub.add_argument("-o", "--output", type=Path, default=Path(".cube/docs"), metavar="DIR", help="(.cube/docs)")
 
     sub = command("test", test, "build and run the test suite; arguments go to pytest")
     sub.add_argument("arguments", nargs=argparse.REMAINDER)

@@ -15,7 +15,7 @@ from cube_tensor_driver.files.share import share
 from cube_tensor_driver.files.skin import read_skin
 from cube_tensor_driver.files.yaml import parse_yaml, write_yaml
 
-GOOD = grid("skin", 3, 2, 0.012, 2, "planar_illustrative", "planar", 100.0, "/dev/ttyACM{}")
+GOOD = grid("skin", 3, 2, 0.012, 2, "planar", "planar", 100.0, "/dev/ttyACM{}")
 
 
 def read(tmp_path: Path, data: object):
@@ -40,7 +40,7 @@ def test_shipped_calibrations_have_their_id():
 
 def test_grid_deals_every_cube_once():
     # 7 cubes on 3 links: 3, 2, 2, indices from 0 on each link, positions centred and one pitch apart
-    data = grid("skin", 7, 1, 0.5, 3, "planar_illustrative", "planar", 10.0, "p{}")
+    data = grid("skin", 7, 1, 0.5, 3, "planar", "planar", 10.0, "p{}")
     assert [(cube["link"], cube["index"]) for cube in data["cubes"]] == [
         ("hub0", 0), ("hub0", 1), ("hub0", 2), ("hub1", 0), ("hub1", 1), ("hub2", 0), ("hub2", 1),
     ]  # fmt: skip
@@ -82,7 +82,7 @@ def change(*path, to=None, remove=False):
         (change("cubes", 2, "uid", to=5), ["cubes[2]", "both uid and index"]),
         (change("cubes", 2, "index", remove=True), ["cubes[2]", "neither uid nor both link and index"]),
         (change("cubes", 0, "layout", to="cube"), ["cubes[0].layout", "'cube'", "'planar'"]),
-        (change("cubes", 0, "calibration", to="nope"), ["cubes[0].calibration", "'nope'", "planar_illustrative"]),
+        (change("cubes", 0, "calibration", to="nope"), ["cubes[0].calibration", "'nope'", "planar, planar_slab"]),
         (change("links", to=[]), ["links", "at least one"]),
         (change("parent_frame", remove=True), ["'parent_frame' is missing"]),
         (change("rate", to=0), ["rate", "found 0", "0.1 to 10000"]),

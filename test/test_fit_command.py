@@ -135,7 +135,7 @@ def test_forces_become_tractions(tmp_path):
         (["layout", "round"], ["unknown layout 'round'"]),
         (["layout", "quad", "--symmetry", "full"], ["lacks this symmetry", "+z-x"]),
         (["layout", "planar", "--symmetry", "round"], ["unknown symmetry 'round'"]),
-        (["layout", "cube", "--calibration", "planar_illustrative"], ["is for layout 'planar'"]),
+        (["layout", "cube", "--calibration", "planar"], ["is for layout 'planar'"]),
         (["fit", "none.csv", "--layout", "planar", "-o", "x.yaml"], ["none.csv", "No such file"]),
     ],
 )

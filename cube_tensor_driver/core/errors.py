@@ -47,3 +47,7 @@ class MessageError(CubeError):
 
 class BagError(CubeError):
     """A bag that cannot be read or written, or that lacks what a command needs."""
+
+
+class TareError(CubeError):
+    """Tare refused: which pad of which cube moves, is noisy, or is too far from its calibration."""

@@ -216,12 +216,12 @@ _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
 _UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {code: kind._unpack for code, kind in _TYPES.items()}
 
 
-def encode(frame: Frame) -> bytes:
+def encode(frame: Frame, version: int = VERSION) -> bytes:
     """Bytes of one frame: a zero, the COBS code of header, payload and CRC-32, a zero.
 
     The leading zero ends whatever half frame or garbage came before, which would otherwise swallow this
-    frame. ProtocolError: a field out of its range, an array of the wrong dtype or shape, a payload over 65535
-    bytes.
+    frame. version: another one than ours, to try the other end with. ProtocolError: a field out of its range,
+    an array of the wrong dtype or shape, a payload over 65535 bytes.
     """
     code = _CODES.get(type(frame))
     if code is None:
@@ -237,7 +237,7 @@ def encode(frame: Frame) -> bytes:
             f"{type(frame).__name__} payload has {len(payload)} bytes, the limit is {MAX_PAYLOAD}: "
             "split the cubes over several frames with first_cube"
         )
-    body = _HEADER.pack(code, VERSION, len(payload)) + payload
+    body = _HEADER.pack(code, version, len(payload)) + payload
     code_words: bytes = cobs.encode(body + zlib.crc32(body).to_bytes(4, "little"))
     return b"\0" + code_words + b"\0"
 

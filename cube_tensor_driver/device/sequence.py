@@ -157,13 +157,13 @@ class Account:
         return sum(tracker.counters.resets for tracker in self._trackers.values())
 
     def counters(self) -> dict[str, int]:
-        """taken = delivered + dropped_in_hub + lost; received = delivered + duplicate; the rest are among these."""
+        """taken = delivered + dropped_in_hub + lost_on_the_way; received = delivered + duplicate."""
         parts = [tracker.counters for tracker in list(self._trackers.values())]
         total = {name: sum(getattr(part, name) for part in parts) for name in SequenceCounters().as_dict()}
         missing = total.pop("missing")
         # Until the next STATS a drop looks like loss, never the other way round.
         dropped = min(self._dropped, missing)
-        book = {"taken": total["delivered"] + missing, "dropped_in_hub": dropped, "lost": missing - dropped}
+        book = {"taken": total["delivered"] + missing, "dropped_in_hub": dropped, "lost_on_the_way": missing - dropped}
         return {**book, **total}
 
     def contradictions(self) -> list[str]:

@@ -1,6 +1,6 @@
 """A virtual bench: plates and rods that move the surface of the elastomer, and what the pads feel.
 
-Plane strain section of the body with the cube, or without it for the true field. Two materials:
+Section of the body with the cube, or without it for the true field. Two materials:
 
     linear      sigma = lambda tr(eps) 1 + 2 mu eps
     finite      compressible neo-Hookean, W = mu/2 (tr F'F - 3 - 2 ln J) + lambda/2 (ln J)^2,
@@ -77,12 +77,12 @@ class Bench:
         self.mesh = mirrored(quarter)
         inside = np.all(np.abs(self.mesh.p[:, self.mesh.t].mean(axis=1)) < 1.0, axis=0)
         self.basis = skfem.Basis(self.mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=4)
-        lam, mu = lame(body.young, body.poisson)
+        if finite and body.plane != "strain":
+            raise ElasticError(f"plane is {body.plane!r}; the finite bench knows 'strain' only")
+        lam, mu = lame(body.young, body.poisson, body.plane)
         stiff = np.where(inside & cube, _STIFF, 1.0)[:, None] * np.ones(self.basis.X.shape[1])
         self._lame = {"lam": lam * stiff, "mu": mu * stiff}
-        self._outside = skfem.Basis(
-            self.mesh, self.basis.elem, elements=np.flatnonzero(~inside), intorder=4
-        )
+        self._outside = skfem.Basis(self.mesh, self.basis.elem, elements=np.flatnonzero(~inside), intorder=4)
         self._body_lame = {"lam": lam, "mu": mu}
         self._inside = inside
 
@@ -123,9 +123,7 @@ class Bench:
         zz = _stress(f, False, self._lame["lam"], self._lame["mu"])[1, 1].mean(axis=1)
         return self.body.side / 2 * u[self.basis.nodal_dofs], zz
 
-    def _advance(
-        self, u: Array, held: NDArray[np.bool_], prescribed: Array, number: int, halvings: int = 0
-    ) -> Array:
+    def _advance(self, u: Array, held: NDArray[np.bool_], prescribed: Array, number: int, halvings: int = 0) -> Array:
         """Newton's method for one step of the load, in halves where it fails."""
         with np.errstate(all="ignore"):  # a failed try passes through inverted elements
             found = self._newton(u, held, prescribed)

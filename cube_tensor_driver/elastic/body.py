@@ -101,7 +101,7 @@ def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
     if steps.min() < 1e-3:
         raise ElasticError(
             f"pad edges are {steps.min():.2g} d0 apart and the mesh resolves 0.001; "
-            "move them together or apart"
+            "make the pads wider, or move their edges together or apart"
         )
     return section(half, stops, level) if layout.planar else block(half, stops, *_SPACE_MESHES[level])
 

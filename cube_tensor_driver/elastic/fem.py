@@ -62,6 +62,7 @@ class Response:
             "convergence": list(self.convergence),
             "seconds": self.seconds,
             "pads": list(self.layout.pads),
+            "layout": self.layout.to_dict(),
             "modes": list(self.modes),
             "symmetry": self.symmetry,
             "mode_residual": self.mode_residual,
@@ -86,13 +87,13 @@ def compute_response(
     check_pads(layout)
     grids = [make_mesh(body, layout, level) for level in range(meshes)]
     check_memory(grids[-1])
+    matrices: list[Array] = []
     total, done = meshes * 2 ** len(field_axes(layout)), itertools.count()
 
     def report(what: str) -> None:
         if progress is not None:
-            progress(next(done), total, what)
+            progress(next(done), total, f"mesh {len(matrices) + 1}, {what}" if what != "done" else what)
 
-    matrices: list[Array] = []
     rows: list[dict[str, Any]] = []
     for grid in grids:
         began = time.perf_counter()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -12,9 +12,15 @@ matplotlib.use("Agg")  # files only, no window
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
+from matplotlib.tri import Triangulation
 
+from ..core.layout import Layout
 from ..core.modes import COMPONENTS, PLANE
-from .paper import Experiment, experiments, figure_4, rod_sweep
+from .bench import Array, Bench
+from .body import Body
+from .fem import Progress, Response
+from .paper import Experiment, experiments, figure_4, loaded_modes, rod_sweep
 from .study import Study
 
 
@@ -42,32 +48,107 @@ def plot_study(result: Study, path: Path) -> None:
     plt.close(figure)
 
 
+def plot_convergence(result: Response, path: Path) -> None:
+    """How far each coefficient on the coarser meshes is from the finest, relative to the largest coefficient."""
+    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    rows = result.convergence
+    last = rows[-1]["coefficients"]
+    largest = max(map(abs, last.values()))
+    unknowns = [row["unknowns"] for row in rows[:-1]]
+    shown = sorted(last, key=lambda name: -abs(last[name]))[:12]
+    for k, name in enumerate(shown):
+        away = [100 * abs(row["coefficients"][name] - last[name]) / largest for row in rows[:-1]]
+        axis.loglog(unknowns, away, "osD^v<>p"[k % 8] + "-", color=f"C{k % 10}", markerfacecolor="none", label=name)
+    axis.set(xlabel="unknowns", ylabel=f"distance from {rows[-1]['unknowns']} unknowns, % of the largest")
+    if unknowns:
+        axis.set_xticks(unknowns, [str(n) for n in unknowns], minor=False)
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("{x:.2g}")
+        axis.legend(fontsize="x-small", ncols=2)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def plot_response(result: Response, path: Path) -> None:
+    """The response matrix, pads down and modes across."""
+    n_pads, n_modes = result.matrix.shape
+    size = (0.6 * n_modes + 2.5, 0.35 * n_pads + 1.5)
+    figure, axis = plt.subplots(figsize=size, layout="constrained")
+    limit = np.abs(result.matrix).max()
+    image = axis.imshow(result.matrix, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto")
+    axis.grid(False)
+    axis.set_xticks(range(n_modes), result.modes, rotation=60 if n_modes > 7 else 0)
+    axis.set_yticks(range(n_pads), [f"V{k + 1}  {pad}" for k, pad in enumerate(result.layout.pads)])
+    for (pad, mode), value in np.ndenumerate(result.matrix):
+        if abs(value) > 5e-3 * limit:
+            color = "white" if abs(value) > 0.6 * limit else "black"
+            axis.text(mode, pad, f"{value:.2f}", ha="center", va="center", fontsize=7, color=color)
+    figure.colorbar(image, ax=axis, label="pad stress per mode, Pa per Pa")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def plot_loads(body: Body, layout: Layout, path: Path) -> None:
+    """sigma_zz around the cube under 10 kPa of every plane mode, with pads, deformed outline and displacements."""
+    bench = Bench(body, layout=layout, size=0.3)
+    found = loaded_modes(bench, PLANE.names)
+    figure, axes = plt.subplots(4, 2, figsize=(11, 12), layout="constrained")
+    for axis, (name, (moved, stress)) in zip(axes.flat, found.items(), strict=False):
+        scale = _draw_field(axis, bench, moved, stress, 4)
+        axis.set_title(f"{name}, 10 kPa (displacements times {scale:.2g})", fontsize="medium")
+        d0 = 1e3 * body.side / 2
+        for place, normal in zip(layout.positions[:, [0, 2]], layout.normals[:, [0, 2]], strict=True):
+            ends = place + np.outer((-0.5, 0.5), layout.pad_size * (1 - np.abs(normal)))
+            axis.plot(*(d0 * ends.T), color="gold", linewidth=3, solid_capstyle="butt")
+    axes.flat[-1].axis("off")
+    figure.supxlabel("x, mm (yellow: pads)")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
 def plot_figure_4(path: Path) -> None:
     """The z component of the normal stress around the cube, with the deformed outline and arrows of displacement."""
     figure, axes = plt.subplots(2, 1, figsize=(7, 7), layout="constrained")
     titles = {"zx": "(a) shear only, 10 kPa", "zz_x": "(b) normal stress growing along x, 10 kPa per d0"}
-    for axis, (name, (bench, moved, stress)) in zip(axes, figure_4().items(), strict=True):
-        d0 = bench.body.side / 2
-        window = 6 * d0
-        near = np.abs(bench.mesh.p[0]) * d0 < window
-        scale = 0.4 * d0 / np.hypot(*moved[:, near]).max()
-        at = 1e3 * (d0 * bench.mesh.p + scale * moved)
-        limit = np.percentile(np.abs(stress[near[bench.mesh.t].all(axis=0)]), 98) / 1e3
-        image = axis.tripcolor(at[0], at[1], bench.mesh.t.T, stress / 1e3, cmap="RdBu_r", vmin=-limit, vmax=limit)
-        ring = np.abs(bench.mesh.p).max(axis=0)
-        grid = np.mgrid[-5:5.1:1, -2.5:2.6:1].reshape(2, -1, 1).swapaxes(0, 1)
-        few = [np.argmin(np.hypot(*(bench.mesh.p - point))) for point in grid]
-        axis.quiver(*at[:, few], *moved[:, few], color="0.25", width=0.002, angles="xy")
-        corners = 1e3 * d0 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
-        axis.plot(*corners, "k:", linewidth=0.8)
-        face = np.flatnonzero(np.isclose(ring, 1))
-        outline = at[:, face[np.argsort(np.arctan2(*bench.mesh.p[::-1, face]))]]
-        axis.plot(*np.append(outline, outline[:, :1], axis=1), "k-", linewidth=1.2)
-        axis.set(xlim=(-1e3 * window, 1e3 * window), aspect="equal", title=titles[name], ylabel="z, mm")
-        figure.colorbar(image, ax=axis, label="sigma_zz, kPa")
+    bench, found = figure_4()
+    scale = 1.0
+    for axis, (name, (moved, stress)) in zip(axes, found.items(), strict=True):
+        scale = _draw_field(axis, bench, moved, stress, 6)
+        axis.set(title=titles[name])
     axes[-1].set_xlabel(f"x, mm (displacements enlarged {scale:.3g} times)")
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def _draw_field(axis: Any, bench: Bench, moved: Array, stress: Array, window: float) -> float:
+    """sigma_zz on the deformed body within `window` d0 of the cube; returns the scale of the displacements."""
+    d0 = bench.body.side / 2
+    near = np.abs(bench.mesh.p[0]) < window
+    scale = 0.4 * d0 / np.hypot(*moved[:, near]).max()
+    at = 1e3 * (d0 * bench.mesh.p + scale * moved)
+    ring = np.abs(bench.mesh.p).max(axis=0)
+    around = ring[bench.mesh.t].max(axis=0) > 1 + 1e-9
+    outside = bench.mesh.t[:, around]
+    total = np.bincount(outside.ravel(), np.tile(stress[around] / 1e3, 3), len(ring))
+    kilopascal = total / np.maximum(np.bincount(outside.ravel(), minlength=len(ring)), 1)
+    limit = np.percentile(np.abs(kilopascal[near & (ring >= 1)]), 95)
+    image = axis.tripcolor(
+        Triangulation(at[0], at[1], outside.T), kilopascal, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud"
+    )
+    tall = min(window, bench.body.height / 2 / d0) - 0.25
+    grid = np.mgrid[-window + 1 : window - 0.9, -tall : tall + 0.1 : tall / 2.5].reshape(2, -1, 1).swapaxes(0, 1)
+    few = [np.argmin(np.hypot(*(bench.mesh.p - point))) for point in grid]
+    axis.quiver(*at[:, few], *moved[:, few], color="0.25", width=0.002, angles="xy")
+    corners = 1e3 * d0 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
+    axis.plot(*corners, "k:", linewidth=0.8)
+    face = np.flatnonzero(np.isclose(ring, 1))
+    outline = at[:, face[np.argsort(np.arctan2(*bench.mesh.p[::-1, face]))]]
+    axis.fill(*outline, facecolor="0.8", edgecolor="black", linewidth=1.2)
+    edge, top = 1e3 * d0 * window, min(1e3 * d0 * window, 600 * bench.body.height)
+    axis.set(xlim=(-edge, edge), ylim=(-top, top), aspect="equal", ylabel="z, mm")
+    axis.figure.colorbar(image, ax=axis, label="sigma_zz, kPa")
+    return float(scale)
 
 
 def plot_experiment(result: Experiment, path: Path) -> None:
@@ -83,6 +164,9 @@ def plot_experiment(result: Experiment, path: Path) -> None:
             axis.plot(x, result.recovered[:, mode] / 1e3, "o-", color=f"C{k}", label=PLANE.names[mode])
             axis.plot(x, result.truth[:, mode] / 1e3, "--", color=f"C{k}")
         axis.set(title=f"{title} (dashed: true)", ylabel="kPa")
+        floor = np.abs(result.recovered).max() / 1e5
+        if max(map(abs, axis.get_ylim())) < floor:  # rounding, not a result
+            axis.set_ylim(-floor, floor)
     for axis in axes:
         axis.legend(fontsize="x-small")
         axis.set_xlabel("displacement, mm")
@@ -103,14 +187,21 @@ def plot_rod_sweep(table: dict[str, list[float]], path: Path) -> None:
     plt.close(figure)
 
 
-def make_paper(out: Path, progress: Callable[[int, int, str], None] | None = None) -> None:
-    """All pictures of docs/paper.md, and their numbers as paper.json, into the folder `out`."""
+def make_paper(out: Path, progress: Progress | None = None) -> list[Path]:
+    """All pictures of docs/paper.md but the study's, and their numbers as paper.json, into the folder `out`."""
     out.mkdir(parents=True, exist_ok=True)
-    plot_figure_4(out / "figure_4.png")
+    made = [out / "figure_4.png"]
+    plot_figure_4(made[0])
     numbers: dict[str, object] = {}
-    for finite, kind in ((False, "linear"), (True, "finite")):
-        for number, result in enumerate(experiments(finite=finite, progress=progress)):
-            plot_experiment(result, out / f"experiment_{number + 1}_{kind}.png")
+    for half, kind in enumerate(("linear", "finite")):
+
+        def report(done: int, total: int, what: str, half: int = half, kind: str = kind) -> None:
+            if progress is not None:
+                progress(half * total + done, 2 * total, f"{kind}: {what}")
+
+        for number, result in enumerate(experiments(finite=kind == "finite", progress=report), 1):
+            made.append(out / f"experiment_{number}_{kind}.png")
+            plot_experiment(result, made[-1])
             numbers[f"{result.name}, {kind}"] = {
                 "displacement": result.displacement.tolist(),
                 "prototype": result.prototype.tolist(),
@@ -119,6 +210,8 @@ def make_paper(out: Path, progress: Callable[[int, int, str], None] | None = Non
                 "truth": result.truth.tolist(),
             }
     table = rod_sweep()
-    plot_rod_sweep(table, out / "rod_positions.png")
+    made += [out / "rod_positions.png", out / "paper.json"]
+    plot_rod_sweep(table, made[-2])
     numbers["rod positions"] = table
-    (out / "paper.json").write_text(json.dumps(numbers, indent=1), encoding="utf-8")
+    made[-1].write_text(json.dumps(numbers, indent=1), encoding="utf-8")
+    return made

@@ -121,16 +121,18 @@ def rod_sweep(
     return table
 
 
-def figure_4(body: Body | None = None) -> dict[str, tuple[Bench, Array, Array]]:
-    """Section 3: the body under shear only, and under a normal stress that varies linearly along x; 10 kPa each.
-
-    {name: (bench, displacement (2, nodes) m, sigma_zz (elements,) Pa)}
-    """
+def figure_4(body: Body | None = None) -> tuple[Bench, dict[str, tuple[Array, Array]]]:
+    """Section 3: the body under shear only, and under a normal stress that varies linearly along x; 10 kPa each."""
     bench = Bench(body or Body(), size=0.2)
+    return bench, loaded_modes(bench, ("zx", "zz_x"))
+
+
+def loaded_modes(bench: Bench, names: Sequence[str]) -> dict[str, tuple[Array, Array]]:
+    """10 kPa of each plane mode: {name: (displacement (2, nodes) m, sigma_zz (elements,) Pa)}."""
     found = {}
-    for name in ("zx", "zz_x"):
+    for name in names:
         mode = PLANE.names.index(name)
         stress = 1e4 * PLANE.stress[mode][np.ix_((0, 2), (0, 2))]
         gradient = 1e4 * PLANE.gradient[mode][np.ix_((0, 2), (0, 2), (0, 2))]
-        found[name] = (bench, *bench.loaded(stress, gradient))
+        found[name] = bench.loaded(stress, gradient)
     return found

@@ -31,7 +31,7 @@ from ..core.modes import COMPONENTS
 from ..core.scene import Places
 
 Array = NDArray[np.float64]
-NEIGHBOURS = 25
+NEIGHBOURS = 9
 RIDGE = 1e-6
 """Added to φ(0) = 1: a thousandth of what is measured counts as noise, which keeps close cubes solvable."""
 PRESSURE = [COMPONENTS.index(name) for name in ("zz", "zz_x", "zz_y")]
@@ -80,8 +80,11 @@ class Surface:
         self.points = patches.reshape(-1, 3)
         self.cube = np.repeat(np.arange(len(places.position)), side**2)
         count = min(NEIGHBOURS, len(places.position))
-        near = cKDTree(places.position).query(places.position, count)[1]
-        self._near = near.reshape(-1, count)
+        apart, near = cKDTree(places.position).query(places.position, min(3 * count, len(places.position)))
+        apart, near = apart.reshape(len(near), -1), near.reshape(len(near), -1)
+        # of cubes equally far the first ones, not those that rounding favours
+        order = np.lexsort((near, (apart / self.pitch).round(6)))[:, :count]
+        self._near = np.take_along_axis(near, order, axis=1)
         self._gradients = gradients
         pairs = cKDTree(self.points).query_pairs(1.5 * self.spacing, output_type="ndarray")
         self._from, self._to = pairs.T
@@ -89,19 +92,22 @@ class Surface:
 
     def field(self, values: Array) -> Field:
         """The field of values (cubes, 15), NaN where not observed; such a cube is filled in by the others. O(M)."""
-        pressure, _ = self._interpolate(values[:, PRESSURE])
+        pressure, _ = self._interpolate(values[:, PRESSURE if self._gradients else PRESSURE[:1]])
         shear = [self._interpolate(values[:, [column]])[0] for column in SHEAR]
         return Field(-pressure, np.stack(shear, axis=1))
 
     def uncertainty(self, values: Array) -> Array:
         """(M,) standard deviation of the pressure between the cubes, as a part of its own size (0 .. 1)."""
-        return self._interpolate(values[:, PRESSURE])[1]
+        return self._interpolate(values[:, PRESSURE if self._gradients else PRESSURE[:1]])[1]
 
     def contacts(self, values: Array, least: float) -> list[Contact]:
         """Where pressure exceeds `least` Pa and FLOOR of the greatest: the strongest first; see Contact.
 
         The layer above the cubes is in equilibrium: the pressure's integral is the force, its first moment is that of
-        the load plus depth × shear force, which is taken off again. Each point counts for the contact nearest to it.
+        the load plus depth × shear force, which is taken off again. For the moment pressure and shear are interpolated
+        alike, by values: below a point force (σzx, σyz, σzz) points away from it in an incompressible body, so then each
+        cube by itself gives the place, and any common weights do. Each point counts for the contact nearest to it.
+        What spreads beyond the skin is lost: of pressure hardly anything, of shear about 1.5 depth / distance to the edge.
         """
         field = self.field(values)
         top = float(field.pressure.max(initial=0.0))
@@ -111,16 +117,14 @@ class Surface:
         joined = inside[self._from] & inside[self._to]
         n = len(self.points)
         links = coo_matrix((np.ones(joined.sum()), (self._from[joined], self._to[joined])), shape=(n, n))
-        _, label = connected_components(links, directed=False)
-        members = np.flatnonzero(inside)
-        nearest = cKDTree(self.points[members]).query(self.points)[1]
-        owner = label[members][nearest]
-        doubt = self.uncertainty(values)
+        label = connected_components(links, directed=False)[1][inside]
+        owner = label[cKDTree(self.points[inside]).query(self.points)[1]] if np.ptp(label) else np.full(n, label[0])
+        doubt, alike = self.uncertainty(values), -self._interpolate(values[:, PRESSURE[:1]])[0]
         sheared = bool(np.isfinite(values[:, SHEAR]).any())
-        found = [self._contact(np.flatnonzero(owner == k), field, doubt, sheared) for k in np.unique(label[members])]
+        found = [self._contact(np.flatnonzero(owner == k), field, alike, doubt, sheared) for k in np.unique(label)]
         return sorted(found, key=lambda contact: -contact.normal_force)
 
-    def _contact(self, mine: NDArray[np.intp], field: Field, doubt: Array, sheared: bool) -> Contact:
+    def _contact(self, mine: NDArray[np.intp], field: Field, alike: Array, doubt: Array, sheared: bool) -> Contact:
         pressure, points, cubes = field.pressure[mine], self.points[mine], self.cube[mine]
         turn = self.places.rotation[cubes]
         weight = pressure * self.area
@@ -129,10 +133,11 @@ class Surface:
         normal /= np.linalg.norm(normal)
         shear = np.einsum("nij,nj->i", turn[:, :, :2], np.nan_to_num(field.shear[mine])) * self.area
         shear -= normal * (shear @ normal)
-        centre = weight @ points / normal_force
-        position = centre + self.depth * (normal - shear / normal_force)
+        moment = alike[mine] * self.area
+        centre = moment @ points / moment.sum()
+        position = centre + self.depth * (normal - shear / moment.sum())
         # errors between cubes are as wide as the pitch is: so many points are wrong together
-        sigma = doubt[mine] * pressure.max() * self.area
+        sigma = doubt[mine] * np.abs(pressure) * self.area
         together = (self.pitch / self.spacing) ** 2
         apart = ((points - centre) ** 2).sum(axis=1) / 2
         return Contact(
@@ -149,8 +154,6 @@ class Surface:
     def _interpolate(self, data: Array) -> tuple[Array, Array]:
         """On all points: interpolated first column and its relative uncertainty; data (cubes, 1 or 3)."""
         scaled = data * np.array([1.0, self._scale, self._scale])[: data.shape[1]]
-        if not self._gradients:
-            scaled = scaled[:, :1]
         known = np.isfinite(scaled)
         weights, doubt = self._weights(known.tobytes(), scaled.shape[1])
         near = np.nan_to_num(scaled)[self._near].reshape(len(data), -1)

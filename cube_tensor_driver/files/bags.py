@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import apsw
 import numpy as np
+from backports import zstd
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.serde import SerdeError
@@ -28,11 +29,11 @@ PACKAGE = "cube_tensor_driver"
 FREQUENCIES, STRESS, INFO = (f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo"))
 VERSIONS = (1,)
 """Of SkinInfo that this package reads. An older one that is not among them has to be converted here."""
-BATCH = 64
+BATCH, BATCH_BYTES = 64, 1 << 19
 """Messages at a time: what numpy costs per call no longer counts, and they fit the cache."""
 # What rosbags and the libraries below it let through where bytes are not what they should be.
-DAMAGE = (ReaderError, SerdeError, TypesysError, apsw.Error, struct.error, ValueError, LookupError, TypeError,
-          AttributeError, AssertionError, ArithmeticError, MemoryError, EOFError, RecursionError)  # fmt: skip
+DAMAGE = (ReaderError, SerdeError, TypesysError, apsw.Error, zstd.ZstdError, struct.error, ValueError, LookupError,
+          TypeError, AttributeError, AssertionError, ArithmeticError, MemoryError, EOFError, RuntimeError)  # fmt: skip
 
 
 @contextmanager
@@ -51,7 +52,9 @@ def damage(path: Path) -> Iterator[None]:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
     except DAMAGE as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        raise BagError(f"{path}: damaged, or no bag ({text[:200]}); ./cube bag repair may help if it was cut off") from None
+        raise BagError(
+            f"{path}: damaged, or no bag ({text[:200]}); ./cube bag repair may help if it was cut off"
+        ) from None
 
 
 @lru_cache
@@ -113,17 +116,29 @@ class Bag:
         """What its topics begin with, ending in /. BagError: no skin, or several."""
         found = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
         if len(found) != 1:
-            raise BagError(f"{self.path}: {len(found)} topics of {FREQUENCIES} ({', '.join(found) or 'none'}); needed is one")
+            raise BagError(
+                f"{self.path}: {len(found)} topics of {FREQUENCIES} ({', '.join(found) or 'none'}); needed is one"
+            )
         return found[0]
 
-    def entries(self, topics: set[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[Entry]:
+    def entries(
+        self, topics: set[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[Entry]:
         """Messages from start_ns until before stop_ns, of some topics or all, in the order of recording."""
         wanted = [c for c in self.connections if topics is None or c.topic in topics]
         if not wanted:
             return
+        count = 0
         with damage(self.path):
             for connection, time_ns, data in self._reader.messages(wanted, start_ns, stop_ns):
+                count += 1
                 yield Entry(connection.topic, connection.msgtype, time_ns, data)
+        # A name damaged in one place only makes rosbags leave messages out without a word.
+        promised = sum(connection.msgcount for connection in wanted)
+        if start_ns is None and stop_ns is None and count != promised:
+            names = ", ".join(sorted({connection.topic for connection in wanted}))
+            raise BagError(f"{self.path}: damaged: {count} messages on {names}, the bag says {promised}; "
+                           "./cube bag repair may help")  # fmt: skip
 
     def decode(self, entry: Entry) -> Any:
         """The message. BagError: its bytes do not fit its type."""
@@ -151,16 +166,16 @@ class Bag:
         stress = topic in self.topics(STRESS)
         find, read = (cdr.stress_shape, cdr.read_stress) if stress else (cdr.frequencies_shape, cdr.read_frequencies)
         waiting: list[Entry] = []
-        shape = None
+        shape, most = None, 1
         for entry in self.entries({topic}):
-            try:
-                found = find(entry.data)
-            except MessageError as error:
-                raise BagError(f"{self.path}: {topic}: {error}") from None
-            if waiting and (found != shape or len(waiting) == BATCH):
-                yield self._batch(read, waiting, shape)
-                waiting = []
-            shape = found
+            if not waiting or len(waiting) >= most or not cdr.same_shape(entry.data, waiting[0].data, shape):
+                if waiting:
+                    yield self._batch(read, waiting, shape)
+                try:
+                    shape = find(entry.data)
+                except MessageError as error:
+                    raise BagError(f"{self.path}: {topic}: {error}") from None
+                waiting, most = [], min(BATCH, BATCH_BYTES // len(entry.data))
             waiting.append(entry)
         if waiting:
             yield self._batch(read, waiting, shape)

@@ -87,6 +87,16 @@ def stress_shape(data: bytes) -> Shape:
     return _checked(data, _STRESS, Shape(*_begin(data), 0))
 
 
+def same_shape(one: bytes, other: bytes, shape: Shape) -> bool:
+    """Whether a message of a type has the shape that another one has; what else its bytes say, reading checks."""
+    rows = -(-(_FIRST_COUNT + 4 + shape.frame) // 4) * 4
+    return (
+        len(one) == len(other)
+        and one[_FIRST_COUNT : _FIRST_COUNT + 4] == other[_FIRST_COUNT : _FIRST_COUNT + 4]
+        and one[rows : rows + 4] == other[rows : rows + 4]
+    )
+
+
 def read_frequencies(data: Sequence[bytes], shape: Shape) -> Batch:
     """Serialised SkinFrequencies of one shape. MessageError: fields contradict each other."""
     return _read(data, _FREQUENCIES, shape)
@@ -118,7 +128,9 @@ def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]]) -> list[bytes]:
 def _begin(data: bytes) -> tuple[int, int]:
     """Length of the frame id, number of rows."""
     if len(data) < _FIRST_COUNT + 8 or data[:2] != LITTLE_ENDIAN[:2]:
-        raise MessageError(f"a batch message of {len(data)} bytes that begin with {data[:4].hex()}: not little-endian CDR")
+        raise MessageError(
+            f"a batch message of {len(data)} bytes that begin with {data[:4].hex()}: not little-endian CDR"
+        )
     (frame,) = struct.unpack_from("<I", data, _FIRST_COUNT)
     place = -(-(_FIRST_COUNT + 4 + frame) // 4) * 4
     if place + 4 > len(data):

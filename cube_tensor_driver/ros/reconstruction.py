@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 
 from ..core.errors import CubeError
+from ..core.health import Health
 from ..core.pipeline import INVALID, Pipeline
+from ..core.tare import DriftTracker
 from ..files.skin import read_skin
+from .cube_health import CubeHealth
 from .cube_topics import CubeTopics
 from .messages import info_message, read_frequencies, stress_message, to_time
 from .node import LATCHED, CubeNode, queue, run
+from .taring import Taring, tare_folder
 
 LISTENERS_S = 0.5
 """How often it is looked up which cubes' own topics anybody listens to."""
+DRIFT_INFO_S = 10
+"""How often rest frequencies that follow drift are published in `info`."""
 
 
 class Reconstruction(CubeNode):
@@ -29,7 +37,13 @@ class Reconstruction(CubeNode):
         self.declare("config", "", "Skin file (YAML).")
         self.declare("wrench_side", 0.0, "Side of the face that wrenches refer to, m; 0: the cube's own.", (0.0, 10.0))
         self.declare("qos_reliability", "reliable", "Reliability of the batch topics.", choices="reliable, best_effort")
+        self.declare("tare_duration", 1.0, "What ~/tare averages over unless it is told, s.", (0.5, 10.0), live=True)
+        self.declare("tare_folder", "", "Where tare is kept, by uid; empty: ~/.ros/cube_tensor_driver/tare.")
+        self.declare("drift_time", 0.0, "Time constant with which rest frequencies follow slow drift while nothing "
+                     "touches a cube, s; 0: never.", (0.0, 1e6), live=True)  # fmt: skip
         self._active = False
+        # In one process with the driver its thread calls `take`, while services run in the main thread.
+        self._lock = threading.Lock()
 
     def configure(self) -> None:
         skin = self._skin = read_skin(self.config())
@@ -40,13 +54,25 @@ class Reconstruction(CubeNode):
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._cubes = CubeTopics(self, skin, self._pipeline, self.value("wrench_side") or None)
+        self._health = Health(self._pipeline)
+        self._drift = DriftTracker(self._pipeline, self._health)
+        self._drift_time = float(self.value("drift_time"))
+        self._drifted, self._ticks = False, 0
+        self._words = CubeHealth(self.get_fully_qualified_name(), skin, self._pipeline, self._health)
+        folder = tare_folder(self.value("tare_folder"))
+        self._taring = Taring(self, skin, self._pipeline, self._health, folder,
+                              lambda: float(self.value("tare_duration")), self._publish_info, self._lock)  # fmt: skip
+        self._listening = self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
         if self._subscribes:
             self._subscription = self.create_subscription(SkinFrequencies, "frequencies", self.take, quality)
         self._own_timers = [
             self.create_timer(1.0, self._publish_diagnostics),
             self.create_timer(LISTENERS_S, self._cubes.find_listeners),
         ]
-        self._info.publish(info_message(skin, self._pipeline, self.get_clock().now().nanoseconds))
+        self._publish_info()
+
+    def changed(self, name: str) -> None:
+        self._drift_time = float(self.value("drift_time"))
 
     def activate(self) -> None:
         self._active = True
@@ -58,6 +84,8 @@ class Reconstruction(CubeNode):
         if hasattr(self, "_own_timers"):
             if self._subscribes:
                 self.destroy_subscription(self._subscription)
+            self.destroy_subscription(self._listening)
+            self._taring.close()
             for timer in self._own_timers:
                 self.destroy_timer(timer)
             for publisher in (self._stress, self._info, self._diagnostics):
@@ -71,7 +99,15 @@ class Reconstruction(CubeNode):
             return
         try:
             times, frequency, pad_fault, temperature = read_frequencies(message)
-            rows = self._pipeline.process(times.cube, frequency, pad_fault, temperature)
+            with self._lock:
+                stamp_ns = int(times.stamp_ns.max(initial=0))
+                windows = self._health.closed
+                pad_fault = self._health.update(times.cube, frequency, pad_fault, stamp_ns, temperature)
+                rows = self._pipeline.process(times.cube, frequency, pad_fault, temperature)
+                self._health.residual(times.cube, rows.status)
+                rows.status[:] |= self._health.status[times.cube]
+                if self._drift_time and self._health.closed != windows:
+                    self._drifted |= self._drift.step(self._drift_time)
         except CubeError as error:
             self._bad_messages += 1
             self.get_logger().error(f"frequencies: {error}", throttle_duration_sec=5.0)
@@ -81,18 +117,33 @@ class Reconstruction(CubeNode):
         self._invalid += int(np.count_nonzero(rows.status & INVALID))
         self._cubes.publish(times, rows, pad_fault)
 
+    def _publish_info(self) -> None:
+        now_ns = self.get_clock().now().nanoseconds
+        self._info.publish(info_message(self._skin, self._pipeline, now_ns, self._taring.uids))
+
     def _publish_diagnostics(self) -> None:
+        self._ticks += 1
+        if self._drifted and self._ticks % DRIFT_INFO_S == 0:
+            self._drifted = False
+            self._publish_info()
+        with self._lock:
+            statuses, lines = self._words.statuses(self._taring.uids)
+            summary = self._words.summary()
+        for line in lines:
+            self.get_logger().warning(line)
         rate, self._rows_before = self._rows - self._rows_before, self._rows
         values = {
             "rows": self._rows,
             "rows per second": rate,
             "invalid rows": self._invalid,
             "messages that contradict themselves": self._bad_messages,
+            **self._taring.age(),
+            **summary,
         }
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), hardware_id=self._skin.name)
         status.level = DiagnosticStatus.WARN if self._bad_messages else DiagnosticStatus.OK
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
+        message = DiagnosticArray(status=[status, *statuses])
         message.header.stamp = to_time(self.get_clock().now().nanoseconds)
         self._diagnostics.publish(message)
 

@@ -98,7 +98,7 @@ class Recorder:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         self._subscriptions.append(
-            self._node.create_subscription(_message_class(topic, msgtype), topic, take, profile, raw=True)
+            self._node.create_subscription(message_class(topic, msgtype), topic, take, profile, raw=True)
         )
 
     def _write(self) -> None:
@@ -124,10 +124,12 @@ class Recorder:
             self._written_bytes += len(data)
 
 
-def _message_class(topic: str, msgtype: str) -> Any:
+def message_class(topic: str, msgtype: str) -> Any:
     """The message class of pkg/msg/Name. BagError: not installed."""
     package, _, name = msgtype.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError):
-        raise BagError(f"{topic}: the messages of {package} are not installed here; source the workspace that has them") from None
+        raise BagError(
+            f"{topic}: the messages of {package} are not installed here; source the workspace that has them"
+        ) from None

@@ -8,7 +8,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.protocol import TEMPERATURE_UNKNOWN, Ack, Command, Decoder, Hello, Request, Result, Sample, Stats, encode
+from ..device.protocol import (
+    TEMPERATURE_UNKNOWN,
+    VERSION,
+    Ack,
+    Command,
+    Decoder,
+    Hello,
+    Request,
+    Result,
+    Sample,
+    Stats,
+    encode,
+)
 
 FIRMWARE = 0x00010000
 PERIOD_LIMITS_US = (100, 10_000_000)
@@ -16,12 +28,16 @@ PERIOD_LIMITS_US = (100, 10_000_000)
 
 @dataclass
 class Run:
-    """Samples first … last (from power-up) were taken at start_us, start_us + period_us, … of simulated time."""
+    """Samples first … last (from power-up) were taken at start_us, start_us + period_us, … of simulated time.
+
+    boot: how often the hub had restarted by then.
+    """
 
     first: int
     last: int
     start_us: int
     period_us: int
+    boot: int = 0
 
 
 @dataclass
@@ -29,7 +45,8 @@ class SimulatedHub:
     """The device side of the protocol.
 
     boot_us: what the hub's clock shows at simulated time 0; period_us: sample period; next_us: simulated time of the
-    next sample; runs: the book of what was sampled; dropped: samples taken that found no room on the line.
+    next sample; runs: the book of what was sampled; dropped: samples taken that found no room on the line, since
+    power-up; boots: restarts. For faults: drift_ppm, version, false_uid, extra_pads, celsius (0.01 °C).
     """
 
     uid: int
@@ -43,14 +60,47 @@ class SimulatedHub:
     dropped: int = 0
     runs: list[Run] = field(default_factory=list)
     decoder: Decoder = field(default_factory=Decoder)
+    boots: int = 0
+    drift_ppm: float = 0.0
+    version: int = VERSION
+    false_uid: int | None = None
+    extra_pads: int = 0
+    celsius: int = TEMPERATURE_UNKNOWN
+    _drift_since_us: int = 0
 
     def hello(self) -> bytes:
         """Bytes of the HELLO frame."""
-        return encode(Hello(self.uid, FIRMWARE, self.n_pads, self.period_us, np.array(self.cube_uids, "<u8")))
+        uid = self.uid if self.false_uid is None else self.false_uid
+        pads, uids = self.n_pads + self.extra_pads, np.array(self.cube_uids, "<u8")
+        return encode(Hello(uid, FIRMWARE, pads, self.period_us, uids), self.version)
 
-    def stats(self, uptime_ms: int) -> bytes:
-        """Bytes of the STATS frame."""
-        return encode(Stats(uptime_ms, self.sequence & 0xFFFFFFFF, self.dropped & 0xFFFFFFFF, 5000))
+    def stats(self, now_us: int) -> bytes:
+        """Bytes of the STATS frame at simulated time now_us."""
+        uptime_ms = max(0, self.device_us(now_us)) // 1000
+        frame = Stats(uptime_ms, self.sequence & 0xFFFFFFFF, self.dropped & 0xFFFFFFFF, 5000)
+        return encode(frame, self.version)
+
+    def device_us(self, now_us: int) -> int:
+        """What the hub's clock shows at simulated time now_us."""
+        return self.boot_us + now_us + round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
+
+    def set_clock(self, now_us: int, step_us: int = 0, drift_ppm: float | None = None) -> None:
+        """Set the clock forward, or give it another rate from now on."""
+        self.boot_us = self.device_us(now_us) - now_us + step_us
+        self.drift_ppm = self.drift_ppm if drift_ppm is None else drift_ppm
+        self._drift_since_us = now_us
+
+    def off(self) -> None:
+        """The power is gone."""
+        self.started = False
+
+    def reset(self, now_us: int, sequence: int) -> None:
+        """Restart: stopped, clock at 0, counting from `sequence`."""
+        self.off()
+        self.boots += 1
+        self.boot_us, self._drift_since_us = -now_us, now_us
+        self.sequence, self.dropped = sequence, 0
+        self.decoder = Decoder()
 
     def receive(self, data: bytes, now_us: int) -> bytes:
         """What the hub answers to bytes that the host sends at simulated time now_us."""
@@ -62,19 +112,19 @@ class SimulatedHub:
         run = self.runs[-1] if self.runs else None
         if (
             run
+            and run.boot == self.boots
             and run.period_us == self.period_us
             and self.next_us == run.start_us + (run.last + 1 - run.first) * run.period_us
         ):
             run.last = self.sequence
         else:
-            self.runs.append(Run(self.sequence, self.sequence, self.next_us, self.period_us))
+            self.runs.append(Run(self.sequence, self.sequence, self.next_us, self.period_us, self.boots))
         n = len(frequency)
-        unknown = np.full(n, TEMPERATURE_UNKNOWN, "<i2")
-        device_us = self.boot_us + self.next_us
-        frame = Sample(self.sequence & 0xFFFFFFFF, 0, device_us, frequency, np.zeros(n, "<u4"), unknown)
+        temperature, device_us = np.full(n, self.celsius, "<i2"), max(0, self.device_us(self.next_us))
+        frame = Sample(self.sequence & 0xFFFFFFFF, 0, device_us, frequency, np.zeros(n, "<u4"), temperature)
         self.sequence += 1
         self.next_us += self.period_us
-        return encode(frame)
+        return encode(frame, self.version)
 
     def _schedule(self, now_us: int) -> None:
         """Samples fall on whole multiples of the period, so that hubs sample together."""
@@ -83,7 +133,7 @@ class SimulatedHub:
     def _answer(self, request: Request, now_us: int) -> bytes:
         result, argument = Result.DONE, 0
         if request.request == Command.HELLO:
-            return encode(Ack(request.request)) + self.hello()
+            return encode(Ack(request.request), self.version) + self.hello()
         if request.request == Command.START:
             self.started = True
             self._schedule(now_us)
@@ -99,4 +149,4 @@ class SimulatedHub:
             argument = self.period_us
         elif request.request != Command.IDENTIFY:
             result = Result.UNKNOWN
-        return encode(Ack(request.request, result, argument))
+        return encode(Ack(request.request, result, argument), self.version)

@@ -15,77 +15,63 @@ import selectors
 import signal
 import sys
 import time
-import tty
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ..core.errors import ConfigError, CubeError
 from ..files.skin import Skin, read_skin
+from ..files.yaml import parse_yaml, read_yaml
 from .cubes import SimulatedCubes
+from .faults import Fault, Injector, parse_faults
 from .hub import SimulatedHub
+from .line import Line
 from .load import CIRCUIT_S, MovingLoad
 
-OUT_LIMIT = 1 << 16
-"""Bytes that wait for the line at most: what is sampled beyond is dropped in the hub, and counted there."""
 ABSENT = -1
 FIRST_UID = 0xC0BE_0000_0000_0001
+CONTROL = ".faults"
+"""A pipe in the folder of the ports: each line written to it is a fault, as YAML."""
 
 
-class Line:
-    """A hub on its pseudo-terminal."""
+@dataclasses.dataclass
+class Bench:
+    """A hub on its line. members: (hub cubes,) index in the skin of each cube of the hub, ABSENT where it has none."""
 
-    def __init__(self, port: Path, hub: SimulatedHub, members: np.ndarray, cubes: SimulatedCubes) -> None:
-        """members: (hub cubes,) index in the skin of each cube of the hub, ABSENT where the skin has none."""
-        self.hub, self.members, self.cubes, self.port = hub, members, cubes, port
-        # The far end stays open, else the near one reports an error whenever the driver closes it.
-        self.fd, self._far = os.openpty()
-        tty.setraw(self._far)
-        os.set_blocking(self.fd, False)
-        self._out = bytearray()
-        self.prepared: list[np.ndarray] = []
-        port.unlink(missing_ok=True)
-        port.symlink_to(os.ttyname(self._far))
-        self.send(hub.hello())
-
-    def send(self, data: bytes) -> bool:
-        """Queue bytes for the line and write what it takes; False when there was no room for them."""
-        room = len(self._out) + len(data) <= OUT_LIMIT
-        if room:
-            self._out += data
-        with contextlib.suppress(BlockingIOError):
-            while self._out:
-                del self._out[: os.write(self.fd, self._out)]
-        return room
-
-    def read(self) -> bytes:
-        try:
-            return os.read(self.fd, 65536)
-        except BlockingIOError:
-            return b""
-
-    def close(self) -> None:
-        self.port.unlink(missing_ok=True)
-        os.close(self.fd)
-        os.close(self._far)
+    name: str
+    hub: SimulatedHub
+    line: Line
+    members: np.ndarray
+    cubes: SimulatedCubes
+    prepared: list[np.ndarray] = dataclasses.field(default_factory=list)
 
 
 class Simulator:
     """All hubs of a skin. noise and drift as in `SimulatedCubes`."""
 
     def __init__(
-        self, skin: Skin, ports: Path, noise: float = 0.0, drift: float = 0.0, instants: int | None = None
+        self,
+        skin: Skin,
+        ports: Path,
+        noise: float = 0.0,
+        drift: float = 0.0,
+        instants: int | None = None,
+        faults: Sequence[Fault] = (),
+        seed: int = 0,
     ) -> None:
         """instants: compute the load at so many instants of its circuit beforehand and go round them, one a sample.
 
-        ConfigError: cubes of one hub have different numbers of pads, or the folder for the ports cannot be used.
+        faults: to carry out; seed: of what is random in them. ConfigError: cubes of one hub have different numbers of
+        pads, the folder for the ports cannot be used, or a fault is of what there is not.
         """
         self._load = MovingLoad(skin)
         self._ports = ports
         self._field: tuple[int, tuple[np.ndarray, np.ndarray]] | None = None
         self._start_ns = time.monotonic_ns()
         self.start_time_ns = time.time_ns()
-        self.lines: dict[str, Line] = {}
+        self.benches: list[Bench] = []
         try:
             ports.mkdir(parents=True, exist_ok=True)
             for number, link in enumerate(skin.links):
@@ -103,18 +89,25 @@ class Simulator:
                 # Clocks that started at different times, as those of real hubs.
                 hub = SimulatedHub(link.hub_uid or number + 1, uids, widths.pop(), boot_us=1_000_003 * (number + 1))
                 simulated = SimulatedCubes([cube.calibration for cube in cubes], noise, drift, seed=number)
-                self.lines[link.name] = Line(ports / link.name, hub, members, simulated)
-            self._prepare(instants or 0)
+                self.benches.append(Bench(link.name, hub, Line(ports / link.name), members, simulated))
+            control = ports / CONTROL
+            control.unlink(missing_ok=True)
+            os.mkfifo(control)
+            self._control = os.open(control, os.O_RDWR | os.O_NONBLOCK)
         except OSError as error:
             raise ConfigError(
                 f"{ports}: {error.strerror}; name a folder that can be written for the simulated ports"
             ) from None
+        self._injector = Injector(self.benches, faults, seed)
+        self._prepare(instants or 0)
+        for bench in self.benches:
+            bench.line.send(bench.hub.hello(), 0)
 
     def _prepare(self, instants: int) -> None:
         for number in range(instants):
             stress, gradient = self._load.at(number * CIRCUIT_S / instants)
-            for line in self.lines.values():
-                line.prepared.append(self._frequency(line, stress, gradient, 0.0))
+            for bench in self.benches:
+                bench.prepared.append(self._frequency(bench, stress, gradient, 0.0))
 
     def now_us(self) -> int:
         """Simulated time: µs since the start."""
@@ -123,59 +116,100 @@ class Simulator:
     def run(self, stop: Stop) -> None:
         """Play the hubs until `stop` is set: HELLO and STATS at 1 Hz, samples when asked for."""
         with selectors.DefaultSelector() as selector:
-            for line in self.lines.values():
-                selector.register(line.fd, selectors.EVENT_READ, line)
+            watched: dict[str, int] = {}
             selector.register(stop.fd, selectors.EVENT_READ, None)
+            selector.register(self._control, selectors.EVENT_READ, self._take_orders)
             second_us = 1_000_000
             while not stop.requested:
-                due = min([second_us, *(line.hub.next_us for line in self.lines.values() if line.hub.started)])
+                for bench in self.benches:
+                    self._watch(selector, watched, bench)
+                due = self._due_us(second_us)
                 for key, _ in selector.select(max(0.0, (due - self.now_us()) * 1e-6)):
-                    line = key.data
-                    if line is not None:
-                        answer = line.hub.receive(line.read(), self.now_us())
-                        line.send(answer)
+                    if key.data is not None:
+                        key.data()
                 now = self.now_us()
-                for line in self.lines.values():
-                    while line.hub.started and line.hub.next_us <= now:
-                        self._sample(line)
+                for bench in self.benches:
+                    while bench.hub.started and bench.hub.next_us <= now:
+                        # Faults fall between the samples where they belong, however late this loop comes.
+                        self._injector.step(bench.hub.next_us)
+                        if bench.hub.started:
+                            self._sample(bench, now)
+                    bench.line.flush(now)
+                self._injector.step(now)
                 if now >= second_us:
                     second_us += 1_000_000
-                    for line in self.lines.values():
-                        line.send(line.hub.hello() + line.hub.stats(now // 1000))
+                    for bench in self.benches:
+                        if bench.line.plugged:
+                            bench.line.send(bench.hub.hello() + bench.hub.stats(now), now)
 
-    def _sample(self, line: Line) -> None:
-        hub = line.hub
-        if line.prepared:
-            frequency = line.prepared[hub.next_us // hub.period_us % len(line.prepared)]
+    def _due_us(self, second_us: int) -> int:
+        """When something is to be done next."""
+        now = self.now_us()
+        times: list[int | None] = [second_us, self._injector.due_us()]
+        times += [bench.hub.next_us for bench in self.benches if bench.hub.started]
+        times += [bench.line.due_us(now) for bench in self.benches]
+        return min(time for time in times if time is not None)
+
+    def _watch(self, selector: selectors.BaseSelector, watched: dict[str, int], bench: Bench) -> None:
+        """Listen to the line as it is plugged now."""
+        fd = bench.line.fd
+        if watched.get(bench.name, -1) != fd:
+            if watched.get(bench.name, -1) >= 0:
+                selector.unregister(watched[bench.name])
+            if fd >= 0:
+                selector.register(fd, selectors.EVENT_READ, partial(self._answer, bench))
+            watched[bench.name] = fd
+
+    def _answer(self, bench: Bench) -> None:
+        now = self.now_us()
+        bench.line.send(bench.hub.receive(bench.line.read(), now), now)
+
+    def _take_orders(self) -> None:
+        """Faults that somebody wrote into the control pipe."""
+        for line in os.read(self._control, 65536).decode(errors="replace").splitlines():
+            try:
+                self._injector.add(Fault.parse(parse_yaml(line, "fault"), "fault"), self.now_us())
+            except ConfigError as error:
+                print(f"simulator: {error}", file=sys.stderr, flush=True)
+
+    def _sample(self, bench: Bench, now_us: int) -> None:
+        hub = bench.hub
+        if bench.prepared:
+            frequency = bench.prepared[hub.next_us // hub.period_us % len(bench.prepared)]
         else:
             if self._field is None or self._field[0] != hub.next_us:
                 self._field = hub.next_us, self._load.at(hub.next_us * 1e-6)
-            frequency = self._frequency(line, *self._field[1], hub.next_us * 1e-6)
-        if not line.send(hub.sample(frequency)):
+            stress, gradient = self._field[1]
+            frequency = self._frequency(bench, stress, gradient, hub.next_us * 1e-6)
+        frame = hub.sample(self._injector.values(bench, frequency, hub.next_us))
+        data = self._injector.frame(bench, frame)
+        if not bench.line.send(data, now_us):
             hub.dropped += 1
 
-    def _frequency(self, line: Line, stress: np.ndarray, gradient: np.ndarray, seconds: float) -> np.ndarray:
-        there = line.members != ABSENT
-        frequency = np.zeros((len(there), line.hub.n_pads), "<u4")
-        cubes = line.members[there]
-        frequency[there] = line.cubes.frequency(stress[cubes], gradient[cubes], seconds)
+    def _frequency(self, bench: Bench, stress: np.ndarray, gradient: np.ndarray, seconds: float) -> np.ndarray:
+        there = bench.members != ABSENT
+        frequency = np.zeros((len(there), bench.hub.n_pads), "<u4")
+        cubes = bench.members[there]
+        frequency[there] = bench.cubes.frequency(stress[cubes], gradient[cubes], seconds)
         return frequency
 
     def book(self) -> dict[str, object]:
-        """What was sampled: start_time_ns (wall clock at simulated time 0) and per link runs, dropped, members."""
+        """What was sampled: start_time_ns (wall clock at simulated time 0), per link runs, dropped, members; faults."""
         links = {
-            name: {
-                "runs": [dataclasses.asdict(run) for run in line.hub.runs],
-                "dropped": line.hub.dropped,
-                "cubes": line.members.tolist(),
+            bench.name: {
+                "runs": [dataclasses.asdict(run) for run in bench.hub.runs],
+                "dropped": bench.hub.dropped,
+                "cubes": bench.members.tolist(),
             }
-            for name, line in self.lines.items()
+            for bench in self.benches
         }
-        return {"start_time_ns": self.start_time_ns, "links": links}
+        return {"start_time_ns": self.start_time_ns, "links": links, "faults": self._injector.book}
 
     def close(self) -> None:
-        for line in self.lines.values():
-            line.close()
+        for bench in self.benches:
+            bench.line.unplug()
+        os.close(self._control)
+        (self._ports / CONTROL).unlink(missing_ok=True)
         # Ours to remove when nobody else put anything there.
         with contextlib.suppress(OSError):
             self._ports.rmdir()
@@ -224,10 +258,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--drift", type=float, default=0.0, help="relative drift of the rest frequencies per second")
     parser.add_argument("--book", type=Path, help="file for the book of what was sampled (JSON), written at the end")
     parser.add_argument("--instants", type=int, help="compute the load at so many instants only, and go round them")
+    parser.add_argument("--faults", type=Path, help="faults to carry out: YAML, a list, see simulation/faults.py")
+    parser.add_argument("--seed", type=int, default=0, help="of what is random in the faults")
     options = parser.parse_args(arguments)
     stop = Stop()
     try:
-        simulator = Simulator(read_skin(options.config), options.ports, options.noise, options.drift, options.instants)
+        faults = parse_faults(read_yaml(options.faults), str(options.faults)) if options.faults else []
+        simulator = Simulator(read_skin(options.config), options.ports, options.noise, options.drift, options.instants,
+                              faults, options.seed)  # fmt: skip
     except CubeError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 1
@@ -236,9 +274,9 @@ def main(arguments: list[str] | None = None) -> int:
     finally:
         simulator.close()
     if options.book:
-        partial = options.book.with_suffix(".part")
-        partial.write_text(json.dumps(simulator.book()))
-        partial.replace(options.book)
+        unfinished = options.book.with_suffix(".part")
+        unfinished.write_text(json.dumps(simulator.book()))
+        unfinished.replace(options.book)
     return 0
 
 

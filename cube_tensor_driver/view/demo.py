@@ -28,13 +28,13 @@ from ..files.yaml import write_yaml
 from ..ros.children import Children
 from ..ros.messages import read_stress
 from ..ros.node import make_executor, queue
-from ..ros.start import skin_processes
+from ..ros.start import Process, skin_processes
 from ..simulation.judge import Judge
 from .table import LiveTable
 
 FIRST_TENSORS_S = 20.0
 LAST_TENSORS_S = 1.0
-CALIBRATION, LAYOUT, PITCH, RATE, CUBES_PER_HUB = "planar_illustrative", "planar", 0.012, 100.0, 8
+CALIBRATION, LAYOUT, PITCH, RATE, CUBES_PER_HUB = "planar", "planar", 0.012, 100.0, 8
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class Options:
     duration: float | None
     headless: bool
     json: Path | None
+    view: bool = False
 
 
 class Interrupted(CubeError):
@@ -97,6 +98,8 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
     with LiveTable(skin, show=not options.headless) as table, Children(folder) as children:
         for process in skin_processes(path, rate=rate, simulated_ports=folder / "ports", book=book):
             children.start(process)
+        if options.view:
+            children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         node = rclpy.create_node("demo", automatically_declare_parameters_from_overrides=False)
 
         def on_stress(message: SkinStress) -> None:
@@ -138,6 +141,9 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
                     f"after {FIRST_TENSORS_S:g} s only {table.seen} of {len(skin.cubes)} cubes have a tensor.\n"
                     + "\n".join(children.log(name)[-1500:] for name in ("driver", "reconstruction"))
                 )
+            if options.view:
+                spin(FIRST_TENSORS_S, lambda: "http://" in children.log("view"))
+                table.note = f"\n{children.log('view').strip().splitlines()[-1].split()[0]} shows it"
             if live:
                 spin(math.inf, lambda: False)
             spin(0.1, lambda: False)

@@ -12,19 +12,21 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ..core.calibration import illustrative
 from ..core.errors import ConfigError
 from ..core.fit import Fit, fit, measured_stress
 from ..core.symmetry import find_structure
 from ..files.calibration import find_calibration, read_calibration, write_calibration
 from ..files.loads import read_loads, unloaded
-from .layout import named_layout
+from .layout import named_layout, shipped_calibration
 from .plots import draw_fit, save
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """As on the command line. area in m² for loads given as forces; base: calibration with the pad law's constants."""
+    """As on the command line. area in m² for loads given as forces; base: calibration with the pad law's constants.
+
+    reference: topic of a bag, which `loads` then is, of its cube `cube`.
+    """
 
     loads: Path
     layout: str
@@ -35,19 +37,32 @@ class Options:
     uid: int | None
     figure: Path | None
     json: Path | None
+    reference: str | None = None
+    cube: str | None = None
 
 
 def run_fit(options: Options) -> int:
     """Fit, report, write. CubeError: what is wrong; nothing is written then."""
     layout = named_layout(options.layout)
+    recorded = None
+    if options.reference is not None:
+        from ..files.bag_loads import bag_loads
+
+        recorded, known = bag_loads(options.loads, options.cube, options.reference, layout, options.area)
     if options.base is not None:
         base = read_calibration(find_calibration(options.base, Path()))
         base.check(layout, options.uid)
+    elif recorded is not None:
+        base = known
     else:
-        base = illustrative(layout.name)
-    loads = read_loads(options.loads, layout, options.area)
-    rest = unloaded(loads)
-    rest_source = "of the rows without load"
+        shipped = shipped_calibration(layout)
+        if shipped is None:
+            raise ConfigError(f"layout {layout.name!r} is not a built-in one: name a calibration for it with --base")
+        base = shipped
+    loads = recorded or read_loads(options.loads, layout, options.area)
+    # A reference sensor never reads exactly 0: which time was without load says the tare.
+    rest = known.rest_frequency if recorded else unloaded(loads)
+    rest_source = "of the bag, after tare" if recorded else "of the rows without load"
     if rest is None:
         rest, rest_source = base.rest_frequency, "of the base calibration: the table has no row without load"
     base = dataclasses.replace(base, rest_frequency=rest, uid=options.uid)
@@ -118,5 +133,3 @@ def _write_json(path: Path, result: Fit) -> None:
         path.write_text(json.dumps(data, indent=2) + "\n")
     except OSError as error:
         raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None
-
-

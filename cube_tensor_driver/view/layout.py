@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ..core.calibration import illustrative
+from ..core.calibration import Calibration
 from ..core.errors import ConfigError, SymmetryError
 from ..core.estimator import summary
 from ..core.layout import LAYOUTS, Layout, find_layout
 from ..core.response import response
 from ..core.symmetry import GENERATORS, find_structure
 from ..files.calibration import find_calibration, read_calibration
+from ..files.share import share
 from ..files.yaml import read_yaml
 from .plots import draw_layout, save
 
@@ -26,17 +28,23 @@ def named_layout(name: str) -> Layout:
     return Layout.from_dict(read_yaml(path)) if path.suffix in (".yaml", ".yml") else find_layout(name)
 
 
+def shipped_calibration(layout: Layout) -> Calibration | None:
+    """The computed calibration of a built-in layout, with no mode neglected; None for other layouts."""
+    known = LAYOUTS.get(layout.name)
+    if known is None or not known.same_as(layout):
+        return None
+    return replace(read_calibration(share() / "config" / "calibration" / f"{layout.name}.yaml"), neglect=())
+
+
 def run_layout(
     name: str, symmetry: str | None, calibration_name: str | None, json_path: Path | None, figure: Path | None
 ) -> int:
     """Print, draw and, if asked, write the figures of a layout. CubeError: what is wrong."""
     layout = named_layout(name)
-    calibration = None
+    calibration = shipped_calibration(layout)
     if calibration_name is not None:
         calibration = read_calibration(find_calibration(calibration_name, Path()))
         calibration.check(layout)
-    elif layout.name in LAYOUTS:
-        calibration = illustrative(layout.name)
     counts = coefficient_counts(layout)
     symmetry = symmetry or (calibration.symmetry if calibration else next(g for g, count in counts.items() if count))
     structure = find_structure(layout, symmetry)
@@ -93,5 +101,3 @@ def _show(layout: Layout, symmetry: str, counts: dict[str, int | None], result: 
         seen = name not in result["unobservable"]
         table.add_row(name, "not observed" if not seen else "unknown" if noise is None else f"{noise:.3f}")
     console.print(table)
-
-

@@ -37,6 +37,7 @@ class LiveTable:
         self._rate_count, self._rate_at, self._rate = self._count.copy(), time.monotonic(), np.full(n, np.nan)
         self._peak = 0.0
         self._drawn_at = 0.0
+        self.note = ""
         self._console = Console(stderr=True)
         self._live = Live(console=self._console, auto_refresh=False, transient=False) if show else None
 
@@ -76,7 +77,7 @@ class LiveTable:
 
     def draw(self, most: int) -> Table:
         """The table, with the `most` cubes that carry the greatest normal stress if there are more."""
-        table = Table(title=f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed")
+        table = Table(title=f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed{self.note}")
         table.add_column("cube")
         table.add_column("pressure", width=BAR)
         names = [name for name in SHOWN if np.isfinite(self._values[:, COMPONENTS.index(name)]).any()]

@@ -1,0 +1,1 @@
+"""The elastomer: response matrices by finite elements, contact fields, a virtual bench."""

@@ -1,0 +1,274 @@
+"""Bags written as rosbag2 does: a folder with storage files and metadata.yaml, message definitions inside.
+
+Each storage file is written by rosbags in a folder of its own and moves up when it is complete, so whatever stands in
+the bag's folder can be read. mcap chunks carry a checksum: a flipped byte is found when it is read.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import struct
+import zlib
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from types import MappingProxyType
+
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ..core.errors import BagError
+from .bags import DAMAGE, damage, typestore
+from .yaml import write_yaml
+
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
+METADATA_VERSION = 9
+FOREVER = QosTime(9223372036, 854775807)
+CHUNK = 1 << 20
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, two times
+_CRC_AT = 9 + 24  # in a chunk record: behind opcode, length, two times and the size
+
+
+def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) -> Qos:
+    """Quality of service as metadata.yaml says it, so that a replay offers the same."""
+    return Qos(
+        QosHistory.KEEP_LAST,
+        depth,
+        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        FOREVER,
+        FOREVER,
+        QosLiveliness.AUTOMATIC,
+        FOREVER,
+        False,
+    )
+
+
+class _Mcap(McapWriter):
+    """rosbags' storage, with the checksum of each chunk filled in, and a message written in two steps instead of ten."""
+
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        number, chunk = connection.id, self.chunk
+        self.message_start_time = min(timestamp, self.message_start_time)
+        self.message_end_time = max(timestamp, self.message_end_time)
+        self.channel_stats[number] += 1
+        chunk.message_start_time = min(timestamp, chunk.message_start_time)
+        chunk.message_end_time = max(timestamp, chunk.message_end_time)
+        chunk.msgs[number].append((timestamp, chunk.bio.tell()))
+        chunk.bio.write(_MESSAGE.pack(5, 22 + len(data), number, 0, timestamp, timestamp))
+        chunk.bio.write(data)
+        if chunk.bio.tell() > CHUNK:
+            self.close_chunk()
+
+    def close_chunk(self) -> None:
+        checksum = zlib.crc32(self.chunk.bio.getbuffer())
+        start = self.bio.tell()
+        super().close_chunk()
+        end = self.bio.tell()
+        self.bio.seek(start + _CRC_AT)
+        self.bio.write(checksum.to_bytes(4, "little"))
+        self.bio.seek(end)
+
+
+class _Writer(Writer):
+    STORAGE_PLUGINS = MappingProxyType({StoragePlugin.MCAP: _Mcap, StoragePlugin.SQLITE3: Sqlite3Writer})
+
+
+class BagWriter:
+    """A new bag; a context that completes it. Not for several threads.
+
+    storage: mcap or sqlite3. max_bytes, max_seconds: of one storage file, 0 without limit.
+    BagError: the folder is there already, cannot be written, or the disk is full; `valid` says what can be read then.
+    """
+
+    def __init__(self, folder: Path, storage: str = "mcap", max_bytes: int = 0, max_seconds: float = 0.0) -> None:
+        self.folder = folder
+        self.messages = self.bytes = 0
+        self._storage, self._max_bytes, self._max_ns = storage, max_bytes, round(max_seconds * 1e9)
+        self._types: dict[str, tuple[str, tuple[Qos, ...]]] = {}
+        self._parts = 0
+        self._writer: _Writer | None = None
+        if storage not in STORAGES:
+            raise BagError(f"storage {storage!r}: use one of {', '.join(STORAGES)}")
+        if folder.exists():
+            raise BagError(f"{folder} is there already; name a new folder")
+        self._attempt(lambda: folder.mkdir(parents=True))
+        self._begin()
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None or not issubclass(kind, BagError):
+            self.close()
+
+    def add_topic(self, topic: str, msgtype: str, qos: Iterable[Qos] = ()) -> None:
+        """Before its first message. BagError: the type is not known."""
+        if msgtype not in typestore().fielddefs:
+            raise BagError(
+                f"{topic}: the type {msgtype} is not known; known are those of ROS 2 Jazzy and of this package"
+            )
+        self._types[topic] = msgtype, tuple(qos)
+        self._attempt(lambda: self._connect(topic))
+
+    def write(self, topic: str, time_ns: int, data: bytes | memoryview) -> None:
+        """Add a message, serialised. BagError: the disk is full or gone."""
+        if (self._max_bytes and self._part_bytes >= self._max_bytes) or (
+            self._max_ns and self._part_messages and time_ns - self._part_start_ns >= self._max_ns
+        ):
+            self._attempt(self._complete)
+            self._begin()
+        if not self._part_messages:
+            self._part_start_ns = time_ns
+        writer = self._writer
+        if writer is None:
+            raise BagError(f"{self.folder} is closed")
+        self._attempt(lambda: writer.write(self._connections[topic], time_ns, data))
+        self._part_messages += 1
+        self._part_bytes += len(data)
+        self.messages += 1
+        self.bytes += len(data)
+
+    def flush(self) -> None:
+        """Hand all that was written to the system: it survives the end of this process."""
+        storage = self._writer.storage if self._writer else None
+        if isinstance(storage, _Mcap):
+            if storage.chunk.msgs:
+                self._attempt(storage.close_chunk)
+            self._attempt(storage.bio.flush)
+        elif isinstance(storage, Sqlite3Writer):
+            self._attempt(storage.conn.commit)
+
+    def close(self) -> None:
+        """Complete the bag; a second time does nothing."""
+        if self._writer is not None:
+            self._attempt(self._complete)
+
+    def _begin(self) -> None:
+        self._part_start_ns = self._part_bytes = self._part_messages = 0
+        self._connections: dict[str, Connection] = {}
+        name = f"{self.folder.resolve().name}_{self._parts}"
+        self._writer = _Writer(self.folder / name, version=METADATA_VERSION, storage_plugin=STORAGES[self._storage])
+        self._attempt(self._writer.open)
+        for topic in self._types:
+            self._attempt(lambda topic=topic: self._connect(topic))  # type: ignore[misc]
+
+    def _connect(self, topic: str) -> None:
+        if self._writer is None:
+            raise BagError(f"{self.folder} is closed")
+        msgtype, qos = self._types[topic]
+        self._connections[topic] = self._writer.add_connection(
+            topic, msgtype, typestore=typestore(), offered_qos_profiles=qos
+        )
+
+    def _complete(self) -> None:
+        writer = self._writer
+        if writer is None:
+            return
+        writer.close()
+        self._writer = None
+        self._parts += 1
+        move_up(writer.path)
+        write_metadata(self.folder)
+
+    def _attempt(self, work) -> None:  # type: ignore[no-untyped-def]
+        try:
+            work()
+        except (OSError, WriterError, sqlite3.Error) as error:
+            writer, self._writer = self._writer, None
+            if writer is not None:
+                with suppress(OSError, sqlite3.Error):
+                    writer.abort()
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            raise BagError(f"{self.folder}: {reason}; name a folder that can be written, on a disk with room") from None
+
+
+def move_up(part: Path) -> None:
+    """Put a storage file out of the folder that it was written in into the bag's folder."""
+    for path in part.iterdir():
+        if path.suffix in SUFFIXES.values():
+            path.replace(part.parent / path.name)
+    shutil.rmtree(part)
+
+
+def part_number(path: Path) -> tuple[int, str]:
+    """Sorts storage files in the order they were written in: name_2 before name_10."""
+    number = path.stem.rpartition("_")[2]
+    return int(number) if number.isdigit() else 0, path.name
+
+
+def write_metadata(folder: Path) -> int:
+    """Write metadata.yaml from what the storage files of a folder hold; returns the number of messages.
+
+    BagError: no storage file, both kinds, or one that cannot be read.
+    """
+    paths = sorted((path for path in folder.iterdir() if path.suffix in SUFFIXES.values()), key=part_number)
+    kinds = {path.suffix for path in paths}
+    if len(kinds) != 1:
+        raise BagError(
+            f"{folder}: storage files of {len(kinds)} kinds; a bag's folder has .mcap or .db3 files, one or more"
+        )
+    files, topics = [], {}
+    for path in paths:
+        with damage(path), Reader(path) as reader:
+            counted = reader.message_count
+            files.append({"path": path.name, "starting_time": {"nanoseconds_since_epoch": reader.start_time},
+                          "duration": {"nanoseconds": max(0, reader.duration - 1)}, "message_count": counted})  # fmt: skip
+            for connection in reader.connections:
+                topic = topics.setdefault((connection.topic, connection.msgtype), _topic(connection))
+                topic["message_count"] += connection.msgcount
+    used = [file for file in files if file["message_count"]] or files[:1]
+    start = min(file["starting_time"]["nanoseconds_since_epoch"] for file in used)
+    end = max(file["starting_time"]["nanoseconds_since_epoch"] + file["duration"]["nanoseconds"] for file in used)
+    count = sum(file["message_count"] for file in files)
+    kind = next(name for name, suffix in SUFFIXES.items() if suffix in kinds)
+    write_yaml(folder / "metadata.yaml", {"rosbag2_bagfile_information": {
+        "version": METADATA_VERSION, "storage_identifier": kind, "duration": {"nanoseconds": end - start},
+        "starting_time": {"nanoseconds_since_epoch": start}, "message_count": count,
+        "topics_with_message_count": list(topics.values()), "compression_format": "", "compression_mode": "",
+        "relative_file_paths": [path.name for path in paths], "files": files, "custom_data": None, "ros_distro": "rosbags",
+    }})  # fmt: skip
+    return count
+
+
+def _topic(connection: Connection) -> dict:
+    qos = [
+        {
+            "history": one.history.name.lower(),
+            "depth": one.depth,
+            "reliability": one.reliability.name.lower(),
+            "durability": one.durability.name.lower(),
+            "deadline": one.deadline._asdict(),
+            "lifespan": one.lifespan._asdict(),
+            "liveliness": one.liveliness.name.lower(),
+            "liveliness_lease_duration": one.liveliness_lease_duration._asdict(),
+            "avoid_ros_namespace_conventions": one.avoid_ros_namespace_conventions,
+        }
+        for one in connection.ext.offered_qos_profiles  # type: ignore[union-attr]
+    ]
+    return {
+        "topic_metadata": {
+            "name": connection.topic,
+            "type": connection.msgtype,
+            "serialization_format": "cdr",
+            "offered_qos_profiles": qos,
+            "type_description_hash": connection.digest or _digest(connection),
+        },
+        "message_count": 0,
+    }
+
+
+def _digest(connection: Connection) -> str:
+    """The type's hash; mcap files do not hold it. Empty where the definition cannot be read."""
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        return store.hash_rihs01(connection.msgtype)
+    except DAMAGE:
+        return ""

@@ -1,0 +1,260 @@
+"""Recorded frequencies to stress again, by the pipeline of the reconstruction node and to the same bits."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.calibration import Calibration
+from ..core.errors import BagError, CalibrationError, CubeError
+from ..core.health import Health
+from ..core.pipeline import Pipeline, StressRows
+from . import cdr
+from .bag_writer import BagWriter, quality
+from .bags import FREQUENCIES, INFO, STRESS, Bag, Entry, calibrations, damage, pipeline, typestore
+from .calibration import calibration_text
+from .skin import Skin
+from .tables import TableWriter
+
+
+PARTIAL = ".partial"
+"""Folder beside the results for what is not complete; a restart begins those anew."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What to do differently from the recording. None: as it was.
+
+    calibration: for all cubes; skin: the calibrations of its cubes, by name; tare: from and to in s after the start of
+    the bag, between which the cubes were without load.
+    """
+
+    calibration: Calibration | None = None
+    skin: Skin | None = None
+    tare: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """One bag to reprocess: where to, as what (bag, parquet, csv)."""
+
+    bag: Path
+    output: Path
+    form: str
+    change: Change
+
+
+class Done(NamedTuple):
+    """What a job did: messages and rows of stress, how much time they cover in s."""
+
+    messages: int
+    rows: int
+    seconds: float
+
+
+class Recording:
+    """The frequencies of a bag as a stream of stress; `topic` of frequencies.
+
+    BagError: no info in the bag, or the change does not fit its cubes.
+    """
+
+    def __init__(self, bag: Bag, topic: str, change: Change | None = None) -> None:
+        change = change or Change()
+        self.bag, self.topic = bag, topic
+        infos = bag.infos(topic.removesuffix("frequencies") + "info")
+        # The driver knows of no tare: what it says counts only where no reconstruction ran.
+        infos = [info for info in infos if info.sender == "reconstruction"] or infos
+        infos.sort(key=lambda info: _stamp_ns(info))
+        self.infos = infos
+        self._now: tuple[int, Pipeline, Health] | None = None
+        self._since = np.array([_stamp_ns(info) for info in infos])
+        with damage(bag.path):
+            self.pipelines = [self._changed(info, change) for info in infos]
+        if change.tare is not None:
+            self._tare(*change.tare)
+
+    def batches(self) -> Iterator[tuple[cdr.Batch, list[Entry], StressRows]]:
+        """Frequencies, the messages they came in, and the stress of all their rows in order."""
+        for batch, entries in self.bag.batches(self.topic):
+            which = np.maximum(np.searchsorted(self._since, batch.stamp_ns, side="right") - 1, 0)
+            for run in np.split(np.arange(len(which)), np.flatnonzero(np.diff(which)) + 1):
+                part = cdr.Batch(batch.shape, batch.stamp_ns[run], batch.field[run])
+                rows = self._process(int(which[run[0]]), part)
+                yield part, entries[run[0] : run[-1] + 1], rows
+
+    def info_messages(self) -> list[bytes]:
+        """The SkinInfo messages that go with the stress, serialised."""
+        return [_info(info, made) for info, made in zip(self.infos, self.pipelines, strict=True)]
+
+    def _process(self, number: int, batch: cdr.Batch) -> StressRows:
+        """Stress of all rows of a batch, as the reconstruction node makes it message by message."""
+        of, health = self._use(number)
+        field = batch.field
+        newest_ns = batch.times_ns.max(axis=1, initial=0)
+        try:
+            masks, bits = health.update_many(
+                field["cube"], field["frequency"], field["pad_fault"], newest_ns, field["temperature"]
+            )
+            rows = of.process(
+                field["cube"].ravel(), field["frequency"].reshape(-1, batch.shape.pads), masks.ravel(),
+                field["temperature"].ravel(),
+            )  # fmt: skip
+        except CubeError as error:
+            raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
+        rows.status[:] |= bits.ravel()
+        return rows
+
+    def _use(self, number: int) -> tuple[Pipeline, Health]:
+        """The pipeline under an info, and the health that goes with it: a tare changes rest frequencies only."""
+        if self._now is None or [c.id for c in self._now[1].calibrations] != [
+            c.id for c in self.pipelines[number].calibrations
+        ]:
+            made = Pipeline(self.pipelines[number].calibrations, np.float32)
+            made.rest_frequency = self.pipelines[number].rest_frequency
+            self._now = number, made, Health(made)
+        elif self._now[0] != number:
+            _, made, health = self._now
+            made.rest_frequency = self.pipelines[number].rest_frequency
+            health.refresh()
+            self._now = number, made, health
+        return self._now[1:]
+
+    def _changed(self, info: Any, change: Change) -> Pipeline:
+        recorded = pipeline(info)
+        if change.skin is not None:
+            by_name = {cube.name: cube.calibration for cube in change.skin.cubes}
+            missing = [cube.name for cube in info.cubes if cube.name not in by_name]
+            if missing:
+                raise BagError(f"{self.bag.path}: the skin file {change.skin.name} has no cubes {', '.join(missing[:5])}; the "
+                               "bag has")  # fmt: skip
+            new = [by_name[cube.name] for cube in info.cubes]
+        elif change.calibration is not None:
+            new = [change.calibration] * len(info.cubes)
+        else:
+            return recorded
+        rest = []
+        for cube, old, made, was in zip(info.cubes, recorded.calibrations, new, recorded.rest_frequency, strict=True):
+            try:
+                made.check(old.layout, cube.uid or None)
+            except CalibrationError as error:
+                raise BagError(f"{self.bag.path}: cube {cube.name}: {error}") from None
+            # A tare is a measurement and stays; without one the calibration says what no load is.
+            n = old.layout.n_pads
+            tared = was[:n] != old.rest_frequency
+            rest.append(
+                np.pad(np.where(tared, was[:n], made.rest_frequency), (0, len(was) - n), constant_values=np.nan)
+            )
+        result = Pipeline(new, np.float32)
+        result.rest_frequency = np.array(rest)
+        return result
+
+    def _tare(self, begin_s: float, end_s: float) -> None:
+        """Mean frequencies of all pads between two times, temperature taken out, become the rest frequencies."""
+        of = self.pipelines[-1]
+        total, count = np.zeros_like(of.rest_frequency), np.zeros(of.rest_frequency.shape)
+        begin_ns, end_ns = (self.bag.start_ns + round(time * 1e9) for time in (begin_s, end_s))
+        for batch, _ in self.bag.batches(self.topic):
+            chosen = (batch.times_ns >= begin_ns) & (batch.times_ns < end_ns)
+            cube = batch.field["cube"][chosen]
+            if not len(cube):
+                continue
+            known = cube < len(of.calibrations)
+            cube = cube[known]
+            frequency = batch.field["frequency"][chosen][known].astype(float)
+            frequency = frequency / of.temperature_factor(cube, batch.field["temperature"][chosen][known])
+            bad = batch.field["pad_fault"][chosen][known][:, None] >> np.arange(frequency.shape[1]) & 1 > 0
+            good = np.isfinite(frequency) & (frequency > 0) & ~bad
+            np.add.at(total, cube, np.where(good, frequency, 0))
+            np.add.at(count, cube, good)
+        exists = np.isfinite(of.rest_frequency)
+        without = (exists & (count == 0)).any(axis=1)
+        if without.any():
+            names = ", ".join(self.infos[-1].cubes[cube].name for cube in np.flatnonzero(without)[:5])
+            seconds = (self.bag.end_ns - self.bag.start_ns) * 1e-9
+            raise BagError(f"{self.bag.path}: --tare-from {begin_s:g} {end_s:g}: no frequencies of every pad of {names} in that "
+                           f"time; the bag lasts from 0 to {seconds:.3f} s")  # fmt: skip
+        rest = np.where(exists, total / np.maximum(count, 1), np.nan)
+        for made in self.pipelines:
+            made.rest_frequency = rest
+
+
+def reprocess(job: Job) -> Done:
+    """Do one job; its output appears when it is complete. BagError: what is wrong with bag or output."""
+    partial = job.output.parent / PARTIAL / job.output.name
+    try:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+        with Bag(job.bag) as bag:
+            topics = bag.topics(FREQUENCIES)
+            if not topics:
+                raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
+            if job.form == "bag":
+                done = _to_bag(bag, topics, job.change, partial)
+            elif len(topics) > 1:
+                raise BagError(f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag")
+            else:
+                done = _to_table(bag, topics[0], job.change, partial)
+        partial.replace(job.output)
+        with suppress(OSError):  # other jobs are at work in there
+            partial.parent.rmdir()
+    except OSError as error:
+        raise BagError(f"{job.output}: {error.strerror}; name a folder that can be written") from None
+    return done
+
+
+def _to_bag(bag: Bag, topics: list[str], change: Change, output: Path) -> Done:
+    messages = rows = 0
+    with BagWriter(output) as writer:
+        for topic in topics:
+            skin = topic.removesuffix("frequencies")
+            recording = Recording(bag, topic, change)
+            writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
+            writer.add_topic(f"{skin}stress", STRESS, [quality()])
+            for info, data in zip(recording.infos, recording.info_messages(), strict=True):
+                writer.write(f"{skin}info", max(bag.start_ns, min(bag.end_ns, _stamp_ns(info))), data)
+            for batch, entries, stress in recording.batches():
+                for entry, data in zip(entries, cdr.stress_messages(batch, stress), strict=True):
+                    writer.write(f"{skin}stress", entry.time_ns, data)
+                messages += len(entries)
+                rows += len(stress.status)
+    return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
+
+
+def _to_table(bag: Bag, topic: str, change: Change, output: Path) -> Done:
+    messages = rows = 0
+    recording = Recording(bag, topic, change)
+    with TableWriter(output, [cube.name for cube in recording.infos[-1].cubes] + ["unknown"]) as table:
+        for batch, entries, stress in recording.batches():
+            table.write(batch.times_ns.ravel(), batch.field["cube"].ravel(), batch.field["sequence"].ravel(), stress)
+            messages += len(entries)
+            rows += len(stress.status)
+    return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
+
+
+def _stamp_ns(info: Any) -> int:
+    return int(info.header.stamp.sec) * cdr.SECOND + int(info.header.stamp.nanosec)
+
+
+def _info(info: Any, made: Pipeline) -> bytes:
+    """The recorded info with the calibrations and rest frequencies of the pipeline, serialised."""
+    distinct = {calibration.id: number for number, calibration in reversed(list(enumerate(made.calibrations)))}
+    cubes = [
+        replace(cube, calibration_id=calibration.id, half_side=calibration.half_side,
+                rest_frequency=rest[: calibration.layout.n_pads])
+        for cube, calibration, rest in zip(info.cubes, made.calibrations, made.rest_frequency, strict=True)
+    ]  # fmt: skip
+    changed = replace(
+        info,
+        sender="reconstruction",
+        cubes=cubes,
+        calibration_ids=list(distinct),
+        calibrations=[calibration_text(made.calibrations[number]) for number in distinct.values()],
+        covariance=np.array([made.covariance(number) for number in distinct.values()]).ravel(),
+    )
+    return bytes(typestore().serialize_cdr(changed, INFO))

@@ -1,0 +1,86 @@
+"""Health of the cubes in words: diagnostics of the cubes that are not fine, a line in the log when that changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from ..core.health import LEFT_OUT, WORDS, Health
+from ..core.pipeline import Pipeline
+from ..files.skin import Skin
+
+MAX_STATUSES = 64
+"""In one message: on a skin whose hubs are all gone, a status for each of 1000 cubes helps nobody."""
+
+
+class CubeHealth:
+    """Turns what `Health` found since the last time into words."""
+
+    def __init__(self, node: str, skin: Skin, pipeline: Pipeline, health: Health) -> None:
+        self._node, self._skin, self._pipeline, self._health = node, skin, pipeline, health
+        self._came = np.zeros(len(skin.cubes), bool)
+        self._words: dict[int, str] = {}
+
+    def statuses(self, uids: Mapping[int, int]) -> tuple[list[DiagnosticStatus], list[str]]:
+        """Statuses of cubes that are not fine or were not the last time; a line for the log of each that changed."""
+        bits, strained, rows = self._health.collect()
+        self._came |= rows > 0
+        levels = np.zeros(len(rows), int)
+        levels[strained | (bits != 0).any(axis=1)] = 1
+        levels[(bits & LEFT_OUT != 0).any(axis=1)] = 2
+        levels[rows == 0] = 3
+        suspects = self._suspects(strained)
+        words = {
+            int(cube): self._describe(int(cube), bits[cube], bool(strained[cube]), bool(rows[cube]), suspects)
+            for cube in np.flatnonzero(levels)[:MAX_STATUSES]
+        }
+        statuses, lines = [], []
+        for cube in sorted({*words, *self._words}):
+            text = words.get(cube, "fine")
+            level = int(levels[cube]) if cube in words else 0
+            name = self._skin.cubes[cube].name
+            if text != self._words.get(cube, "fine"):
+                lines.append(f"cube {name}: {text}")
+            uid = self._skin.cubes[cube].uid or uids.get(cube, 0)
+            status = DiagnosticStatus(name=f"{self._node}: cube {name}", hardware_id=f"{uid:#x}" if uid else "")
+            status.level, status.message = bytes([level]), text
+            status.values = [KeyValue(key="rows since the last", value=str(int(rows[cube])))]
+            statuses.append(status)
+        self._words = words
+        return statuses, lines
+
+    def summary(self) -> dict[str, int]:
+        """How many pads and cubes are how, now; only what there is."""
+        counts = {f"pads {word}": int(np.count_nonzero(self._health.state & bit)) for bit, word in WORDS.items()}
+        counts["cubes with a residual"] = int(np.count_nonzero(self._health.strained))
+        return {name: count for name, count in counts.items() if count}
+
+    def _describe(self, cube: int, bits: np.ndarray, strained: bool, came: bool, suspects: dict[int, list[str]]) -> str:
+        if not came:
+            return "stale: no rows any more, see its link" if self._came[cube] else "missing: no row yet, see its link"
+        pads = self._skin.cubes[cube].calibration.layout.pads
+        texts = [
+            f"pad {pads[pad]} {' and '.join(word for bit, word in WORDS.items() if bits[pad] & bit)}"
+            for pad in np.flatnonzero(bits).tolist()
+        ]
+        if strained:
+            named = suspects.get(cube)
+            texts.append(
+                "residual above its level: "
+                + (f"pad {' or '.join(named)} may be bad" if named else "a pad is bad or the load is none it can tell")
+            )
+        return "; ".join(texts)
+
+    def _suspects(self, strained: np.ndarray) -> dict[int, list[str]]:
+        """Pads of which one alone would explain the newest residual, by cube."""
+        cubes = np.flatnonzero(strained)
+        if not len(cubes):
+            return {}
+        health = self._health
+        found = self._pipeline.suspects(cubes, health.last[cubes], health.mask[cubes], health.temperature[cubes])
+        return {
+            cube: [self._skin.cubes[cube].calibration.layout.pads[pad] for pad in np.flatnonzero(row)]
+            for cube, row in zip(cubes.tolist(), found, strict=True)
+        }

@@ -1,0 +1,153 @@
+"""A bag onto its topics again, bytes as they were recorded, in its own rhythm, with its own clock if asked for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from ..core.errors import BagError
+from ..files.bags import PACKAGE, Bag, Entry
+from .messages import SECOND
+from .recorder import DEPTH, message_class
+
+CLOCK_S = 0.01
+"""Of real time, at least so often the clock is sent; and before every message."""
+DISCOVERY_S = 1.0
+"""Before the first message: so long subscribers may take to find the publishers."""
+MADE = tuple(f"{PACKAGE}/msg/{name}" for name in ("SkinStress", "StressTensorStamped")) + (
+    "geometry_msgs/msg/WrenchStamped",
+)
+"""Types that a reconstruction makes, of topics that are left out unless stress is asked for."""
+
+
+class Player:
+    """Publishes a bag; `run` once, from one thread, the rest from any.
+
+    rate: times the recorded speed. stress: also what a reconstruction made. clock: publish /clock.
+    paused: an event; progress: called with the seconds of the bag that have passed.
+    BagError: the bag cannot be read, or has nothing to publish.
+    """
+
+    def __init__(self, node: Node, bag: Bag, *, rate: float, stress: bool, clock: bool) -> None:
+        self.stop = threading.Event()
+        self.published = 0
+        self._paused, self._steps = False, 0
+        self._wake = threading.Condition()
+        self._node, self._bag, self._rate = node, bag, rate
+        self._publishers: dict[str, Any] = {}
+        self._latched: set[str] = set()
+        skins = [topic.removesuffix("frequencies") for topic in bag.topics(f"{PACKAGE}/msg/SkinFrequencies")]
+        for connection in bag.connections:
+            topic = connection.topic
+            made = connection.msgtype in MADE and (
+                connection.msgtype.startswith(PACKAGE) or any(topic.startswith(f"{skin}cubes/") for skin in skins)
+            )
+            if topic not in self._publishers and topic != "/clock" and (stress or not made):
+                self._add(topic, connection)
+        if not self._publishers:
+            raise BagError(
+                f"{bag.path}: nothing to publish but what a reconstruction makes; --stress publishes that too"
+            )
+        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._clock = node.create_publisher(Clock, "/clock", best_effort) if clock else None
+
+    @property
+    def paused(self) -> bool:
+        return self._paused
+
+    def pause(self, paused: bool) -> None:
+        """Hold the bag, or go on."""
+        with self._wake:
+            self._paused, self._steps = paused, 0
+            self._wake.notify()
+
+    def step(self) -> None:
+        """While paused: the next message of frequencies, and what stands before it."""
+        with self._wake:
+            self._steps += 1
+            self._wake.notify()
+
+    def end(self) -> None:
+        """End `run` soon."""
+        with self._wake:
+            self.stop.set()
+            self._wake.notify()
+
+    def run(self, start_s: float, loop: bool, progress: Callable[[float], None]) -> None:
+        """Publish from start_s after the begin of the bag to its end, over and over with `loop`. BagError: damaged."""
+        start_ns = self._bag.start_ns + round(start_s * SECOND)
+        if start_ns > self._bag.end_ns:
+            length = (self._bag.end_ns - self._bag.start_ns) / SECOND
+            raise BagError(f"{self._bag.path}: --start {start_s:g}: the bag is {length:.3f} s long")
+        self.stop.wait(DISCOVERY_S)
+        while not self.stop.is_set():
+            self._once(start_ns, progress)
+            if not loop:
+                break
+
+    def _add(self, topic: str, connection: Any) -> None:
+        offered = connection.ext.offered_qos_profiles
+        latched = bool(offered) and all(one.durability.value == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)
+        best_effort = bool(offered) and any(one.reliability.value == ReliabilityPolicy.BEST_EFFORT for one in offered)
+        profile = QoSProfile(
+            depth=DEPTH,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        )
+        self._publishers[topic] = self._node.create_publisher(message_class(topic, connection.msgtype), topic, profile)
+        if latched:
+            self._latched.add(topic)
+
+    def _once(self, start_ns: int, progress: Callable[[float], None]) -> None:
+        # What was latched before the start is true at the start.
+        for entry in self._bag.entries(self._latched, None, start_ns):
+            self._publish(entry)
+        self._anchor(start_ns)
+        for entry in self._bag.entries(set(self._publishers), start_ns):
+            if not self._wait(entry.time_ns):
+                return
+            self._say(entry.time_ns)
+            self._publish(entry)
+            progress((entry.time_ns - self._bag.start_ns) / SECOND)
+            if self._steps and entry.topic.endswith("frequencies"):
+                with self._wake:
+                    self._steps -= 1
+
+    def _anchor(self, bag_ns: int) -> None:
+        """From now on bag_ns is now."""
+        self._bag_ns, self._begun = bag_ns, time.monotonic()
+
+    def _wait(self, bag_ns: int) -> bool:
+        """Until a message is due; False: asked to end."""
+        with self._wake:
+            while not self.stop.is_set():
+                if self._paused:
+                    if self._steps:
+                        self._anchor(bag_ns)
+                        return True
+                    self._wake.wait()
+                    self._anchor(bag_ns)
+                    continue
+                left = self._begun + (bag_ns - self._bag_ns) / SECOND / self._rate - time.monotonic()
+                if left <= 0:
+                    return True
+                if self._clock is not None:
+                    self._say(bag_ns - round(left * self._rate * SECOND))
+                    left = min(left, CLOCK_S)
+                self._wake.wait(left)
+        return False
+
+    def _say(self, bag_ns: int) -> None:
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=Time(sec=bag_ns // SECOND, nanosec=bag_ns % SECOND)))
+
+    def _publish(self, entry: Entry) -> None:
+        self._publishers[entry.topic].publish(entry.data)
+        self.published += 1

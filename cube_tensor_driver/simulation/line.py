@@ -1,0 +1,89 @@
+"""The line of a simulated hub: a pseudo-terminal that can be unplugged, held up, and taken in bursts."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tty
+from pathlib import Path
+
+OUT_LIMIT = 1 << 16
+"""Bytes that wait for the line at most: what is sampled beyond is dropped in the hub, and counted there."""
+BURST_US = 16_000
+"""The latency timer of common USB serial chips."""
+
+
+class Line:
+    """One pseudo-terminal, whose near end appears as the link `port`.
+
+    held_until_us, burst_until_us: until when (simulated time) nothing, or every BURST_US all, goes out.
+    """
+
+    def __init__(self, port: Path) -> None:
+        self.port = port
+        self.fd = self._far = -1
+        self.held_until_us = self.burst_until_us = 0
+        self._out = bytearray()
+        self._burst = 0
+        self.plug()
+
+    @property
+    def plugged(self) -> bool:
+        return self.fd >= 0
+
+    def plug(self, port: Path | None = None) -> None:
+        """Appear, under another name if `port` is given."""
+        self.port = port or self.port
+        # The far end stays open, else the near one reports an error whenever the driver closes it.
+        self.fd, self._far = os.openpty()
+        tty.setraw(self._far)
+        os.set_blocking(self.fd, False)
+        self.port.unlink(missing_ok=True)
+        self.port.symlink_to(os.ttyname(self._far))
+
+    def unplug(self) -> None:
+        """Vanish, with all that was on its way."""
+        if self.plugged:
+            self.port.unlink(missing_ok=True)
+            os.close(self.fd)
+            os.close(self._far)
+            self.fd = self._far = -1
+        self._out.clear()
+
+    def send(self, data: bytes, now_us: int) -> bool:
+        """Queue bytes for the line and write what it takes; False when there was no room for them."""
+        room = self.plugged and len(self._out) + len(data) <= OUT_LIMIT
+        if room:
+            self._out += data
+        self.flush(now_us)
+        return room
+
+    def flush(self, now_us: int) -> None:
+        """Write what the line takes now."""
+        if not self.plugged or now_us < self.held_until_us:
+            return
+        if now_us < self.burst_until_us:
+            burst = now_us // BURST_US
+            if burst == self._burst:
+                return
+            self._burst = burst
+        with contextlib.suppress(BlockingIOError):
+            while self._out:
+                del self._out[: os.write(self.fd, self._out)]
+
+    def due_us(self, now_us: int) -> int | None:
+        """When `flush` is worth calling again, None if nothing waits for its time."""
+        if not self._out:
+            return None
+        if now_us < self.held_until_us:
+            return self.held_until_us
+        return (now_us // BURST_US + 1) * BURST_US if now_us < self.burst_until_us else None
+
+    def read(self) -> bytes:
+        """What the host sent."""
+        if not self.plugged:
+            return b""
+        try:
+            return os.read(self.fd, 65536)
+        except BlockingIOError:
+            return b""

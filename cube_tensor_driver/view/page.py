@@ -1,0 +1,311 @@
+"""The page of the browser view: the skin in 3-D, controls, one cube's plots and numbers. Knows viser, not ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import viser
+from transforms3d.quaternions import mat2quat
+from viser import uplot
+
+from ..core import scene
+from ..core.modes import COMPONENTS
+from ..core.pipeline import STATUS
+from ..core.scene import QUANTITIES, Newest, Places
+from ..elastic.surface import Contact, Surface
+from .history import History
+
+SPAN = 2.0
+"""The longest side of a skin in the scene: cameras and clipping planes of viewers are made for metres, skins for cm."""
+MOST_POINTS = 5000
+"""Of the field's carpet."""
+PLOTS = (
+    ("normal stress / kPa", 1e-3, ("xx", "yy", "zz")),
+    ("shear / kPa", 1e-3, ("zx", "yz", "xy")),
+    ("gradient / kPa/mm", 1e-6, ("zz_x", "zz_y", "zz_z")),
+    ("residual / σ", 1.0, ("residual",)),
+)
+TIME = uplot.Scale(time=False, auto=False, range=(-10.0, 0.0))
+STROKES = ("#4dabf7", "#ffa94d", "#69db7c")
+DASHES = ((), (6, 3), (2, 3))
+CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+CUBE_FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+                       [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+TILE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+TILE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+AMBIENT, DIRECT = 2.0, 1.4
+WHITE, GOLD, PULL, PUSH = (235, 235, 235), (255, 170, 60), (255, 90, 70), (90, 150, 255)
+
+
+@dataclass
+class Buttons:
+    """What the page's buttons do; each returns at once. Called in viser's threads."""
+
+    tare: Callable[[], None]
+    clear_tare: Callable[[], None]
+    record: Callable[[], None]
+
+
+@dataclass
+class Facts:
+    """What the page says beside the skin: lines about the links, about the last action, whether a bag is written."""
+
+    links: list[str] = field(default_factory=list)
+    action: str = ""
+    recording: bool = False
+
+
+class Page:
+    """One skin on a viser server. `draw` is the picture, `write` the numbers and plots; both for the newest rows."""
+
+    def __init__(self, server: viser.ViserServer, name: str, names: Sequence[str], places: Places, depth: float,
+                 buttons: Buttons) -> None:  # fmt: skip
+        self._server, self._names, self.selected = server, list(names), 0
+        self._surface = Surface(places, depth, int(np.clip(np.sqrt(MOST_POINTS / len(names)), 2, 8)))
+        size = np.ptp(places.position, axis=0).max() + places.pitch
+        self._unit = SPAN / size
+        centre = (places.position.min(axis=0) + places.position.max(axis=0)) / 2
+        self._centre = centre
+        self._places = Places((places.position - centre) * self._unit, places.rotation, places.half_side * self._unit)
+        self._pitch = places.pitch * self._unit
+        self._top = self._longest = self._steepest = 0.0
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large",
+                                   brand_color=(33, 145, 140))  # fmt: skip
+        server.gui.set_panel_label(name)
+        server.gui.main_panel.dock_right()
+        server.initial_camera.position = (0.15 * SPAN, -0.85 * SPAN, 0.75 * SPAN)
+        server.initial_camera.look_at = (0.0, -0.02 * SPAN, 0.0)
+        self._make_scene(server.scene)
+        self._make_controls(server.gui, buttons)
+
+    @property
+    def paused(self) -> bool:
+        return self._paused
+
+    def close(self) -> None:
+        self._server.scene.reset()
+        self._server.gui.reset()
+
+    def _make_scene(self, to: viser.SceneApi) -> None:
+        places, n = self._places, len(self._names)
+        # No shadows, no reflections, and as much light as shows colours as the legend has them; a machine without a
+        # graphics card shall do.
+        to.configure_default_lights(enabled=False)
+        to.configure_environment_map(None)
+        to.add_light_ambient("/light/all", intensity=AMBIENT)
+        to.add_light_directional("/light/above", intensity=DIRECT, position=(-0.4, -0.6, 1.0))
+        turns = np.array([mat2quat(rotation) for rotation in places.rotation])
+        grey = np.full((n, 3), 90, np.uint8)
+        self._cubes = to.add_batched_meshes_simple(
+            "/cubes", CUBE, CUBE_FACES, turns, places.position, batched_scales=places.half_side,
+            batched_colors=grey, flat_shading=True, lod="off", cast_shadow=False, receive_shadow=False)  # fmt: skip
+        self._cubes.on_click(self._pick)
+        points = (self._surface.points - self._centre) * self._unit
+        cube = self._surface.cube
+        points = points - places.rotation[cube, :, 2] * places.half_side[cube, None]
+        self._carpet = to.add_batched_meshes_simple(
+            "/field", TILE * self._surface.spacing * self._unit, TILE_FACES, turns[cube], points,
+            batched_colors=np.full((len(points), 3), 60, np.uint8), side="double", lod="off", cast_shadow=False,
+            receive_shadow=False)  # fmt: skip
+        self._carpet.on_click(self._pick)
+        thick = {"shaft_radius": 0.025 * self._pitch, "head_radius": 0.075 * self._pitch, "head_length": 0.2 * self._pitch}
+        none = np.zeros((0, 2, 3))
+        self._traction = to.add_arrows("/traction", none, WHITE, **thick)
+        self._gradient = to.add_arrows("/gradient", none, GOLD, **thick)
+        self._crosses = to.add_line_segments("/principal", none, WHITE, thickness=0.04 * self._pitch, visible=False)
+        self._faults = to.add_line_segments("/faults", none, WHITE, thickness=0.06 * self._pitch)
+        ring = np.linspace(0, 2 * np.pi, 49)
+        circle = np.stack([np.cos(ring), np.sin(ring), 0 * ring], axis=1) * 0.62 * self._pitch
+        self._ring = to.add_line_segments("/selected", np.stack([circle[:-1], circle[1:]], 1), WHITE,
+                                        thickness=0.03 * self._pitch)  # fmt: skip
+        self._contact = to.add_label("/contact", "", visible=False, anchor="bottom-center", font_screen_scale=1.3)
+
+    def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
+        self._head = gui.add_html("")
+        self._paused = False
+        row = gui.add_button_group("", ("pause", "tare", "clear tare", "record"))
+
+        @row.on_click
+        def _(_: object) -> None:
+            if row.value == "pause":
+                self._paused = not self._paused
+            else:
+                {"tare": buttons.tare, "clear tare": buttons.clear_tare, "record": buttons.record}[row.value]()
+
+        self._action = gui.add_html("")
+        self._quantity = gui.add_dropdown("colour", [q.label for q in QUANTITIES.values()])
+        self._quantity.on_update(lambda _: setattr(self, "_top", 0.0))
+        self._range = gui.add_number("range (0: auto)", 0.0, min=0.0, step=0.1)
+        self._legend = gui.add_html("")
+        layers = gui.add_button_group("show", ("field", "traction", "gradient", "principal"))
+
+        @layers.on_click
+        def _(_: object) -> None:
+            nodes = {"field": self._carpet, "traction": self._traction, "gradient": self._gradient}
+            node = {**nodes, "principal": self._crosses}[layers.value]
+            node.visible = not node.visible
+
+        self._chosen = gui.add_dropdown("cube", self._names)
+
+        @self._chosen.on_update
+        def _(_: object) -> None:
+            self.selected = self._names.index(self._chosen.value)
+
+        with gui.add_folder("numbers"):
+            self._numbers = gui.add_html("")
+        with gui.add_folder("last 10 s"):
+            empty = np.array([0.0])
+            self._plots = []
+            for title, _, columns in PLOTS:
+                lines = [uplot.Series(label=label(name), stroke=stroke, width=1.5, dash=dash)
+                         for name, stroke, dash in zip(columns, STROKES, DASHES, strict=False)]  # fmt: skip
+                axes = tuple(uplot.Axis(stroke="#ced4da", grid={"stroke": "#495057", "width": 0.5}, size=size)
+                             for size in (34, 46))  # fmt: skip
+                self._plots.append(gui.add_uplot(
+                    (empty,) * (1 + len(lines)), (uplot.Series(label="s"), *lines), title=title, height=160, axes=axes,
+                    scales={"x": TIME, "y": uplot.Scale(auto=False, range=(0.0, 1.0))}, padding=(4, 8, 0, 0)))  # fmt: skip
+        with gui.add_folder("health"):
+            self._health = gui.add_html("")
+
+    def _pick(self, event: viser.SceneNodePointerEvent) -> None:
+        start, ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        apart = np.linalg.norm(np.cross(self._places.position - start, ray / np.linalg.norm(ray)), axis=1)
+        self._chosen.value = self._names[int(apart.argmin())]
+
+    @property
+    def quantity(self) -> scene.Quantity:
+        return next(q for q in QUANTITIES.values() if q.label == self._quantity.value)
+
+    def draw(self, newest: Newest, health: np.ndarray) -> None:
+        """Colours, arrows, crosses, carpet."""
+        places, quantity = self._places, self.quantity
+        values = np.where((health < scene.FAULTY)[:, None], newest.values, np.nan)
+        shown = quantity.of(values, newest.residual)
+        self._top = self._range.value * quantity.size or scene.automatic(quantity, shown, self._top)
+        shear, gradient = QUANTITIES["shear"], QUANTITIES["gradient"]
+        self._longest = scene.automatic(shear, values[:, 2:5], self._longest)
+        self._steepest = scene.automatic(gradient, gradient.of(values, newest.residual), self._steepest)
+        with self._server.atomic():
+            self._cubes.batched_colors = _light(scene.colours(quantity, shown, self._top))
+            if self._carpet.visible:
+                carpet = scene.colours(quantity, self._field(values, shown), self._top)
+                self._carpet.batched_colors = _light(0.75 * carpet)
+            if self._traction.visible:
+                arrows = scene.traction_arrows(places, values, 1.8 * self._pitch / self._longest)
+                self._traction.points = _seen(arrows, 0.15 * self._pitch)
+            if self._gradient.visible:
+                arrows = scene.gradient_arrows(places, values, 1.2 * self._pitch / self._steepest)
+                self._gradient.points = _seen(arrows, 0.15 * self._pitch)
+            if self._crosses.visible:
+                lines, pulls = scene.principal_crosses(places, values, self._pitch / self._longest)
+                self._crosses.points = lines.reshape(-1, 2, 3).astype(np.float32)
+                colours = np.where(pulls.reshape(-1, 1, 1), PULL, PUSH).repeat(2, axis=1)
+                self._crosses.colors = colours.astype(np.uint8)
+            bad = np.flatnonzero(health)
+            self._faults.points = scene.fault_crosses(places, health)[bad].reshape(-1, 2, 3).astype(np.float32)
+            self._faults.colors = _bytes(scene.MARK[health[bad]]).repeat(2, axis=0)[:, None].repeat(2, axis=1)
+            up = places.rotation[self.selected, :, 2] * places.half_side[self.selected] * 1.1
+            self._ring.position = places.position[self.selected] + up
+            self._ring.wxyz = mat2quat(places.rotation[self.selected])
+
+    def _field(self, values: np.ndarray, shown: np.ndarray) -> np.ndarray:
+        """On the carpet: the interpolated field where it is pressure or shear, elsewhere each cube's own value."""
+        if self.quantity is QUANTITIES["pressure"]:
+            return self._surface.field(values).pressure
+        if self.quantity is QUANTITIES["shear"]:
+            return np.linalg.norm(np.nan_to_num(self._surface.field(values).shear), axis=1)
+        return shown[self._surface.cube]
+
+    def write(self, newest: Newest, health: np.ndarray, rate: np.ndarray, history: History, facts: Facts) -> None:
+        """Status, legend, contact, the selected cube's numbers and plots, health."""
+        quantity, k = self.quantity, self.selected
+        live = np.count_nonzero(health < scene.FAULTY)
+        dot, word = ("#51cf66", "live") if live == len(health) else ("#ffa94d", "not all cubes") if live else ("#ff6b6b", "no data")  # fmt: skip
+        if self._paused:
+            dot, word = "#ffd43b", "paused"
+        hertz = np.nanmax(rate, initial=0.0)
+        recording = " · <b style='color:#ff6b6b'>● recording</b>" if facts.recording else ""
+        self._head.content = _box(f"<span style='color:{dot}'>⬤</span> <b>{word}</b> · {live} of {len(health)} cubes · {hertz:.0f} Hz{recording}")  # fmt: skip
+        self._action.content = _box(facts.action) if facts.action else ""
+        if self._paused:
+            return
+        self._legend.content = _box(_legend_html(quantity, self._top))
+        contact = next(iter(self._surface.contacts(newest.values, 300.0)), None) if live else None
+        self._show_contact(contact)
+        rows = [
+            (label(name), f"{newest.values[k, i] * (1e-6 if '_' in name else 1e-3):+.3f}", "kPa/mm" if "_" in name else "kPa")
+            for i, name in enumerate(COMPONENTS) if np.isfinite(newest.values[k, i])
+        ]  # fmt: skip
+        rows += [("residual", f"{newest.residual[k]:.2f}", "σ"), ("rate", f"{rate[k]:.0f}", "Hz")]
+        words = [name.lower().replace("_", " ") for name, bit in STATUS.items() if newest.status[k] & bit]
+        rows.append(("state", ", ".join(words) or scene.HEALTH[health[k]], ""))
+        cells = "".join(f"<tr><td>{a}</td><td style='text-align:right;font-family:monospace'>{b}</td><td>&nbsp;{c}</td></tr>" for a, b, c in rows)  # fmt: skip
+        self._numbers.content = _box(f"<table style='width:100%;line-height:1.35'>{cells}</table>")
+        times, lines = history.of(k)
+        for plot, (_, factor, columns) in zip(self._plots, PLOTS, strict=True):
+            shown = [lines[:, History.COLUMNS.index(name)] * factor for name in columns]
+            plot.data = (times, *shown)
+            finite = np.concatenate(shown)
+            finite = finite[np.isfinite(finite)]
+            span = _nice(finite.min(initial=0.0), finite.max(initial=0.0))
+            # uPlot cannot scale by itself where there is NaN.
+            if plot.scales["y"]["range"] != span:
+                plot.scales = {"x": TIME, "y": uplot.Scale(auto=False, range=span)}
+        bad = [f"<tr><td>{self._names[i]}</td><td>{scene.HEALTH[health[i]]}</td></tr>" for i in np.flatnonzero(health)[:20]]
+        counts = ", ".join(f"{np.count_nonzero(health == h)} {word}" for h, word in enumerate(scene.HEALTH))
+        links = "".join(f"<div>{line}</div>" for line in facts.links)
+        self._health.content = _box(f"{links}<div>{counts}</div><table style='width:100%'>{''.join(bad)}</table>")
+
+    def _show_contact(self, contact: Contact | None) -> None:
+        if contact is None:
+            self._contact.visible = False
+            return
+        place = (contact.position - self._centre + 1.1 * self._surface.pitch * contact.normal) * self._unit
+        shear = "" if np.isnan(contact.shear_force) else f", shear {contact.shear_force:.2f} N"
+        self._contact.text = f"{contact.normal_force:.2f} N{shear}"
+        self._contact.position = place
+        self._contact.visible = True
+
+
+def label(name: str) -> str:
+    """A component as people write it: zz_x is ∂zz/∂x."""
+    return f"∂{name[:2]}/∂{name[3]}" if "_" in name else name
+
+
+def _box(content: str) -> str:
+    return f"<div style='padding:0 0.8em 0.4em;font-size:0.85em'>{content}</div>"
+
+
+def _legend_html(quantity: scene.Quantity, top: float) -> str:
+    stops = np.linspace(-top if quantity.signed else 0, top, 9)
+    colours = ",".join("rgb(" + ",".join(map(str, c)) + ")" for c in _bytes(scene.colours(quantity, stops, top)).tolist())
+    ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in stops[::4])
+    return (
+        f"<div style='height:0.9em;border-radius:3px;background:linear-gradient(to right,{colours})'></div>"
+        f"<div style='display:flex;justify-content:space-between'>{ticks}</div>"
+        f"<div style='text-align:center'>{quantity.label} in {quantity.unit}; grey: not observed</div>"
+    )
+
+
+def _bytes(colours: np.ndarray) -> np.ndarray:
+    return (255 * colours).astype(np.uint8)
+
+
+def _light(colours: np.ndarray) -> np.ndarray:
+    """Colours of batched meshes: the client takes them as amounts of light, not as sRGB."""
+    return _bytes(np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4))
+
+
+def _nice(low: float, high: float) -> tuple[float, float]:
+    """A range of an axis that holds low .. high and zero, in steps so coarse that it seldom changes."""
+    size = max(-low, high, 1e-9)
+    power = 10.0 ** np.floor(np.log10(size))
+    step = power * next(k for k in (1, 2, 5, 10) if k * power >= size * (1 - 1e-9)) / 2
+    return float(np.floor(min(low, 0) / step) * step), float(np.ceil(max(high, 0) / step) * step)
+
+
+def _seen(arrows: np.ndarray, least: float) -> np.ndarray:
+    """The arrows that are longer than `least`: of shorter ones only the heads would be seen."""
+    return arrows[np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1) > least].astype(np.float32)

@@ -1,0 +1,126 @@
+"""./cube pictures: the pictures of the documentation, made anew so that they stay true."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+
+from ..core.errors import ConfigError, CubeError
+from ..elastic.field_study import DEPTH, FORCE, FieldStudy, field_study, flat_skin, truth
+from ..elastic.surface import Surface
+from ..files.share import share
+from ..ros.children import Children
+from ..ros.start import Process, skin_processes
+from .plots import save
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = (
+    "--headless --no-sandbox --disable-background-networking --enable-unsafe-swiftshader --use-gl=angle "
+    "--use-angle=swiftshader --hide-scrollbars --window-size=1400,900"
+).split()
+START_S, LOOK_S = 30.0, 14.0
+"""How long the processes may take to start, and how long the browser looks before the picture: plots need a while."""
+
+
+def run_pictures(folder: Path) -> int:
+    """Write field.png, field_error.png, field.json and, where there is Chromium, view.png; returns the exit code."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: {error.strerror}; name a folder that can be written") from None
+    save(draw_field(), folder / "field.png")
+    study = field_study()
+    save(draw_study(study), folder / "field_error.png")
+    table = {name: getattr(study, name).tolist() for name in ("pitches", "widths", "error", "position", "force")}
+    (folder / "field.json").write_text(json.dumps(table) + "\n")
+    print(f"wrote {folder}/field.png, field_error.png, field.json\n{table_text(study)}")
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        print("no view.png: needs Chromium, apt-get install chromium", file=sys.stderr)
+        return 0
+    photograph(browser, folder / "view.png")
+    print(f"wrote {folder}/view.png")
+    return 0
+
+
+def draw_field(pitch: float = 0.010, width: float = 0.012) -> Figure:
+    """One contact between the cubes: true pressure, and the field of values alone and of values and gradients."""
+    skin, centre = flat_skin(pitch, 0.05), pitch * np.array([0.35, 0.25])
+    side, load = 20, FORCE * np.array([0.3, 0.0, -1.0])
+    surfaces = {"values alone": Surface(skin, DEPTH, side, False), "values and gradients": Surface(skin, DEPTH, side)}
+    points = surfaces["values alone"].points
+    maps = {"truth": -truth(points, width, load, centre)[:, 2]}
+    values = truth(skin.position, width, load, centre)
+    maps |= {name: surface.field(values).pressure for name, surface in surfaces.items()}
+    figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), sharey=True)
+    order = np.lexsort((points[:, 0].round(9), points[:, 1].round(9)))
+    n = round(np.sqrt(len(points)))
+    x, y = (1e3 * points[order, k].reshape(n, n) for k in (0, 1))
+    top = 1e-3 * max(pressure.max() for pressure in maps.values())
+    for axis, (name, pressure) in zip(axes, maps.items(), strict=True):
+        kilo = 1e-3 * pressure[order].reshape(n, n)
+        image = axis.pcolormesh(x, y, kilo, vmin=0, vmax=top, shading="nearest", rasterized=True)
+        axis.contour(x, y, kilo, levels=np.arange(2, top, 4), colors="white", linewidths=0.5)
+        axis.plot(*(1e3 * skin.position[:, :2].T), "s", ms=4, mfc="none", mec="0.8", label="cube")
+        axis.plot(*(1e3 * centre), "r+", ms=9, label="load")
+        rms = np.sqrt(((pressure - maps["truth"]) ** 2).mean() / (maps["truth"] ** 2).mean())
+        axis.set(title=name if name == "truth" else f"{name}: {100 * rms:.0f} %", xlabel="x / mm", aspect="equal",
+                 xlim=(-22, 22), ylim=(-22, 22))  # fmt: skip
+        axis.grid(False)
+    axes[0].set_ylabel("y / mm")
+    axes[0].legend(fontsize=7, loc="lower left")
+    figure.colorbar(image, ax=axes, label="pressure in the cubes' plane / kPa")
+    return figure
+
+
+def draw_study(study: FieldStudy) -> Figure:
+    """Error of the field over pitch for each width, dashed without gradients."""
+    figure, axis = plt.subplots(figsize=(5.5, 3.8))
+    for row, (width, marker) in enumerate(zip(study.widths, "os^Dv", strict=True)):
+        style = {"color": str(0.7 * row / len(study.widths)), "marker": marker, "ms": 4, "lw": 1}
+        axis.loglog(1e3 * study.pitches, study.error[row, :, 0], ls="--", mfc="none", **style)
+        axis.loglog(1e3 * study.pitches, study.error[row, :, 1], label=f"{1e3 * width:.0f} mm", **style)
+    axis.set(xlabel="pitch of the cubes / mm", ylabel="rms error / rms pressure")
+    axis.set_xticks(1e3 * study.pitches, [f"{1e3 * pitch:.0f}" for pitch in study.pitches], minor=False)
+    axis.minorticks_off()
+    axis.legend(title="contact width\n(dashed: values alone)", fontsize=7, title_fontsize=7)
+    return figure
+
+
+def table_text(study: FieldStudy) -> str:
+    """Markdown: error of the field without → with gradients."""
+    head = "| width \\ pitch | " + " | ".join(f"{1e3 * pitch:.0f} mm" for pitch in study.pitches) + " |"
+    lines = [head, "|---" * (1 + len(study.pitches)) + "|"]
+    for width, row in zip(study.widths, study.error, strict=True):
+        lines.append(f"| {1e3 * width:.0f} mm | " + " | ".join(f"{a:.2f} → {b:.2f}" for a, b in row) + " |")
+    return "\n".join(lines)
+
+
+def photograph(browser: str, path: Path) -> None:
+    """The browser view of the simulated demo skin under its load. CubeError: no picture came."""
+    skin = share() / "config" / "skin_demo.yaml"
+    with tempfile.TemporaryDirectory(prefix="cube_pictures_") as name, Children(Path(name)) as children:
+        for process in skin_processes(skin, simulated_ports=Path(name) / "ports"):
+            children.start(process)
+        children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view", "--port", "8088")))
+        until = time.monotonic() + START_S
+        while "http://" not in children.log("view"):
+            if time.monotonic() > until:
+                raise CubeError(f"the view did not start within {START_S:g} s:\n{children.log('view')}")
+            children.check()
+            time.sleep(0.1)
+        url = children.log("view").split()[0]
+        command = [browser, *FLAGS, f"--user-data-dir={name}/browser", f"--timeout={1e3 * LOOK_S:.0f}",
+                   f"--screenshot={path.resolve()}", url]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, timeout=START_S + 3 * LOOK_S, check=False)
+        if done.returncode or not path.is_file():
+            raise CubeError(f"{browser} made no picture of {url}:\n{done.stderr[-500:]}")

@@ -1,0 +1,23 @@
+"""Sphinx settings: ./cube docs builds the pages, every warning an error."""
+
+project = "cube_tensor_driver"
+author = "the cube_tensor_driver authors"
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+html_theme = "furo"
+myst_heading_anchors = 3
+myst_enable_extensions = ["dollarmath"]
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "undoc-members": False}
+exclude_patterns = ["_build"]
+# Links to files of the repository that are no pages.
+suppress_warnings = ["myst.xref_missing"]
+
+
+def setup(app) -> None:
+    """Docstrings are plain text with equations drawn in characters: shown as they stand."""
+
+    def literal(app, what, name, obj, options, lines: list[str]) -> None:
+        if lines:
+            lines[:] = ["::", "", *("   " + line for line in lines)]
+
+    app.connect("autodoc-process-docstring", literal)

@@ -1,0 +1,93 @@
+"""Bags of known content, made without ROS and without the code that reads them: by rosbags' own serialiser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.files.bag_writer import BagWriter, quality
+from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, typestore
+from cube_tensor_driver.files.calibration import calibration_text
+from cube_tensor_driver.files.skin import read_skin
+
+START_NS = 1_700_000_000_000_000_000
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+
+
+def message(kind: str, **fields: object) -> object:
+    return typestore().types[kind](**fields)
+
+
+def header(stamp_ns: int, frame_id: str = "skin_base") -> object:
+    stamp = message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def info_of(
+    skin: object, pipeline: Pipeline, stamp_ns: int, sender: str = "reconstruction", version: int = 1
+) -> object:
+    kinds = {cube.calibration.id: cube.calibration for cube in skin.cubes}
+    pose = message("geometry_msgs/msg/Pose", position=message("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0),
+                   orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0))  # fmt: skip
+    cubes = [
+        message("cube_tensor_driver/msg/CubeInfo", name=cube.name, frame_id=skin.frame(cube), pose=pose,
+                link=cube.link or "", index=cube.index or 0, uid=cube.uid or 0, layout=cube.calibration.layout.name,
+                pads=list(cube.calibration.layout.pads), half_side=cube.calibration.half_side,
+                calibration_id=cube.calibration.id, rest_frequency=rest[: cube.calibration.layout.n_pads])
+        for cube, rest in zip(skin.cubes, pipeline.rest_frequency, strict=True)
+    ]  # fmt: skip
+    return message(INFO, version=version, header=header(stamp_ns), sender=sender, name=skin.name, cubes=cubes,
+                   calibration_ids=list(kinds), calibrations=[calibration_text(kind) for kind in kinds.values()],
+                   covariance=np.zeros(225 * len(kinds)))  # fmt: skip
+
+
+def frequencies_of(k: int, stamp_ns: int, frequency: np.ndarray) -> object:
+    n = len(frequency)
+    return message(FREQUENCIES, header=header(stamp_ns), cube=np.arange(n, dtype=np.uint16),
+                   sequence=np.full(n, k, np.uint32), time_offset=np.arange(n, dtype=np.int32) * 100,
+                   n_pads=frequency.shape[1], frequency=frequency.astype(np.float32).ravel(),
+                   temperature=np.full(n, np.nan, np.float32), pad_fault=np.zeros(n, np.uint32))  # fmt: skip
+
+
+def stress_of(source: object, pipeline: Pipeline) -> object:
+    """Message by message, as the node does where no pad is bad."""
+    n = len(source.cube)
+    rows = pipeline.process(source.cube, source.frequency.reshape(n, -1), source.pad_fault, source.temperature)
+    return message(STRESS, header=source.header, cube=source.cube, sequence=source.sequence,
+                   time_offset=source.time_offset, stress=np.ascontiguousarray(rows.stress).ravel(),
+                   gradient=np.ascontiguousarray(rows.gradient).ravel(), residual=rows.residual, status=rows.status,
+                   observed=rows.observed)  # fmt: skip
+
+
+def loads(pipeline: Pipeline, seconds: float) -> np.ndarray:
+    """(cubes, P) Hz: every pad squeezed by up to 3 %, slowly and each in its own rhythm."""
+    phase = np.arange(pipeline.rest_frequency.size).reshape(pipeline.rest_frequency.shape)
+    return pipeline.rest_frequency * (1 - 0.015 * (1 - np.cos(3 * seconds + phase)))
+
+
+def make_bag(folder: Path, skin_file: Path, messages: int = 300, rate: float = 100.0, **options: object) -> Path:
+    """info, frequencies, stress, and on /force what cube 0 was pressed with: fz = 0.1 N · sin(3 t)."""
+    skin = read_skin(skin_file)
+    pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+    store = typestore()
+
+    def put(topic: str, time_ns: int, one: object) -> None:
+        writer.write(topic, time_ns, bytes(store.serialize_cdr(one, one.__msgtype__)))
+
+    with BagWriter(folder, **options) as writer:
+        for topic, kind in (("/frequencies", FREQUENCIES), ("/stress", STRESS), ("/force", WRENCH)):
+            writer.add_topic(topic, kind, [quality(depth=100)])
+        writer.add_topic("/info", INFO, [quality(latched=True)])
+        put("/info", START_NS, info_of(skin, pipeline, START_NS))
+        for k in range(messages):
+            stamp_ns = START_NS + round(k / rate * 1e9)
+            raw = frequencies_of(k, stamp_ns, loads(pipeline, k / rate))
+            put("/frequencies", stamp_ns + 1000, raw)
+            put("/stress", stamp_ns + 2000, stress_of(raw, pipeline))
+            force = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.1 * np.sin(3 * k / rate))
+            zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+            wrench = message("geometry_msgs/msg/Wrench", force=force, torque=zero)
+            put("/force", stamp_ns + 3000, message(WRENCH, header=header(stamp_ns, "sensor"), wrench=wrench))
+    return folder

@@ -1,0 +1,388 @@
+"""Bags as files: written, read, cut off and repaired, damaged, made into stress again. Needs no ROS."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from rosbags.highlevel import AnyReader
+
+from bag_maker import START_NS, WRENCH, frequencies_of, header, info_of, loads, make_bag, message
+from conftest import ROOT
+from cube_tensor_driver.cli import main
+from cube_tensor_driver.core.errors import BagError
+from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.files.bag_writer import BagWriter
+from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, Bag, typestore
+from cube_tensor_driver.files.calibration import read_calibration, write_calibration
+from cube_tensor_driver.files.repair import repair
+from cube_tensor_driver.files.reprocess import Change, Job, reprocess
+from cube_tensor_driver.files.share import share
+from cube_tensor_driver.files.skin import read_skin
+
+SKIN = share() / "config" / "skin_demo.yaml"
+KEPT = ROOT / "test" / "data" / "bag_v1"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return make_bag(tmp_path_factory.mktemp("made") / "bag", SKIN)
+
+
+@pytest.fixture
+def copy(bag, tmp_path):
+    return Path(shutil.copytree(bag, tmp_path / "bag"))
+
+
+def stress(path: Path) -> dict[int, np.ndarray]:
+    """Records by stamp."""
+    with Bag(path) as bag:
+        return {int(stamp): one for batch, _ in bag.batches("/stress")
+                for stamp, one in zip(batch.stamp_ns, batch.field, strict=True)}  # fmt: skip
+
+
+def differing_bits(one: dict[int, np.ndarray], other: dict[int, np.ndarray]) -> int:
+    assert one.keys() == other.keys()
+    names = ("cube", "sequence", "time_offset", "stress", "gradient", "residual", "status", "observed")
+    count = 0
+    for stamp, record in one.items():
+        for name in names:
+            a, b = (np.ascontiguousarray(each[name]).view(np.uint8) for each in (record, other[stamp]))
+            count += int(np.unpackbits(a ^ b).sum())
+    return count
+
+
+@pytest.mark.parametrize("options", [{}, {"storage": "sqlite3"}, {"max_seconds": 1.0}, {"max_bytes": 400_000}])
+def test_a_written_bag_is_read_by_rosbags(tmp_path, options):
+    path = make_bag(tmp_path / "bag", SKIN, **options)
+    with AnyReader([path]) as reader:  # with the definitions in the bag alone
+        counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+        assert counts == {"/frequencies": 300, "/stress": 300, "/force": 300, "/info": 1}
+        connection = next(one for one in reader.connections if one.topic == "/frequencies")
+        times = []
+        for _, time_ns, data in reader.messages([connection]):
+            times.append(time_ns)
+            assert reader.deserialize(data, connection.msgtype).n_pads == 8
+    assert times == [START_NS + 10_000_000 * k + 1000 for k in range(300)]
+    if "max_seconds" in options:
+        assert len(list(path.glob("*.mcap"))) == 3
+
+
+def test_type_hashes_are_those_of_ros():
+    """rosbags' reading of our message files is the one that ROS generated code from."""
+    pytest.importorskip("rclpy")
+    installed = Path(os.environ["AMENT_PREFIX_PATH"].split(":")[0]) / "share/cube_tensor_driver/msg"
+    for kind in (FREQUENCIES, STRESS, INFO):
+        text = (installed / f"{kind.split('/')[-1]}.json").read_text()
+        assert typestore().hash_rihs01(kind) in text
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_reprocessed_is_recorded_to_the_bit(tmp_path, storage):
+    path = make_bag(tmp_path / "bag", SKIN, storage=storage)
+    done = reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    assert done.messages == 300 and done.rows == 300 * 16
+    assert differing_bits(stress(path), stress(tmp_path / "out")) == 0
+    with Bag(path) as one, Bag(tmp_path / "out") as other:
+        assert other.infos("/info")[0].calibrations == one.infos("/info")[0].calibrations
+
+
+def test_reprocess_needs_no_ros(bag, tmp_path):
+    script = (
+        "import sys; from pathlib import Path; from cube_tensor_driver.files.reprocess import *\n"
+        "reprocess(Job(Path(sys.argv[1]), Path(sys.argv[2]), 'bag', Change()))\n"
+        "found = {'rclpy', 'cube_tensor_driver.msg', 'matplotlib'} & set(sys.modules)\n"
+        "sys.exit(f'imported {found}' if found else 0)"
+    )
+    subprocess.run([sys.executable, "-c", script, str(bag), str(tmp_path / "out")], check=True, cwd=ROOT)
+
+
+def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
+    """Two infos of the reconstruction and one, later, of the driver, which knows of no tare."""
+    skin = read_skin(SKIN)
+    pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+    tared = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+    tared.rest_frequency = pipeline.rest_frequency * 1.001
+    store, middle = typestore(), START_NS + 500_000_000
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic, kind in (("/frequencies", FREQUENCIES), ("/info", INFO)):
+            writer.add_topic(topic, kind)
+        for of, stamp, sender in ((pipeline, START_NS, "reconstruction"), (tared, middle, "reconstruction"),
+                                  (pipeline, middle + 1, "driver")):  # fmt: skip
+            writer.write("/info", stamp, bytes(store.serialize_cdr(info_of(skin, of, stamp, sender), INFO)))
+        for k in range(100):
+            raw = frequencies_of(k, START_NS + 10_000_000 * k, loads(pipeline, 0.01 * k))
+            writer.write("/frequencies", START_NS + 10_000_000 * k, bytes(store.serialize_cdr(raw, FREQUENCIES)))
+    reprocess(Job(tmp_path / "bag", tmp_path / "out", "bag", Change()))
+    for k, record in enumerate(stress(tmp_path / "out").values()):
+        of = pipeline if k < 50 else tared
+        expected = of.process(record["cube"], loads(pipeline, 0.01 * k).astype(np.float32))
+        np.testing.assert_array_equal(record["stress"], expected.stress, err_msg=str(k))
+
+
+def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
+    for form in ("parquet", "csv"):
+        reprocess(Job(bag, tmp_path / f"bag.{form}", form, Change()))
+    parquet = pyarrow.parquet.read_table(tmp_path / "bag.parquet")
+    csv = pyarrow.csv.read_csv(tmp_path / "bag.csv")
+    assert parquet.column_names == csv.column_names
+    assert {"stamp_ns", "stress_zz_Pa", "gradient_zz_x_Pa_per_m"} <= set(parquet.column_names)
+    records = list(stress(bag).values())
+    zz = np.concatenate([record["stress"][:, 2] for record in records])
+    np.testing.assert_array_equal(parquet["stress_zz_Pa"].to_numpy(), zz)
+    np.testing.assert_array_equal(csv["stress_zz_Pa"].to_numpy().astype(np.float32), zz)
+    assert parquet["cube"].to_pylist()[:17] == [f"c{k:02}" for k in range(16)] + ["c00"]
+    assert parquet["stamp_ns"].to_pylist()[1] == START_NS + 100
+
+
+def test_another_calibration_and_tare(bag, tmp_path, capsys):
+    """Twice the modulus is twice the stress; after a tare over one instant that instant has none."""
+    known = read_skin(SKIN).cubes[0].calibration
+    write_calibration(tmp_path / "stiff.yaml", dataclasses.replace(known, modulus=2 * known.modulus))
+    common = ["reprocess", str(bag), "-o", str(tmp_path / "stiff"), "--jobs", "1"]
+    assert main([*common, "--calibration", str(tmp_path / "stiff.yaml")]) == 0
+    before, after = stress(bag), stress(tmp_path / "stiff" / "bag")
+    for stamp, record in after.items():
+        np.testing.assert_allclose(record["stress"], 2 * before[stamp]["stress"], rtol=1e-5)  # float32
+    assert main(["reprocess", str(bag), "-o", str(tmp_path / "tared"), "--tare-from", "0.999", "1.001"]) == 0
+    with Bag(tmp_path / "tared" / "bag") as made:
+        assert len(made.infos("/info")) == 1
+    record = stress(tmp_path / "tared" / "bag")[START_NS + 1_000_000_000]
+    # rest is float64, the frequency float32: 6e-8 of it, as strain, times the modulus of 0.3 MPa and the inversion
+    assert np.nanmax(np.abs(record["stress"])) < 1
+    assert np.nanmax(np.abs(before[START_NS + 1_000_000_000]["stress"])) > 100
+    assert main(["reprocess", str(bag), "-o", str(tmp_path / "late"), "--tare-from", "50", "51"]) == 1
+    assert "0 to 2.990 s" in " ".join(capsys.readouterr().err.split())
+
+
+def test_reprocess_goes_on_where_it_ended(bag, tmp_path, capsys):
+    other = shutil.copytree(bag, tmp_path / "other")
+    out = tmp_path / "out"
+    assert main(["reprocess", str(bag), "-o", str(out), "--jobs", "1"]) == 0
+    (out / ".partial" / "other").mkdir(parents=True)  # as left behind by a killed run
+    stamp = (out / "bag" / "metadata.yaml").stat().st_mtime_ns
+    assert main(["reprocess", str(bag), str(other), "-o", str(out), "--jobs", "2"]) == 0
+    assert (out / "bag" / "metadata.yaml").stat().st_mtime_ns == stamp
+    assert differing_bits(stress(bag), stress(out / "other")) == 0
+    assert not (out / ".partial").exists()
+    assert main(["reprocess", str(bag), "-o", str(out), "--tare-from", "0", "1"]) == 1
+    assert "other options" in capsys.readouterr().err
+
+
+def test_reprocess_on_a_dask_cluster(bag, tmp_path):
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        assert main(["reprocess", str(bag), "-o", str(tmp_path / "out"), "--scheduler", address]) == 0
+    assert differing_bits(stress(bag), stress(tmp_path / "out" / "bag")) == 0
+
+
+def test_cut_off_anywhere_is_repaired(bag, tmp_path):
+    """What stood in complete chunks is there after the repair, the rest is kept, whatever byte the end fell on."""
+    rng = np.random.default_rng(7)
+    whole = tmp_path / "whole"
+    with Bag(bag) as source, BagWriter(whole) as writer:
+        for connection in source.connections:
+            writer.add_topic(connection.topic, connection.msgtype)
+        flushed = []
+        for number, entry in enumerate(source.entries(), 1):
+            writer.write(entry.topic, entry.time_ns, entry.data)
+            if number % 60 == 0:
+                writer.flush()
+                flushed.append((next(whole.glob("*/*.mcap")).stat().st_size, number))
+        data = next(whole.glob("*/*.mcap")).read_bytes()
+    for number, size in enumerate(rng.integers(flushed[0][0], len(data), 20).tolist()):
+        path = tmp_path / f"cut{number}"
+        (path / "cut_0").mkdir(parents=True)
+        (path / "cut_0" / f"cut{number}_0.mcap").write_bytes(data[:size])
+        (path / "cut_0").rename(path / f"cut{number}_0")
+        with pytest.raises(BagError, match="repair"):
+            Bag(path)
+        done = repair(path)
+        complete = max(count for at, count in flushed if at <= size)
+        assert done.messages == complete and done.damaged == 0
+        with Bag(path) as read:
+            assert sum(1 for _ in read.entries()) == complete
+        assert sum(one.stat().st_size for one in path.glob("*.rest")) == done.cut
+        assert repair(path).cut == 0
+
+
+def test_random_damage_is_one_message_or_no_harm(tmp_path):
+    """Truncated, flipped, missing, exchanged: either all is read and equal, or one line says what is wrong."""
+    rng = np.random.default_rng(3)
+    sqlite = make_bag(tmp_path / "sqlite", SKIN, 60, storage="sqlite3")
+    mcap = make_bag(tmp_path / "mcap", SKIN, 60)
+    good = {path: stress(path) for path in (sqlite, mcap)}
+    outcomes = {"refused": 0, "harmless": 0}
+    for number in range(100):
+        source = (sqlite, mcap)[number % 2]
+        path = Path(shutil.copytree(source, tmp_path / f"case{number}"))
+        storage = next(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))
+        target = path / "metadata.yaml" if number % 10 == 9 else storage
+        data = bytearray(target.read_bytes())
+        what = number % 5
+        if what == 0:
+            data = data[: rng.integers(len(data))]
+        elif what in (1, 2, 4):
+            for at in rng.integers(0, len(data), 1 + 20 * (what == 2)):
+                data[at] ^= 1 << rng.integers(8)
+        if what == 3 and number % 20 < 10:
+            target.unlink()
+        elif what == 3:
+            target.write_bytes(data.replace(b"SkinFrequencies", b"SkinFrequencieX"))
+        else:
+            target.write_bytes(data)
+        try:
+            reprocess(Job(path, tmp_path / f"out{number}", "bag", Change()))
+        except BagError as error:
+            outcomes["refused"] += 1
+            assert str(path.name) in str(error) and "\n" not in str(error), str(error)
+            continue
+        outcomes["harmless"] += 1
+        again = stress(tmp_path / f"out{number}")
+        if source == mcap:  # sqlite has no checksums: a flipped bit of a number stays a number
+            assert differing_bits(again, good[source]) == 0
+    assert outcomes["refused"] > 40
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("nowhere", "name a bag"), ("empty", "repair"), ("text.mcap", "damaged, or no bag"), ("text.txt", "damaged")],
+)
+def test_what_is_no_bag_is_refused(tmp_path, name, words, capsys):
+    (tmp_path / "empty").mkdir()
+    for file in ("text.mcap", "text.txt"):
+        (tmp_path / file).write_text("no bag at all")
+    assert main(["bag", "info", str(tmp_path / name)]) == 1
+    error = capsys.readouterr().err
+    assert words in error and str(tmp_path / name) in error and "Traceback" not in error
+
+
+def test_an_unknown_version_is_refused(tmp_path):
+    skin = read_skin(SKIN)
+    pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/info", INFO)
+        writer.write("/info", 1, bytes(typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO)))
+    with Bag(tmp_path / "bag") as bag, pytest.raises(BagError, match="version 7, newer than"):
+        bag.infos("/info")
+
+
+def test_the_kept_bag_of_version_1_can_be_read(tmp_path):
+    reprocess(Job(KEPT, tmp_path / "out", "bag", Change()))
+    recorded, again = stress(KEPT), stress(tmp_path / "out")
+    common = recorded.keys() & again.keys()
+    assert len(common) > 100
+    for stamp in common:
+        # not to the bit: another processor may round otherwise
+        np.testing.assert_allclose(again[stamp]["stress"], recorded[stamp]["stress"], rtol=1e-4, atol=0.1)
+    with Bag(KEPT) as bag:
+        assert bag.infos("/info")[0].version == 1
+
+
+def test_fit_from_a_bag(tmp_path, capsys):
+    """A cube under known loads recovers its coefficients; by forces alone, what they do not tell is named."""
+    skin = read_skin(share() / "config" / "cube.yaml")
+    calibration, area = skin.cubes[0].calibration, 1e-4
+    modes, kind = calibration.modes, "cube_tensor_driver/msg/StressTensorStamped"
+    pipeline = Pipeline([calibration], np.float32)
+    zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+
+    def put(topic: str, stamp: int, one: object) -> None:
+        writer.write(topic, stamp, bytes(typestore().serialize_cdr(one, one.__msgtype__)))
+
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic, of in (("/frequencies", FREQUENCIES), ("/info", INFO), ("/force", WRENCH), ("/known", kind)):
+            writer.add_topic(topic, of)
+        put("/info", START_NS, info_of(skin, pipeline, START_NS))
+        for k in range(80):
+            state = 3000 * np.sin(0.1 * k * (1 + np.arange(modes.n_modes)))
+            v = calibration.response @ state
+            f = pad_frequency(v, calibration.rest_frequency, calibration.beta, calibration.modulus)
+            stamp = START_NS + 10_000_000 * k
+            put("/frequencies", stamp, frequencies_of(k, stamp, f[None]))
+            values = modes.components @ state
+            values[6:] /= calibration.half_side
+            xx, yy, zz, yz, zx, xy = values[:6]
+            force = message("geometry_msgs/msg/Vector3", x=zx * area, y=yz * area, z=zz * area)
+            wrench = message("geometry_msgs/msg/Wrench", force=force, torque=zero)
+            put("/force", stamp, message(WRENCH, header=header(stamp, "sensor"), wrench=wrench))
+            tensor = message("cube_tensor_driver/msg/StressTensor",
+                             normal=message("geometry_msgs/msg/Vector3", x=xx, y=yy, z=zz),
+                             shear=message("geometry_msgs/msg/Vector3", x=yz, y=zx, z=xy), normal_gradient=values[6:],
+                             covariance=np.zeros(225), residual=0.0, status=0, observed=0)  # fmt: skip
+            put("/known", stamp, message(kind, header=header(stamp, "cube"), tensor=tensor))
+    common = ["fit", str(tmp_path / "bag"), "--layout", "planar", "-o", str(tmp_path / "f.yaml"), "--reference"]
+    assert main([*common, "/known"]) == 0
+    fitted = read_calibration(tmp_path / "f.yaml")
+    for name, value in calibration.coefficients.items():
+        # float32 carries 6e-8 of f, which is 2e-5 of a strain of 0.3 %
+        assert fitted.coefficients[name] == pytest.approx(value, abs=2e-4), name
+    capsys.readouterr()
+    assert main([*common, "/force", "--area", str(area)]) == 1
+    assert "do not determine e, f" in capsys.readouterr().err
+
+
+def test_fit_says_what_a_bag_lacks(bag, tmp_path, capsys):
+    common = ["fit", str(bag), "--layout", "planar", "-o", str(tmp_path / "f.yaml")]
+    for more, words in (
+        (["--reference", "/force"], "--cube"),
+        (["--reference", "/force", "--cube", "c99"], "no cube 'c99'"),
+        (["--reference", "/nothing", "--cube", "c00"], "not there"),
+        (["--reference", "/force", "--cube", "c00"], "--area"),
+    ):
+        assert main([*common, *more]) == 1
+        assert words in capsys.readouterr().err
+
+
+def test_plot_and_info(bag, tmp_path, capsys):
+    figure = tmp_path / "c03.png"
+    assert main(["plot", str(bag), "--cube", "c03", "--from", "0.5", "--to", "1.5", "-o", str(figure)]) == 0
+    # 300 ns after each scan: the one at 1.5 s is behind the end
+    assert "100 samples" in capsys.readouterr().out and figure.stat().st_size > 20_000
+    assert main(["plot", str(bag), "--cube", "c99", "-o", str(figure)]) == 1
+    assert "no cube 'c99'" in capsys.readouterr().err
+    assert main(["bag", "info", str(bag)]) == 0
+    text = capsys.readouterr().out
+    assert "skin skin: 16 cubes" in text and read_skin(SKIN).cubes[0].calibration.id in text
+    row = next(line for line in text.splitlines() if " c07 " in line)
+    assert [cell.strip() for cell in row.split("│")[3:6]] == ["300", "100.0", "0"]
+
+
+def test_disk_full_leaves_what_was_written(bag, tmp_path):
+    """The file system takes 300 kB, then no more."""
+    script = (
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from cube_tensor_driver.core.errors import BagError\n"
+        "from cube_tensor_driver.files.bags import Bag; from cube_tensor_driver.files.bag_writer import BagWriter\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n"
+        "try:\n"
+        "    with Bag(Path(sys.argv[1])) as source, BagWriter(Path(sys.argv[2])) as writer:\n"
+        "        for one in source.connections: writer.add_topic(one.topic, one.msgtype)\n"
+        "        for entry in source.entries(): writer.write(entry.topic, entry.time_ns, entry.data); writer.flush()\n"
+        "except BagError as error: print(error); sys.exit(3)"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(bag), str(tmp_path / "full")], capture_output=True, text=True,
+                          cwd=ROOT, check=False)  # fmt: skip
+    assert done.returncode == 3 and "File too large" in done.stdout and "with room" in done.stdout, done.stderr
+    kept = repair(tmp_path / "full", keep_rest=False)
+    assert kept.messages > 100
+    with Bag(tmp_path / "full") as read:
+        assert sum(1 for _ in read.entries()) == kept.messages
+
+
+def test_unwritable_and_existing_folders_are_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder, words in ((tmp_path, "is there already"), (tmp_path / "file" / "bag", "Not a directory")):
+        with pytest.raises(BagError, match=words):
+            BagWriter(folder)

@@ -1,0 +1,192 @@
+"""Recording and replaying in real processes."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from bag_maker import START_NS, make_bag
+from conftest import ROOT
+from cube_tensor_driver.core.errors import BagError
+from cube_tensor_driver.files.bags import FREQUENCIES, Bag
+from cube_tensor_driver.files.repair import repair
+from cube_tensor_driver.files.reprocess import Change, Job, reprocess
+from cube_tensor_driver.files.share import share
+from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
+from cube_tensor_driver.ros.children import Children
+from cube_tensor_driver.ros.messages import read_stress, to_ns
+from cube_tensor_driver.ros.node import queue
+from cube_tensor_driver.ros.start import Process, skin_processes
+from test_bags_files import differing_bits, stress
+
+SKIN = share() / "config" / "skin_demo.yaml"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def cube(*arguments: object) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", *map(str, arguments)], cwd=ROOT,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
+
+
+def end(process: subprocess.Popen, number: int = signal.SIGINT) -> str:
+    process.send_signal(number)
+    return process.communicate(timeout=20)[1]
+
+
+def grown(folder: Path, size: int) -> bool:
+    return sum(path.stat().st_size for path in folder.glob("**/*.mcap")) > size
+
+
+@pytest.fixture
+def running(ros, tmp_path):
+    """A simulated skin of sixteen cubes, and a tester that listens."""
+    with Children(tmp_path) as children:
+        for process in skin_processes(SKIN, simulated_ports=tmp_path / "ports"):
+            children.start(process)
+        heard = ros.listen(SkinStress, "stress", 1000)
+        ros.wait(lambda: heard)
+        yield ros
+        children.check()
+
+
+def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
+    """Nothing lost against what another subscriber hears; and the pipeline gives the nodes' own bits again."""
+    path = tmp_path / "bag"
+    heard = running.listen(SkinFrequencies, "frequencies", 1000)
+    recorder = cube("record", "-o", path)
+    running.wait(lambda: grown(path, 400_000))
+    output = end(recorder)
+    running.wait(lambda: len(heard) > 100)
+    assert recorder.returncode == 0 and "/frequencies" in output, output
+    with Bag(path) as bag:
+        assert {info.sender for info in bag.infos("/info")} == {"driver", "reconstruction"}
+        recorded = [int(stamp) for batch, _ in bag.batches("/frequencies") for stamp in batch.stamp_ns]
+        qos = {one.topic: one.ext.offered_qos_profiles[0].durability.name for one in bag.connections}
+    assert qos["/info"] == "TRANSIENT_LOCAL" and qos["/frequencies"] == "VOLATILE"
+    stamps = [to_ns(message.header.stamp) for message in heard]
+    first, last = stamps.index(recorded[0]), stamps.index(recorded[-1])
+    assert recorded == stamps[first : last + 1] and len(recorded) > 100
+    reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    live, again = stress(path), stress(tmp_path / "out")
+    common = live.keys() & again.keys()
+    assert len(common) > 100
+    assert differing_bits({k: live[k] for k in common}, {k: again[k] for k in common}) == 0
+
+
+def test_killed_recordings_lose_less_than_a_second(running, tmp_path):
+    heard = running.listen(SkinFrequencies, "frequencies", 1000)
+    for number in range(3):
+        path = tmp_path / f"killed{number}"
+        recorder = cube("record", "-o", path)
+        running.wait(lambda path=path, size=60_000 * (1 + number): grown(path, size))
+        recorder.kill()
+        recorder.communicate(timeout=10)
+        latest = to_ns(heard[-1].header.stamp)
+        with pytest.raises(BagError, match="repair"):
+            Bag(path)
+        assert repair(path).messages > 0
+        with Bag(path) as bag:
+            stamps = [int(stamp) for batch, _ in bag.batches("/frequencies") for stamp in batch.stamp_ns]
+        assert latest - stamps[-1] < 1_000_000_000
+        assert max(np.diff(stamps)) < 100_000_000
+
+
+def test_record_says_what_is_wrong(domain, tmp_path):
+    (tmp_path / "there").mkdir()
+    recorder = cube("record", "-o", tmp_path / "there")
+    _, errors = recorder.communicate(timeout=30)
+    assert recorder.returncode == 1 and "is there already" in errors and "Traceback" not in errors
+    recorder = cube("record", "-o", tmp_path / "bag", "--topics", "nothing", "--duration", "0.5")
+    _, errors = recorder.communicate(timeout=30)
+    assert "/nothing: nobody offers it" in errors and "Traceback" not in errors
+
+
+def reconstruction(children: Children) -> None:
+    children.start(Process("reconstruction", "cube_tensor_driver.ros.reconstruction",
+                           parameters={"config": str(SKIN), "use_sim_time": True}))  # fmt: skip
+
+
+def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path):
+    """To the bit, stamps included, also the second time round after the jump back."""
+    path = make_bag(tmp_path / "bag", SKIN, 150)
+    batches = ros.listen(SkinStress, "stress", queue(None))
+    infos = ros.listen(SkinInfo, "info", LATCHED)
+    clock = ros.listen(Clock, "/clock", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
+    with Children(tmp_path) as children:
+        reconstruction(children)
+        ros.wait(lambda: len(infos) == 1)
+        player = cube("replay", path, "--clock", "--loop", "--rate", "2")
+        ros.wait(lambda: len(batches) >= 300 and len(infos) > 1)
+        assert "Traceback" not in end(player)
+        assert player.returncode == 0
+        children.check()
+    recorded = stress(path)
+    for message in batches:
+        times, rows = read_stress(message)
+        one = recorded[to_ns(message.header.stamp)]
+        assert (times.cube == one["cube"]).all() and (times.sequence == one["sequence"]).all()
+        assert (times.time_offset == one["time_offset"]).all()
+        for name in ("stress", "gradient", "residual"):
+            assert (getattr(rows, name).view(np.uint32) == one[name].view(np.uint32)).all()
+        assert (rows.status == one["status"]).all()
+    stamps = [to_ns(message.header.stamp) for message in batches]
+    assert stamps[0] == START_NS and stamps.count(START_NS) >= 2
+    now = [to_ns(message.clock) for message in clock]
+    assert min(np.diff(now)) < -1_000_000_000  # the jump back
+    assert all(START_NS <= one <= START_NS + 1_500_000_000 for one in now)
+
+
+def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
+    """Keys through a terminal of its own."""
+    path = make_bag(tmp_path / "bag", SKIN, 300)
+    raw = ros.listen(SkinFrequencies, "frequencies", queue(None))
+    infos = ros.listen(SkinInfo, "info", LATCHED)
+    near, far = pty.openpty()
+    player = subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--start", "1"],
+                              cwd=ROOT, stdin=far, stdout=far, stderr=far)  # fmt: skip
+    os.close(far)
+    os.set_blocking(near, False)
+    try:
+        ros.wait(lambda: len(raw) > 10)
+        assert raw[0].sequence[0] == 100 and len(infos) == 1
+        os.write(near, b" ")
+        held: list[int] = []
+
+        def still() -> bool:
+            held.append(len(raw))
+            return len(held) > 4 and len(set(held[-4:])) == 1
+
+        ros.wait(still)
+        before = len(raw)
+        os.write(near, b"s")
+        ros.wait(lambda: len(raw) > before)
+        ros.wait(still)
+        assert len(raw) == before + 1
+        os.write(near, b"q")
+        assert player.wait(timeout=10) == 0
+    finally:
+        player.kill()
+        player.wait()
+        os.close(near)
+
+
+def test_types_of_the_bag_are_offered_as_they_were(ros, tmp_path):
+    path = make_bag(tmp_path / "bag", SKIN, 50)
+    player = cube("replay", path, "--stress")
+    ros.wait(lambda: {name for name, _ in ros.node.get_topic_names_and_types()} >= {"/stress", "/info", "/force"})
+    offered = ros.node.get_publishers_info_by_topic("/info")[0]
+    assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert ros.node.get_publishers_info_by_topic("/frequencies")[0].topic_type == FREQUENCIES
+    assert player.communicate(timeout=20) and player.returncode == 0

@@ -1,0 +1,311 @@
+"""The fault injector does what it says, and its judge is not easily pleased."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.device.protocol import Decoder, Hello, Sample, Stats
+from cube_tensor_driver.device.sequence import Account, Verdict
+from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.files.yaml import parse_yaml, write_yaml
+from cube_tensor_driver.simulation.faults import FRAME, KINDS, Fault, Injector, parse_faults
+from cube_tensor_driver.simulation.hub import SimulatedHub
+from cube_tensor_driver.simulation.inject import inject
+from cube_tensor_driver.simulation.reckoning import Reckoning
+from cube_tensor_driver.view.torture import CUTS, failures, schedule
+
+PERIOD_US = 2000
+VALUES = np.arange(1, 17, dtype="<u4").reshape(2, 8) * 1_000_000
+
+
+@dataclass
+class Wire:
+    """A line that keeps what it is given."""
+
+    plugged: bool = True
+    held_until_us: int = 0
+    burst_until_us: int = 0
+    sent: list = field(default_factory=list)
+
+    def send(self, data, now_us):
+        self.sent.append(data)
+        return True
+
+    def unplug(self):
+        self.plugged = False
+
+    def plug(self, port=None):
+        self.plugged, self.port = True, port
+
+
+class Bench:
+    def __init__(self):
+        self.name = "hub0"
+        self.hub = SimulatedHub(1, [10, 11], 8, period_us=PERIOD_US, started=True)
+        self.line = Wire()
+        from pathlib import Path
+
+        self.line.port = Path("/tmp/hub0")
+
+    def play(self, injector, samples):
+        """Samples through the injector into a decoder; returns the decoder and its frames."""
+        decoder, frames = Decoder(), []
+        for _ in range(samples):
+            injector.step(self.hub.next_us)
+            if self.hub.started:
+                data = injector.frame(self, self.hub.sample(injector.values(self, VALUES, self.hub.next_us)))
+                self.line.send(data, self.hub.next_us)
+            else:
+                self.hub.next_us += PERIOD_US
+            frames += decoder.feed(b"".join(self.line.sent))
+            self.line.sent.clear()
+        return decoder, [frame for frame in frames if isinstance(frame, Sample)]
+
+
+def faulty(*faults):
+    bench = Bench()
+    return bench, Injector([bench], [Fault(**fault) for fault in faults], seed=3)
+
+
+@pytest.mark.parametrize("kind", FRAME)
+def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
+    bench, injector = faulty({"kind": kind, "at": 0.01, "count": 20})
+    decoder, samples = bench.play(injector, 100)
+    account = Account()
+    verdicts = [account.sample(sample) for sample in samples]
+    account.stats(Stats(10_000, bench.hub.sequence, 0))
+    counters = account.counters()
+    assert not account.contradictions()
+    assert counters["taken"] == 100 == counters["delivered"] + counters["lost_on_the_way"]
+    for sample in samples:
+        np.testing.assert_array_equal(sample.frequency, VALUES)
+    lost, noise = counters["lost_on_the_way"], decoder.counters.crc + decoder.counters.framing + decoder.counters.length
+    expected = {
+        "drop": (lost == 20, noise == 0),
+        "flip": (lost == 20, noise >= 20),
+        "insert": (0 < lost <= 20, noise > 0),
+        "duplicate": (lost == 0, counters["duplicate"] == 20),
+        "reorder": (lost == 0, verdicts.count(Verdict.LATE) == 10),
+        "truncate": (lost == 20, noise == 20),
+    }
+    assert all(expected[kind]), (counters, noise)
+
+
+def test_stats_close_the_book_and_tell_drops_from_loss():
+    account = Account()
+    bench, injector = faulty()
+    _, samples = bench.play(injector, 10)
+    for sample in samples[:6]:
+        account.sample(sample)
+    account.stats(Stats(20, 10, 3))
+    assert account.counters()["taken"] == 10
+    assert (account.counters()["dropped_in_hub"], account.counters()["lost_on_the_way"]) == (3, 1)
+    assert account.sample(samples[7]) is Verdict.LATE
+    assert account.counters()["lost_on_the_way"] + account.counters()["dropped_in_hub"] == 3
+    account.received += 1
+    assert "lost count" in account.contradictions()[0]
+
+
+def test_faults_of_pads_and_hub_change_what_the_hub_says():
+    bench, injector = faulty(
+        {"kind": "short", "at": 0.01, "seconds": 0.01, "cube": 1, "pad": 2},
+        {"kind": "stuck", "at": 0.03, "seconds": 0.01, "cube": 0, "pad": 0},
+        {"kind": "pads", "at": 0.05, "seconds": 0.01},
+        {"kind": "version", "at": 0.07, "seconds": 0.01},
+        {"kind": "temperature", "at": 0.09, "seconds": 0.002, "value": 10.0},
+    )
+    decoder, samples = bench.play(injector, 60)
+    by_time = {sample.device_us: sample for sample in samples}
+    assert by_time[12_000].frequency[1, 2] == 0 and by_time[22_000].frequency[1, 2] == VALUES[1, 2]
+    assert by_time[52_000].n_pads == 9 and by_time[62_000].n_pads == 8
+    assert decoder.counters.version == 5 and decoder.other_version == 2
+    warm = by_time[100_000]
+    np.testing.assert_allclose(warm.frequency, VALUES * (1 + 10 * 50e-6), rtol=1e-6)
+    assert warm.temperature[0] == 3500
+    assert [(fault["kind"], start, end) for start, end, _, fault in injector.book][:2] == [
+        ("short", 10_000, 20_000), ("stuck", 30_000, 40_000)]  # fmt: skip
+
+
+def test_restart_wrap_and_clock():
+    bench, injector = faulty(
+        {"kind": "drift", "at": 0.01, "value": 100.0},
+        {"kind": "step", "at": 0.02, "value": 1.5},
+        {"kind": "wrap", "at": 0.03, "count": 2},
+    )
+    _, samples = bench.play(injector, 12)
+    times = [sample.device_us for sample in samples]
+    assert times[5] - times[4] == 2000 and times[10] - times[9] == 2000 + 1_500_000
+    bench.hub.started, bench.hub.next_us = True, bench.hub.next_us + (-bench.hub.next_us % PERIOD_US)
+    bench.play(injector, 5)
+    bench.hub.started = True
+    _, samples = bench.play(injector, 4)
+    assert [sample.sequence for sample in samples] == [2**32 - 2, 2**32 - 1, 0, 1]
+    assert [run.boot for run in bench.hub.runs] == [0, 1]
+    assert bench.hub.runs[1].first == 2**32 - 2
+
+
+def test_unplug_takes_the_power_and_rename_comes_back_elsewhere():
+    bench, injector = faulty({"kind": "rename", "at": 0.01, "seconds": 0.02})
+    bench.play(injector, 6)
+    assert not bench.line.plugged and not bench.hub.started and bench.hub.boots == 0
+    bench.play(injector, 12)
+    assert bench.line.plugged and bench.hub.boots == 1 and bench.line.port.name == "hub0_1"
+    assert isinstance(Decoder().feed(bench.hub.hello())[0], Hello)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{kind: explode}", ["explode", "drop"]),
+        ("{kind: drop, count: -1}", ["count", "-1"]),
+        ("{kind: drop, link: 3}", ["link", "3"]),
+        ("{kind: drop, seconds: .nan}", ["seconds"]),
+        ("{kind: drop, how: often}", ["how", "kind"]),
+        ("drop", ["drop", "kind"]),
+    ],
+)
+def test_a_fault_that_is_none_is_told(text, words):
+    with pytest.raises(ConfigError) as error:
+        Fault.parse(parse_yaml(text, "x"), "faults.yaml")
+    for word in ["faults.yaml", *words]:
+        assert word in str(error.value)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+                    lambda child: st.lists(child, max_size=3) | st.dictionaries(
+                        st.sampled_from(["kind", "at", "link", "seconds", "count", "cube", "pad", "value", "x"]),
+                        child | st.sampled_from(sorted(KINDS)), max_size=4)))  # fmt: skip
+def test_any_data_is_faults_or_our_error(data):
+    try:
+        faults = parse_faults(data, "x")
+        bench = Bench()
+        Injector([bench], faults)
+    except ConfigError:
+        return
+    assert all(fault.kind in KINDS for fault in faults)
+
+
+def test_the_wrong_link_cube_or_pad():
+    for fault in ({"kind": "drop", "link": "hub9"}, {"kind": "open", "cube": 2}, {"kind": "short", "pad": 8}):
+        with pytest.raises(ConfigError, match="allowed"):
+            faulty(fault)
+
+
+def test_inject_speaks_to_the_pipe_or_says_that_nobody_listens(tmp_path):
+    with pytest.raises(ConfigError, match="No such file"):
+        inject(tmp_path, ["kind=drop"])
+    os.mkfifo(tmp_path / ".faults")
+    with pytest.raises(ConfigError, match="no simulator reads it"):
+        inject(tmp_path, ["kind=drop"])
+    reader = os.open(tmp_path / ".faults", os.O_RDONLY | os.O_NONBLOCK)
+    inject(tmp_path, ["kind=unplug", "link=hub0", "seconds=2"])
+    assert parse_yaml(os.read(reader, 1000), "pipe") == {"kind": "unplug", "link": "hub0", "seconds": 2}
+    os.close(reader)
+
+
+def test_a_long_torture_has_every_fault_and_the_same_seed_the_same_mix():
+    mix = list(schedule(120.0, 5))
+    assert {fault["kind"] for _, fault in mix} == set(FRAME) | set(CUTS) | {
+        "open",
+        "short",
+        "stuck",
+        "noisy",
+        "temperature",
+    }
+    assert set(KINDS) == {fault["kind"] for _, fault in mix}
+    assert mix == list(schedule(120.0, 5)) != list(schedule(120.0, 6))
+    assert [at for at, _ in mix] == sorted(at for at, _ in mix)
+
+
+INSTANTS, COUNT = 40, 200
+
+
+@pytest.fixture(scope="module")
+def skin(tmp_path_factory):
+    from cube_tensor_driver.files.grid import grid
+
+    path = tmp_path_factory.mktemp("skin") / "skin.yaml"
+    write_yaml(path, grid("skin", 4, 1, 0.012, 2, "planar", "planar", 500.0, "/dev/null{}"))
+    return read_skin(path)
+
+
+def judged(skin, spoil=lambda k, sequence, stamp, frequency, rows: None, skip=(), faults=(), counted=0):
+    """What the judge says of COUNT samples of both hubs, after `spoil` had its hands on them."""
+    reckoning = Reckoning(skin, INSTANTS)
+    pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+    cube = np.arange(4, dtype=np.uint16)
+    for k in range(COUNT):
+        if k in skip:
+            continue
+        frequency = reckoning._table[(k + 1) % INSTANTS].copy()
+        sequence, stamp = np.full(4, k, np.uint32), np.full(4, (k + 1) * PERIOD_US * 1000 + 10_000)
+        rows = pipeline.process(cube, frequency)
+        spoil(k, sequence, stamp, frequency, rows)
+        reckoning.frequencies(cube, sequence, stamp, frequency)
+        reckoning.stress(cube, sequence, stamp, rows)
+    run = {"first": 0, "last": COUNT - 1, "start_us": PERIOD_US, "period_us": PERIOD_US, "boot": 0}
+    links = {name: {"runs": [run], "dropped": 0, "cubes": []} for name in ("hub0", "hub1")}
+    return reckoning.close({"start_time_ns": 0, "links": links, "faults": list(faults)}, 10**12, counted)
+
+
+def test_the_judge_finds_nothing_where_nothing_is(skin):
+    result = judged(skin)
+    assert result["samples_sent"] == result["delivered"] == 4 * COUNT
+    figures = ("unaccounted", "wrong", "wrong_tensors", "false_alarms", "lost_with_power")
+    assert [result[name] for name in figures] == [0] * 5
+    assert judged(skin, skip=[50, 51], counted=8)["unaccounted"] == 0
+
+
+def test_the_judge_finds_what_is_wrong(skin):
+    assert judged(skin, skip=[50, 51])["unaccounted"] == 8
+    assert judged(skin, counted=3)["unaccounted"] == 3
+
+    def bit(k, sequence, stamp, frequency, rows):
+        if k == 70:
+            frequency[1, 4] = np.nextafter(frequency[1, 4], np.float32(0))
+
+    assert judged(skin, bit)["wrong"] == 1
+    fault = [60_000, 160_000, "hub0", {"kind": "noisy", "cube": 1, "pad": 4, "value": 1e-3, "seconds": 0.1}]
+    assert judged(skin, bit, faults=[fault])["wrong"] == 0
+    other = [60_000, 160_000, "hub0", {"kind": "noisy", "cube": 1, "pad": 5, "value": 1e-3, "seconds": 0.1}]
+    assert judged(skin, bit, faults=[other])["wrong"] == 1
+
+    def tensor(k, sequence, stamp, frequency, rows):
+        if k == 70:
+            rows.stress[2, 2] += 0.01 * 10e3
+
+    assert judged(skin, tensor)["wrong_tensors"] == 1
+
+    def status(k, sequence, stamp, frequency, rows):
+        if k == 70:
+            rows.status[3] = 2
+
+    assert judged(skin, status)["false_alarms"] == 1
+
+    def twice(k, sequence, stamp, frequency, rows):
+        if k == 70:
+            sequence[:], stamp[:] = 69, stamp - PERIOD_US * 1000
+
+    assert judged(skin, twice)["wrong"] > 0
+
+    def never_taken(k, sequence, stamp, frequency, rows):
+        if k == 70:
+            sequence[:] = 5000
+
+    assert judged(skin, never_taken)["wrong"] > 0
+
+
+def test_limits_of_the_figures():
+    good = dict.fromkeys(("unaccounted", "wrong", "wrong_tensors", "false_alarms", "crashes", "threads_leaked"), 0)
+    good |= {"rss_growth_mb": 1.0, "worst_reconnect_s": 1.0, "stamp_error_p99_ms": 0.5}
+    assert failures(good) == []
+    assert failures({**good, "unaccounted": 1, "stamp_error_p99_ms": 1.2}) == ["unaccounted", "stamp_error_p99_ms"]

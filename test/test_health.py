@@ -1,0 +1,192 @@
+"""Health of pads: what is broken is named at once, and nothing healthy is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.core import health
+from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.health import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK, Health
+from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.pipeline import PAD_FAULT, RESIDUAL, Pipeline
+
+PERIOD_NS = 10_000_000  # 100 Hz
+CALIBRATION = illustrative("planar")
+NOISE = 8e-6
+
+
+class Skin:
+    """Cubes under a load that moves (or rests), with their health."""
+
+    def __init__(self, cubes: int = 6, moving: bool = True, noise: float = NOISE) -> None:
+        self.pipeline = Pipeline([CALIBRATION] * cubes, np.float32)
+        self.health = Health(self.pipeline)
+        self.cube = np.arange(cubes, dtype=np.uint16)
+        self._moving, self._noise, self._random = moving, noise, np.random.default_rng(1)
+        self.row = 0
+
+    def frequency(self) -> np.ndarray:
+        n = len(self.cube)
+        phase = np.arange(8) + np.arange(n)[:, None]
+        state = 10e3 * np.sin(2 * np.pi * 0.5 * self.row * 1e-9 * PERIOD_NS + phase[:, : CALIBRATION.modes.n_modes])
+        v = self._moving * state @ CALIBRATION.response.T
+        f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+        f *= 1 + self._noise * self._random.standard_normal((n, 8))
+        return np.rint(f * 1e3) * 1e-3
+
+    def play(self, seconds: float, harm=lambda frequency, row: None, pad_fault: int = 0) -> np.ndarray:
+        """Returns the last mask of bad pads."""
+        for _ in range(round(seconds * 1e9 / PERIOD_NS)):
+            frequency = self.frequency()
+            harm(frequency, self.row)
+            faults = np.zeros(len(self.cube), np.uint32)
+            faults[2] = pad_fault
+            mask = self.health.update(self.cube, frequency.astype(np.float32), faults, self.row * PERIOD_NS)
+            rows = self.pipeline.process(self.cube, frequency, mask)
+            self.health.residual(self.cube, rows.status)
+            self.row += 1
+        return mask
+
+
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize("noise", [0.0, NOISE, 2 * NOISE])
+def test_nothing_healthy_is_called_ill(moving, noise):
+    skin = Skin(64, moving, noise)
+    skin.play(20)
+    assert not skin.health.collect()[0].any()
+
+
+def set_pad(value):
+    def harm(frequency, row):
+        frequency[2, 5] = value
+
+    return harm
+
+
+def noisy(frequency, row):
+    frequency[2, 5] *= 1 + 3e-4 * np.random.default_rng(row).standard_normal()
+
+
+FAULTS = {
+    "short": (set_pad(np.nan), SHORT, 0.01),
+    "zero": (set_pad(0.0), SHORT, 0.01),
+    "open": (set_pad(433e3), OPEN, 0.01),
+    "beyond the law": (set_pad(4e6), OPEN, 0.01),
+    "squeezed": (set_pad(20e3), RANGE, 0.01),
+    "stretched": (set_pad(180e3), RANGE, 0.01),
+    "stuck": (set_pad(101_234.567), STUCK, 1.02),
+    "noisy": (noisy, NOISY, 1.02),
+}
+
+
+@pytest.mark.parametrize("name", list(FAULTS))
+def test_a_broken_pad_is_named_in_time_left_out_and_taken_back(name):
+    harm, bit, within = FAULTS[name]
+    skin = Skin()
+    skin.play(3)
+    mask = skin.play(within, harm)
+    expected = np.zeros((6, 8), np.uint16)
+    expected[2, 5] = bit
+    np.testing.assert_array_equal(skin.health.state, expected)
+    mask = skin.play(0.02, harm)
+    assert mask.tolist() == [0, 0, 1 << 5, 0, 0, 0]
+    skin.play(5)
+    assert not skin.health.state.any()
+    assert skin.health.collect()[0][2, 5] & bit  # not forgotten until it was told
+    assert not skin.health.collect()[0].any()
+
+
+def test_what_the_hub_reports():
+    skin = Skin()
+    assert skin.play(0.01, pad_fault=1 << 3).tolist() == [0, 0, 8, 0, 0, 0]
+    assert skin.health.state[2, 3] == REPORTED
+
+
+def test_one_bad_row_between_two_looks_is_seen_and_a_flapping_pad_does_not_flicker():
+    skin = Skin()
+    skin.play(1)
+    skin.play(0.01, set_pad(np.nan))
+    skin.play(3)
+    assert skin.health.collect()[0][2, 5] == SHORT
+
+    changes, before = 0, 0
+
+    def flap(frequency, row):
+        nonlocal changes, before
+        if row % 37 == 0:
+            frequency[2, 5] = np.nan
+        changes += before != skin.health.state[2, 5]
+        before = int(skin.health.state[2, 5])
+
+    skin.play(10, flap)
+    assert changes == 1
+
+
+def test_one_pad_that_wanders_while_all_rest_is_drifting_and_still_used():
+    skin = Skin(moving=False)
+    skin.play(2)
+    start = skin.row
+
+    def wander(frequency, row):
+        frequency[2, 5] *= 1 + 2e-5 * (row - start) * 1e-9 * PERIOD_NS  # 20 ppm a second
+
+    skin.play(20, wander)
+    expected = np.zeros((6, 8), np.uint16)
+    expected[2, 5] = DRIFT
+    np.testing.assert_array_equal(skin.health.state, expected)
+    assert not skin.health.mask.any()
+
+    # all together is temperature or load, not a pad
+    skin = Skin(moving=False)
+    skin.play(20, lambda frequency, row: frequency.__imul__(1 + 2e-5 * row * 1e-9 * PERIOD_NS))
+    assert not skin.health.state.any()
+
+
+def test_a_residual_is_of_the_cube_and_has_hysteresis():
+    skin = Skin()
+
+    def bend(share):
+        return lambda frequency, row: frequency[2].__setitem__(5, frequency[2, 5] * (1 + 0.01 * (row % 50 < share)))
+
+    skin.play(2)
+    assert not skin.health.strained.any()
+    skin.play(3, bend(50))
+    assert skin.health.strained.tolist() == [False, False, True, False, False, False]
+    skin.play(3, bend(15))  # 30 % of the rows: stays what it was
+    assert skin.health.strained[2]
+    skin.play(2)
+    assert not skin.health.strained.any()
+    skin.play(3, bend(15))
+    assert not skin.health.strained.any()
+
+
+def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
+    """Rows fed one by one and all at once leave the same state."""
+    generator = np.random.default_rng(3)
+    cube = np.array([4, 1, 4, 0, 1, 4], np.uint16)
+    frequency = (100e3 * (1 + 1e-5 * generator.standard_normal((6, 8)))).astype(np.float32)
+    together, singly = (Health(Pipeline([CALIBRATION] * 6, np.float32)) for _ in range(2))
+    none = np.zeros(6, np.uint32)
+    together.update(cube, frequency, none, 0)
+    for row in range(6):
+        singly.update(cube[row : row + 1], frequency[row : row + 1], none[:1], 0)
+    for name in ("last", "_before", "_lowest", "_highest", "_count", "_bend"):
+        np.testing.assert_array_equal(getattr(together, name), getattr(singly, name))
+    assert together.rows.tolist() == [1, 2, 0, 0, 3, 0]
+
+
+def test_mixed_layouts_and_pads_that_do_not_exist():
+    pipeline = Pipeline([illustrative("quad"), CALIBRATION], np.float32)
+    watch = Health(pipeline)
+    frequency = np.full((2, 8), 100e3, np.float32)
+    frequency[0, 4:] = np.nan
+    watch.update(np.arange(2), frequency, np.array([0xF0, 0], np.uint32), 0)
+    assert not watch.state.any()
+
+
+def test_bits_are_those_of_the_message():
+    message = pytest.importorskip("cube_tensor_driver.msg", exc_type=ImportError).SkinStress
+    assert (message.PAD_FAULT, message.RESIDUAL) == (PAD_FAULT, RESIDUAL)
+    for name in ("OPEN", "SHORT", "RANGE", "STUCK", "NOISY", "REPORTED", "DRIFT"):
+        assert getattr(message, f"PAD_{name}") == getattr(health, name)

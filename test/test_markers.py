@@ -1,0 +1,167 @@
+"""The picture of a skin: its geometry against hand-made cases, its message as other nodes read it."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from conftest import ROOT
+from cube_tensor_driver.core import scene
+from cube_tensor_driver.core.pipeline import INVALID, PAD_FAULT, StressRows
+from cube_tensor_driver.core.scene import QUANTITIES, Newest, Places
+from cube_tensor_driver.core.tensor import rotation_from_rpy
+
+
+def places(n: int = 3, turn: np.ndarray | None = None) -> Places:
+    position = np.stack([0.01 * np.arange(n), np.zeros(n), np.zeros(n)], axis=1)
+    return Places(position, np.tile(np.eye(3) if turn is None else turn, (n, 1, 1)), np.full(n, 0.002))
+
+
+def rows(values: np.ndarray, status: int = 0) -> StressRows:
+    n = len(values)
+    return StressRows(values[:, :6], values[:, 6:], np.ones(n), np.full(n, status, np.uint16), np.zeros(n, np.uint16))
+
+
+def test_traction_pushes_to_the_face_and_pulls_away_from_it():
+    values = np.full((2, 15), np.nan)
+    values[0, 2], values[1, 2] = -1e3, 2e3
+    (pushed, pulled) = scene.traction_arrows(places(2), values, 1e-5)
+    np.testing.assert_allclose(pushed, [[0, 0, 0.012], [0, 0, 0.002]])
+    np.testing.assert_allclose(pulled, [[0.01, 0, 0.002], [0.01, 0, 0.022]])
+
+
+def test_arrows_turn_with_their_cube():
+    values = np.zeros((1, 15))
+    values[0, 2:5] = -1e3, 300, 500
+    values[0, 12:14] = 2e5, -1e5
+    turn = rotation_from_rpy(0.4, 0.9, -2.0)
+    for draw, length in ((scene.traction_arrows, 1e-5), (scene.gradient_arrows, 1e-8)):
+        straight, turned = draw(places(1), values, length), draw(places(1, turn), values, length)
+        np.testing.assert_allclose(turned, straight @ turn.T, atol=1e-15)
+    # pressure −σzz grows against the gradient of σzz
+    tail, tip = scene.gradient_arrows(places(1), values, 1e-8)[0]
+    np.testing.assert_allclose(tip - tail, [-2e-3, 1e-3, 0], atol=1e-15)
+
+
+def test_principal_cross_of_pure_shear_lies_at_45_degrees():
+    values = np.full((1, 15), np.nan)
+    values[0, [0, 2, 4]] = 0, 0, 1e3
+    lines, pulls = scene.principal_crosses(places(1), values, 1e-5)
+    assert pulls[0].tolist() == [True, False, False]
+    along = lines[0, 0, 1] - lines[0, 0, 0]
+    np.testing.assert_allclose(np.abs(along), np.array([1, 0, 1]) * 0.01 / np.sqrt(2), atol=1e-9)
+
+
+def test_colours_are_the_table_s_ends_grey_where_unknown_and_monotonous_in_lightness():
+    quantity = QUANTITIES["pressure"]
+    shown = scene.colours(quantity, np.array([-5.0, 0, 10, 99, np.nan]), 10.0)
+    dark, bright = np.array([0x44, 0x01, 0x54]) / 255, np.array([0xFD, 0xE7, 0x25]) / 255
+    np.testing.assert_allclose(shown, [dark, dark, bright, bright, scene.GREY])
+    lightness = scene.colours(quantity, np.linspace(0, 10, 50), 10.0) @ [0.299, 0.587, 0.114]
+    assert (np.diff(lightness) > 0).all()
+    signed = scene.colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ [0.299, 0.587, 0.114]
+    assert signed[1] > 2 * max(signed[0], signed[2])
+
+
+def test_automatic_range_rises_at_once_and_falls_slowly():
+    quantity = QUANTITIES["pressure"]
+    top = scene.automatic(quantity, np.array([np.nan, 9e3, -2e3]))
+    assert top == 9e3
+    assert scene.automatic(quantity, np.array([1.0]), top) == pytest.approx(9e3 * scene.FALL)
+    assert scene.automatic(quantity, np.array([np.nan])) == quantity.least
+
+
+def test_health_says_doubtful_no_tensor_and_stale():
+    newest = Newest(4)
+    values = np.zeros((3, 15))
+    newest.update(np.array([0, 1, 2, 9]), rows(np.zeros((4, 15))), 10.0)  # cube 9 is not ours
+    newest.update(np.array([1]), rows(values[:1], PAD_FAULT), 10.5)
+    newest.update(np.array([2]), rows(values[:1], INVALID | PAD_FAULT), 10.5)
+    assert newest.health(10.6, 1.0).tolist() == [scene.FINE, scene.DOUBTFUL, scene.FAULTY, scene.STALE]
+    assert newest.health(11.2, 1.0).tolist() == [scene.STALE, scene.DOUBTFUL, scene.FAULTY, scene.STALE]
+    crosses = scene.fault_crosses(places(4), newest.health(10.6, 1.0))
+    assert (np.ptp(crosses[0], axis=1) == 0).all() and (np.ptp(crosses[1:], axis=2).max(axis=(1, 2)) > 0.004).all()
+
+
+def test_markers_node_draws_what_comes(ros, tmp_path):
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import Header
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    from cube_tensor_driver.core.pipeline import Pipeline
+    from cube_tensor_driver.files.share import share
+    from cube_tensor_driver.files.skin import read_skin
+    from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
+    from cube_tensor_driver.ros.children import Children
+    from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
+    from cube_tensor_driver.ros.start import Process
+
+    skin = read_skin(share() / "config" / "skin_demo.yaml")
+    n, pressed, silent = len(skin.cubes), 6, 15
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    info = ros.node.create_publisher(SkinInfo, "info", latched)
+    info.publish(info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns()))
+    publisher = ros.node.create_publisher(SkinStress, "stress", 10)
+    pictures, contacts = ros.listen(MarkerArray, "markers"), ros.listen(SkinContacts, "contacts")
+    values = np.full((n, 15), np.nan)
+    values[:, [0, 2, 4, 12]] = 0
+    values[pressed, [2, 4]] = -20e3, 4e3
+
+    def sent() -> None:
+        cubes = np.delete(np.arange(n, dtype=np.uint16), silent)
+        none = np.zeros(len(cubes))
+        times = Times(Header(stamp=to_time(time.time_ns())), cubes, none, none)
+        publisher.publish(stress_message(times, rows(values[cubes].astype(np.float32))))
+
+    def drawn() -> bool:
+        sent()
+        return bool(contacts and contacts[-1].position and pictures and "20 kPa" in pictures[-1].markers[-1].text)
+
+    with Children(tmp_path) as children:
+        for name, given in (("markers", {"crosses": True}), ("contacts", {})):
+            children.start(Process(name, f"cube_tensor_driver.ros.{name}", parameters=given))
+        ros.wait(drawn)
+        children.check()
+
+    markers = {marker.ns: marker for marker in pictures[-1].markers}
+    assert len(pictures[-1].markers) <= 8
+    assert all(marker.header.frame_id == "skin_base" and marker.action == Marker.ADD for marker in markers.values())
+    cubes = markers["cubes 0"]
+    assert cubes.type == Marker.CUBE_LIST and len(cubes.points) == len(cubes.colors) == n
+    np.testing.assert_allclose([[p.x, p.y, p.z] for p in cubes.points], [cube.xyz for cube in skin.cubes], atol=1e-12)
+    colours = np.array([[c.r, c.g, c.b, c.a] for c in cubes.colors])
+    np.testing.assert_allclose(colours[pressed], [0xFD / 255, 0xE7 / 255, 0x25 / 255, 1], atol=1e-6)
+    np.testing.assert_allclose(colours[silent, :3], scene.GREY, atol=1e-6)
+    traction = np.array([[p.x, p.y, p.z] for p in markers["traction"].points]).reshape(n, 3, 2, 3)
+    shaft = traction[pressed, 0, 1] - traction[pressed, 0, 0]
+    np.testing.assert_allclose(shaft / np.linalg.norm(shaft), np.array([1, 0, -5]) / np.sqrt(26), atol=1e-6)
+    assert not np.ptp(np.delete(traction, pressed, 0), axis=2).any()
+    faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
+    assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
+    assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
+
+    contact = contacts[-1]
+    assert contact.header.frame_id == "skin_base" and len(contact.position) == 1
+    assert contact.normal_force[0] > 0 and contact.force[0].z < 0 < contact.force[0].x
+
+
+def test_rviz_and_foxglove_layouts_name_our_topics():
+    yaml = pytest.importorskip("yaml")
+    rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
+    displays = {display["Class"]: display for display in rviz["Visualization Manager"]["Displays"]}
+    assert displays["rviz_default_plugins/MarkerArray"]["Topic"]["Value"] == "markers"
+    assert displays["rviz_default_plugins/RobotModel"]["Description Topic"]["Value"] == "robot_description"
+    assert displays["rviz_default_plugins/Wrench"]["Topic"]["Value"].endswith("/wrench")
+    assert rviz["Visualization Manager"]["Global Options"]["Fixed Frame"] == "skin_base"
+    foxglove = json.loads((ROOT / "config" / "foxglove_skin.json").read_text())
+    panels = foxglove["configById"]
+    scene_panel = next(panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert scene_panel["topics"]["/markers"]["visible"] and scene_panel["followTf"] == "skin_base"
+
+    def leaves(node: object) -> list[str]:
+        return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
+
+    assert set(leaves(foxglove["layout"])) == set(panels)

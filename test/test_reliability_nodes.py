@@ -1,0 +1,250 @@
+"""Tare, live parameters, lifecycle and shutdown of the real nodes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import psutil
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
+from test_end_to_end import SINGLE, Hub
+
+from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.device.protocol import Hello, Sample, encode
+from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
+from cube_tensor_driver.ros.children import Children, ros_arguments
+from cube_tensor_driver.ros.messages import read_stress
+from cube_tensor_driver.ros.start import skin_processes
+from cube_tensor_driver.srv import Tare
+
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+CALIBRATION = read_skin(SINGLE).cubes[0].calibration
+PERIOD_S = 0.01
+UID = 0xCD
+
+
+class Stage:
+    """A hub that plays frequencies in real time, both nodes, and what they publish."""
+
+    def __init__(self, ros, tmp_path, children):
+        self.ros, self.folder, self.children = ros, tmp_path, children
+        self.hub = Hub(tmp_path / "ports", "hub0")
+        self.pads = np.full(8, 100e3)
+        self.stress = ros.listen(SkinStress, "stress")
+        self.infos = ros.listen(SkinInfo, "info", LATCHED)
+        self.diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+        self.number = 0
+        self.noise = np.random.default_rng(4)
+
+    def start(self):
+        self.hub.listen()
+        self.hub.requests.clear()
+        for process in skin_processes(SINGLE, simulated_ports=self.folder / "ports")[1:]:
+            if process.executable == "reconstruction":
+                process.parameters["tare_folder"] = str(self.folder / "tare")
+            self.children.start(process)
+        self.ros.wait(lambda: 1 in self.hub.listen())
+        self.hub.send(encode(Hello(0xAB, 1, 8, round(1e6 * PERIOD_S), np.array([UID], "<u8"))))
+        self.ros.wait(lambda: 2 in self.hub.listen())
+        self.began = time.monotonic() - self.number * PERIOD_S
+        self.wait(lambda: self.stress)
+
+    def play(self):
+        """Send the samples that are due."""
+        while self.number * PERIOD_S < time.monotonic() - self.began:
+            f = self.pads * (1 + 8e-6 * self.noise.standard_normal(8))
+            millihertz = np.rint(1e3 * f).astype("<u4")[None]
+            device_us = round(1e6 * PERIOD_S * self.number)
+            self.hub.send(encode(Sample(self.number, 0, device_us, millihertz, np.zeros(1, "<u4"), np.zeros(1, "<i2"))))
+            self.number += 1
+
+    def wait(self, done, seconds=20.0):
+        def step():
+            self.play()
+            return done()
+
+        self.ros.wait(step, seconds)
+
+    def seconds(self, duration):
+        end = self.number + round(duration / PERIOD_S)
+        self.wait(lambda: self.number >= end)
+
+    def call(self, kind, service, request):
+        client = self.ros.node.create_client(kind, service)
+        self.wait(client.service_is_ready)
+        future = client.call_async(request)
+        self.wait(future.done)
+        self.ros.node.destroy_client(client)
+        return future.result()
+
+    def tare(self, *cubes):
+        return self.call(Tare, "/reconstruction/tare", Tare.Request(cubes=list(cubes)))
+
+    def zz(self):
+        count = len(self.stress)
+        self.wait(lambda: len(self.stress) > count + 5)
+        return float(read_stress(self.stress[-1])[1].stress[0, 2])
+
+    def says(self, text):
+        return any(text in status.message for array in self.diagnostics for status in array.status)
+
+
+@pytest.fixture
+def stage(ros, tmp_path):
+    with Children(tmp_path) as children:
+        stage = Stage(ros, tmp_path, children)
+        try:
+            yield stage
+        finally:
+            stage.hub.close()
+
+
+def loaded(pascal):
+    """Frequencies under a uniform zz."""
+    stress, gradient = np.zeros((1, 6)), np.zeros((1, 6, 3))
+    stress[0, 2] = pascal
+    from cube_tensor_driver.simulation.cubes import true_state
+
+    v = true_state(CALIBRATION, stress, gradient) @ CALIBRATION.response.T
+    return pad_frequency(v[0], CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+
+
+def test_tare_is_refused_taken_told_kept_and_undone(stage):
+    stage.start()
+    stage.pads = loaded(5000.0)
+    stage.seconds(0.3)
+    answer = stage.tare()
+    assert not answer.success and ("moves" in answer.message or "data since the start" in answer.message)
+    answer = stage.tare("nobody")
+    assert not answer.success and "no cube 'nobody'" in answer.message and "c0" in answer.message
+    stage.seconds(2)
+    assert abs(stage.zz() - 5000) < 50
+    answer = stage.tare("c0")
+    assert answer.success and "kept on disk" in answer.message, answer.message
+    assert abs(stage.zz()) < 50
+    stage.wait(lambda: abs(stage.infos[-1].cubes[0].rest_frequency[0] / stage.pads[0] - 1) < 1e-5)
+    assert stage.infos[-1].cubes[0].uid == UID
+
+    # another start: the same rest, from the file of this uid
+    stage.children.end(["reconstruction", "driver"])
+    stage.stress.clear()
+    stage.start()
+    stage.wait(lambda: abs(stage.zz()) < 50)
+    assert "restored" in stage.children.log("reconstruction")
+
+    assert stage.call(Trigger, "/reconstruction/clear_tare", Trigger.Request()).success
+    assert abs(stage.zz() - 5000) < 50
+    stage.wait(lambda: stage.infos[-1].cubes[0].rest_frequency[0] == 100e3)
+    assert not list((stage.folder / "tare").iterdir())
+    stage.children.check()
+
+
+def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
+    raw = stage.ros.listen(SkinFrequencies, "frequencies")
+    stage.start()
+    stage.pads = loaded(5000.0)
+    stage.pads[2] = 0
+    pad = CALIBRATION.layout.pads[2]
+    stage.wait(lambda: stage.says(f"pad {pad} short"))
+    stage.zz()
+    _, rows = read_stress(stage.stress[-1])
+    assert rows.status[0] == SkinStress.PAD_FAULT | SkinStress.PAD_SHORT
+    # seven pads for seven unknowns: all there still, and right
+    assert abs(rows.stress[0, 2] - 5000) < 100
+    assert np.isnan(raw[-1].frequency[2])
+    stage.pads = loaded(5000.0)
+    stage.diagnostics.clear()
+    stage.wait(lambda: stage.says("fine"))
+    stage.zz()
+    assert read_stress(stage.stress[-1])[1].status[0] == 0
+    assert f"pad {pad} short" in stage.children.log("reconstruction")
+
+
+def test_parameters_live(stage):
+    stage.start()
+
+    def change(node, name, value):
+        kinds = {float: ("double_value", ParameterType.PARAMETER_DOUBLE), str: ("string_value", 4)}
+        field, number = kinds[type(value)]
+        parameter = Parameter(name=name, value=ParameterValue(type=number, **{field: value}))
+        answer = stage.call(SetParameters, f"/{node}/set_parameters", SetParameters.Request(parameters=[parameter]))
+        return answer.results[0]
+
+    stage.hub.requests.clear()
+    assert change("driver", "rate", 50.0).successful
+    stage.wait(lambda: 4 in stage.hub.listen())  # SET_PERIOD
+    for node, name, value, words in (
+        ("driver", "rate", -1.0, "range"),
+        ("driver", "config", "other.yaml", "while the node is configured"),
+        ("driver", "qos_reliability", "maybe", "reliable, best_effort"),
+        ("reconstruction", "drift_time", float("nan"), ""),
+        ("reconstruction", "tare_duration", 60.0, "range"),
+    ):
+        result = change(node, name, value)
+        assert not result.successful and words in result.reason, (name, result)
+    assert change("reconstruction", "drift_time", 600.0).successful
+    stage.children.check()
+
+
+def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path):
+    simulator, _, driver = skin_processes(SINGLE, simulated_ports=tmp_path / "ports")
+    driver.parameters["autostart"] = False
+    kind = Transition
+    cycle = (kind.TRANSITION_CONFIGURE, kind.TRANSITION_ACTIVATE, kind.TRANSITION_DEACTIVATE, kind.TRANSITION_CLEANUP)
+    with Children(tmp_path) as children:
+        children.start(simulator)
+        children.start(driver)
+        client = ros.node.create_client(ChangeState, "/driver/change_state")
+        ros.wait(client.service_is_ready)
+        process = psutil.Process(children.pid("driver"))
+
+        def run(cycles):
+            for _ in range(cycles):
+                for number in cycle:
+                    future = client.call_async(ChangeState.Request(transition=Transition(id=number)))
+                    ros.wait(future.done)
+                    assert future.result().success, children.log("driver")[-500:]
+            return process.num_threads(), process.num_fds(), process.memory_info().rss / 2**20
+
+        threads, fds, _ = run(5)
+        _, _, early = run(45)
+        late = run(50)
+        assert late[:2] == (threads, fds)
+        assert late[2] - early < 1.0, f"{late[2] - early:.2f} MB in 50 cycles"
+        children.check()
+
+
+@pytest.mark.parametrize("port", ["/nowhere/ttyACM0", "socket://127.0.0.1:9", "socket://192.0.2.1:4000"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_shutdown_in_the_middle_of_a_reconnect(domain, port, number):
+    command = [sys.executable, "-u", "-m", "cube_tensor_driver.ros.driver", "--ros-args"]
+    command += ros_arguments({"config": str(SINGLE), "port": port})
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ)
+    said = ""
+    while "hub0: waiting" not in said:
+        said += process.stdout.readline()
+        assert process.poll() is None
+    start = time.monotonic()
+    process.send_signal(number)
+    try:
+        rest, _ = process.communicate(timeout=10)
+    finally:
+        process.kill()
+    assert process.returncode == 0, said + rest
+    assert time.monotonic() - start < 2.0
+    assert "Traceback" not in said + rest

@@ -1,0 +1,218 @@
+"""Tare: taken only at rest, kept by uid, undone; drift followed only while nothing touches."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.errors import ConfigError, TareError
+from cube_tensor_driver.core.health import HOLD, WINDOW_S, Health
+from cube_tensor_driver.core.oscillator import TemperatureModel
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.tare import DriftTracker, measure_rest
+from cube_tensor_driver.files.tare import read_tare, remove_tare, tare_path, write_tare
+
+CALIBRATION = illustrative("planar")
+NAMES = ["a", "b", "c"]
+RATE, NOISE = 40, 8e-6
+NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc)
+
+
+class Skin:
+    """Three cubes whose pads' frequencies a test gives."""
+
+    def __init__(self, calibration=CALIBRATION, noise=NOISE):
+        self.pipeline = Pipeline([calibration] * 3)
+        self.health = Health(self.pipeline)
+        self.tracker = DriftTracker(self.pipeline, self.health)
+        self.seconds = 0.0
+        self.noise = noise
+        self._random = np.random.default_rng(2)
+
+    def play(self, seconds, frequency, time_constant=None, temperature=None, fault=0):
+        """frequency: (3, 8), or a function of time that gives it."""
+        for _ in range(round(seconds * RATE)):
+            f = frequency(self.seconds) if callable(frequency) else frequency
+            f = f * (1 + self.noise * self._random.standard_normal((3, 8)))
+            windows = self.health.closed
+            faults = np.array([0, fault, 0], np.uint32)
+            self.health.update(np.arange(3), f.astype(np.float32), faults, round(self.seconds * 1e9), temperature)
+            if time_constant and self.health.closed != windows:
+                self.tracker.step(time_constant)
+            self.seconds += 1 / RATE
+
+    def tare(self, cubes=(0, 1, 2), duration=1.0):
+        self.pipeline.rest_frequency = measure_rest(self.pipeline, self.health, cubes, duration, NAMES)
+        self.health.refresh()
+        return self.pipeline.rest_frequency
+
+
+def pads(scale=1.0):
+    return 100e3 * scale * (1 + 0.01 * np.arange(24).reshape(3, 8) / 24)
+
+
+def test_tare_is_the_mean_and_only_of_the_cubes_named():
+    skin = Skin()
+    skin.play(3, pads())
+    before = skin.pipeline.rest_frequency
+    rest = skin.tare([0, 2])
+    # 40 rows or more of 8 ppm average to 1.3 ppm; six times that leaves no false alarm
+    np.testing.assert_allclose(rest[[0, 2]], pads()[[0, 2]], rtol=8e-6)
+    np.testing.assert_array_equal(rest[1], before[1])
+    rows = skin.pipeline.process(np.arange(3), pads())
+    assert np.nanmax(np.abs(rows.stress[0])) < 20 < np.nanmax(np.abs(rows.stress[1]))
+
+
+def test_tare_is_at_the_reference_temperature():
+    model = TemperatureModel(25.0, np.full((8, 1), -1e-3))
+    skin = Skin(illustrative_with(model))
+    skin.play(3, pads(0.98), temperature=np.full(3, 45.0))  # 20 K above the reference: 2 % lower
+    np.testing.assert_allclose(skin.tare(), pads(), rtol=8e-6)
+
+
+def illustrative_with(model):
+    from dataclasses import replace
+
+    return replace(CALIBRATION, temperature=model)
+
+
+def wave(hertz, depth):
+    def frequency(t):
+        f = pads()
+        f[1, 3] *= 1 + depth * np.sin(2 * np.pi * hertz * t)
+        return f
+
+    return frequency
+
+
+def late_step(t):
+    f = pads()
+    f[1, 3] *= 1 + 0.01 * (t > 2.9)
+    return f
+
+
+def noisy(t):
+    f = pads()
+    f[1, 3] *= 1 + 6 * NOISE * np.random.default_rng(round(t * RATE)).standard_normal()
+    return f
+
+
+REFUSALS = {
+    "moves": (wave(0.5, 1e-3), 1.0, ["cube b", "-z+x", "moves", "12"]),
+    "moved a moment ago": (late_step, 1.0, ["cube b", "-z+x", "moves"]),
+    "noisy": (noisy, 1.0, ["cube b", "-z+x", "noisy", "4"]),
+    "far": (pads(0.75), 1.0, ["far", "25", "20"]),
+    "too long": (pads(), 11.0, ["11 s", "10 s"]),
+    "none": (pads(), 0.0, ["0 s"]),
+    "more than there is": (pads(), 5.0, ["2.5 s", "5 s"]),
+}
+
+
+@pytest.mark.parametrize("name", list(REFUSALS))
+def test_refusals_give_a_reason_and_change_nothing(name):
+    frequency, duration, words = REFUSALS[name]
+    skin = Skin()
+    skin.play(2.98, frequency)
+    before = skin.pipeline.rest_frequency
+    with pytest.raises(TareError) as error:
+        skin.tare(duration=duration)
+    for word in words:
+        assert word in str(error.value)
+    np.testing.assert_array_equal(skin.pipeline.rest_frequency, before)
+
+
+def test_a_cube_that_is_silent_is_refused_and_bad_pads_keep_their_rest():
+    skin = Skin()
+    skin.play(3, pads(), fault=1 << 3)
+    rest = skin.tare()
+    assert rest[1, 3] == 100e3
+    np.testing.assert_allclose(np.delete(rest[1], 3), np.delete(pads()[1], 3), rtol=8e-6)
+    skin.play(3, pads(), fault=255)
+    with pytest.raises(TareError, match="cube b: no pad works"):
+        skin.tare()
+    for _ in range(3 * RATE):
+        f = pads()[:1].astype(np.float32)
+        skin.health.update(np.arange(1), f, np.zeros(1, np.uint32), round(skin.seconds * 1e9))
+        skin.seconds += 1 / RATE
+    with pytest.raises(TareError, match="cube b: no data"):
+        skin.tare([1])
+
+
+def test_a_steady_load_survives_an_hour_of_drift_tracking_and_drift_does_not():
+    """In simulated time: cubes a and c are loaded after 10 s, for an hour; b and c drift by 20 ppm a minute."""
+    skin = Skin()
+    load, hour = np.linspace(-0.02, 0.02, 8), 3600.0
+
+    def frequency(t):
+        f = np.full((3, 8), 100e3)
+        f[1:] *= 1 + 20e-6 * t / 60
+        if 10 < t < 10 + hour:
+            f[[0, 2]] *= 1 + load
+        return f
+
+    skin.play(9, frequency, time_constant=60.0)
+    skin.play(hour, frequency, time_constant=60.0)
+    rest, now = skin.pipeline.rest_frequency, frequency(skin.seconds)
+    np.testing.assert_allclose(rest[0], 100e3, rtol=3 * NOISE)
+    stress = skin.pipeline.pad_stress(np.arange(3), now)
+    true = Skin().pipeline.pad_stress(np.arange(3), np.tile(100e3 * (1 + load), (3, 1)))[0]
+    np.testing.assert_allclose(stress[0], true, atol=3 * 3.2)  # the pads' noise is 3.1 Pa
+    # a follower of time constant τ lags behind a ramp by rate · τ = 20 ppm
+    np.testing.assert_allclose(rest[1], now[1] * (1 - 20e-6), rtol=10e-6)
+    np.testing.assert_allclose(rest[2], 100e3 * (1 + 20e-6 * 10 / 60), rtol=3 * NOISE)
+
+
+def test_a_load_that_comes_and_goes_is_not_eaten():
+    skin = Skin()
+
+    def touch(t):
+        f = np.full((3, 8), 100e3)
+        f[0] *= 1 + 1e-3 * ((t % 20) < 14)
+        return f
+
+    skin.play(200, touch, time_constant=10.0)
+    np.testing.assert_allclose(skin.pipeline.rest_frequency, 100e3, rtol=3 * NOISE)
+    assert HOLD * WINDOW_S < 5
+
+
+def test_file_round_trip_and_what_does_not_fit(tmp_path):
+    rest = pads()[1]
+    assert read_tare(tmp_path, 7, CALIBRATION) is None
+    write_tare(tmp_path / "deep", 7, CALIBRATION, rest, NOW)
+    stored = read_tare(tmp_path / "deep", 7, CALIBRATION)
+    np.testing.assert_array_equal(stored.rest_frequency, rest)
+    assert stored.created == NOW
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["0000000000000007.yaml"]
+    other = illustrative_with(TemperatureModel(25.0, np.full((8, 1), 1e-5)))
+    with pytest.raises(ConfigError, match=f"{CALIBRATION.id}.*{other.id}"):
+        read_tare(tmp_path / "deep", 7, other)
+    tare_path(tmp_path / "deep", 7).rename(tare_path(tmp_path / "deep", 8))
+    with pytest.raises(ConfigError, match="0x7"):
+        read_tare(tmp_path / "deep", 8, CALIBRATION)
+    remove_tare(tmp_path / "deep", 8)
+    remove_tare(tmp_path / "deep", 8)
+    assert read_tare(tmp_path / "deep", 8, CALIBRATION) is None
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_damaged_files_are_our_errors(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("tare")
+    write_tare(folder, 7, CALIBRATION, pads()[0], NOW)
+    path = tare_path(folder, 7)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 8))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    try:
+        stored = read_tare(folder, 7, CALIBRATION)
+    except ConfigError as error:
+        assert path.name in str(error)
+    else:
+        assert stored is not None and stored.rest_frequency.shape == (8,) and (stored.rest_frequency > 0).all()
