@@ -338,13 +338,13 @@ def parser() -> argparse.ArgumentParser:
 
     sub = command("record", record, "record the topics of a running skin into a bag that ros2 bag reads too")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the bag, a new one")
-    sub.add_argument("--topics", nargs="+", default=[], metavar="T", help="frequencies stress info /diagnostics if none")
+    sub.add_argument("--topics", nargs="+", default=[], metavar="T", help="frequencies stress info /diagnostics")
     sub.add_argument("--duration", type=positive, metavar="S", help="end after S seconds (default: Ctrl-C)")
     sub.add_argument("--storage", choices=["mcap", "sqlite3"], default="mcap", help="(default: mcap)")
     sub.add_argument("--split-size", type=positive, metavar="MB", help="begin a new file after so many megabytes")
     sub.add_argument("--split-time", type=positive, metavar="S", help="begin a new file after so many seconds")
 
-    sub = command("replay", replay, "publish a bag: what was recorded but the stress, which a reconstruction makes anew")
+    sub = command("replay", replay, "publish a bag: all but the stress, which a reconstruction makes anew")
     sub.add_argument("bag", type=Path, metavar="BAG")
     sub.add_argument("--rate", type=positive, default=1.0, metavar="R", help="times the recorded speed (1)")
     sub.add_argument("--loop", action="store_true", help="begin anew at the end")
@@ -352,7 +352,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--clock", action="store_true", help="publish /clock for nodes with use_sim_time")
     sub.add_argument("--stress", action="store_true", help="publish the recorded stress too")
 
-    sub = command("reprocess", reprocess, "make stress of recorded frequencies again, as live but with what is known now")
+    sub = command("reprocess", reprocess, "make stress of recorded frequencies again, with what is known now")
     sub.add_argument("bags", type=Path, nargs="+", metavar="BAG")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
     sub.add_argument("--calibration", metavar="FILE", help="of all cubes (default: as recorded)")
@@ -378,7 +378,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("bag", type=Path, metavar="BAG")
 
     sub = command("view", view, "show a running skin in the browser: 3-D, plots, tare, recording")
-    sub.add_argument("--port", type=int, default=8080, metavar="N", help="of the page on 127.0.0.1 (8080, or the next free)")
+    sub.add_argument("--port", type=int, default=8080, metavar="N", help="of the page (8080, or the next free)")
     sub.add_argument("--depth", type=positive, default=0.004, metavar="M", help="cubes below the surface (0.004 m)")
 
     sub = command("pictures", pictures, "make the pictures of the documentation anew")

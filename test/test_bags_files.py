@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
+from bag_maker import START_NS, WRENCH, frequencies_of, header, info_of, loads, make_bag, message
 from rosbags.highlevel import AnyReader
 
-from bag_maker import START_NS, WRENCH, frequencies_of, header, info_of, loads, make_bag, message
 from conftest import ROOT
 from cube_tensor_driver.cli import main
 from cube_tensor_driver.core.errors import BagError
@@ -140,6 +140,8 @@ def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
     zz = np.concatenate([record["stress"][:, 2] for record in records])
     np.testing.assert_array_equal(parquet["stress_zz_Pa"].to_numpy(), zz)
     np.testing.assert_array_equal(csv["stress_zz_Pa"].to_numpy().astype(np.float32), zz)
+    for name in ("residual", "status", "observed", "sequence"):
+        np.testing.assert_array_equal(parquet[name].to_numpy(), np.concatenate([record[name] for record in records]))
     assert parquet["cube"].to_pylist()[:17] == [f"c{k:02}" for k in range(16)] + ["c00"]
     assert parquet["stamp_ns"].to_pylist()[1] == START_NS + 100
 
@@ -213,6 +215,10 @@ def test_cut_off_anywhere_is_repaired(bag, tmp_path):
         assert done.messages == complete and done.damaged == 0
         with Bag(path) as read:
             assert sum(1 for _ in read.entries()) == complete
+            # topic by topic by the index: entries counts them against what the bag says
+            assert sum(1 for connection in read.connections for _ in read.entries({connection.topic})) == complete
+        kept = size - done.cut
+        assert next(path.glob("*.mcap")).read_bytes()[:kept] == data[:kept]
         assert sum(one.stat().st_size for one in path.glob("*.rest")) == done.cut
         assert repair(path).cut == 0
 
@@ -372,8 +378,8 @@ def test_disk_full_leaves_what_was_written(bag, tmp_path):
         "        for entry in source.entries(): writer.write(entry.topic, entry.time_ns, entry.data); writer.flush()\n"
         "except BagError as error: print(error); sys.exit(3)"
     )
-    done = subprocess.run([sys.executable, "-c", script, str(bag), str(tmp_path / "full")], capture_output=True, text=True,
-                          cwd=ROOT, check=False)  # fmt: skip
+    command = [sys.executable, "-c", script, str(bag), str(tmp_path / "full")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 3 and "File too large" in done.stdout and "with room" in done.stdout, done.stderr
     kept = repair(tmp_path / "full", keep_rest=False)
     assert kept.messages > 100

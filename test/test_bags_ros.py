@@ -14,10 +14,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
+from bag_maker import START_NS, make_bag
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from test_bags_files import differing_bits, stress
 
-from bag_maker import START_NS, make_bag
 from conftest import ROOT
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.files.bags import FREQUENCIES, Bag
@@ -29,7 +30,6 @@ from cube_tensor_driver.ros.children import Children
 from cube_tensor_driver.ros.messages import read_stress, to_ns
 from cube_tensor_driver.ros.node import queue
 from cube_tensor_driver.ros.start import Process, skin_processes
-from test_bags_files import differing_bits, stress
 
 SKIN = share() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -166,13 +166,14 @@ def test_junk_around_loses_no_frame(name: str, feed) -> None:
 HEADER_1 = bytes([0x03, 1, 18, 0])
 STATS_PAYLOAD = bytes(18)
 BAD = {
-    "not COBS": (b"\0\x0bab345678\0", "framing"),
+    "not COBS": (b"\0\x1bab3456789abcdef\0", "framing"),
     "eight bytes on the wire": (b"\0\x08abcdefg\0", "length"),
+    "thirteen bytes on the wire": (b"\0\x0dabcdefghijkl\0", "length"),
     "too short": (wire(b"\x03\x01\x00"), "length"),
     "seven bytes": (b"\0" + cobs_of(b"1234567") + b"\0", "length"),
     "checksum": (b"\0" + cobs_of(HEADER_1 + STATS_PAYLOAD + b"\0\0\0\0") + b"\0", "crc"),
     "version 2": (wire(bytes([0x03, 2, 18, 0]) + STATS_PAYLOAD), "version"),
-    "version 2 of a type to come": (wire(bytes([0x77, 2, 9, 9])), "version"),
+    "version 2 of a type to come": (wire(bytes([0x77, 2, 9, 9]) + bytes(5)), "version"),
     "unknown type": (wire(bytes([0x04, 1, 18, 0]) + STATS_PAYLOAD), "unknown_type"),
     "length says less": (wire(bytes([0x03, 1, 17, 0]) + STATS_PAYLOAD), "length"),
     "length says more": (wire(bytes([0x03, 1, 19, 0]) + STATS_PAYLOAD), "length"),

@@ -169,13 +169,22 @@ def test_too_little_memory_is_said_before_any_work(monkeypatch, capsys):
     assert re.search(r"about \d\.\d GB of memory and 0\.1 GB are available", capsys.readouterr().err)
 
 
-def test_an_interrupted_run_leaves_no_file(tmp_path):
+def test_control_c_ends_it_quietly(tmp_path):
     command = cube("fem", "-o", tmp_path / "cube.yaml", "--json", tmp_path / "fem.json")
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stdout and "steel cube of 4 mm" in process.stdout.readline()  # it works from here on
         process.send_signal(signal.SIGINT)
         output, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and not errors and not output
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_leaves_no_file(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cube_tensor_driver.elastic.fem.linear_response", interrupt)
+    assert cli.main(["fem", "-o", str(tmp_path / "cube.yaml"), "--json", str(tmp_path / "fem.json")]) == 130
     assert not list(tmp_path.iterdir())
 
 

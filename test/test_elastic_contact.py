@@ -85,13 +85,8 @@ def test_printed_components(nu):
     r2, rho = x * x + y * y, np.sqrt(x * x + y * y + z * z)
     k = 1 / (2 * np.pi)
     pressed, _ = one(np.array([x, y, -z]), np.array([0, 0, -1.0]), nu)
-    sxx = k * (
-        (1 - 2 * nu) / r2 * ((1 - z / rho) * (x * x - y * y) / r2 + z * y * y / rho**3)
-        - 3 * z * x * x / rho**5
-    )
-    sxy = k * (
-        (1 - 2 * nu) / r2 * ((1 - z / rho) * 2 * x * y / r2 - x * y * z / rho**3) - 3 * x * y * z / rho**5
-    )
+    sxx = k * ((1 - 2 * nu) / r2 * ((1 - z / rho) * (x * x - y * y) / r2 + z * y * y / rho**3) - 3 * z * x * x / rho**5)
+    sxy = k * ((1 - 2 * nu) / r2 * ((1 - z / rho) * 2 * x * y / r2 - x * y * z / rho**3) - 3 * x * y * z / rho**5)
     assert pressed[0, 0] == pytest.approx(sxx, rel=1e-12)
     assert pressed[2, 2] == pytest.approx(-3 * k * z**3 / rho**5, rel=1e-12)
     assert pressed[0, 2] == pytest.approx(3 * k * x * z * z / rho**5, rel=1e-12)
@@ -101,13 +96,11 @@ def test_printed_components(nu):
     a = rho + z
     sxx = k * (
         -3 * x**3 / rho**5
-        + (1 - 2 * nu)
-        * (x / rho**3 - 3 * x / (rho * a**2) + x**3 / (rho**3 * a**2) + 2 * x**3 / (rho**2 * a**3))
+        + (1 - 2 * nu) * (x / rho**3 - 3 * x / (rho * a**2) + x**3 / (rho**3 * a**2) + 2 * x**3 / (rho**2 * a**3))
     )
     syy = k * (
         -3 * x * y * y / rho**5
-        + (1 - 2 * nu)
-        * (x / rho**3 - x / (rho * a**2) + x * y * y / (rho**3 * a**2) + 2 * x * y * y / (rho**2 * a**3))
+        + (1 - 2 * nu) * (x / rho**3 - x / (rho * a**2) + x * y * y / (rho**3 * a**2) + 2 * x * y * y / (rho**2 * a**3))
     )
     assert slid[0, 0] == pytest.approx(sxx, rel=1e-12)
     assert slid[1, 1] == pytest.approx(syy, rel=1e-12)
@@ -123,9 +116,9 @@ def test_force_over_a_plane_below():
     angle = (t + 1) / 2 * top  # r = tan(angle) opens up the far field
     r, weight = np.tan(angle), weight / 2 * top / np.cos(angle) ** 2
     phi = 2 * np.pi * np.arange(16) / 16
-    points = np.stack(
-        [np.outer(r, np.cos(phi)), np.outer(r, np.sin(phi)), np.full((60, 16), -1.0)], axis=-1
-    ).reshape(-1, 3)
+    points = np.stack([np.outer(r, np.cos(phi)), np.outer(r, np.sin(phi)), np.full((60, 16), -1.0)], axis=-1).reshape(
+        -1, 3
+    )
     stress, _ = contact.field(points, np.zeros((1, 3)), [f], 0.4)
     area = np.repeat(weight * r * 2 * np.pi / 16, 16)
     below = (area[:, None] * stress[:, [4, 3, 2]]).sum(axis=0)  # the lower part has the outward normal +z

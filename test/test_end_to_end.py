@@ -338,7 +338,7 @@ def of_version(version: int) -> bytes:
 
     from cobs import cobs
 
-    body = bytes([3, version, 0, 0])
+    body = bytes([3, version, 5, 0]) + bytes(5)
     return b"\0" + cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
 
 

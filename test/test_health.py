@@ -71,7 +71,7 @@ def noisy(frequency, row):
 FAULTS = {
     "short": (set_pad(np.nan), SHORT, 0.01),
     "zero": (set_pad(0.0), SHORT, 0.01),
-    "open": (set_pad(433e3), OPEN, 0.01),
+    "open": (set_pad(350e3), OPEN, 0.01),
     "beyond the law": (set_pad(4e6), OPEN, 0.01),
     "squeezed": (set_pad(20e3), RANGE, 0.01),
     "stretched": (set_pad(180e3), RANGE, 0.01),
@@ -114,7 +114,7 @@ def test_one_bad_row_between_two_looks_is_seen_and_a_flapping_pad_does_not_flick
 
     def flap(frequency, row):
         nonlocal changes, before
-        if row % 37 == 0:
+        if row % 120 == 0:  # every 1.2 s; what is found lasts 1.5 s
             frequency[2, 5] = np.nan
         changes += before != skin.health.state[2, 5]
         before = int(skin.health.state[2, 5])

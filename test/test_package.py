@@ -25,12 +25,12 @@ HOMES = {
     "jsonschema": {"files"},
     "rich": {"view"},
     "rosbags": {"files"},
-    "apsw": {"files"},
     "pyarrow": {"files"},
     "distributed": {"view"},
     "skfem": {"elastic"},
     "transforms3d": {"core"},
     "launch": {"ros"},
+    "viser": {"view"},
 }
 
 

@@ -221,10 +221,11 @@ def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path):
                     assert future.result().success, children.log("driver")[-500:]
             return process.num_threads(), process.num_fds(), process.memory_info().rss / 2**20
 
-        threads, fds, _ = run(5)
-        _, _, early = run(45)
+        run(50)
+        threads, fds, early = run(1)
         late = run(50)
-        assert late[:2] == (threads, fds)
+        # DDS ends a thread of its own now and then; what grows would have grown by 50.
+        assert late[0] - threads < 5 and late[1] - fds < 5, (threads, fds, late)
         assert late[2] - early < 1.0, f"{late[2] - early:.2f} MB in 50 cycles"
         children.check()
 

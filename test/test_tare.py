@@ -172,7 +172,7 @@ def test_a_load_that_comes_and_goes_is_not_eaten():
 
     def touch(t):
         f = np.full((3, 8), 100e3)
-        f[0] *= 1 + 1e-3 * ((t % 20) < 14)
+        f[0] *= 1 + 1e-3 * ((t % 20) < 14) + 2e-4 * (14 <= (t % 20) < 17)  # creeps back for 3 s
         return f
 
     skin.play(200, touch, time_constant=10.0)

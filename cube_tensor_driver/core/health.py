@@ -180,23 +180,28 @@ class Health:
     ) -> tuple[np.ndarray, np.ndarray]:
         """`update` of B batches one after the other, to the same bits, for what was recorded.
 
-        cube (B, N), frequency (B, N, P), pad_fault (B, N), stamp_ns (B,), temperature (B, N). Returns (B, N) bits of the
-        pads to leave out, as `update`, and (B, N) status after each.
+        cube (B, N), frequency (B, N, P), pad_fault (B, N), stamp_ns (B,), temperature (B, N). Returns (B, N) bits of
+        the pads to leave out, as `update`, and (B, N) status after each.
         """
         masks, bits = np.empty(cube.shape, np.uint32), np.empty(cube.shape, np.uint16)
-        # What is possible and no fault, of the same rising cubes as before, changes nothing but sums within a window.
-        quiet = (cube[1:] == cube[:-1]).all(axis=1) & (cube[1:, 1:] > cube[1:, :-1]).all(axis=1)
-        if quiet.any() and frequency.shape[2] == self._shape[1] and int(cube.max()) < self._shape[0]:
-            with np.errstate(invalid="ignore"):
-                possible = (frequency > self._low[cube]) & (frequency < self._high[cube])
-            quiet &= possible[1:].all(axis=(1, 2)) & ~pad_fault[1:].any(axis=1)
+        # What is possible and no fault, of the same rising cubes all along, changes nothing but sums within a window.
+        quiet = np.zeros(len(cube), bool)
+        if (
+            cube.size
+            and (cube == cube[0]).all()
+            and (cube[0, 1:] > cube[0, :-1]).all()
+            and frequency.shape[2] == self._shape[1]
+            and cube[0, -1] < self._shape[0]
+        ):
+            possible = (frequency > self._low[cube[0]]) & (frequency < self._high[cube[0]])
+            quiet = possible.all(axis=(1, 2)) & ~pad_fault.any(axis=1)
         k = 0
         while k < len(cube):
             masks[k] = self.update(cube[k], frequency[k], pad_fault[k], int(stamp_ns[k]), temperature[k])
             bits[k] = self.status[cube[k]]
             end = k = k + 1
             low, high = (self._window_end or 0) - 2e9 * WINDOW_S, self._window_end or 0
-            while end < len(cube) and quiet[end - 1] and low <= stamp_ns[end] < high:
+            while end < len(cube) and quiet[end] and low <= stamp_ns[end] < high:
                 end += 1
             if end > k:
                 self._add_many(cube[k], frequency[k:end])

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from transforms3d.quaternions import mat2quat
 
 from .modes import COMPONENTS, STRESS
 from .pipeline import INVALID, StressRows
@@ -47,6 +48,11 @@ class Places(NamedTuple):
         apart = square[:, None] + square - 2 * self.position @ self.position.T
         np.fill_diagonal(apart, np.inf)
         return max(side, float(np.sqrt(max(0.0, np.median(apart.min(axis=1))))))
+
+
+def turns(rotation: np.ndarray) -> np.ndarray:
+    """(N, 4) quaternions w, x, y, z of rotations (N, 3, 3). A loop: for once per skin, not per picture."""
+    return np.array([mat2quat(matrix) for matrix in rotation])
 
 
 class Newest:
@@ -137,9 +143,10 @@ def _table(hexes: str) -> np.ndarray:
 
 
 def traction_arrows(places: Places, values: np.ndarray, length: float) -> np.ndarray:
-    """(N, 2, 3) from tail to tip: the traction σ·n on the faces +z, `length` metres per Pa; unobserved parts count as 0.
+    """(N, 2, 3) from tail to tip: the traction σ·n on the faces +z, `length` metres per Pa.
 
-    It is how the load pushes: pressing points into the skin and ends on the face, pulling begins there.
+    It is how the load pushes: pressing points into the skin and ends on the face, pulling begins there. Unobserved
+    parts count as 0.
     """
     t = np.nan_to_num(values[:, [4, 3, 2]]) * length
     arrow = np.einsum("nij,nj->ni", places.rotation, t)
@@ -170,7 +177,7 @@ def principal_crosses(places: Places, values: np.ndarray, length: float) -> tupl
 def fault_crosses(places: Places, health: np.ndarray) -> np.ndarray:
     """(N, 2, 2, 3) two lines across the face +z of each cube that is not fine; lines of length 0 where it is."""
     corner = np.array([[[-1, -1, 0.0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]) * 1.3
-    corner = np.where((health != FINE)[:, None, None, None], corner, 0) + (0, 0, 1.2)
+    corner = np.where((health != FINE)[:, None, None, None], corner, 0) + np.array([0, 0, 1.2])
     return places.position[:, None, None] + np.einsum(
         "nij,nabj->nabi", places.rotation, corner * places.half_side[:, None, None, None]
     )

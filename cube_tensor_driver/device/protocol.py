@@ -44,8 +44,8 @@ _REQUEST = struct.Struct("<BI")
 _ACK = struct.Struct("<BBI")
 _U16, _U32, _U64, _I16 = (np.dtype(code) for code in ("<u2", "<u4", "<u8", "<i2"))
 _OVERHEAD = _HEADER.size + 4
-MIN_RUN = _OVERHEAD + 1
-"""Shortest run that can be a frame; all longer ones decode to 8 bytes at least."""
+MIN_RUN = _OVERHEAD + _REQUEST.size + 1
+"""Shortest run that can be a frame, of any version: to try shorter ones would let noise slow the decoder down."""
 # CRC-32 over data followed by its own CRC is this constant: no slice, no second look at the frame's end.
 _CRC_RESIDUE = 0x2144DF1C
 

@@ -50,9 +50,7 @@ def field(points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: flo
     f = f[..., None, :, :]
     radius = np.sqrt(np.einsum("...i,...i->...", d, d))
     if not np.all(radius > 0.0):
-        raise ElasticError(
-            "a point lies on a point force, where the stress is infinite; move it below the surface"
-        )
+        raise ElasticError("a point lies on a point force, where the stress is infinite; move it below the surface")
     stress, gradient = _radial(d, f, radius)
     if poisson != 0.5:
         airy_stress, airy_gradient = _airy(d, f, radius)
@@ -62,9 +60,7 @@ def field(points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: flo
     return stress, gradient
 
 
-def disc(
-    radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6
-) -> tuple[Array, Array]:
+def disc(radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6) -> tuple[Array, Array]:
     """Uniform traction on a disc as point forces: (sources (L, 3) m, forces (L, 3) N), L = 4 order^2.
 
     Gauss points in r^2 and equally spaced angles: the error falls exponentially with `order` at points
@@ -74,9 +70,7 @@ def disc(
     return _rings(radius, np.sqrt(t), weight, force, centre)
 
 
-def hertz(
-    radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6
-) -> tuple[Array, Array]:
+def hertz(radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6) -> tuple[Array, Array]:
     """Traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2) on a disc: a sphere that presses or slides.
 
     Same result and errors as `disc`; Johnson 4.2 (normal) and 7.1 (sliding).
@@ -102,15 +96,11 @@ def _check(points: Array, sources: Array, forces: Array, poisson: float) -> None
         if a.ndim < 2 or a.shape[-1] != 3 or not np.all(np.isfinite(a)):
             raise ElasticError(f"{name} have shape {a.shape}; give finite numbers of shape (..., n, 3)")
     if sources.shape[-2] != forces.shape[-2]:
-        raise ElasticError(
-            f"{sources.shape[-2]} sources but {forces.shape[-2]} forces; give one force per source"
-        )
+        raise ElasticError(f"{sources.shape[-2]} sources but {forces.shape[-2]} forces; give one force per source")
     if not -1.0 < poisson <= 0.5:
         raise ElasticError(f"Poisson's ratio is {poisson}; it must lie in (-1, 0.5]")
     if np.any(points[..., 2] > 0.0):
-        raise ElasticError(
-            f"a point is at z = {points[..., 2].max():g} m; the skin is z <= 0, depths are negative z"
-        )
+        raise ElasticError(f"a point is at z = {points[..., 2].max():g} m; the skin is z <= 0, depths are negative z")
     if np.any(sources[..., 2] != 0.0):
         raise ElasticError("a force acts off the surface; sources must have z = 0")
 
@@ -177,9 +167,7 @@ def _gauss(order: int) -> tuple[Array, Array]:
     return (t + 1.0) / 2.0, weight / 2.0
 
 
-def _rings(
-    radius: float, r: Array, weight: Array, force: ArrayLike, centre: ArrayLike
-) -> tuple[Array, Array]:
+def _rings(radius: float, r: Array, weight: Array, force: ArrayLike, centre: ArrayLike) -> tuple[Array, Array]:
     if not radius > 0.0:
         raise ElasticError(f"patch radius is {radius} m; it must be positive")
     n = 4 * len(r)

@@ -36,14 +36,16 @@ class FieldStudy:
     force: Array
 
     def cubes_saved(self, error: float) -> Array:
-        """Per width: by what factor fewer cubes per area give this error with gradients; NaN out of the study's range."""
+        """Per width: how many times fewer cubes per area give this error with gradients; NaN out of range."""
         saved = np.full(len(self.widths), np.nan)
         for row, curves in enumerate(self.error):
             pitch = []
             for curve in curves.T:
                 rising = np.maximum.accumulate(curve)
                 inside = rising[0] < error < rising[-1]
-                pitch.append(np.exp(np.interp(np.log(error), np.log(rising), np.log(self.pitches))) if inside else np.nan)
+                pitch.append(
+                    np.exp(np.interp(np.log(error), np.log(rising), np.log(self.pitches))) if inside else np.nan
+                )
             saved[row] = (pitch[1] / pitch[0]) ** 2
         return saved
 

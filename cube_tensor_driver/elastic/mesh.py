@@ -56,9 +56,7 @@ def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
     return skfem.MeshTri(np.ascontiguousarray(unique), inverse.reshape(-1)[np.concatenate(triangles, axis=1)])
 
 
-def block(
-    half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float
-) -> skfem.MeshHex:
+def block(half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float) -> skfem.MeshHex:
     """Bricks on the product of [0, half[k]]: `size` on a face, shrinking to `smallest` at its edges."""
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]

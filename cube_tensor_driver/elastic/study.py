@@ -115,13 +115,9 @@ def study(
     pads = pad_stresses(solid, layout, lambda parity: solid.outer_forces(parity, field), report)
     shape = (len(sides), len(widths), len(offsets), len(COMPONENTS))
     truth = np.concatenate([_components(*load, depth, poisson) for load in loads]).reshape(shape)
-    recovered = {
-        name: (pads[: LAYOUTS[name].n_pads].T @ _recovery(matrix, name).T).reshape(shape) for name in LAYOUTS
-    }
+    recovered = {name: (pads[: LAYOUTS[name].n_pads].T @ _recovery(matrix, name).T).reshape(shape) for name in LAYOUTS}
     error = {name: np.abs(found - truth).max(axis=2) / np.ptp(truth, axis=2) for name, found in recovered.items()}
-    return Study(
-        np.asarray(sides), np.asarray(widths), np.asarray(offsets), depth, truth, recovered, error
-    )
+    return Study(np.asarray(sides), np.asarray(widths), np.asarray(offsets), depth, truth, recovered, error)
 
 
 def _stress(x: Array, width: float, offset: float, depth: float, poisson: float) -> tuple[Array, Array]:

@@ -105,9 +105,9 @@ class Surface:
 
         The layer above the cubes is in equilibrium: the pressure's integral is the force, its first moment is that of
         the load plus depth × shear force, which is taken off again. For the moment pressure and shear are interpolated
-        alike, by values: below a point force (σzx, σyz, σzz) points away from it in an incompressible body, so then each
-        cube by itself gives the place, and any common weights do. Each point counts for the contact nearest to it.
-        What spreads beyond the skin is lost: of pressure hardly anything, of shear about 1.5 depth / distance to the edge.
+        alike, by values: below a point force (σzx, σyz, σzz) points away from it in an incompressible body, so that
+        each cube by itself gives the place, and any common weights do. Each point counts for the contact nearest to it.
+        What spreads beyond the skin is lost: hardly any pressure, of shear about 1.5 depth / distance to the edge.
         """
         field = self.field(values)
         top = float(field.pressure.max(initial=0.0))
@@ -200,5 +200,7 @@ def _covariance(d: Array, u: Array, v: Array) -> Array:
     result[..., 0, 1:] = -2 * f1[..., None] * dv
     result[..., 1:, 0] = 2 * f1[..., None] * du
     straight = np.einsum("...ai,...bi->...ab", u, v)
-    result[..., 1:, 1:] = -2 * f1[..., None, None] * straight - 4 * f2[..., None, None] * du[..., None] * dv[..., None, :]
+    result[..., 1:, 1:] = (
+        -2 * f1[..., None, None] * straight - 4 * f2[..., None, None] * du[..., None] * dv[..., None, :]
+    )
     return result

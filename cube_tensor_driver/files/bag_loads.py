@@ -31,7 +31,7 @@ MOST = 4000
 def bag_loads(
     path: Path, name: str | None, reference: str, layout: Layout, area: float | None
 ) -> tuple[Loads, Calibration]:
-    """Loads of a cube (may be left out of a skin of one), and its recorded calibration with the rest frequencies in use.
+    """Loads of a cube (None: the only one), and its recorded calibration with the rest frequencies in use.
 
     reference: topic of a WrenchStamped on the face +z (then area in m² is needed), of a StressTensorStamped, or of a
     SkinStress with a row for the cube; modes that it does not know are taken as 0. Samples and reference meet by their

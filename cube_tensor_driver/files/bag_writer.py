@@ -6,15 +6,15 @@ the bag's folder can be read. mcap chunks carry a checksum: a flipped byte is fo
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, Literal, NoReturn
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
@@ -28,9 +28,10 @@ from .yaml import write_yaml
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
-METADATA_VERSION = 9
+METADATA_VERSION: Literal[9] = 9
+ERRORS = (OSError, WriterError, sqlite3.Error)
 FOREVER = QosTime(9223372036, 854775807)
-CHUNK = 1 << 20
+CHUNK = 1 << 18
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, two times
 _CRC_AT = 9 + 24  # in a chunk record: behind opcode, length, two times and the size
 
@@ -51,7 +52,7 @@ def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) ->
 
 
 class _Mcap(McapWriter):
-    """rosbags' storage, with the checksum of each chunk filled in, and a message written in two steps instead of ten."""
+    """rosbags' storage, with the checksum of each chunk filled in; a message takes two writes instead of ten."""
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
         number, chunk = connection.id, self.chunk
@@ -83,13 +84,14 @@ class _Writer(Writer):
 class BagWriter:
     """A new bag; a context that completes it. Not for several threads.
 
-    storage: mcap or sqlite3. max_bytes, max_seconds: of one storage file, 0 without limit.
-    BagError: the folder is there already, cannot be written, or the disk is full; `valid` says what can be read then.
+    storage: mcap or sqlite3. max_bytes, max_seconds: of one storage file, 0 without limit. messages, bytes: written.
+    BagError: the folder is there already, cannot be written, or the disk is full; `repair` then saves what was written.
     """
 
     def __init__(self, folder: Path, storage: str = "mcap", max_bytes: int = 0, max_seconds: float = 0.0) -> None:
         self.folder = folder
         self.messages = self.bytes = 0
+        self._part_start_ns = self._part_bytes = self._part_messages = 0
         self._storage, self._max_bytes, self._max_ns = storage, max_bytes, round(max_seconds * 1e9)
         self._types: dict[str, tuple[str, tuple[Qos, ...]]] = {}
         self._parts = 0
@@ -126,10 +128,12 @@ class BagWriter:
             self._begin()
         if not self._part_messages:
             self._part_start_ns = time_ns
-        writer = self._writer
-        if writer is None:
+        if self._writer is None:
             raise BagError(f"{self.folder} is closed")
-        self._attempt(lambda: writer.write(self._connections[topic], time_ns, data))
+        try:
+            self._writer.write(self._connections[topic], time_ns, data)
+        except ERRORS as error:
+            self._fail(error)
         self._part_messages += 1
         self._part_bytes += len(data)
         self.messages += 1
@@ -177,16 +181,19 @@ class BagWriter:
         move_up(writer.path)
         write_metadata(self.folder)
 
-    def _attempt(self, work) -> None:  # type: ignore[no-untyped-def]
+    def _attempt(self, work: Callable[[], object]) -> None:
         try:
             work()
-        except (OSError, WriterError, sqlite3.Error) as error:
-            writer, self._writer = self._writer, None
-            if writer is not None:
-                with suppress(OSError, sqlite3.Error):
-                    writer.abort()
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-            raise BagError(f"{self.folder}: {reason}; name a folder that can be written, on a disk with room") from None
+        except ERRORS as error:
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> NoReturn:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with suppress(*ERRORS):
+                writer.abort()
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise BagError(f"{self.folder}: {reason}; name a folder that can be written, on a disk with room") from None
 
 
 def move_up(part: Path) -> None:
@@ -214,12 +221,14 @@ def write_metadata(folder: Path) -> int:
         raise BagError(
             f"{folder}: storage files of {len(kinds)} kinds; a bag's folder has .mcap or .db3 files, one or more"
         )
-    files, topics = [], {}
+    files: list[dict[str, Any]] = []
+    topics: dict[tuple[str, str], dict[str, Any]] = {}
     for path in paths:
         with damage(path), Reader(path) as reader:
             counted = reader.message_count
-            files.append({"path": path.name, "starting_time": {"nanoseconds_since_epoch": reader.start_time},
-                          "duration": {"nanoseconds": max(0, reader.duration - 1)}, "message_count": counted})  # fmt: skip
+            begun, length = reader.start_time, max(0, reader.duration - 1)
+            files.append({"path": path.name, "starting_time": {"nanoseconds_since_epoch": begun},
+                          "duration": {"nanoseconds": length}, "message_count": counted})  # fmt: skip
             for connection in reader.connections:
                 topic = topics.setdefault((connection.topic, connection.msgtype), _topic(connection))
                 topic["message_count"] += connection.msgcount
@@ -232,12 +241,13 @@ def write_metadata(folder: Path) -> int:
         "version": METADATA_VERSION, "storage_identifier": kind, "duration": {"nanoseconds": end - start},
         "starting_time": {"nanoseconds_since_epoch": start}, "message_count": count,
         "topics_with_message_count": list(topics.values()), "compression_format": "", "compression_mode": "",
-        "relative_file_paths": [path.name for path in paths], "files": files, "custom_data": None, "ros_distro": "rosbags",
+        "relative_file_paths": [path.name for path in paths], "files": files,
+        "custom_data": None, "ros_distro": "rosbags",
     }})  # fmt: skip
     return count
 
 
-def _topic(connection: Connection) -> dict:
+def _topic(connection: Connection) -> dict[str, Any]:
     qos = [
         {
             "history": one.history.name.lower(),

@@ -1,4 +1,4 @@
-"""Bags (rosbag2 folders, or one .mcap or .db3 file) read without ROS. All that can be wrong with one is a `BagError`."""
+"""Bags (rosbag2 folders, or one .mcap or .db3 file) read without ROS. All that is wrong with one is a `BagError`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import apsw
 import numpy as np
-from backports import zstd
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.storage_mcap import zstd
+from rosbags.rosbag2.storage_sqlite3 import apsw
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -149,13 +149,14 @@ class Bag:
         """The SkinInfo messages of a topic. BagError: none, or a version that cannot be read."""
         infos = [self.decode(entry) for entry in self.entries({topic})]
         if not infos:
-            raise BagError(f"{self.path}: no message on {topic}: the bag does not say what its frequencies mean. Record "
-                           f"{topic} too, or give --skin FILE")  # fmt: skip
+            raise BagError(f"{self.path}: no message on {topic}: the bag does not say what its frequencies mean; "
+                           f"record {topic} too")  # fmt: skip
         for info in infos:
             if info.version not in VERSIONS:
                 older = "older than" if info.version < min(VERSIONS) else "newer than"
-                raise BagError(f"{self.path}: {topic} has version {info.version}, {older} the {VERSIONS} that this package "
-                               "reads; use the package it was recorded with, or a newer one")  # fmt: skip
+                raise BagError(f"{self.path}: {topic} has version {info.version}, {older} what this package "
+                               f"reads ({', '.join(map(str, VERSIONS))}); use the package it was recorded with, or "
+                               "a newer one")  # fmt: skip
         return infos
 
     def batches(self, topic: str) -> Iterator[tuple[cdr.Batch, list[Entry]]]:
@@ -166,7 +167,7 @@ class Bag:
         stress = topic in self.topics(STRESS)
         find, read = (cdr.stress_shape, cdr.read_stress) if stress else (cdr.frequencies_shape, cdr.read_frequencies)
         waiting: list[Entry] = []
-        shape, most = None, 1
+        shape, most = cdr.Shape(0, 0, 0), 1
         for entry in self.entries({topic}):
             if not waiting or len(waiting) >= most or not cdr.same_shape(entry.data, waiting[0].data, shape):
                 if waiting:
@@ -224,7 +225,8 @@ def rest_frequency(info: Any, of: Pipeline) -> np.ndarray:
     rest = of.rest_frequency
     for row, cube, calibration in zip(rest, info.cubes, of.calibrations, strict=True):
         if len(cube.rest_frequency) != calibration.layout.n_pads:
-            raise BagError(f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} rest frequencies, "
-                           f"its layout {calibration.layout.name} has {calibration.layout.n_pads} pads")  # fmt: skip
+            raise BagError(f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} rest "
+                           f"frequencies, its layout {calibration.layout.name} has {calibration.layout.n_pads} "
+                           "pads")  # fmt: skip
         row[: len(cube.rest_frequency)] = cube.rest_frequency
     return rest

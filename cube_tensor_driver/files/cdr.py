@@ -117,7 +117,7 @@ def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]]) -> list[bytes]:
     for name in ("encapsulation", "sec", "nanosec", "frame_id", "cube", "sequence", "time_offset"):
         out[name] = batch.field[name]
     out["n of frame_id"] = batch.shape.frame
-    for (name, _, width), values in zip(_STRESS[3:], rows, strict=True):
+    for (name, _, _), values in zip(_STRESS[3:], rows, strict=True):
         out[name] = np.reshape(values, out[name].shape)
     for name, _, width in _STRESS:
         out[f"n of {name}"] = batch.shape.rows * width
@@ -143,8 +143,8 @@ def _checked(data: bytes, fields: tuple[tuple[str, str, int], ...], shape: Shape
     if shape.rows <= len(data) and 0 <= len(data) - _record(fields, shape).itemsize < 4:
         return shape
     raise MessageError(
-        f"a batch message of {len(data)} bytes says it has {shape.rows} rows of {shape.pads} pads: damaged, or of another "
-        "version of the messages"
+        f"a batch message of {len(data)} bytes says it has {shape.rows} rows of {shape.pads} pads: damaged, or of "
+        "another version of the messages"
     )
 
 

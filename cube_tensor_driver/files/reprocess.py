@@ -17,11 +17,10 @@ from ..core.health import Health
 from ..core.pipeline import Pipeline, StressRows
 from . import cdr
 from .bag_writer import BagWriter, quality
-from .bags import FREQUENCIES, INFO, STRESS, Bag, Entry, calibrations, damage, pipeline, typestore
+from .bags import FREQUENCIES, INFO, STRESS, Bag, Entry, damage, pipeline, typestore
 from .calibration import calibration_text
 from .skin import Skin
 from .tables import TableWriter
-
 
 PARTIAL = ".partial"
 """Folder beside the results for what is not complete; a restart begins those anew."""
@@ -82,7 +81,9 @@ class Recording:
     def batches(self) -> Iterator[tuple[cdr.Batch, list[Entry], StressRows]]:
         """Frequencies, the messages they came in, and the stress of all their rows in order."""
         for batch, entries in self.bag.batches(self.topic):
-            which = np.maximum(np.searchsorted(self._since, batch.stamp_ns, side="right") - 1, 0)
+            # An info holds for what was sampled from its stamp on: the node stamps it just behind the last row before.
+            newest_ns = batch.times_ns.max(axis=1, initial=0)
+            which = np.maximum(np.searchsorted(self._since, newest_ns, side="right") - 1, 0)
             for run in np.split(np.arange(len(which)), np.flatnonzero(np.diff(which)) + 1):
                 part = cdr.Batch(batch.shape, batch.stamp_ns[run], batch.field[run])
                 rows = self._process(int(which[run[0]]), part)
@@ -131,8 +132,8 @@ class Recording:
             by_name = {cube.name: cube.calibration for cube in change.skin.cubes}
             missing = [cube.name for cube in info.cubes if cube.name not in by_name]
             if missing:
-                raise BagError(f"{self.bag.path}: the skin file {change.skin.name} has no cubes {', '.join(missing[:5])}; the "
-                               "bag has")  # fmt: skip
+                raise BagError(f"{self.bag.path}: the skin file {change.skin.name} has no cubes "
+                               f"{', '.join(missing[:5])}; the bag has")  # fmt: skip
             new = [by_name[cube.name] for cube in info.cubes]
         elif change.calibration is not None:
             new = [change.calibration] * len(info.cubes)
@@ -177,8 +178,8 @@ class Recording:
         if without.any():
             names = ", ".join(self.infos[-1].cubes[cube].name for cube in np.flatnonzero(without)[:5])
             seconds = (self.bag.end_ns - self.bag.start_ns) * 1e-9
-            raise BagError(f"{self.bag.path}: --tare-from {begin_s:g} {end_s:g}: no frequencies of every pad of {names} in that "
-                           f"time; the bag lasts from 0 to {seconds:.3f} s")  # fmt: skip
+            raise BagError(f"{self.bag.path}: --tare-from {begin_s:g} {end_s:g}: not every pad of {names} was "
+                           f"measured in that time; the bag lasts from 0 to {seconds:.3f} s")  # fmt: skip
         rest = np.where(exists, total / np.maximum(count, 1), np.nan)
         for made in self.pipelines:
             made.rest_frequency = rest

@@ -16,7 +16,7 @@ from ..device.clock import ClockMap
 from ..device.link import LinkConfig, LinkState
 from ..device.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats
 from ..device.reader import Reader
-from ..device.scan import Place, Scan
+from ..device.scan import Place, Rows, Scan
 from ..device.sequence import Account, Verdict
 from ..files.skin import Skin, read_skin
 from .messages import frequencies_message, info_message, to_time
@@ -28,6 +28,10 @@ LEVELS = {
     LinkState.SILENT: DiagnosticStatus.STALE,
     LinkState.CLOSED: DiagnosticStatus.WARN,
 }
+
+
+MAX_SCANS = 16
+"""Scans in one message at most: DDS keeps the largest message of each place in its queues for ever."""
 
 
 class Driver(CubeNode):
@@ -138,8 +142,10 @@ class Driver(CubeNode):
             self._unaccounted_rows = self._scan.unaccounted()
 
     def _publish(self) -> None:
-        rows = self._scan.take()
-        if rows is not None:
+        gathered = self._scan.take()
+        most = MAX_SCANS * len(self._skin.cubes)
+        for start in range(0, 0 if gathered is None else len(gathered.cube), most):
+            rows = Rows(*(column[start : start + most] for column in gathered or ()))
             message = frequencies_message(rows, self._skin.parent_frame)
             if self._take is None or self._frequencies.get_subscription_count():
                 self._frequencies.publish(message)
@@ -209,7 +215,9 @@ class Driver(CubeNode):
             happened, self._happened[number] = self._happened[number], []
             notes += dict.fromkeys(text for _, text in happened if text not in notes)
             level = max(
-                LEVELS[link.state], DiagnosticStatus.WARN if notes else DiagnosticStatus.OK, *(one for one, _ in happened)
+                LEVELS[link.state],
+                DiagnosticStatus.WARN if notes else DiagnosticStatus.OK,
+                *(one for one, _ in happened),
             )
             values: dict[str, object] = {**link.counters, **account.counters()}
             clock = self._clocks[number]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from rclpy.node import Node
@@ -35,7 +36,7 @@ class Follower:
         on_skin: Callable[[], None] | None = None,
         on_stress: Callable[[Times, StressRows], None] | None = None,
     ) -> None:
-        self.info: SkinInfo | None = None
+        self.info: Any = None  # of type SkinInfo
         self.bad_messages = 0
         self.messages = 0
         self._node, self._on_skin, self._on_stress = node, on_skin, on_stress

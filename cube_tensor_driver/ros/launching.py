@@ -53,7 +53,8 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
         markers=wanted("markers") or wanted("rviz"),
         simulated_ports=Path(tempfile.mkdtemp(prefix="cube_ports_")) if wanted("simulate") else None,
     )
-    actions = [_action(process, namespace) for process in processes]
+    # Nodes first: where one cannot be started launch gives up, and leaves what it has started already.
+    actions = [_action(process, namespace) for process in sorted(processes, key=lambda process: not process.node)]
     if wanted("state_publisher") or wanted("rviz"):
         actions.append(_state_publisher(skin, namespace))
     if wanted("record"):

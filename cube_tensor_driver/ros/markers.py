@@ -12,7 +12,6 @@ import numpy as np
 from geometry_msgs.msg import Point, Quaternion, Vector3
 from rclpy.serialization import serialize_message
 from std_msgs.msg import ColorRGBA
-from transforms3d.quaternions import mat2quat
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..core import scene
@@ -24,7 +23,13 @@ LEGEND_BYTES = 160
 LIFETIME_S = 2
 """Viewers drop the picture so long after the node is gone: no old load stands there as if it were true."""
 BAR = 32
-WHITE, TRACTION, GRADIENT, PULL, PUSH = (0.9, 0.9, 0.9), (0.95, 0.95, 0.95), (1.0, 0.6, 0.1), (0.9, 0.3, 0.2), (0.3, 0.5, 1)
+WHITE, TRACTION, GRADIENT, PULL, PUSH = (
+    (0.9, 0.9, 0.9),
+    (0.95, 0.95, 0.95),
+    (1.0, 0.6, 0.1),
+    (0.9, 0.3, 0.2),
+    (0.3, 0.5, 1),
+)
 
 
 class Drawn(NamedTuple):
@@ -126,7 +131,7 @@ class Canvas:
         self._groups = [np.flatnonzero(group.ravel() == k) for k in range(len(turns))]
         for k, (turn, members) in enumerate(zip(turns, self._groups, strict=True)):
             marker = self._add(f"cubes {k}", Marker.CUBE_LIST, len(members), True)
-            w, x, y, z = mat2quat(turn.reshape(3, 3)).tolist()
+            ((w, x, y, z),) = scene.turns(turn.reshape(1, 3, 3)).tolist()
             marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
             side = 2.0 * float(places.half_side[members].max())
             marker.scale = Vector3(x=side, y=side, z=side)
@@ -149,7 +154,8 @@ class Canvas:
             # points of a marker are in its pose, which is turned
             self[f"cubes {k}"].points[:] = places.position[members] @ turn.reshape(3, 3)
         self["legend bar"].points[:] = np.stack(
-            [middle + width * (np.linspace(0, 1, BAR) - 0.5), np.full(BAR, low[1] - 1.2 * pitch), np.full(BAR, low[2])], 1
+            [middle + width * (np.linspace(0, 1, BAR) - 0.5), np.full(BAR, low[1] - 1.2 * pitch), np.full(BAR, low[2])],
+            1,
         )
 
     def __getitem__(self, name: str) -> Drawn:

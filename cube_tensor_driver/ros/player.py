@@ -19,11 +19,9 @@ from .recorder import DEPTH, message_class
 
 CLOCK_S = 0.01
 """Of real time, at least so often the clock is sent; and before every message."""
-DISCOVERY_S = 1.0
-"""Before the first message: so long subscribers may take to find the publishers."""
-MADE = tuple(f"{PACKAGE}/msg/{name}" for name in ("SkinStress", "StressTensorStamped")) + (
-    "geometry_msgs/msg/WrenchStamped",
-)
+DISCOVERY_S, LOOK_S = 1.0, 0.1
+"""Before the first message: no further subscriber has found the publishers for so long."""
+MADE = (f"{PACKAGE}/msg/SkinStress", f"{PACKAGE}/msg/StressTensorStamped", "geometry_msgs/msg/WrenchStamped")
 """Types that a reconstruction makes, of topics that are left out unless stress is asked for."""
 
 
@@ -86,7 +84,11 @@ class Player:
         if start_ns > self._bag.end_ns:
             length = (self._bag.end_ns - self._bag.start_ns) / SECOND
             raise BagError(f"{self._bag.path}: --start {start_s:g}: the bag is {length:.3f} s long")
-        self.stop.wait(DISCOVERY_S)
+        found, since = -1, time.monotonic()
+        while time.monotonic() - since < DISCOVERY_S and not self.stop.wait(LOOK_S):
+            now = sum(publisher.get_subscription_count() for publisher in self._publishers.values())
+            if now != found:
+                found, since = now, time.monotonic()
         while not self.stop.is_set():
             self._once(start_ns, progress)
             if not loop:

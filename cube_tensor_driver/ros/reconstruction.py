@@ -118,8 +118,9 @@ class Reconstruction(CubeNode):
         self._cubes.publish(times, rows, pad_fault)
 
     def _publish_info(self) -> None:
-        now_ns = self.get_clock().now().nanoseconds
-        self._info.publish(info_message(self._skin, self._pipeline, now_ns, self._taring.uids))
+        # Just behind the last row that was made without it: so a bag says from which row on it holds.
+        since_ns = self._health.newest_ns + 1 if self._health.newest_ns else self.get_clock().now().nanoseconds
+        self._info.publish(info_message(self._skin, self._pipeline, since_ns, self._taring.uids))
 
     def _publish_diagnostics(self) -> None:
         self._ticks += 1

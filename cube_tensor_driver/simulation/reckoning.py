@@ -21,8 +21,8 @@ TOLERANCE = 1e-3
 """Of a component's range: float32 leaves 1e-6, a wrong sample 1e-1."""
 SETTLE_S = 10.0
 """After a restart or a jump of a hub's clock, until its stamps are judged."""
-HOLD_S = 2.5
-"""How long a pad that works again may still be left out, and what it explains."""
+HOLD_S = 6.0
+"""How long a pad that works again may still be left out: 2 s of rows, and its link may be cut for 2 s meanwhile."""
 INDEX_KEPT = 10_000
 """Samples remembered until their tensors come: 5 s of 4 hubs at 500 Hz."""
 CLOCK = ("reset", "wrap", "unplug", "rename", "step", "drift")
@@ -70,7 +70,9 @@ class Reckoning:
             bits = (~same[bad]) @ (1 << np.arange(same.shape[1]))
             self._odd.append(np.stack([cube[bad], bits, stamp_ns[bad], np.zeros(len(bad), int)], axis=1))
         keys = hub[first] << 32 | number[first]
-        self._index.update(zip(keys.tolist(), index[first].tolist(), strict=True))
+        for key, place in zip(keys.tolist(), index[first].tolist(), strict=True):
+            self._index.pop(key, None)  # a number given again counts as new, else it were forgotten with the old
+            self._index[key] = place
         if len(self._index) > 2 * INDEX_KEPT:
             self._index = dict(list(self._index.items())[-INDEX_KEPT:])
         self._samples.append(np.stack([hub[first], number[first], stamp_ns[first], index[first]], axis=1))

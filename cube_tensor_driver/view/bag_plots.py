@@ -56,7 +56,7 @@ def run_plot(options: Options) -> int:
 
 
 def cube_series(bag: Bag, name: str | None, start_s: float | None, end_s: float | None) -> Series:
-    """A cube (the first without a name) between two times. Stress is made of the frequencies, as when it was recorded."""
+    """A cube (None: the first) between two times. Stress is made of the frequencies, as it was when recorded."""
     recording = Recording(bag, f"{bag.skin()}frequencies")
     cubes = recording.infos[-1].cubes
     names = [cube.name for cube in cubes]

@@ -1,4 +1,4 @@
-"""./cube view: a page on this machine that shows a running skin; a process of its own, so that it slows nothing else."""
+"""./cube view: a page on this machine that shows a running skin. A process of its own: it slows nothing else."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from ..core.errors import ConfigError
 from ..ros.follow import Follower
 from ..ros.node import make_executor
 from .history import History
-from .page import Buttons, Facts, Page
+from .markup import Facts
+from .page import Buttons, Page
 
 HOST = "127.0.0.1"
 PORT = 8080
@@ -100,9 +101,10 @@ class Browser:
         self._rate = np.full(len(names), np.nan)
 
     def _draw(self, numbers: bool) -> None:
-        page, newest = self._page, self._follower.newest if self._page else None
+        page = self._page
         if page is None:
             return
+        newest = self._follower.newest
         health = self._follower.health()
         if not page.paused:
             self._history.add(self._follower.now(), newest)

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 import viser
-from transforms3d.quaternions import mat2quat
 from viser import uplot
 
 from ..core import scene
-from ..core.modes import COMPONENTS
-from ..core.pipeline import STATUS
 from ..core.scene import QUANTITIES, Newest, Places
 from ..elastic.surface import Contact, Surface
+from . import markup
 from .history import History
+from .markup import Facts
 
 SPAN = 2.0
 """The longest side of a skin in the scene: cameras and clipping planes of viewers are made for metres, skins for cm."""
+LEAST_PA = 300.0
+"""Pressure at the cubes that counts as contact."""
 MOST_POINTS = 5000
 """Of the field's carpet."""
 PLOTS = (
@@ -48,34 +50,27 @@ class Buttons:
     record: Callable[[], None]
 
 
-@dataclass
-class Facts:
-    """What the page says beside the skin: lines about the links, about the last action, whether a bag is written."""
-
-    links: list[str] = field(default_factory=list)
-    action: str = ""
-    recording: bool = False
-
-
 class Page:
     """One skin on a viser server. `draw` is the picture, `write` the numbers and plots; both for the newest rows."""
 
     def __init__(self, server: viser.ViserServer, name: str, names: Sequence[str], places: Places, depth: float,
                  buttons: Buttons) -> None:  # fmt: skip
-        self._server, self._names, self.selected = server, list(names), 0
+        self._server, self._names = server, list(names)
         self._surface = Surface(places, depth, int(np.clip(np.sqrt(MOST_POINTS / len(names)), 2, 8)))
         size = np.ptp(places.position, axis=0).max() + places.pitch
         self._unit = SPAN / size
         centre = (places.position.min(axis=0) + places.position.max(axis=0)) / 2
         self._centre = centre
+        self.selected = int(((places.position - centre) ** 2).sum(axis=1).argmin())
         self._places = Places((places.position - centre) * self._unit, places.rotation, places.half_side * self._unit)
         self._pitch = places.pitch * self._unit
         self._top = self._longest = self._steepest = 0.0
+        self._load: Contact | None = None
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large",
                                    brand_color=(33, 145, 140))  # fmt: skip
         server.gui.set_panel_label(name)
         server.gui.main_panel.dock_right()
-        server.initial_camera.position = (0.15 * SPAN, -0.85 * SPAN, 0.75 * SPAN)
+        server.initial_camera.position = (0.12 * SPAN, -0.75 * SPAN, 0.65 * SPAN)
         server.initial_camera.look_at = (0.0, -0.02 * SPAN, 0.0)
         self._make_scene(server.scene)
         self._make_controls(server.gui, buttons)
@@ -96,7 +91,7 @@ class Page:
         to.configure_environment_map(None)
         to.add_light_ambient("/light/all", intensity=AMBIENT)
         to.add_light_directional("/light/above", intensity=DIRECT, position=(-0.4, -0.6, 1.0))
-        turns = np.array([mat2quat(rotation) for rotation in places.rotation])
+        turns = self._turns = scene.turns(places.rotation)
         grey = np.full((n, 3), 90, np.uint8)
         self._cubes = to.add_batched_meshes_simple(
             "/cubes", CUBE, CUBE_FACES, turns, places.position, batched_scales=places.half_side,
@@ -110,7 +105,11 @@ class Page:
             batched_colors=np.full((len(points), 3), 60, np.uint8), side="double", lod="off", cast_shadow=False,
             receive_shadow=False)  # fmt: skip
         self._carpet.on_click(self._pick)
-        thick = {"shaft_radius": 0.025 * self._pitch, "head_radius": 0.075 * self._pitch, "head_length": 0.2 * self._pitch}
+        thick = {
+            "shaft_radius": 0.025 * self._pitch,
+            "head_radius": 0.075 * self._pitch,
+            "head_length": 0.2 * self._pitch,
+        }
         none = np.zeros((0, 2, 3))
         self._traction = to.add_arrows("/traction", none, WHITE, **thick)
         self._gradient = to.add_arrows("/gradient", none, GOLD, **thick)
@@ -147,7 +146,7 @@ class Page:
             node = {**nodes, "principal": self._crosses}[layers.value]
             node.visible = not node.visible
 
-        self._chosen = gui.add_dropdown("cube", self._names)
+        self._chosen = gui.add_dropdown("cube", self._names, initial_value=self._names[self.selected])
 
         @self._chosen.on_update
         def _(_: object) -> None:
@@ -158,21 +157,23 @@ class Page:
         with gui.add_folder("last 10 s"):
             empty = np.array([0.0])
             self._plots = []
-            for title, _, columns in PLOTS:
-                lines = [uplot.Series(label=label(name), stroke=stroke, width=1.5, dash=dash)
+            self._spans = [(0.0, 1.0) for _ in PLOTS]
+            scales = {"x": TIME, "y": uplot.Scale(auto=False, range=(0.0, 1.0))}
+            for title, _factor, columns in PLOTS:
+                lines = [uplot.Series(label=markup.label(name), stroke=stroke, width=1.5, dash=dash)
                          for name, stroke, dash in zip(columns, STROKES, DASHES, strict=False)]  # fmt: skip
                 axes = tuple(uplot.Axis(stroke="#ced4da", grid={"stroke": "#495057", "width": 0.5}, size=size)
                              for size in (34, 46))  # fmt: skip
                 self._plots.append(gui.add_uplot(
                     (empty,) * (1 + len(lines)), (uplot.Series(label="s"), *lines), title=title, height=160, axes=axes,
-                    scales={"x": TIME, "y": uplot.Scale(auto=False, range=(0.0, 1.0))}, padding=(4, 8, 0, 0)))  # fmt: skip
+                    scales=scales, padding=(4, 8, 0, 0)))  # fmt: skip
         with gui.add_folder("health"):
             self._health = gui.add_html("")
 
     def _pick(self, event: viser.SceneNodePointerEvent) -> None:
         start, ray = np.array(event.ray_origin), np.array(event.ray_direction)
         apart = np.linalg.norm(np.cross(self._places.position - start, ray / np.linalg.norm(ray)), axis=1)
-        self._chosen.value = self._names[int(apart.argmin())]
+        self._chosen.value = self._names[int(apart.argmin())]  # type: ignore[misc]  # Viser's own handle has the setter.
 
     @property
     def quantity(self) -> scene.Quantity:
@@ -208,7 +209,7 @@ class Page:
             self._faults.colors = _bytes(scene.MARK[health[bad]]).repeat(2, axis=0)[:, None].repeat(2, axis=1)
             up = places.rotation[self.selected, :, 2] * places.half_side[self.selected] * 1.1
             self._ring.position = places.position[self.selected] + up
-            self._ring.wxyz = mat2quat(places.rotation[self.selected])
+            self._ring.wxyz = self._turns[self.selected]
 
     def _field(self, values: np.ndarray, shown: np.ndarray) -> np.ndarray:
         """On the carpet: the interpolated field where it is pressure or shear, elsewhere each cube's own value."""
@@ -220,73 +221,38 @@ class Page:
 
     def write(self, newest: Newest, health: np.ndarray, rate: np.ndarray, history: History, facts: Facts) -> None:
         """Status, legend, contact, the selected cube's numbers and plots, health."""
-        quantity, k = self.quantity, self.selected
-        live = np.count_nonzero(health < scene.FAULTY)
-        dot, word = ("#51cf66", "live") if live == len(health) else ("#ffa94d", "not all cubes") if live else ("#ff6b6b", "no data")  # fmt: skip
-        if self._paused:
-            dot, word = "#ffd43b", "paused"
-        hertz = np.nanmax(rate, initial=0.0)
-        recording = " · <b style='color:#ff6b6b'>● recording</b>" if facts.recording else ""
-        self._head.content = _box(f"<span style='color:{dot}'>⬤</span> <b>{word}</b> · {live} of {len(health)} cubes · {hertz:.0f} Hz{recording}")  # fmt: skip
-        self._action.content = _box(facts.action) if facts.action else ""
+        k = self.selected
+        live = bool((health < scene.FAULTY).any())
+        if not self._paused:
+            self._load = next(iter(self._surface.contacts(newest.values, LEAST_PA)), None) if live else None
+        hertz = float(np.nanmax(rate, initial=0.0))
+        self._head.content = markup.head(health, hertz, self._load, self._paused, facts.recording)
+        self._action.content = markup.box(escape(facts.action)) if facts.action else ""
         if self._paused:
             return
-        self._legend.content = _box(_legend_html(quantity, self._top))
-        contact = next(iter(self._surface.contacts(newest.values, 300.0)), None) if live else None
-        self._show_contact(contact)
-        rows = [
-            (label(name), f"{newest.values[k, i] * (1e-6 if '_' in name else 1e-3):+.3f}", "kPa/mm" if "_" in name else "kPa")
-            for i, name in enumerate(COMPONENTS) if np.isfinite(newest.values[k, i])
-        ]  # fmt: skip
-        rows += [("residual", f"{newest.residual[k]:.2f}", "σ"), ("rate", f"{rate[k]:.0f}", "Hz")]
-        words = [name.lower().replace("_", " ") for name, bit in STATUS.items() if newest.status[k] & bit]
-        rows.append(("state", ", ".join(words) or scene.HEALTH[health[k]], ""))
-        cells = "".join(f"<tr><td>{a}</td><td style='text-align:right;font-family:monospace'>{b}</td><td>&nbsp;{c}</td></tr>" for a, b, c in rows)  # fmt: skip
-        self._numbers.content = _box(f"<table style='width:100%;line-height:1.35'>{cells}</table>")
+        self._legend.content = markup.legend(self.quantity, self._top)
+        self._show_contact(self._load)
+        self._numbers.content = markup.numbers(newest, k, health[k], rate[k])
         times, lines = history.of(k)
-        for plot, (_, factor, columns) in zip(self._plots, PLOTS, strict=True):
+        for number, (plot, (_, factor, columns)) in enumerate(zip(self._plots, PLOTS, strict=True)):
             shown = [lines[:, History.COLUMNS.index(name)] * factor for name in columns]
             plot.data = (times, *shown)
             finite = np.concatenate(shown)
             finite = finite[np.isfinite(finite)]
             span = _nice(finite.min(initial=0.0), finite.max(initial=0.0))
             # uPlot cannot scale by itself where there is NaN.
-            if plot.scales["y"]["range"] != span:
-                plot.scales = {"x": TIME, "y": uplot.Scale(auto=False, range=span)}
-        bad = [f"<tr><td>{self._names[i]}</td><td>{scene.HEALTH[health[i]]}</td></tr>" for i in np.flatnonzero(health)[:20]]
-        counts = ", ".join(f"{np.count_nonzero(health == h)} {word}" for h, word in enumerate(scene.HEALTH))
-        links = "".join(f"<div>{line}</div>" for line in facts.links)
-        self._health.content = _box(f"{links}<div>{counts}</div><table style='width:100%'>{''.join(bad)}</table>")
+            if self._spans[number] != span:
+                self._spans[number], plot.scales = span, {"x": TIME, "y": uplot.Scale(auto=False, range=span)}
+        self._health.content = markup.conditions(self._names, health, facts.links)
 
     def _show_contact(self, contact: Contact | None) -> None:
         if contact is None:
             self._contact.visible = False
             return
         place = (contact.position - self._centre + 1.1 * self._surface.pitch * contact.normal) * self._unit
-        shear = "" if np.isnan(contact.shear_force) else f", shear {contact.shear_force:.2f} N"
-        self._contact.text = f"{contact.normal_force:.2f} N{shear}"
+        self._contact.text = markup.newtons(contact)
         self._contact.position = place
         self._contact.visible = True
-
-
-def label(name: str) -> str:
-    """A component as people write it: zz_x is ∂zz/∂x."""
-    return f"∂{name[:2]}/∂{name[3]}" if "_" in name else name
-
-
-def _box(content: str) -> str:
-    return f"<div style='padding:0 0.8em 0.4em;font-size:0.85em'>{content}</div>"
-
-
-def _legend_html(quantity: scene.Quantity, top: float) -> str:
-    stops = np.linspace(-top if quantity.signed else 0, top, 9)
-    colours = ",".join("rgb(" + ",".join(map(str, c)) + ")" for c in _bytes(scene.colours(quantity, stops, top)).tolist())
-    ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in stops[::4])
-    return (
-        f"<div style='height:0.9em;border-radius:3px;background:linear-gradient(to right,{colours})'></div>"
-        f"<div style='display:flex;justify-content:space-between'>{ticks}</div>"
-        f"<div style='text-align:center'>{quantity.label} in {quantity.unit}; grey: not observed</div>"
-    )
 
 
 def _bytes(colours: np.ndarray) -> np.ndarray:

@@ -22,13 +22,9 @@ from ..ros.children import Children
 from ..ros.start import Process, skin_processes
 from .plots import save
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-FLAGS = (
-    "--headless --no-sandbox --disable-background-networking --enable-unsafe-swiftshader --use-gl=angle "
-    "--use-angle=swiftshader --hide-scrollbars --window-size=1400,900"
-).split()
-START_S, LOOK_S = 30.0, 14.0
-"""How long the processes may take to start, and how long the browser looks before the picture: plots need a while."""
+START_S, LOOK_S = 30.0, 120.0
+"""How long the processes may take to start, and the browser to make its picture."""
+PORT = 8088
 
 
 def run_pictures(folder: Path) -> int:
@@ -43,11 +39,10 @@ def run_pictures(folder: Path) -> int:
     table = {name: getattr(study, name).tolist() for name in ("pitches", "widths", "error", "position", "force")}
     (folder / "field.json").write_text(json.dumps(table) + "\n")
     print(f"wrote {folder}/field.png, field_error.png, field.json\n{table_text(study)}")
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        print("no view.png: needs Chromium, apt-get install chromium", file=sys.stderr)
+    if not shutil.which("chromedriver"):
+        print("no view.png: needs Chromium, apt-get install chromium chromium-driver", file=sys.stderr)
         return 0
-    photograph(browser, folder / "view.png")
+    photograph(folder / "view.png")
     print(f"wrote {folder}/view.png")
     return 0
 
@@ -105,13 +100,13 @@ def table_text(study: FieldStudy) -> str:
     return "\n".join(lines)
 
 
-def photograph(browser: str, path: Path) -> None:
+def photograph(path: Path) -> None:
     """The browser view of the simulated demo skin under its load. CubeError: no picture came."""
     skin = share() / "config" / "skin_demo.yaml"
     with tempfile.TemporaryDirectory(prefix="cube_pictures_") as name, Children(Path(name)) as children:
         for process in skin_processes(skin, simulated_ports=Path(name) / "ports"):
             children.start(process)
-        children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view", "--port", "8088")))
+        children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view", "--port", str(PORT))))
         until = time.monotonic() + START_S
         while "http://" not in children.log("view"):
             if time.monotonic() > until:
@@ -119,8 +114,8 @@ def photograph(browser: str, path: Path) -> None:
             children.check()
             time.sleep(0.1)
         url = children.log("view").split()[0]
-        command = [browser, *FLAGS, f"--user-data-dir={name}/browser", f"--timeout={1e3 * LOOK_S:.0f}",
-                   f"--screenshot={path.resolve()}", url]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, timeout=START_S + 3 * LOOK_S, check=False)
-        if done.returncode or not path.is_file():
-            raise CubeError(f"{browser} made no picture of {url}:\n{done.stderr[-500:]}")
+        # A tool of the repository, not of the package: only it needs a browser's driver.
+        command = [sys.executable, str(share() / "tools" / "photograph.py"), url, str(path.resolve())]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LOOK_S, check=False)
+        if done.returncode:
+            raise CubeError(f"no picture of {url}:\n{done.stderr[-500:]}")

@@ -62,7 +62,8 @@ def _record(recorder: Recorder, executor, options: Options, stop: threading.Even
     begun = time.monotonic()
     until = float("inf") if options.duration is None else begun + options.duration
     find_at = say_at = begun
-    dropped, refused = 0, set()
+    dropped = 0
+    refused: set[str] = set()
     with console.status("") as status:
         while not stop.is_set() and recorder.error is None and (now := time.monotonic()) < until:
             executor.spin_once(timeout_sec=min(SPIN_S, until - now))

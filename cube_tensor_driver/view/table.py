@@ -77,7 +77,8 @@ class LiveTable:
 
     def draw(self, most: int) -> Table:
         """The table, with the `most` cubes that carry the greatest normal stress if there are more."""
-        table = Table(title=f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed{self.note}")
+        title = f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed"
+        table = Table(title=title + self.note)
         table.add_column("cube")
         table.add_column("pressure", width=BAR)
         names = [name for name in SHOWN if np.isfinite(self._values[:, COMPONENTS.index(name)]).any()]

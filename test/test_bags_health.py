@@ -1,0 +1,43 @@
+"""Health of recorded batches at once against the same one by one, as the node does it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.health import Health
+from cube_tensor_driver.core.pipeline import Pipeline
+
+
+@pytest.mark.parametrize("kinds", [["planar"], ["planar", "cube"]])
+@pytest.mark.parametrize("faults", [False, True])
+def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
+    rng = np.random.default_rng(11)
+    n, count = 6, 400
+    pipeline = Pipeline([illustrative(kinds[k % len(kinds)]) for k in range(n)], np.float32)
+    frequency = pipeline.rest_frequency * (1 - 0.02 * rng.random((count, n, pipeline.n_pads)))
+    frequency = frequency.astype(np.float32)
+    pad_fault = np.zeros((count, n), np.uint32)
+    if faults:
+        frequency[50:90, 2, 1], frequency[200, 4, 3], frequency[300:, 1, 0] = np.nan, 1e9, 98_000.0
+        pad_fault[120, 3] = 4
+    stamp_ns = 10_000_000 * np.arange(count)
+    stamp_ns[250:] -= 2_000_000_000  # played again from further back
+    cube = np.broadcast_to(np.arange(n, dtype=np.uint16), (count, n))
+    temperature = np.full((count, n), np.nan, np.float32)
+    single, many = Health(pipeline), Health(pipeline)
+    rows = zip(cube, frequency, pad_fault, stamp_ns.tolist(), temperature, strict=True)
+    expected = [single.update(*one) for one in rows]
+    masks = []
+    for part in np.array_split(np.arange(count), 9):
+        mask, _ = many.update_many(cube[part], frequency[part], pad_fault[part], stamp_ns[part], temperature[part])
+        masks.append(mask)
+    np.testing.assert_array_equal(np.concatenate(masks), expected)
+    assert bool(np.any(expected)) == faults
+    assert many.closed == single.closed
+    for a, b in zip(many.history, single.history, strict=True):
+        for one, other in zip(a, b, strict=True):
+            np.testing.assert_array_equal(one, other)
+    for name in ("state", "mask", "status", "still", "last", "rows", "newest_ns"):
+        np.testing.assert_array_equal(getattr(many, name), getattr(single, name), err_msg=name)
