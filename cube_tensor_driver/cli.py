@@ -3,200 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def demo(options: argparse.Namespace) -> int:
-    from .view.demo import Options, run_demo
-
-    duration = options.duration
-    if duration is None and (options.headless or options.json):
-        duration = 10.0
-    return run_demo(
-        Options(options.config, options.cubes, options.rate, duration, options.headless, options.json, options.view)
-    )
-
-
-def config_grid(options: argparse.Namespace) -> int:
-    from .files.grid import grid
-    from .files.yaml import write_yaml
-
-    skin = grid(options.name, options.nx, options.ny, options.pitch, options.links, options.calibration,
-                options.layout, options.rate, options.port)  # fmt: skip
-    text = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart, on {options.links} links"
-    write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
-    print(f"wrote {options.output}: {text}")
-    return 0
-
-
-def config_check(options: argparse.Namespace) -> int:
-    from collections import Counter
-
-    from .files.skin import read_skin
-
-    skin = read_skin(options.file)
-    layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
-    kinds = ", ".join(f"{count} {name}" for name, count in layouts.items())
-    rate = "as the hubs have it" if skin.rate is None else f"{skin.rate:g} Hz"
-    print(f"{options.file}: skin {skin.name}, {kinds} on {len(skin.links)} links, {rate}: nothing wrong")
-    return 0
-
-
-def urdf(options: argparse.Namespace) -> int:
-    from .files.skin import read_skin
-    from .files.urdf import skin_urdf
-
-    print(skin_urdf(read_skin(options.file)), end="")
-    return 0
-
-
-def torture(options: argparse.Namespace) -> int:
-    from .view.torture import Options, run_torture
-
-    return run_torture(Options(options.duration, options.seed, options.json))
-
-
-def inject(options: argparse.Namespace) -> int:
-    from .simulation.inject import inject
-
-    inject(options.ports, options.fault)
-    return 0
-
-
-def layout(options: argparse.Namespace) -> int:
-    from .view.layout import run_layout
-
-    figure = options.figure or Path(f"{Path(options.name).stem}.png")
-    return run_layout(options.name, options.symmetry, options.calibration, options.json, figure)
-
-
-def fit(options: argparse.Namespace) -> int:
-    from .view.fit import Options, run_fit
-
-    figure = options.figure or options.output.with_suffix(".png")
-    return run_fit(
-        Options(
-            options.loads,
-            options.layout,
-            options.symmetry,
-            options.output,
-            options.base,
-            options.area,
-            options.uid,
-            figure,
-            options.json,
-            options.reference,
-            options.cube,
-        )
-    )
-
-
-def fem(options: argparse.Namespace) -> int:
-    from .view.elastic import Options, run_fem
-
-    given = {name: value for name, value in vars(options).items() if name not in ("command", "run")}
-    return run_fem(Options(**given | {"neglect": tuple(given.get("neglect", ()))}))
-
-
-def study(options: argparse.Namespace) -> int:
-    from .view.elastic import run_study
-
-    return run_study(options.json, options.figure)
-
-
-def paper(options: argparse.Namespace) -> int:
-    from .view.elastic import run_paper
-
-    return run_paper(options.out)
-
-
-def bench(options: argparse.Namespace) -> int:
-    from .view import bench
-
-    if options.what == "pipeline":
-        return bench.bench_pipeline(options.cubes, options.json)
-    if options.what == "echo":
-        return bench.bench_echo(options.cubes, options.rate, options.duration, options.json)
-    if options.what == "skin":
-        return bench.bench_skin(options.cubes, options.rate, options.duration, options.composed, options.json)
-    return bench.bench_scale(options.counts, options.rate, options.duration, options.json, options.figure)
-
-
-def record(options: argparse.Namespace) -> int:
-    from .view.record import Options, run_record
-
-    return run_record(Options(options.output, options.topics, options.duration, options.storage,
-                              round((options.split_size or 0) * 1e6), options.split_time or 0.0))  # fmt: skip
-
-
-def replay(options: argparse.Namespace) -> int:
-    from .view.replay import Options, run_replay
-
-    return run_replay(
-        Options(options.bag, options.rate, options.loop, options.start, options.clock, options.stress)
-    )
-
-
-def reprocess(options: argparse.Namespace) -> int:
-    from .view.reprocess import Options, run_reprocess
-
-    tare = tuple(options.tare_from) if options.tare_from else None
-    return run_reprocess(Options(options.bags, options.output, options.format, options.calibration, options.skin,
-                                 tare, options.jobs, options.scheduler))  # fmt: skip
-
-
-def plot(options: argparse.Namespace) -> int:
-    from .view.bag_plots import Options, run_plot
-
-    return run_plot(Options(options.bag, options.cube, options.start, options.to, options.output))
-
-
-def bag_info(options: argparse.Namespace) -> int:
-    from .view.bag import run_info
-
-    return run_info(options.bag)
-
-
-def bag_repair(options: argparse.Namespace) -> int:
-    from .view.bag import run_repair
-
-    return run_repair(options.bag)
-
-
-def view(options: argparse.Namespace) -> int:
-    from .view.browser import run_view
-
-    return run_view(options.port, options.depth)
-
-
-def pictures(options: argparse.Namespace) -> int:
-    from .view.pictures import run_pictures
-
-    return run_pictures(options.output)
-
-
-def docs(options: argparse.Namespace) -> int:
-    """Sphinx, every warning an error."""
-    command = ["sphinx", "-W", "--keep-going", "-q", "docs", str(options.output)]
-    return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode
-
-
-def test(options: argparse.Namespace) -> int:
-    os.chdir(ROOT)
-    os.execv(sys.executable, [sys.executable, "-m", "pytest", *(options.arguments or ["test"])])
-
-
-def lint(options: argparse.Namespace) -> int:
-    commands = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
-    return max(
-        subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode for command in commands
-    )
+from . import commands as run
 
 
 def positive(text: str) -> float:
@@ -214,15 +25,19 @@ def not_negative(text: str) -> float:
 
 
 def parser() -> argparse.ArgumentParser:
-    top = argparse.ArgumentParser(prog="./cube", description="Driver for cubic stress tensor sensors on ROS 2.")
+    top = argparse.ArgumentParser(
+        prog="./cube",
+        description="Driver for cubic stress tensor sensors on ROS 2.",
+        formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=14, width=110),
+    )
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
-    def command(name: str, run: Callable[[argparse.Namespace], int] | None, text: str) -> argparse.ArgumentParser:
+    def command(name: str, function: Callable[[argparse.Namespace], int] | None, text: str) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=text, description=text)
-        added.set_defaults(run=run)
+        added.set_defaults(run=function)
         return added
 
-    sub = command("demo", demo, "run simulated cubes, driver and reconstruction, with a live table")
+    sub = command("demo", run.demo, "run simulated cubes, driver and reconstruction, with a live table")
     sub.add_argument(
         "--config", type=Path, metavar="FILE", help="skin file to simulate (default: sixteen planar cubes)"
     )
@@ -240,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
 
     configs = command("config", None, "make or check skin files").add_subparsers(metavar="WHAT", required=True)
     sub = configs.add_parser("grid", help="write the skin file of a flat grid of cubes")
-    sub.set_defaults(run=config_grid)
+    sub.set_defaults(run=run.config_grid)
     sub.add_argument("--nx", type=int, required=True, metavar="N", help="cubes along x")
     sub.add_argument("--ny", type=int, required=True, metavar="N", help="cubes along y")
     sub.add_argument("--pitch", type=positive, default=0.012, metavar="M", help="distance of neighbours (0.012 m)")
@@ -252,29 +67,29 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--calibration", default="planar", metavar="FILE", help="calibration file or name (planar)")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="skin file to write")
     sub = configs.add_parser("check", help="say what is wrong with a skin file, or what it holds")
-    sub.set_defaults(run=config_check)
+    sub.set_defaults(run=run.config_check)
     sub.add_argument("file", type=Path, metavar="FILE")
 
-    sub = command("torture", torture, "32 simulated cubes at 500 Hz under a random mix of all faults, judged")
+    sub = command("torture", run.torture, "32 simulated cubes at 500 Hz under a random mix of all faults, judged")
     sub.add_argument("--duration", type=positive, default=60.0, metavar="S", help="of the faults, s (60)")
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="of the mix (0)")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
 
-    sub = command("inject", inject, "inject a fault into running simulated hubs: kind=unplug link=hub0 seconds=2")
+    sub = command("inject", run.inject, "inject a fault into running simulated hubs: kind=unplug link=hub0 seconds=2")
     sub.add_argument("fault", nargs="+", metavar="KEY=VALUE", help="kind=… and what it needs; docs/reliability.md")
     sub.add_argument("--ports", type=Path, metavar="FOLDER", help="of the simulated ports (the newest demo's)")
 
-    sub = command("urdf", urdf, "print a URDF of a skin: one link per cube under its parent frame")
+    sub = command("urdf", run.urdf, "print a URDF of a skin: one link per cube under its parent frame")
     sub.add_argument("file", type=Path, metavar="FILE")
 
-    sub = command("layout", layout, "what a layout's pads can tell: ranks, unobservable modes, noise; a picture")
+    sub = command("layout", run.layout, "what a layout's pads can tell: ranks, unobservable modes, noise; a picture")
     sub.add_argument("name", metavar="NAME", help="quad, planar, cube, or a YAML file with a layout")
     sub.add_argument("--symmetry", metavar="G", help="full, slab, mirrors or none (default: the calibration's)")
     sub.add_argument("--calibration", metavar="FILE", help="calibration file or name (default: the computed one)")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
     sub.add_argument("--figure", type=Path, metavar="FILE", help="picture of the cube (default: NAME.png)")
 
-    sub = command("fit", fit, "calibrate from a table of known loads and measured frequencies")
+    sub = command("fit", run.fit, "calibrate from a table of known loads and measured frequencies")
     sub.add_argument("loads", type=Path, metavar="LOADS", help="CSV: pads (Hz), modes (Pa) or fx fy fz (N); or a bag")
     sub.add_argument("--reference", metavar="TOPIC", help="of a bag: WrenchStamped (with --area) or stress to fit to")
     sub.add_argument("--cube", metavar="NAME", help="of a bag: which cube, if there are several")
@@ -287,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--figure", type=Path, metavar="FILE", help="measured against fitted (default: beside -o, .png)")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
 
-    sub = command("fem", fem, "compute a cube's response matrix by finite elements; lengths in mm")
+    sub = command("fem", run.fem, "compute a cube's response matrix by finite elements; lengths in mm")
     sub.argument_default = argparse.SUPPRESS  # what is not given is left to view.elastic.Options
     sub.add_argument("--3d", dest="space", action="store_true", help="in space: 24 pads; minutes, and up to 6 GB")
     sub.add_argument("--layout", metavar="NAME", help="quad, planar, cube, or a YAML file (planar; cube with --3d)")
@@ -307,14 +122,14 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--figures", type=Path, metavar="DIR", help="pictures: convergence, response, stress of each load")
     sub.add_argument("-o", "--output", type=Path, metavar="FILE", help="calibration file to write")
 
-    sub = command("study", study, "how wide a contact must be for each layout to be right, by indenter sweeps")
+    sub = command("study", run.study, "how wide a contact must be for each layout to be right, by indenter sweeps")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
     sub.add_argument("--figure", type=Path, default=Path("study.png"), metavar="FILE", help="(study.png)")
 
-    sub = command("paper", paper, "the source paper's simulation and experiments on a virtual bench, as pictures")
+    sub = command("paper", run.paper, "the source paper's simulation and experiments on a virtual bench, as pictures")
     sub.add_argument("--out", type=Path, default=Path("paper"), metavar="DIR", help="folder to write to (paper)")
 
-    benches = command("bench", bench, "measure speed against bare floors").add_subparsers(
+    benches = command("bench", run.bench, "measure speed against bare floors").add_subparsers(
         dest="what", metavar="WHAT", required=True
     )
     for name, text in (
@@ -336,7 +151,7 @@ def parser() -> argparse.ArgumentParser:
         if name == "skin":
             sub.add_argument("--composed", action="store_true", help="driver and reconstruction in one process")
 
-    sub = command("record", record, "record the topics of a running skin into a bag that ros2 bag reads too")
+    sub = command("record", run.record, "record the topics of a running skin into a bag that ros2 bag reads too")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the bag, a new one")
     sub.add_argument("--topics", nargs="+", default=[], metavar="T", help="frequencies stress info /diagnostics")
     sub.add_argument("--duration", type=positive, metavar="S", help="end after S seconds (default: Ctrl-C)")
@@ -344,7 +159,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--split-size", type=positive, metavar="MB", help="begin a new file after so many megabytes")
     sub.add_argument("--split-time", type=positive, metavar="S", help="begin a new file after so many seconds")
 
-    sub = command("replay", replay, "publish a bag: all but the stress, which a reconstruction makes anew")
+    sub = command("replay", run.replay, "publish a bag: all but the stress, which a reconstruction makes anew")
     sub.add_argument("bag", type=Path, metavar="BAG")
     sub.add_argument("--rate", type=positive, default=1.0, metavar="R", help="times the recorded speed (1)")
     sub.add_argument("--loop", action="store_true", help="begin anew at the end")
@@ -352,7 +167,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--clock", action="store_true", help="publish /clock for nodes with use_sim_time")
     sub.add_argument("--stress", action="store_true", help="publish the recorded stress too")
 
-    sub = command("reprocess", reprocess, "make stress of recorded frequencies again, with what is known now")
+    sub = command("reprocess", run.reprocess, "make stress of recorded frequencies again, with what is known now")
     sub.add_argument("bags", type=Path, nargs="+", metavar="BAG")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
     sub.add_argument("--calibration", metavar="FILE", help="of all cubes (default: as recorded)")
@@ -362,7 +177,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--jobs", type=int, metavar="N", help="processes (default: one per core)")
     sub.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster to run on, tcp://host:8786")
 
-    sub = command("plot", plot, "draw frequencies, stress, gradient and residual of one cube of a bag")
+    sub = command("plot", run.plot, "draw frequencies, stress, gradient and residual of one cube of a bag")
     sub.add_argument("bag", type=Path, metavar="BAG")
     sub.add_argument("--cube", metavar="NAME", help="(default: the first)")
     sub.add_argument("--from", dest="start", type=float, metavar="S", help="seconds after the start of the bag")
@@ -371,24 +186,24 @@ def parser() -> argparse.ArgumentParser:
 
     bags = command("bag", None, "look into a bag, or repair one").add_subparsers(metavar="WHAT", required=True)
     sub = bags.add_parser("info", help="print skin, cubes, calibrations, rates, gaps and counters")
-    sub.set_defaults(run=bag_info)
+    sub.set_defaults(run=run.bag_info)
     sub.add_argument("bag", type=Path, metavar="BAG")
     sub = bags.add_parser("repair", help="make a bag readable that was cut off: killed, disk full, power lost")
-    sub.set_defaults(run=bag_repair)
+    sub.set_defaults(run=run.bag_repair)
     sub.add_argument("bag", type=Path, metavar="BAG")
 
-    sub = command("view", view, "show a running skin in the browser: 3-D, plots, tare, recording")
+    sub = command("view", run.view, "show a running skin in the browser: 3-D, plots, tare, recording")
     sub.add_argument("--port", type=int, default=8080, metavar="N", help="of the page (8080, or the next free)")
     sub.add_argument("--depth", type=positive, default=0.004, metavar="M", help="cubes below the surface (0.004 m)")
 
-    sub = command("pictures", pictures, "make the pictures of the documentation anew")
-    sub.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "pictures", metavar="DIR")
-    sub = command("docs", docs, "build the documentation as HTML; a warning is an error")
+    sub = command("pictures", run.pictures, "make the pictures of the documentation anew")
+    sub.add_argument("-o", "--output", type=Path, default=run.ROOT / "docs" / "pictures", metavar="DIR")
+    sub = command("docs", run.docs, "build the documentation as HTML; a warning is an error")
     sub.add_argument("-o", "--output", type=Path, default=Path(".cube/docs"), metavar="DIR", help="(.cube/docs)")
 
-    sub = command("test", test, "build and run the test suite; arguments go to pytest")
+    sub = command("test", run.test, "build and run the test suite; arguments go to pytest")
     sub.add_argument("arguments", nargs=argparse.REMAINDER)
-    command("lint", lint, "check style and types (ruff, mypy)")
+    command("lint", run.lint, "check style and types (ruff, mypy)")
     # Run by tools/environment.py, before Python modules of the environment are needed; here for --help.
     command("exec", None, "run any command inside the built environment: ./cube exec python -c '…'")
     return top
@@ -403,6 +218,10 @@ def main(arguments: list[str] | None = None) -> int:
         return int(options.run(options))
     except CubeError as error:
         print(f"cube: {error}", file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        # Not every command needs every library; those without a rosdep key are installed by hand.
+        print(f"cube: this command needs the Python module {error.name}: install it with pip", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

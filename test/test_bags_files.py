@@ -218,6 +218,7 @@ def test_cut_off_anywhere_is_repaired(bag, tmp_path):
             # topic by topic by the index: entries counts them against what the bag says
             assert sum(1 for connection in read.connections for _ in read.entries({connection.topic})) == complete
         kept = size - done.cut
+        assert kept == max(at for at, _ in flushed if at <= size)
         assert next(path.glob("*.mcap")).read_bytes()[:kept] == data[:kept]
         assert sum(one.stat().st_size for one in path.glob("*.rest")) == done.cut
         assert repair(path).cut == 0

@@ -145,7 +145,7 @@ class Driver(CubeNode):
         gathered = self._scan.take()
         most = MAX_SCANS * len(self._skin.cubes)
         for start in range(0, 0 if gathered is None else len(gathered.cube), most):
-            rows = Rows(*(column[start : start + most] for column in gathered or ()))
+            rows = Rows(*(column[start : start + most] for column in gathered or ()))  # type: ignore[arg-type]
             message = frequencies_message(rows, self._skin.parent_frame)
             if self._take is None or self._frequencies.get_subscription_count():
                 self._frequencies.publish(message)

@@ -19,8 +19,8 @@ from .recorder import DEPTH, message_class
 
 CLOCK_S = 0.01
 """Of real time, at least so often the clock is sent; and before every message."""
-DISCOVERY_S, LOOK_S = 1.0, 0.1
-"""Before the first message: no further subscriber has found the publishers for so long."""
+DISCOVERY_S, NOBODY_S, LOOK_S = 1.0, 3.0, 0.1
+"""Before the first message: no further subscriber has found the publishers for so long, or none at all."""
 MADE = (f"{PACKAGE}/msg/SkinStress", f"{PACKAGE}/msg/StressTensorStamped", "geometry_msgs/msg/WrenchStamped")
 """Types that a reconstruction makes, of topics that are left out unless stress is asked for."""
 
@@ -84,8 +84,8 @@ class Player:
         if start_ns > self._bag.end_ns:
             length = (self._bag.end_ns - self._bag.start_ns) / SECOND
             raise BagError(f"{self._bag.path}: --start {start_s:g}: the bag is {length:.3f} s long")
-        found, since = -1, time.monotonic()
-        while time.monotonic() - since < DISCOVERY_S and not self.stop.wait(LOOK_S):
+        found, since = 0, time.monotonic()
+        while time.monotonic() - since < (DISCOVERY_S if found else NOBODY_S) and not self.stop.wait(LOOK_S):
             now = sum(publisher.get_subscription_count() for publisher in self._publishers.values())
             if now != found:
                 found, since = now, time.monotonic()

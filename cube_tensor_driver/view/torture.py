@@ -197,6 +197,7 @@ def _run(options: Options, folder: Path, interrupted: threading.Event) -> dict[s
         "duration_s": options.duration,
         "seed": options.seed,
         **result,
+        "rows_lost_before_the_judge": watch.counters["rows published"] - reckoning.rows,
         "faults": _kinds(json.loads(book.read_text())),
         "counters": watch.counters,
         "threads_leaked": leaked,
@@ -213,8 +214,11 @@ class _Watch:
         self._waiting: deque[SkinStress] = deque()
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
-        node.create_subscription(SkinFrequencies, "frequencies", self._on_frequencies, queue(RATE))
-        node.create_subscription(SkinStress, "stress", self._on_stress, queue(RATE))
+        # Deeper than anybody else's: a judge that is held up must not blame the driver for it.
+        quality = queue(RATE)
+        quality.depth = 20_000
+        node.create_subscription(SkinFrequencies, "frequencies", self._on_frequencies, quality)
+        node.create_subscription(SkinStress, "stress", self._on_stress, quality)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
     def _on_frequencies(self, message: SkinFrequencies) -> None:
