@@ -28,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="./cube",
         description="Driver for cubic stress tensor sensors on ROS 2.",
-        formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=14, width=110),
+        formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=16, width=110),
     )
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
