@@ -2,8 +2,8 @@
 
     python test/fuzz_decoder.py CORPUS_FOLDER -max_total_time=60
 
-Any bytes, and sound frames around any payload: nothing may be raised, whatever is decoded encodes to one frame again, and
-the book adds up.
+Any bytes, and sound frames around any payload: nothing may be raised, whatever is decoded encodes to one frame again,
+and the book adds up.
 """
 
 from __future__ import annotations

@@ -66,22 +66,22 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     path = tmp_path / "bag"
     heard = running.listen(SkinFrequencies, "frequencies", 1000)
     recorder = cube("record", "-o", path)
-    running.wait(lambda: grown(path, 400_000))
+    running.wait(lambda: grown(path, 600_000))
     output = end(recorder)
-    running.wait(lambda: len(heard) > 100)
     assert recorder.returncode == 0 and "/frequencies" in output, output
     with Bag(path) as bag:
         assert {info.sender for info in bag.infos("/info")} == {"driver", "reconstruction"}
         recorded = [int(stamp) for batch, _ in bag.batches("/frequencies") for stamp in batch.stamp_ns]
         qos = {one.topic: one.ext.offered_qos_profiles[0].durability.name for one in bag.connections}
     assert qos["/info"] == "TRANSIENT_LOCAL" and qos["/frequencies"] == "VOLATILE"
+    running.wait(lambda: to_ns(heard[-1].header.stamp) >= recorded[-1])
     stamps = [to_ns(message.header.stamp) for message in heard]
     first, last = stamps.index(recorded[0]), stamps.index(recorded[-1])
     assert recorded == stamps[first : last + 1] and len(recorded) > 100
     reprocess(Job(path, tmp_path / "out", "bag", Change()))
     live, again = stress(path), stress(tmp_path / "out")
     common = live.keys() & again.keys()
-    assert len(common) > 100
+    assert len(common) > 50
     assert differing_bits({k: live[k] for k in common}, {k: again[k] for k in common}) == 0
 
 

@@ -433,7 +433,7 @@ def test_garbage_is_counted_and_no_frame_lost(start: Start, hub: PtyHub) -> None
 def test_other_version_is_named(start: Start, hub: PtyHub) -> None:
     watch = start(LinkConfig("a", hub.port))
     hub.expect(Command.HELLO)
-    body = bytes([1, 2, 4, 0]) + b"abcd"
+    body = bytes([1, 2, 5, 0]) + b"abcde"
     hub.send(b"\0" + cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0")
     hub.hello()
     watch.frame(Hello)

@@ -143,6 +143,19 @@ def test_one_pad_that_wanders_while_all_rest_is_drifting_and_still_used():
     assert not skin.health.state.any()
 
 
+def test_a_load_put_on_between_two_windows_is_no_drift():
+    skin = Skin(moving=False)
+    skin.play(health.WINDOW_S * 4)
+    start = skin.row
+
+    def load(frequency, row):
+        frequency[2] *= 1 + 0.01 * np.arange(8) / 8
+
+    skin.play(5, load)
+    assert start % round(health.WINDOW_S * 1e9 / PERIOD_NS) == 0
+    assert not skin.health.collect()[0].any()
+
+
 def test_a_residual_is_of_the_cube_and_has_hysteresis():
     skin = Skin()
 

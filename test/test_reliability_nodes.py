@@ -173,6 +173,8 @@ def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
     stage.zz()
     assert read_stress(stage.stress[-1])[1].status[0] == 0
     assert f"pad {pad} short" in stage.children.log("reconstruction")
+    stage.ros.wait(lambda: stage.says("stale: no rows any more"))  # nothing is sent now
+    stage.ros.wait(lambda: stage.says("no sample for"))
 
 
 def test_parameters_live(stage):

@@ -93,6 +93,7 @@ class Health:
         self._seen = np.zeros(self._shape, np.uint16)
         self._strained_seen = self.strained.copy()
         self._reference = np.full(self._shape, np.nan)
+        self._middle = np.full(self._shape, np.nan)  # means of the window before
         self._window_end: int | None = None
         self.history: deque[Window] = deque(maxlen=HISTORY)
         self.closed = 0
@@ -311,7 +312,11 @@ class Health:
             # What comes and goes shows a single value now and then, which is not stuck.
             found[(span == 0) & moving & (self.state & (OPEN | SHORT | RANGE) == 0)] |= STUCK
             healthy = self.state & LEFT_OUT == 0
-            self.still = enough & ((span < STILL * self.noise) | ~healthy | ~self._exists).all(axis=1)
+            # A step that falls between two windows shows in neither.
+            jumped = np.abs(middle - self._middle) > STILL * self.noise
+            unmoved = (span < STILL * self.noise) & ~jumped
+            self.still = enough & (unmoved | ~healthy | ~self._exists).all(axis=1)
+            self._middle = np.where(np.isnan(middle), self._middle, middle)
             self._reference[~self.still & (self._count > 0)] = np.nan
             fresh = self.still[:, None] & np.isnan(self._reference)
             self._reference[fresh] = middle[fresh]

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from transforms3d.quaternions import mat2quat
 
 from .modes import COMPONENTS, STRESS
 from .pipeline import INVALID, StressRows
-from .tensor import principal_stresses
+from .tensor import principal_stresses, quaternion_from_rotation
 
 # viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both read in grey.
 SEQUENTIAL = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
@@ -52,7 +51,7 @@ class Places(NamedTuple):
 
 def turns(rotation: np.ndarray) -> np.ndarray:
     """(N, 4) quaternions w, x, y, z of rotations (N, 3, 3). A loop: for once per skin, not per picture."""
-    return np.array([mat2quat(matrix) for matrix in rotation])
+    return np.array([np.roll(quaternion_from_rotation(matrix), 1) for matrix in rotation])
 
 
 class Newest:

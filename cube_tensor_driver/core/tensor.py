@@ -75,6 +75,12 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     return np.array([x, y, z, w]) * (1 if w >= 0 else -1)
 
 
+def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
+    """(4,) x, y, z, w of a rotation matrix (3, 3), w not negative."""
+    w, x, y, z = quaternions.mat2quat(np.asarray(rotation, dtype=float))
+    return np.array([x, y, z, w])
+
+
 def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
     """(3, 3) from x, y, z, w of any length but 0; CubeError for a zero or non-finite one."""
     x, y, z, w = np.asarray(quaternion, dtype=float)

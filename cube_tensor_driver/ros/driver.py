@@ -30,7 +30,7 @@ LEVELS = {
 }
 
 
-MAX_SCANS = 16
+MAX_SCANS = 4
 """Scans in one message at most: DDS keeps the largest message of each place in its queues for ever."""
 
 

@@ -197,7 +197,7 @@ def _run(options: Options, folder: Path, interrupted: threading.Event) -> dict[s
         "duration_s": options.duration,
         "seed": options.seed,
         **result,
-        "rows_lost_before_the_judge": watch.counters["rows published"] - reckoning.rows,
+        "rows_lost_before_the_judge": max(0, watch.counters["rows published"] - reckoning.rows),
         "faults": _kinds(json.loads(book.read_text())),
         "counters": watch.counters,
         "threads_leaked": leaked,
