@@ -16,6 +16,7 @@ def generate_launch_description() -> LaunchDescription:
         ),
         switch("simulate", "Simulate the skin's hubs on pseudo-terminals instead of opening its ports."),
         switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
+        switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),
         switch(
             "state_publisher", "Publish the cubes' frames (robot_state_publisher, URDF of the skin file)."

@@ -18,15 +18,15 @@ SKIN = share() / "config" / "skin_demo.yaml"
 
 
 def test_one_list_serves_launch_and_demo():
-    names = [process.executable for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True)]
-    assert names == ["simulator", "reconstruction", "driver", "markers"]
+    names = [process.executable for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True)]
+    assert names == ["simulator", "reconstruction", "driver", "markers", "contacts"]
     assert [process.executable for process in skin_processes(SKIN, composed=True)] == ["composed"]
     assert [process.executable for process in skin_processes(SKIN)] == ["reconstruction", "driver"]
 
 
 def test_every_executable_of_the_list_is_a_script_and_a_module():
     cmake = (ROOT / "CMakeLists.txt").read_text()
-    every = skin_processes(SKIN, simulated_ports=Path("p"), markers=True) + skin_processes(SKIN, composed=True)
+    every = skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True) + skin_processes(SKIN, composed=True)
     for process in every:
         script = ROOT / "scripts" / process.executable
         assert os.access(script, os.X_OK) and f"from {process.module} import main" in script.read_text()

@@ -18,7 +18,7 @@ from ..files.skin import Skin
 from .messages import Times, tensor_message, to_time, wrench_message
 
 ALL_AT_ONCE = 64
-"""Skins up to so many cubes announce all their topics; in larger ones a topic is announced once somebody asks for it."""
+"""Skins up to so many cubes announce all their topics; in larger ones a topic is announced once somebody asks."""
 COVARIANCES_KEPT = 4096
 DEPTH = 10
 

@@ -30,8 +30,8 @@ def switch(name: str, description: str) -> DeclareLaunchArgument:
 def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list[LaunchDescriptionEntity]:
     """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask for.
 
-    arguments: config and namespace; port, rate, simulate, composed, markers, record, rviz, state_publisher if the
-    launch file has them. ConfigError: the skin file or an argument is wrong.
+    arguments: config and namespace; port, rate, simulate, composed, markers, contacts, record, rviz, state_publisher
+    if the launch file has them. ConfigError: the skin file or an argument is wrong.
     """
     given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
     path = Path(given["config"]).expanduser().resolve()
@@ -51,6 +51,7 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
         rate=rate,
         composed=wanted("composed"),
         markers=wanted("markers") or wanted("rviz"),
+        contacts=wanted("contacts"),
         simulated_ports=Path(tempfile.mkdtemp(prefix="cube_ports_")) if wanted("simulate") else None,
     )
     # Nodes first: where one cannot be started launch gives up, and leaves what it has started already.

@@ -30,6 +30,7 @@ def skin_processes(
     rate: float = 0.0,
     composed: bool = False,
     markers: bool = False,
+    contacts: bool = False,
     simulated_ports: Path | None = None,
     book: Path | None = None,
     instants: int | None = None,
@@ -37,7 +38,7 @@ def skin_processes(
     """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
 
     port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
-    for the file's. composed: driver and reconstruction in one process. markers: the node that draws, too. book: where
+    for the file's. composed: driver and reconstruction in one process. markers, contacts: those nodes, too. book: where
     the simulator writes what it sampled; instants: see `simulation.main.Simulator`.
     """
     skin: dict[str, Value] = {"config": str(config)}
@@ -49,8 +50,9 @@ def skin_processes(
             Process("reconstruction", "cube_tensor_driver.ros.reconstruction", parameters=skin),
             Process("driver", "cube_tensor_driver.ros.driver", parameters=driver),
         ]
-    if markers:
-        processes.append(Process("markers", "cube_tensor_driver.ros.markers"))
+    for name, wanted in {"markers": markers, "contacts": contacts}.items():
+        if wanted:
+            processes.append(Process(name, f"cube_tensor_driver.ros.{name}"))
     if simulated_ports is not None:
         arguments = ["--config", str(config), "--ports", str(simulated_ports)]
         if book is not None:
