@@ -18,9 +18,7 @@ def generate_launch_description() -> LaunchDescription:
         switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
         switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),
-        switch(
-            "state_publisher", "Publish the cubes' frames (robot_state_publisher, URDF of the skin file)."
-        ),
+        switch("state_publisher", "Publish the cubes' frames (robot_state_publisher, URDF of the skin file)."),
         switch("record", "Record frequencies, stress and info into a bag with ros2 bag (mcap)."),
         switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
     ]

@@ -8,8 +8,8 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from conftest import ROOT
 
+from conftest import ROOT
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.files.skin import read_skin
 

@@ -1,4 +1,4 @@
-"""Set-up: what is missing is said before any work, a step that was interrupted is done again, nothing is left running."""
+"""Set-up: what is missing is said before any work, an interrupted step is done again, nothing is left running."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+
 from conftest import ROOT
 
 sys.path.insert(0, str(ROOT / "tools"))
@@ -89,15 +90,19 @@ def test_a_failed_step_shows_the_end_of_its_log(tmp_path):
 
 def test_an_interrupted_step_leaves_no_process(tmp_path):
     # A step with a child of its own that ignores SIGTERM, as compilers under colcon may.
-    grandchild = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"
+    grandchild = (
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"
+    )
     child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {grandchild!r}])"
     script = (
-        f"import sys, signal; sys.path.insert(0, {str(ROOT / 'tools')!r}); import environment; from pathlib import Path\n"
+        f"import sys, signal; sys.path.insert(0, {str(ROOT / 'tools')!r})\nimport environment; from pathlib import Path\n"
         "signal.signal(signal.SIGTERM, environment.interrupt)\n"
         f"environment.run([sys.executable, '-c', {child!r}], {{}}, Path({str(tmp_path / 'log')!r}),"
         " lambda line: print(line, end='', flush=True))"
     )
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
     watchdog = threading.Timer(30, process.kill)
     watchdog.start()
     try:
@@ -124,6 +129,8 @@ def test_help_needs_no_environment(tmp_path):
 def test_no_python_is_said_with_the_way_out(tmp_path):
     for name in ("sh", "dirname", "readlink", "cat"):
         (tmp_path / name).symlink_to(Path("/bin") / name if Path("/bin", name).exists() else Path("/usr/bin") / name)
-    done = subprocess.run([ROOT / "cube", "demo"], capture_output=True, text=True, check=False, env={"PATH": str(tmp_path)})
+    done = subprocess.run(
+        [ROOT / "cube", "demo"], capture_output=True, text=True, check=False, env={"PATH": str(tmp_path)}
+    )
     assert done.returncode == 1
     assert "no Python 3.10 to 3.13 found" in done.stderr and "sudo apt install" in done.stderr

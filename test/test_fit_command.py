@@ -1,4 +1,4 @@
-"""./cube fit and ./cube layout as a user runs them: tables in, calibration files and pictures out, one line per mistake."""
+"""./cube fit and ./cube layout as a user runs them: tables in, calibrations and pictures out, one line per mistake."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
 
+from conftest import ROOT
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -55,7 +55,18 @@ def write(path: Path, state: np.ndarray, frequency: np.ndarray, **change) -> Pat
 def test_a_bench_is_recovered_with_its_deviations(tmp_path):
     truth, state, frequency = bench(0, noise=0.001, loads=20, outliers=2)
     table = write(tmp_path / "loads.csv", state, frequency)
-    done = cube("fit", table, "--layout", "planar", "-o", tmp_path / "cal.yaml", "--json", tmp_path / "fit.json", "--uid", "0x2a")
+    done = cube(
+        "fit",
+        table,
+        "--layout",
+        "planar",
+        "-o",
+        tmp_path / "cal.yaml",
+        "--json",
+        tmp_path / "fit.json",
+        "--uid",
+        "0x2a",
+    )
     assert done.returncode == 0, done.stderr
     calibration = read_calibration(tmp_path / "cal.yaml")
     assert calibration.uid == 0x2A and calibration.symmetry == "full" and "loads.csv" in calibration.source

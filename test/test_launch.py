@@ -1,4 +1,4 @@
-"""Launch files: every argument described, the processes those of the one shared list, and a skin that starts and ends."""
+"""Launch files: every argument described, the processes of the one shared list, and a skin that starts and ends."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
 
+from conftest import ROOT
 from cube_tensor_driver.files.share import share
 from cube_tensor_driver.ros.start import skin_processes
 
@@ -18,7 +18,9 @@ SKIN = share() / "config" / "skin_demo.yaml"
 
 
 def test_one_list_serves_launch_and_demo():
-    names = [process.executable for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True)]
+    names = [
+        process.executable for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True)
+    ]
     assert names == ["simulator", "reconstruction", "driver", "markers", "contacts"]
     assert [process.executable for process in skin_processes(SKIN, composed=True)] == ["composed"]
     assert [process.executable for process in skin_processes(SKIN)] == ["reconstruction", "driver"]
@@ -26,7 +28,9 @@ def test_one_list_serves_launch_and_demo():
 
 def test_every_executable_of_the_list_is_a_script_and_a_module():
     cmake = (ROOT / "CMakeLists.txt").read_text()
-    every = skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True) + skin_processes(SKIN, composed=True)
+    every = skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True) + skin_processes(
+        SKIN, composed=True
+    )
     for process in every:
         script = ROOT / "scripts" / process.executable
         assert os.access(script, os.X_OK) and f"from {process.module} import main" in script.read_text()
@@ -67,4 +71,3 @@ def test_a_simulated_skin_starts_and_ends(domain):
         assert output.count("process has finished cleanly") == 3
     finally:
         process.kill()
-

@@ -47,8 +47,8 @@ def read_loads(path: Path, layout: Layout, area: float | None = None) -> Loads:
     ):
         if names:
             raise FitError(
-                f"{path}: columns {what}: {', '.join(map(repr, names))}; needed are the pads {', '.join(layout.pads)} and "
-                f"modes ({', '.join(modes.names)}) or forces ({', '.join(FORCE)})"
+                f"{path}: columns {what}: {', '.join(map(repr, names))}; needed are the pads {', '.join(layout.pads)} "
+                f"and modes ({', '.join(modes.names)}) or forces ({', '.join(FORCE)})"
             )
     column = {name: cells[:, header.index(name)] for name in header}
     by_force = [name for name in FORCE if name in header]

@@ -1,7 +1,7 @@
-"""The floor of the benchmark: bare rclpy publishing, and echoing, messages of the sizes that a skin sends. No work inside.
+"""The floor of the benchmark: bare rclpy publishing, and echoing, messages of a skin's sizes. No work inside.
 
-`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress; the same executor, the same quality of
-service, the same flat arrays as the real nodes.
+`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress; the same executor, the same
+quality of service, the same flat arrays as the real nodes.
 """
 
 from __future__ import annotations

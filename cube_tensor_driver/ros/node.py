@@ -154,7 +154,7 @@ class CubeNode(LifecycleNode):
 
 
 def run(make: Callable[[], Sequence[CubeNode]]) -> None:
-    """Run nodes, started in order, until SIGINT or SIGTERM, then end them in reverse; exit code 1 when one cannot start."""
+    """Run nodes, started in order, until SIGINT or SIGTERM, then end them in reverse; exit code 1: one cannot start."""
     stopping = False
 
     def stop(*_: object) -> None:

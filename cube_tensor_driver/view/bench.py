@@ -215,7 +215,13 @@ def _echo(cubes: int, rate: float, duration: float, progress: Progress) -> dict[
 
 
 def _measure(
-    processes: list[Process], children: Children, tally: Any, rate: float, duration: float, progress: Progress, what: str
+    processes: list[Process],
+    children: Children,
+    tally: Any,
+    rate: float,
+    duration: float,
+    progress: Progress,
+    what: str,
 ) -> tuple[dict[str, float], dict[str, float], tuple[int, int, float]]:
     """Start processes, wait for the first tensors, let them settle, measure for `duration`.
 

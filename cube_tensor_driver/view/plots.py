@@ -57,7 +57,9 @@ def draw_layout(layout: Layout) -> Figure:
         u, w = np.eye(3)[np.flatnonzero(normal == 0)] * layout.pad_size / 2
         outline = np.array([centre + a * u + b * w for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))])
         front = normal @ view > 0
-        axes.plot(*outline.T, color="C0" if front else "0.55", lw=1.2, ls="-" if front else "--", zorder=3 if front else 1)
+        axes.plot(
+            *outline.T, color="C0" if front else "0.55", lw=1.2, ls="-" if front else "--", zorder=3 if front else 1
+        )
         if front:
             from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -107,7 +109,9 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
     left.set(xscale="log", yscale="log", xlabel="cubes", ylabel="CPU per frame / µs")
     left.legend()
     for name, style in (("p50", "o-"), ("p99", "s--")):
-        right.plot(cubes, [row[f"latency_{name}_ms"] for row in rows], style, color="black", mfc="white", ms=5, label=name)
+        right.plot(
+            cubes, [row[f"latency_{name}_ms"] for row in rows], style, color="black", mfc="white", ms=5, label=name
+        )
     right.set(xscale="log", xlabel="cubes", ylabel="latency, pads read to tensor received / ms", ylim=(0, None))
     right.legend()
     return figure
