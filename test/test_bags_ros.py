@@ -76,6 +76,7 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     assert qos["/info"] == "TRANSIENT_LOCAL" and qos["/frequencies"] == "VOLATILE"
     running.wait(lambda: to_ns(heard[-1].header.stamp) >= recorded[-1])
     stamps = [to_ns(message.header.stamp) for message in heard]
+    assert {recorded[0], recorded[-1]} <= set(stamps), (recorded[0] - stamps[0], stamps[-1] - recorded[-1])
     first, last = stamps.index(recorded[0]), stamps.index(recorded[-1])
     assert recorded == stamps[first : last + 1] and len(recorded) > 50
     reprocess(Job(path, tmp_path / "out", "bag", Change()))

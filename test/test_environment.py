@@ -95,9 +95,11 @@ def test_an_interrupted_step_leaves_no_process(tmp_path):
     )
     child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {grandchild!r}])"
     script = (
-        f"import sys, signal; sys.path.insert(0, {str(ROOT / 'tools')!r})\nimport environment; from pathlib import Path\n"
+        f"import sys, signal; sys.path.insert(0, {str(ROOT / 'tools')!r})\n"
+        "import environment; from pathlib import Path\n"
         "signal.signal(signal.SIGTERM, environment.interrupt)\n"
-        f"environment.run([sys.executable, '-c', {child!r}], {{}}, Path({str(tmp_path / 'log')!r}),"
+        f"environment.run([sys.executable, '-c', {child!r}], {{}},"
+        f" Path({str(tmp_path / 'log')!r}),"
         " lambda line: print(line, end='', flush=True))"
     )
     process = subprocess.Popen(
