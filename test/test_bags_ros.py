@@ -65,6 +65,7 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     """Nothing lost against what another subscriber hears; and the pipeline gives the nodes' own bits again."""
     path = tmp_path / "bag"
     heard = running.listen(SkinFrequencies, "frequencies", 1000)
+    running.wait(lambda: heard)
     recorder = cube("record", "-o", path)
     running.wait(lambda: grown(path, 800_000))
     output = end(recorder)
@@ -76,7 +77,6 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     assert qos["/info"] == "TRANSIENT_LOCAL" and qos["/frequencies"] == "VOLATILE"
     running.wait(lambda: to_ns(heard[-1].header.stamp) >= recorded[-1])
     stamps = [to_ns(message.header.stamp) for message in heard]
-    assert {recorded[0], recorded[-1]} <= set(stamps), (recorded[0] - stamps[0], stamps[-1] - recorded[-1])
     first, last = stamps.index(recorded[0]), stamps.index(recorded[-1])
     assert recorded == stamps[first : last + 1] and len(recorded) > 50
     reprocess(Job(path, tmp_path / "out", "bag", Change()))
