@@ -16,6 +16,7 @@ from ..core.errors import ConfigError
 from ..files.share import share
 from ..files.skin import Skin, read_skin
 from ..files.urdf import skin_urdf
+from ..files.yaml import read_yaml, write_yaml
 from .start import Process, skin_processes
 
 TOPICS = ("frequencies", "stress", "info")
@@ -109,5 +110,10 @@ def _record(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
     prefix = f"/{namespace.strip('/')}/" if namespace else "/"
     command = ["ros2", "bag", "record", "--storage", "mcap", "-o", f"{skin.name}_bag"]
     overrides = share() / "config" / "record_qos.yaml"
+    if namespace:
+        # The file names topics without a namespace.
+        profiles = {prefix.rstrip("/") + topic: profile for topic, profile in read_yaml(overrides).items()}
+        overrides = Path(tempfile.mkdtemp(prefix="cube_record_")) / overrides.name
+        write_yaml(overrides, profiles)
     command += ["--qos-profile-overrides-path", str(overrides), *(prefix + topic for topic in TOPICS)]
     return _installed("ros2bag", ExecuteProcess(cmd=command, output="screen"))
