@@ -91,7 +91,10 @@ def test_killed_recordings_lose_less_than_a_second(running, tmp_path):
     for number in range(3):
         path = tmp_path / f"killed{number}"
         recorder = cube("record", "-o", path)
-        running.wait(lambda path=path, size=60_000 * (1 + number): grown(path, size))
+        # Reconstruction, this test and the recorder; each topic is discovered in its own time.
+        running.wait(lambda: running.node.count_subscribers("/frequencies") == 3)
+        enough = len(heard) + 200
+        running.wait(lambda path=path, enough=enough: len(heard) > enough and grown(path, 60_000))
         recorder.kill()
         recorder.communicate(timeout=10)
         latest = to_ns(heard[-1].header.stamp)
@@ -129,7 +132,14 @@ def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path):
         reconstruction(children)
         ros.wait(lambda: len(infos) == 1)
         player = cube("replay", path, "--clock", "--loop", "--rate", "2")
-        ros.wait(lambda: len(batches) >= 300 and len(infos) > 1)
+
+        def twice_round() -> bool:
+            """Two beginnings and a jump back seen; how much of the first round is heard is up to discovery."""
+            begun = [message for message in batches if to_ns(message.header.stamp) == START_NS]
+            now = [to_ns(message.clock) for message in clock]
+            return len(begun) >= 2 and len(infos) > 1 and min(np.diff(now), default=0) < 0
+
+        ros.wait(twice_round)
         assert "Traceback" not in end(player)
         assert player.returncode == 0
         children.check()
@@ -142,8 +152,6 @@ def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path):
         for name in ("stress", "gradient", "residual"):
             assert (getattr(rows, name).view(np.uint32) == one[name].view(np.uint32)).all()
         assert (rows.status == one["status"]).all()
-    stamps = [to_ns(message.header.stamp) for message in batches]
-    assert stamps[0] == START_NS and stamps.count(START_NS) >= 2
     now = [to_ns(message.clock) for message in clock]
     assert min(np.diff(now)) < -1_000_000_000  # the jump back
     assert all(START_NS <= one <= START_NS + 1_500_000_000 for one in now)

@@ -84,9 +84,10 @@ class Player:
         if start_ns > self._bag.end_ns:
             length = (self._bag.end_ns - self._bag.start_ns) / SECOND
             raise BagError(f"{self._bag.path}: --start {start_s:g}: the bag is {length:.3f} s long")
+        publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
         found, since = 0, time.monotonic()
         while time.monotonic() - since < (DISCOVERY_S if found else NOBODY_S) and not self.stop.wait(LOOK_S):
-            now = sum(publisher.get_subscription_count() for publisher in self._publishers.values())
+            now = sum(publisher.get_subscription_count() for publisher in publishers)
             if now != found:
                 found, since = now, time.monotonic()
         while not self.stop.is_set():
