@@ -40,6 +40,7 @@ NEEDED = {
     "yaml": "python3-yaml",
     "jsonschema": "python3-jsonschema",
     "rich": "python3-rich",
+    "psutil": "python3-psutil",
     "scipy": "python3-scipy",
     "matplotlib": "python3-matplotlib",
 }

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from lifecycle_msgs.msg import State
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
@@ -200,6 +199,3 @@ def make_executor() -> Any:
 
         return SingleThreadedExecutor()
     return EventsExecutor()
-
-
-ACTIVE = State.PRIMARY_STATE_ACTIVE
