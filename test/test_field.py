@@ -81,6 +81,28 @@ def test_cubes_without_a_tensor_are_filled_in_by_the_others():
     assert surface.contacts(values, 300.0) == []
 
 
+def test_weights_solved_anew_for_some_cubes_are_those_of_a_new_surface():
+    skin = flat(7, 7, 0.006)
+    surface, values = Surface(skin, DEPTH), measured(skin, 0.02, (1, 0, -3), np.zeros(2))
+    surface.contacts(values, 300.0)
+    values[10], values[30, 12:] = np.nan, np.nan
+    anew = Surface(skin, DEPTH)
+    (known,), (new,) = surface.contacts(values, 300.0), anew.contacts(values, 300.0)
+    np.testing.assert_array_equal(surface.field(values).pressure, anew.field(values).pressure)
+    np.testing.assert_array_equal(surface.uncertainty(values), anew.uncertainty(values))
+    np.testing.assert_array_equal(known.position, new.position)
+
+
+def test_a_contact_beside_cubes_of_which_nothing_is_known_is_finite():
+    skin = flat(20, 5, 0.006)
+    values = measured(skin, 0.012, (0.3, 0, -2), np.array([-0.03, 0.0]))
+    values[skin.position[:, 0] > 0.01] = np.nan
+    surface = Surface(skin, DEPTH)
+    assert np.isnan(surface.field(values).pressure).any()
+    (found,) = surface.contacts(values, 300.0)
+    assert found.normal_force == pytest.approx(2, rel=0.1) and np.isfinite(found.position).all()
+
+
 def test_contact_has_the_load_s_place_and_force():
     skin = flat(9, 9, 0.006)
     force, centre = np.array([0.6, -0.4, -3.0]), np.array([0.0023, -0.0031])

@@ -82,6 +82,8 @@ def test_health_says_doubtful_no_tensor_and_stale():
     newest.update(np.array([2]), rows(values[:1], INVALID | PAD_FAULT), 10.5)
     assert newest.health(10.6, 1.0).tolist() == [scene.FINE, scene.DOUBTFUL, scene.FAULTY, scene.STALE]
     assert newest.health(11.2, 1.0).tolist() == [scene.STALE, scene.DOUBTFUL, scene.FAULTY, scene.STALE]
+    believed = newest.believed(newest.health(10.6, 1.0))
+    assert np.isnan(believed).all(axis=1).tolist() == [False, False, True, True]
     crosses = scene.fault_crosses(places(4), newest.health(10.6, 1.0))
     assert (np.ptp(crosses[0], axis=1) == 0).all() and (np.ptp(crosses[1:], axis=2).max(axis=(1, 2)) > 0.004).all()
 

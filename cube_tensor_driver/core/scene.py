@@ -80,6 +80,10 @@ class Newest:
         health[now - self.arrived > stale] = STALE
         return health
 
+    def believed(self, health: np.ndarray) -> np.ndarray:
+        """(N, 15) the values, NaN where the health is FAULTY or STALE."""
+        return np.where((health < FAULTY)[:, None], self.values, np.nan)
+
 
 @dataclass(frozen=True)
 class Quantity:

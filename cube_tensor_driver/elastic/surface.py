@@ -17,12 +17,11 @@ of the layer above the cubes for the contact's force and centre.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -60,6 +59,23 @@ class Contact(NamedTuple):
     force_uncertainty: float
 
 
+class Weights:
+    """What makes points of cubes: matrix (M, cubes × width), its entries data (cubes, points, neighbours × width).
+
+    known (cubes, width): what they were solved for; doubt (cubes, points): relative uncertainty; blank (cubes,): none
+    of the neighbours has a value.
+    """
+
+    def __init__(self, near: NDArray[np.intp], points: int, known: NDArray[np.bool_]) -> None:
+        n, width = known.shape
+        columns = (near[:, :, None] * width + np.arange(width)).reshape(n, -1)
+        self.known, self.blank, self.doubt = known, np.zeros(n, bool), np.zeros((n, points // n))
+        self.data = np.zeros((n, points // n, columns.shape[1]))
+        place = np.repeat(columns, points // n, axis=0).ravel()
+        ends = np.arange(points + 1) * columns.shape[1]
+        self.matrix = csr_matrix((self.data.ravel(), place, ends), shape=(points, n * width), copy=False)
+
+
 class Surface:
     """Points of a skin's surface, `side` × `side` on each cube's patch, and the field on them.
 
@@ -73,7 +89,7 @@ class Surface:
             raise ElasticError(f"surface: depth {depth} m, {side} points a side; both must be greater than 0")
         self.places, self.depth, self.pitch = places, depth, places.pitch
         self.spacing = self.pitch / side
-        self.area = self.spacing**2
+        self.area, self._scale = self.spacing**2, 3.0 * depth
         offset = (np.arange(side) - (side - 1) / 2) * self.spacing
         grid = np.stack([*(a.ravel() for a in np.meshgrid(offset, offset)), np.zeros(side**2)], axis=1)
         patches = places.position[:, None] + np.einsum("nij,qj->nqi", places.rotation, grid)
@@ -85,20 +101,18 @@ class Surface:
         # of cubes equally far the first ones, not those that rounding favours
         order = np.lexsort((near, (apart / self.pitch).round(6)))[:, :count]
         self._near = np.take_along_axis(near, order, axis=1)
-        self._gradients = gradients
+        self._columns = PRESSURE if gradients else PRESSURE[:1]
         pairs = cKDTree(self.points).query_pairs(1.5 * self.spacing, output_type="ndarray")
         self._from, self._to = pairs.T
-        self._weights = lru_cache(maxsize=4)(self._make_weights)
+        self._solved: dict[tuple[int, ...], Weights] = {}
 
     def field(self, values: Array) -> Field:
         """The field of values (cubes, 15), NaN where not observed; such a cube is filled in by the others. O(M)."""
-        pressure, _ = self._interpolate(values[:, PRESSURE if self._gradients else PRESSURE[:1]])
-        shear = [self._interpolate(values[:, [column]])[0] for column in SHEAR]
-        return Field(-pressure, np.stack(shear, axis=1))
+        return Field(self._pressure(values), self._shear(values))
 
     def uncertainty(self, values: Array) -> Array:
         """(M,) standard deviation of the pressure between the cubes, as a part of its own size (0 .. 1)."""
-        return self._interpolate(values[:, PRESSURE if self._gradients else PRESSURE[:1]])[1]
+        return self._weights(np.isfinite(values), self._columns).doubt.ravel()
 
     def contacts(self, values: Array, least: float) -> list[Contact]:
         """Where pressure exceeds `least` Pa and FLOOR of the greatest: the strongest first; see Contact.
@@ -106,32 +120,45 @@ class Surface:
         The layer above the cubes is in equilibrium: the pressure's integral is the force, its first moment is that of
         the load plus depth × shear force, which is taken off again. For the moment pressure and shear are interpolated
         alike, by values: below a point force (σzx, σyz, σzz) points away from it in an incompressible body, so that
-        each cube by itself gives the place, and any common weights do. Each point counts for the contact nearest to it.
+        each cube by itself gives the place, and any common weights do. Each patch counts for the contact nearest to it.
         What spreads beyond the skin is lost: hardly any pressure, of shear about 1.5 depth / distance to the edge.
         """
-        field = self.field(values)
-        top = float(field.pressure.max(initial=0.0))
-        inside = field.pressure > max(least, FLOOR * top)
+        # Where no cube around has a value nothing presses that we know of.
+        pressure = np.nan_to_num(self._pressure(values))
+        inside = pressure > max(least, FLOOR * float(pressure.max()))
         if not inside.any():
             return []
-        joined = inside[self._from] & inside[self._to]
-        n = len(self.points)
-        links = coo_matrix((np.ones(joined.sum()), (self._from[joined], self._to[joined])), shape=(n, n))
-        label = connected_components(links, directed=False)[1][inside]
-        owner = label[cKDTree(self.points[inside]).query(self.points)[1]] if np.ptp(label) else np.full(n, label[0])
-        doubt, alike = self.uncertainty(values), -self._interpolate(values[:, PRESSURE[:1]])[0]
+        label = self._parts(inside)
+        # Each patch counts for the contact nearest to its cube, points of a contact for their own.
+        own = cKDTree(self.points[inside]).query(self.places.position)[1]
+        owner = label[own][self.cube]
+        owner[inside] = label
+        field = Field(pressure, np.nan_to_num(self._shear(values)))
+        doubt, alike = self.uncertainty(values), -np.nan_to_num(self._interpolate(values, PRESSURE[:1]))
         sheared = bool(np.isfinite(values[:, SHEAR]).any())
         found = [self._contact(np.flatnonzero(owner == k), field, alike, doubt, sheared) for k in np.unique(label)]
         return sorted(found, key=lambda contact: -contact.normal_force)
 
+    def _parts(self, inside: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """Number of the connected part of each of the points `inside`."""
+        joined = inside[self._from] & inside[self._to]
+        number, n = np.cumsum(inside) - 1, np.count_nonzero(inside)
+        links = coo_matrix(
+            (np.ones(joined.sum()), (number[self._from[joined]], number[self._to[joined]])), shape=(n, n)
+        )
+        labels: NDArray[np.int32] = connected_components(links, directed=False)[1]
+        return labels
+
     def _contact(self, mine: NDArray[np.intp], field: Field, alike: Array, doubt: Array, sheared: bool) -> Contact:
         pressure, points, cubes = field.pressure[mine], self.points[mine], self.cube[mine]
-        turn = self.places.rotation[cubes]
-        weight = pressure * self.area
-        normal_force = float(weight.sum())
-        normal = np.einsum("n,ni->i", weight, turn[:, :, 2])
+
+        def per_cube(x: Array) -> Array:
+            return np.bincount(cubes, x * self.area, len(self.places.position)).astype(float)
+
+        normal_force = float(pressure.sum() * self.area)
+        normal = per_cube(pressure) @ self.places.rotation[:, :, 2]
         normal /= np.linalg.norm(normal)
-        shear = np.einsum("nij,nj->i", turn[:, :, :2], np.nan_to_num(field.shear[mine])) * self.area
+        shear = sum(per_cube(field.shear[mine, k]) @ self.places.rotation[:, :, k] for k in (0, 1))
         shear -= normal * (shear @ normal)
         moment = alike[mine] * self.area
         centre = moment @ points / moment.sum()
@@ -151,39 +178,50 @@ class Surface:
             float(np.sqrt(together * (sigma**2).sum())),
         )
 
-    def _interpolate(self, data: Array) -> tuple[Array, Array]:
-        """On all points: interpolated first column and its relative uncertainty; data (cubes, 1 or 3)."""
-        scaled = data * np.array([1.0, self._scale, self._scale])[: data.shape[1]]
-        known = np.isfinite(scaled)
-        weights, doubt = self._weights(known.tobytes(), scaled.shape[1])
-        near = np.nan_to_num(scaled)[self._near].reshape(len(data), -1)
-        value = np.matmul(weights, near[:, :, None])[..., 0].ravel()
-        empty = ~known[self._near, 0].any(axis=1)  # none of the neighbours has a value
-        return np.where(empty[self.cube], np.nan, value), doubt
+    def _pressure(self, values: Array) -> Array:
+        return -self._interpolate(values, self._columns)
 
-    @property
-    def _scale(self) -> float:
-        return 3.0 * self.depth
+    def _shear(self, values: Array) -> Array:
+        return np.stack([self._interpolate(values, [column]) for column in SHEAR], axis=1)
 
-    def _make_weights(self, known_bytes: bytes, width: int) -> tuple[Array, Array]:
-        """Weights (cubes, points of a patch, neighbours × width) and relative uncertainty (M,)."""
-        n, k = self._near.shape
-        known = np.frombuffer(known_bytes, bool).reshape(n, width)[self._near].reshape(n, k * width)
-        places = self.places.position[self._near] / self._scale
-        axes = np.swapaxes(self.places.rotation[:, :, :2], 1, 2)[self._near]  # (n, k, 2, 3)
-        if width == 1:
-            axes = axes[:, :, :0]
-        points = self.points.reshape(n, -1, 3) / self._scale
+    def _interpolate(self, values: Array, columns: list[int]) -> Array:
+        """(M,) the first of the columns of values (cubes, 15) on all points; the others are its gradient."""
+        known = np.isfinite(values)
+        weights = self._weights(known, columns)
+        scale = np.array([1.0, self._scale, self._scale])[: len(columns)]
+        value: Array = weights.matrix @ (np.where(known, values, 0)[:, columns] * scale).ravel()
+        value[np.repeat(weights.blank, value.size // weights.blank.size)] = np.nan
+        return value
+
+    def _weights(self, known: NDArray[np.bool_], columns: list[int]) -> Weights:
+        """Weights of these columns; they depend on what is known alone, and are solved anew where that has changed."""
+        mine = known[:, columns]
+        if tuple(columns) not in self._solved:
+            self._solved[tuple(columns)] = Weights(self._near, len(self.points), ~mine)
+        solved = self._solved[tuple(columns)]
+        if not np.array_equal(mine, solved.known):
+            changed = np.flatnonzero((mine != solved.known)[self._near].any(axis=(1, 2)))
+            solved.data[changed], solved.doubt[changed] = self._solve(changed, mine)
+            solved.known, solved.blank = mine, ~mine[self._near, 0].any(axis=1)
+        return solved
+
+    def _solve(self, patches: NDArray[np.intp], known: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Weights (patches, points of a patch, neighbours × width) and relative uncertainty (patches, points)."""
+        near, n, width = self._near[patches], len(patches), known.shape[1]
+        size = near.shape[1] * width
+        seen = known[near].reshape(n, size)
+        places = self.places.position[near] / self._scale
+        axes = np.swapaxes(self.places.rotation[:, :, : width - 1], 1, 2)[near]  # (n, k, 2 or 0, 3)
+        points = self.points.reshape(len(self._near), -1, 3)[patches] / self._scale
         matrix = _covariance(places[:, :, None] - places[:, None], axes[:, :, None], axes[:, None])
-        matrix = np.moveaxis(matrix, 3, 2).reshape(n, k * width, k * width)
-        matrix *= known[:, :, None] & known[:, None]
-        matrix[:, np.arange(k * width), np.arange(k * width)] += np.where(known, RIDGE, 1.0)
+        matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
+        matrix *= seen[:, :, None] & seen[:, None]
+        matrix[:, np.arange(size), np.arange(size)] += np.where(seen, RIDGE, 1.0)
         none = np.zeros((n, points.shape[1], 1, 0, 3))
         to_points = _covariance(points[:, :, None] - places[:, None], none, axes[:, None])
-        to_points = to_points.reshape(n, -1, k * width) * known[:, None]
+        to_points = to_points.reshape(n, -1, size) * seen[:, None]
         weights = np.swapaxes(np.linalg.solve(matrix, np.swapaxes(to_points, 1, 2)), 1, 2)
-        doubt = np.sqrt(np.clip(1 - np.einsum("nqd,nqd->nq", weights, to_points), 0, 1)).ravel()
-        return np.ascontiguousarray(weights), doubt
+        return weights, np.sqrt(np.clip(1 - np.einsum("nqd,nqd->nq", weights, to_points), 0, 1))
 
 
 def _covariance(d: Array, u: Array, v: Array) -> Array:

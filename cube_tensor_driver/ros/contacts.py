@@ -8,56 +8,31 @@ from numpy.typing import NDArray
 from cube_tensor_driver.msg import SkinContacts
 
 from ..elastic.surface import Contact, Surface
-from .follow import Follower
-from .messages import Times
-from .node import CubeNode, run
+from .follow import FollowerNode
+from .node import run
 
 
-class Contacts(CubeNode):
+class Contacts(FollowerNode):
     """Publishes `contacts` for the newest `stress`, at most `rate` times a second; empty arrays: nothing presses."""
 
     def __init__(self) -> None:
-        super().__init__("contacts")
-        self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
-        self.declare("rate", 20.0, "Most messages per second.", (0.1, 1000.0))
+        super().__init__("contacts", SkinContacts, 10)
         self.declare("depth", 0.004, "From the cubes' centres to the skin's surface, m.", (1e-5, 1.0))
         self.declare("least", 300.0, "Pressure at the cubes that counts as contact, Pa.", (0.0, 1e9))
-        self._active = False
 
-    def configure(self) -> None:
-        self._surface: Surface | None = None
-        self._newest: Times | None = None
-        self._follower = Follower(self, self._new_skin, self._new_rows)
-        self._publisher = self.create_lifecycle_publisher(SkinContacts, "contacts", 10)
-        self._timer = self.create_timer(1.0 / self.value("rate"), self._publish)
+    def new_skin(self) -> None:
+        self._surface, self._said = Surface(self.follower.places, self.value("depth")), None
 
-    def activate(self) -> None:
-        self._active = True
-
-    def deactivate(self) -> None:
-        self._active = False
-
-    def cleanup(self) -> None:
-        if hasattr(self, "_timer"):
-            self.destroy_timer(self._timer)
-            self._follower.close()
-            self.destroy_publisher(self._publisher)
-            del self._timer
-
-    def _new_skin(self) -> None:
-        self._surface = Surface(self._follower.places, self.value("depth"))
-
-    def _new_rows(self, times: Times, _: object) -> None:
-        self._newest = times
-
-    def _publish(self) -> None:
-        times, self._newest = self._newest, None
-        if not self._active or self._surface is None or times is None or not self._publisher.get_subscription_count():
-            return
-        message = contacts_message(self._surface.contacts(self._follower.newest.values, self.value("least")))
-        message.header.stamp = times.header.stamp
-        message.header.frame_id = self._follower.info.header.frame_id
-        self._publisher.publish(message)
+    def message(self) -> SkinContacts | None:
+        stamp = self.follower.stamp
+        if stamp is self._said:
+            return None
+        self._said = stamp
+        values = self.follower.newest.believed(self.follower.health())
+        message = contacts_message(self._surface.contacts(values, self.value("least")))
+        message.header.stamp = stamp
+        message.header.frame_id = self.follower.info.header.frame_id
+        return message
 
 
 def contacts_message(contacts: list[Contact]) -> SkinContacts:

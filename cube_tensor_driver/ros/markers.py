@@ -16,8 +16,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ..core import scene
 from ..core.errors import ConfigError
-from .follow import Follower
-from .node import CubeNode, run
+from .follow import FollowerNode
+from .node import run
 
 LEGEND_BYTES = 160
 LIFETIME_S = 2
@@ -39,53 +39,32 @@ class Drawn(NamedTuple):
     colours: np.ndarray
 
 
-class Markers(CubeNode):
+class Markers(FollowerNode):
     """Publishes `markers`: cubes coloured by a quantity, traction and gradient arrows, crosses over faulty cubes."""
 
     def __init__(self) -> None:
-        super().__init__("markers")
-        self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
-        self.declare("rate", 20.0, "Pictures per second.", (0.1, 100.0))
+        super().__init__("markers", MarkerArray, 2)
         self.declare("quantity", "pressure", "What the colours mean.", choices=", ".join(scene.QUANTITIES))
         self.declare("range", 0.0, "Top of the colours' range, SI; 0: follows what is there.", (0.0, 1e9))
         self.declare("crosses", False, "Draw the principal stresses of each cube as a cross.")
-        self._active = False
 
     def configure(self) -> None:
         name = self.value("quantity")
         if name not in scene.QUANTITIES:
             raise ConfigError(f"parameter quantity is {name!r}, allowed: {', '.join(scene.QUANTITIES)}")
         self._quantity = scene.QUANTITIES[name]
-        self._top = self._longest = self._steepest = 0.0
-        self._canvas: Canvas | None = None
-        self._follower = Follower(self, self._new_skin)
-        self._publisher = self.create_lifecycle_publisher(MarkerArray, "markers", 2)
-        self._timer = self.create_timer(1.0 / self.value("rate"), self._draw)
+        super().configure()
 
-    def activate(self) -> None:
-        self._active = True
-
-    def deactivate(self) -> None:
-        self._active = False
-
-    def cleanup(self) -> None:
-        if hasattr(self, "_timer"):
-            self.destroy_timer(self._timer)
-            self._follower.close()
-            self.destroy_publisher(self._publisher)
-            del self._timer
-
-    def _new_skin(self) -> None:
-        places = self._follower.places
+    def new_skin(self) -> None:
+        places = self.follower.places
         self._pitch = places.pitch
-        self._canvas = Canvas(self._follower.info.header.frame_id, places, self._pitch, self.value("crosses"))
+        self._canvas = Canvas(self.follower.info.header.frame_id, places, self._pitch, self.value("crosses"))
+        self._top = self._longest = self._steepest = 0.0
 
-    def _draw(self) -> None:
-        if not self._active or self._canvas is None or not self._publisher.get_subscription_count():
-            return
-        canvas, places, newest = self._canvas, self._follower.places, self._follower.newest
-        health = self._follower.health()
-        values = np.where((health < scene.FAULTY)[:, None], newest.values, np.nan)
+    def message(self) -> bytes:
+        canvas, places, newest = self._canvas, self.follower.places, self.follower.newest
+        health = self.follower.health()
+        values = newest.believed(health)
         shown = self._quantity.of(values, newest.residual)
         self._top = float(self.value("range")) or scene.automatic(self._quantity, shown, self._top)
         canvas.colour_cubes(scene.colours(self._quantity, shown, self._top))
@@ -107,7 +86,7 @@ class Markers(CubeNode):
         bar = np.linspace(-self._top if self._quantity.signed else 0.0, self._top, BAR)
         canvas["legend bar"].colours[:, :3] = scene.colours(self._quantity, bar, self._top)
         canvas.write(self._legend(health))
-        self._publisher.publish(bytes(canvas.message))
+        return bytes(canvas.message)
 
     def _legend(self, health: np.ndarray) -> str:
         quantity = self._quantity

@@ -182,7 +182,7 @@ class Page:
     def draw(self, newest: Newest, health: np.ndarray) -> None:
         """Colours, arrows, crosses, carpet."""
         places, quantity = self._places, self.quantity
-        values = np.where((health < scene.FAULTY)[:, None], newest.values, np.nan)
+        values = newest.believed(health)
         shown = quantity.of(values, newest.residual)
         self._top = self._range.value * quantity.size or scene.automatic(quantity, shown, self._top)
         shear, gradient = QUANTITIES["shear"], QUANTITIES["gradient"]
@@ -222,9 +222,8 @@ class Page:
     def write(self, newest: Newest, health: np.ndarray, rate: np.ndarray, history: History, facts: Facts) -> None:
         """Status, legend, contact, the selected cube's numbers and plots, health."""
         k = self.selected
-        live = bool((health < scene.FAULTY).any())
         if not self._paused:
-            self._load = next(iter(self._surface.contacts(newest.values, LEAST_PA)), None) if live else None
+            self._load = next(iter(self._surface.contacts(newest.believed(health), LEAST_PA)), None)
         hertz = float(np.nanmax(rate, initial=0.0))
         self._head.content = markup.head(health, hertz, self._load, self._paused, facts.recording)
         self._action.content = markup.box(escape(facts.action)) if facts.action else ""
