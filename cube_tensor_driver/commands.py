@@ -37,9 +37,12 @@ def config_grid(options: argparse.Namespace) -> int:
 def config_check(options: argparse.Namespace) -> int:
     from collections import Counter
 
-    from .files.skin import read_skin
+    from .files.skin import check_skin
 
-    skin = read_skin(options.file)
+    skin, mistakes = check_skin(options.file)
+    if skin is None:
+        print("\n".join(f"cube: {options.file}: {mistake}" for mistake in mistakes), file=sys.stderr)
+        return 1
     layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
     kinds = ", ".join(f"{count} {name}" for name, count in layouts.items())
     rate = "as the hubs have it" if skin.rate is None else f"{skin.rate:g} Hz"

@@ -61,4 +61,8 @@ def test_check_says_what_is_wrong(tmp_path):
     path = tmp_path / "skin.yaml"
     path.write_text("name: skin\nlinks: []\n")
     done = cube("config", "check", path)
-    assert done.returncode == 1 and "Traceback" not in done.stderr and str(path) in done.stderr
+    assert done.returncode == 1 and done.stdout == ""
+    assert done.stderr.splitlines() == [
+        f"cube: {path}: top level: the key 'parent_frame', 'cubes' is missing",
+        f"cube: {path}: links: found [], allowed: a list of links, at least one",
+    ]

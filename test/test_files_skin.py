@@ -12,7 +12,7 @@ from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.files.calibration import read_calibration
 from cube_tensor_driver.files.grid import grid
 from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.files.skin import check_skin, read_skin
 from cube_tensor_driver.files.yaml import parse_yaml, write_yaml
 
 GOOD = grid("skin", 3, 2, 0.012, 2, "planar", "planar", 100.0, "/dev/ttyACM{}")
@@ -72,11 +72,17 @@ def change(*path, to=None, remove=False):
     [
         (change("speed", to=3), ["top level", "unknown key 'speed'", "allowed: name, parent_frame"]),
         (change("links", 0, "prot", to="x"), ["links[0]", "'prot'", "name, port, baud"]),
-        (change("cubes", 3, "pose", "xyz", to=[1, 2]), ["cubes[3].pose.xyz", "found [1, 2]", "three numbers"]),
+        (change("cubes", 3, "pose", "xyz", to=[1, 2]), ["cubes[3].pose.xyz", "found [1, 2]", "three finite numbers"]),
         (change("cubes", 1, "index", to="two"), ["cubes[1].index", "'two'", "integer from 0 to 65535"]),
         (change("cubes", 1, "index", to=-1), ["cubes[1].index", "found -1", "0 to 65535"]),
         (change("cubes", 2, "name", to="c 2"), ["cubes[2].name", "'c 2'", "letters, digits"]),
         (change("cubes", 2, "name", to="c1"), ["cubes", "name 'c1' is there twice"]),
+        (change("cubes", 2, "name", to="c2\n"), ["cubes[2].name", "letters, digits"]),
+        (change("cubes", 2, "name", to="c" * 65), ["cubes[2].name", "at most 64"]),
+        (change("cubes", 2, "name", to="2c"), ["cubes[2].name", "a letter first"]),
+        (change("name", to="haut_ß"), ["name: found 'haut_ß'", "letters, digits"]),
+        (change("parent_frame", to="/base"), ["parent_frame", "'/base'", "a letter first"]),
+        (change("links", 1, "name", to="hub0"), ["links", "name 'hub0' is there twice"]),
         (change("cubes", 2, "link", to="hub9"), ["cubes[2].link", "'hub9'", "hub0, hub1"]),
         (change("cubes", 2, "index", to=1), ["link and index 'hub0', 1 is there twice"]),
         (change("cubes", 2, "uid", to=5), ["cubes[2]", "both uid and index"]),
@@ -87,7 +93,7 @@ def change(*path, to=None, remove=False):
         (change("parent_frame", remove=True), ["'parent_frame' is missing"]),
         (change("rate", to=0), ["rate", "found 0", "0.1 to 10000"]),
         (change("rate", to=float("nan")), ["rate", "found nan"]),
-        (change("cubes", 0, "pose", "rpy", to=[0.0, float("inf"), 0.0]), ["cubes[0].pose", "finite"]),
+        (change("cubes", 0, "pose", "rpy", to=[0.0, float("inf"), 0.0]), ["pose.rpy[1]", "found inf", "finite"]),
     ],
 )  # fmt: skip
 def test_one_message_per_mistake(tmp_path, break_it, words):
@@ -100,6 +106,49 @@ def test_one_message_per_mistake(tmp_path, break_it, words):
     for word in words:
         assert word in text
     assert "\n" not in text
+
+
+def test_uids_once_in_any_spelling(tmp_path):
+    data = copy.deepcopy(GOOD)
+    for number, uid in ((1, 0x1F), (4, "0x1F")):
+        del data["cubes"][number]["index"]
+        data["cubes"][number]["uid"] = uid
+    for link in data["links"]:
+        link["hub_uid"] = 7
+    with pytest.raises(ConfigError, match=r"hub_uid 0x7 is there twice; .* \(and 1 more: ./cube config check"):
+        read(tmp_path, data)
+    path = tmp_path / "skin.yaml"
+    assert check_skin(path)[1] == [
+        "links: the hub_uid 0x7 is there twice; keep one",
+        "cubes: the uid 0x1f is there twice; keep one",
+    ]
+
+
+def test_every_mistake_is_told_at_once(tmp_path):
+    data = copy.deepcopy(GOOD)
+    del data["parent_frame"]
+    data["links"][1]["baud"] = 3
+    data["cubes"][0]["name"] = "c 0"
+    data["cubes"][1]["calibration"] = "nope"
+    data["cubes"][2]["layout"] = "cube"
+    data["cubes"][5]["name"] = "c4"
+    path = tmp_path / "skin.yaml"
+    path.write_text(yaml.safe_dump(data))
+    skin, mistakes = check_skin(path)
+    assert skin is None
+    for line, start in zip(
+        mistakes,
+        [
+            "top level: the key 'parent_frame'",
+            "cubes[0].name",
+            "links[1].baud",
+            "cubes[1].calibration",
+            "cubes[2].layout",
+            "cubes: the name 'c4'",
+        ],
+        strict=True,
+    ):
+        assert line.startswith(start)
 
 
 @pytest.mark.parametrize(

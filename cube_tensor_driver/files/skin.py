@@ -1,117 +1,63 @@
 """Skin files: which links there are, which cubes they carry, where the cubes sit, how they are calibrated.
 
-docs/config.md describes the keys. A file is checked whole before anything starts: `ConfigError` gives file, key, what
-was found and what is allowed.
+docs/config.md describes the keys. A file is checked whole before anything starts: every mistake is one line with file,
+key, what was found and what is allowed.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jsonschema
-
 from ..core.calibration import Calibration
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, CubeError
 from .calibration import find_calibration, read_calibration
+from .schema import NAME, TEXT, TRIPLE, Schema, real, several, table
 from .yaml import read_yaml
 
-_NAME = {
-    "type": "string",
-    "pattern": "^[A-Za-z][A-Za-z0-9_]*$",
-    "description": "a name of letters, digits and _, a letter first",
-}
 _FRAME = {
     "type": "string",
-    "pattern": "^[A-Za-z][A-Za-z0-9_/]*$",
-    "description": "a frame id of letters, digits, _ and /",
-}
-_TEXT = {"type": "string", "minLength": 1, "description": "a text that is not empty"}
-_TRIPLE = {
-    "type": "array",
-    "items": {"type": "number", "description": "a number"},
-    "minItems": 3,
-    "maxItems": 3,
-    "description": "three numbers",
+    "pattern": r"^[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z",
+    "description": "a frame id of letters, digits, _ and /, a letter first",
 }
 # An integer, or a text such as 0x1f because uids are hexadecimal on labels.
 _UID = {
     "anyOf": [
         {"type": "integer", "minimum": 1, "maximum": 2**64 - 1},
-        {"type": "string", "pattern": "^0x[0-9a-fA-F]{1,16}$"},
+        {"type": "string", "pattern": r"^0x(?!0+\Z)[0-9a-fA-F]{1,16}\Z"},
     ],
     "description": "a uid: 1 to 2^64 - 1, or hexadecimal as in 0x1f",
 }
-
-
-def _object(required: Iterable[str], properties: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "type": "object",
-        "required": list(required),
-        "properties": properties,
-        "additionalProperties": False,
-        "description": "the keys " + ", ".join(properties),
-    }
-
-
-def _several(item: dict[str, Any], what: str) -> dict[str, Any]:
-    return {"type": "array", "items": item, "minItems": 1, "description": f"a list of {what}, at least one"}
-
-
-SCHEMA = _object(
-    ("name", "parent_frame", "links", "cubes"),
+_INDEX = {"type": "integer", "minimum": 0, "maximum": 65535, "description": "an integer from 0 to 65535"}
+_BAUD = {"type": "integer", "minimum": 1200, "maximum": 20_000_000, "description": "1200 to 20000000"}
+_LINK = table(("name", "port"), {"name": NAME, "port": TEXT, "baud": _BAUD, "hub_uid": _UID})
+_CUBE = table(
+    ("name", "pose", "layout", "calibration"),
     {
-        "name": _NAME,
-        "parent_frame": _FRAME,
-        "rate": {
-            "type": "number",
-            "minimum": 0.1,
-            "maximum": 10_000,
-            "description": "samples per second, 0.1 to 10000",
-        },
-        "links": _several(
-            _object(
-                ("name", "port"),
-                {
-                    "name": _NAME,
-                    "port": _TEXT,
-                    "baud": {
-                        "type": "integer",
-                        "minimum": 1200,
-                        "maximum": 20_000_000,
-                        "description": "1200 to 20000000",
-                    },
-                    "hub_uid": _UID,
-                },
-            ),
-            "links",
-        ),
-        "cubes": _several(
-            _object(
-                ("name", "pose", "layout", "calibration"),
-                {
-                    "name": _NAME,
-                    "link": _NAME,
-                    "index": {
-                        "type": "integer",
-                        "minimum": 0,
-                        "maximum": 65535,
-                        "description": "an integer from 0 to 65535",
-                    },
-                    "uid": _UID,
-                    "pose": _object(("xyz", "rpy"), {"xyz": _TRIPLE, "rpy": _TRIPLE}),
-                    "layout": _TEXT,
-                    "calibration": _TEXT,
-                },
-            ),
-            "cubes",
-        ),
+        "name": NAME,
+        "link": NAME,
+        "index": _INDEX,
+        "uid": _UID,
+        "pose": table(("xyz", "rpy"), {"xyz": TRIPLE, "rpy": TRIPLE}),
+        "layout": TEXT,
+        "calibration": TEXT,
     },
 )
-_VALIDATOR = jsonschema.Draft7Validator(SCHEMA)
+_SCHEMA = Schema(
+    table(
+        ("name", "parent_frame", "links", "cubes"),
+        {
+            "name": NAME,
+            "parent_frame": _FRAME,
+            "rate": real("samples per second, 0.1 to 10000", minimum=0.1, maximum=10_000),
+            "links": several(_LINK, "links"),
+            "cubes": several(_CUBE, "cubes"),
+        },
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -162,92 +108,94 @@ class Skin:
 
 
 def read_skin(path: Path) -> Skin:
-    """Read and check a skin file. ConfigError names file, key, what was found and what is allowed."""
+    """Read and check a skin file.
+
+    ConfigError: the first mistake (file, key, what was found, what is allowed) and how many more there are.
+    """
+    skin, mistakes = check_skin(path)
+    if skin is None:
+        more = f" (and {len(mistakes) - 1} more: ./cube config check {path})" if len(mistakes) > 1 else ""
+        raise ConfigError(f"{path}: {mistakes[0]}{more}")
+    return skin
+
+
+def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
+    """The skin of a file and no mistakes, or None and every mistake, one line each. ConfigError: it cannot be read."""
     data = read_yaml(path)
-    _check_schema(data, path)
+    found = _SCHEMA.mistakes(data)
+    mistakes = [line for _, line in found]
+    if not isinstance(data, dict) or not all(isinstance(data.get(key), list) for key in ("links", "cubes")):
+        return None, mistakes
+    # Where an entry is malformed the others are looked at all the same.
+    wrong = {where[:2] for where, _ in found}
     links = tuple(
         SkinLink(link["name"], link["port"], link.get("baud", 921_600), _uid(link.get("hub_uid")))
-        for link in data["links"]
+        for number, link in enumerate(data["links"])
+        if ("links", number) not in wrong
     )
-    _check_unique(((link.name,) for link in links), path, "links", "name")
-    calibrations: dict[str, Calibration] = {}
+    mistakes += _twice("links", "name", [repr(link.name) for link in links])
+    mistakes += _twice("links", "hub_uid", [hex(link.hub_uid) for link in links if link.hub_uid is not None])
+    names = {link.name for link in links}
+    whole = len(names) == len(data["links"])
+    calibrations: dict[str, Calibration | CubeError] = {}
     cubes = []
     for number, item in enumerate(data["cubes"]):
-        key = f"cubes[{number}]"
+        if ("cubes", number) in wrong:
+            continue
         name = item["calibration"]
         if name not in calibrations:
             try:
                 calibrations[name] = read_calibration(find_calibration(name, path.parent))
-            except ConfigError as error:
-                raise ConfigError(f"{path}: {key}.calibration: {error}") from None
-        cubes.append(_cube(item, calibrations[name], links, f"{path}: {key}"))
-    _check_unique(((cube.name,) for cube in cubes), path, "cubes", "name")
-    _check_unique(((cube.uid,) for cube in cubes if cube.uid is not None), path, "cubes", "uid")
-    _check_unique(
-        ((cube.link, cube.index) for cube in cubes if cube.index is not None), path, "cubes", "link and index"
+            except CubeError as error:
+                calibrations[name] = error
+                mistakes.append(f"cubes[{number}].calibration: {error}")
+        calibration, uid = calibrations[name], _uid(item.get("uid"))
+        if isinstance(calibration, CubeError):
+            continue
+        mistakes += [
+            f"cubes[{number}]{line}" for line in _contradictions(item, uid, calibration, names if whole else None)
+        ]
+        xyz, rpy = (tuple(float(value) for value in item["pose"][part]) for part in ("xyz", "rpy"))
+        cubes.append(SkinCube(item["name"], item.get("link"), item.get("index"), uid, xyz, rpy, calibration))  # type: ignore[arg-type]
+    mistakes += _twice("cubes", "name", [repr(cube.name) for cube in cubes])
+    mistakes += _twice("cubes", "uid", [hex(cube.uid) for cube in cubes if cube.uid is not None])
+    mistakes += _twice(
+        "cubes", "link and index", [f"{cube.link!r}, {cube.index}" for cube in cubes if cube.index is not None]
     )
+    if mistakes:
+        return None, mistakes
     rate = data.get("rate")
-    if rate is not None and not math.isfinite(rate):
-        raise ConfigError(f"{path}: rate: found {rate}, allowed: {SCHEMA['properties']['rate']['description']}")
-    return Skin(data["name"], data["parent_frame"], None if rate is None else float(rate), links, tuple(cubes))
+    return Skin(data["name"], data["parent_frame"], None if rate is None else float(rate), links, tuple(cubes)), []
 
 
-def _cube(item: dict[str, Any], calibration: Calibration, links: tuple[SkinLink, ...], place: str) -> SkinCube:
-    names = [link.name for link in links]
-    link, index, uid = item.get("link"), item.get("index"), _uid(item.get("uid"))
-    if link is not None and link not in names:
-        raise ConfigError(f"{place}.link: found {link!r}, allowed: one of the links {', '.join(names)}")
+def _contradictions(
+    item: dict[str, Any], uid: int | None, calibration: Calibration, names: set[str] | None
+) -> Iterator[str]:
+    """What the keys of a cube say against each other; names: of the links, None if not all are known."""
+    link, index = item.get("link"), item.get("index")
+    if link is not None and names is not None and link not in names:
+        yield f".link: found {link!r}, allowed: one of the links {', '.join(sorted(names))}"
     if uid is None and (link is None or index is None):
-        raise ConfigError(
-            f"{place}: found neither uid nor both link and index, which say where the cube is; add one of them"
-        )
+        yield ": found neither uid nor both link and index, which say where the cube is; add one of them"
     if uid is not None and index is not None:
-        raise ConfigError(f"{place}: found both uid and index; keep one, they might contradict each other")
+        yield ": found both uid and index; keep one, they might contradict each other"
     if item["layout"] != calibration.layout.name:
-        raise ConfigError(
-            f"{place}.layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
+        yield (
+            f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
             f"is for the layout {calibration.layout.name!r}"
         )
     if calibration.uid is not None and uid != calibration.uid:
-        raise ConfigError(
-            f"{place}.calibration: {item['calibration']!r} was made for the cube with uid {calibration.uid:#x}, "
+        yield (
+            f".calibration: {item['calibration']!r} was made for the cube with uid {calibration.uid:#x}, "
             f"this cube's uid is {'not given' if uid is None else hex(uid)}"
         )
-    xyz, rpy = (tuple(float(value) for value in item["pose"][part]) for part in ("xyz", "rpy"))
-    if not all(map(math.isfinite, (*xyz, *rpy))):
-        raise ConfigError(f"{place}.pose: found {item['pose']}, allowed: finite numbers")
-    return SkinCube(item["name"], link, index, uid, xyz, rpy, calibration)  # type: ignore[arg-type]
 
 
 def _uid(value: int | str | None) -> int | None:
     return int(value, 16) if isinstance(value, str) else value
 
 
-def _check_schema(data: Any, path: Path) -> None:
-    error = jsonschema.exceptions.best_match(_VALIDATOR.iter_errors(data))
-    if error is None:
-        return
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path).lstrip(".")
-    schema = error.schema
-    if error.validator == "additionalProperties":
-        unknown = ", ".join(repr(name) for name in error.instance if name not in schema["properties"])
-        raise ConfigError(
-            f"{path}: {key or 'top level'}: unknown key {unknown}, allowed: {', '.join(schema['properties'])}"
-        )
-    if error.validator == "required":
-        missing = ", ".join(repr(name) for name in schema["required"] if name not in error.instance)
-        raise ConfigError(f"{path}: {key or 'top level'}: the key {missing} is missing")
-    found = repr(error.instance)
-    found = found if len(found) <= 60 else found[:57] + "..."
-    raise ConfigError(
-        f"{path}: {key or 'top level'}: found {found}, allowed: {schema.get('description', error.message)}"
-    )
-
-
-def _check_unique(values: Iterable[tuple[Any, ...]], path: Path, where: str, what: str) -> None:
-    seen: set[tuple[Any, ...]] = set()
-    for value in values:
-        if value in seen:
-            shown = ", ".join(hex(part) if what == "uid" else repr(part) for part in value)
-            raise ConfigError(f"{path}: {where}: the {what} {shown} is there twice; it must be unique")
-        seen.add(value)
+def _twice(where: str, what: str, values: list[str]) -> Iterator[str]:
+    for value, count in Counter(values).items():
+        if count > 1:
+            yield f"{where}: the {what} {value} is there {'twice' * (count == 2) or f'{count} times'}; keep one"
