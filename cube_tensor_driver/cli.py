@@ -166,6 +166,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--start", type=not_negative, default=0.0, metavar="S", help="begin S seconds into the bag")
     sub.add_argument("--clock", action="store_true", help="publish /clock for nodes with use_sim_time")
     sub.add_argument("--stress", action="store_true", help="publish the recorded stress too")
+    sub.add_argument("--view", action="store_true", help="show the recorded stress in the browser, with a time slider")
 
     sub = command("reprocess", run.reprocess, "make stress of recorded frequencies again, with what is known now")
     sub.add_argument("bags", type=Path, nargs="+", metavar="BAG")

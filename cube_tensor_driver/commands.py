@@ -140,7 +140,8 @@ def record(options: argparse.Namespace) -> int:
 def replay(options: argparse.Namespace) -> int:
     from .view.replay import Options, run_replay
 
-    return run_replay(Options(options.bag, options.rate, options.loop, options.start, options.clock, options.stress))
+    return run_replay(Options(options.bag, options.rate, options.loop, options.start, options.clock, options.stress,
+                              options.view))  # fmt: skip
 
 
 def reprocess(options: argparse.Namespace) -> int:

@@ -1,14 +1,19 @@
-"""The browser view in a real browser: a page, a load that comes, a cube that is chosen, a tare that is asked for."""
+"""The browser view in a real browser: a load that comes, a cube that is chosen, a tare, a replay that is steered."""
 
 from __future__ import annotations
 
 import io
+import json
+import re
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from urllib.parse import urlparse
 
 import numpy as np
 import pytest
@@ -16,149 +21,237 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 pytest.importorskip("selenium", reason="needs selenium: run this with ./cube test")
 
+import viser
+from bag_maker import START_NS, make_bag
 from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.action_chains import ActionChains
-from std_msgs.msg import Header
+from selenium.webdriver.common.keys import Keys
+from websockets.sync.client import connect
 
 from conftest import ROOT
-from cube_tensor_driver.core.pipeline import Pipeline, StressRows
+from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.device.scan import Rows
 from cube_tensor_driver.files.share import share
 from cube_tensor_driver.files.skin import read_skin
-from cube_tensor_driver.msg import SkinInfo, SkinStress
-from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
-from cube_tensor_driver.srv import Tare
+from cube_tensor_driver.msg import SkinFrequencies, SkinStress
+from cube_tensor_driver.ros.children import Children
+from cube_tensor_driver.ros.messages import frequencies_message, to_ns
+from cube_tensor_driver.ros.start import Process
+from cube_tensor_driver.srv import SteerReplay
 
 CHROMIUM, DRIVER = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
 FLAGS = ("--headless", "--no-sandbox", "--disable-background-networking", "--enable-unsafe-swiftshader",
          "--use-gl=angle", "--use-angle=swiftshader", "--window-size=1200,900")  # fmt: skip
-SKIN = read_skin(share() / "config" / "skin_demo.yaml")
+CONFIG = share() / "config" / "skin_demo.yaml"
+SKIN = read_skin(CONFIG)
 N = len(SKIN.cubes)
-PRESSED = 10
+PRESSED, RATE, NOISE = 10, 50.0, 8e-6
+HERE = "127.0.0.1"
 
 
-@pytest.fixture
-def page(domain) -> Iterator[tuple[object, str]]:
-    """A browser that shows a view of its own process."""
+@contextmanager
+def browser(url: str) -> Iterator[webdriver.Chrome]:
     if not CHROMIUM or not DRIVER:
         pytest.skip("needs a browser: apt-get install chromium chromium-driver")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    view = subprocess.Popen(
-        [sys.executable, "-m", "cube_tensor_driver.cli", "view", "--port", str(port)], cwd=ROOT,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
+    options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
     for flag in FLAGS:
         options.add_argument(flag)
-    browser = None
+    chrome = webdriver.Chrome(options, Service(DRIVER))
     try:
-        until = time.monotonic() + 30
-        while True:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            assert view.poll() is None and time.monotonic() < until, "the view did not start"
-        browser = webdriver.Chrome(options, Service(DRIVER))
-        browser.set_script_timeout(60)
-        browser.get(f"http://127.0.0.1:{port}")
-        yield browser, f"127.0.0.1:{port}"
+        chrome.set_script_timeout(60)
+        chrome.get(url)
+        yield chrome
     finally:
-        if browser is not None:
-            browser.quit()
-        view.terminate()
-        view.communicate(timeout=15)
-    assert view.returncode == 0
+        chrome.quit()
 
 
-class Skin:
-    """Publishes what a driver and a reconstruction would: latched info, and rows whenever it is turned."""
+class Skin(threading.Thread):
+    """Publishes the frequencies of a driver, under a load that the test sets, until ended."""
 
-    def __init__(self, ros) -> None:
-        from rclpy.qos import DurabilityPolicy, QoSProfile
+    def __init__(self, node) -> None:
+        super().__init__()
+        self._publisher = node.create_publisher(SkinFrequencies, "frequencies", 1000)
+        self._ended = threading.Event()
+        self.sent = 0
+        self.press(0.0)
 
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._info = ros.node.create_publisher(SkinInfo, "info", latched)
-        self._info.publish(info_message(SKIN, Pipeline([cube.calibration for cube in SKIN.cubes]), time.time_ns()))
-        self._stress = ros.node.create_publisher(SkinStress, "stress", 10)
-        self.zz = 0.0
+    def press(self, zz: float) -> None:
+        """zz in Pa on the pressed cube."""
+        state = np.zeros((N, 7))
+        state[PRESSED, 0] = zz
+        calibration = SKIN.cubes[0].calibration
+        law = calibration.rest_frequency, calibration.beta, calibration.modulus
+        self._frequency = pad_frequency(state @ calibration.response.T, *law)
 
-    def send(self) -> None:
-        stress, gradient = np.zeros((N, 6), np.float32), np.zeros((N, 9), np.float32)
-        stress[:, [1, 3, 5]] = np.nan
-        stress[PRESSED, 2] = self.zz
-        gradient[:, [1, 4, 7]] = np.nan
-        rows = StressRows(stress, gradient, np.ones(N, np.float32), np.zeros(N, np.uint16), np.zeros(N, np.uint16))
-        times = Times(Header(stamp=to_time(time.time_ns())), np.arange(N, dtype=np.uint16),
-                      np.zeros(N, np.uint32), np.zeros(N, np.int32))  # fmt: skip
-        self._stress.publish(stress_message(times, rows))
+    def run(self) -> None:
+        noise = np.random.default_rng(3)
+        cubes, none = np.arange(N, dtype=np.uint16), np.zeros(N, np.uint32)
+        while not self._ended.wait(1 / RATE):
+            frequency = self._frequency * (1 + NOISE * noise.standard_normal(self._frequency.shape))
+            sequence, now = np.full(N, self.sent, np.uint32), np.full(N, time.time_ns())
+            scan = Rows(cubes, sequence, now, frequency.astype(np.float32), np.full(N, np.nan, np.float32), none)
+            self._publisher.publish(frequencies_message(scan, "skin_base"))
+            self.sent += 1
 
-
-def test_the_page_shows_a_load_a_cube_and_a_tare(page, ros):
-    browser, _ = page
-    skin = Skin(ros)
-    asked = []
-
-    def tare(request, answer):
-        asked.append(request)
-        skin.zz = 0.0
-        answer.success, answer.message = True, "16 cubes over 1 s"
-        return answer
-
-    ros.node.create_service(Tare, "reconstruction/tare", tare)
-
-    def until(done: Callable[[], object], seconds: float = 40.0) -> None:
-        """Rows keep coming meanwhile: a skin that is silent is stale."""
-
-        def turned() -> object:
-            skin.send()
-            return done()
-
-        ros.wait(turned, seconds)
-
-    def text() -> str:
-        return browser.execute_script("return document.body.innerText")
-
-    def yellow() -> np.ndarray:
-        """Pixels (y, x) of the 3-D part with the colour of the range's top."""
-        image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
-        red, green, blue = np.asarray(image)[:, : image.width // 2].astype(int).transpose(2, 0, 1)
-        return np.argwhere((red > 150) & (green > 130) & (blue < 90))
-
-    until(lambda: f"{N} of {N} cubes" in text() and "live" in text())
-    assert "pressure −σzz in kPa" in text()
-    until(lambda: "state" in text())
-    assert len(yellow()) == 0
-
-    skin.zz = -20e3
-    seen: list[np.ndarray] = []
-    until(lambda: seen.append(yellow()) or len(seen[-1]) > 200)
-    # the legend's top follows: 20 kPa
-    until(lambda: "\n20\n" in text())
-
-    # another cube is shown until this one is clicked
-    assert "-20.000" not in text()
-    y, x = np.median(seen[-1], axis=0)
-    canvas = browser.find_element("tag name", "body")
-    ActionChains(browser).move_to_element_with_offset(
-        canvas, int(x) - canvas.size["width"] // 2, int(y) - canvas.size["height"] // 2
-    ).click().perform()
-    until(lambda: "-20.000" in text())
-    drawn = browser.execute_script("return document.querySelectorAll('.uplot canvas').length")
-    assert drawn == 4
-
-    press(browser, "tare")
-    until(lambda: asked)
-    assert list(asked[0].cubes) == []
-    until(lambda: "tare done: 16 cubes over 1 s" in text() and "-20.000" not in text())
-
-    press(browser, "clear tare")
-    until(lambda: "no reconstruction node" in text())
+    def end(self) -> None:
+        self._ended.set()
+        self.join()
 
 
-def press(browser, label: str) -> None:
+def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
+    """Beside a browser that has stopped reading, and without the internet."""
+    heard = ros.listen(SkinStress, "stress")
+    skin = Skin(ros.node)
+    with ExitStack() as stack:
+        children = stack.enter_context(Children(tmp_path))
+        children.start(Process("reconstruction", "cube_tensor_driver.ros.reconstruction",
+                               parameters={"config": str(CONFIG), "tare_folder": str(tmp_path / "tare")}))  # fmt: skip
+        children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
+        skin.start()
+        stack.callback(skin.end)
+        url = children.said("view", "http://", 30).split()[0]
+        port = urlparse(url).port
+        sleeper = socket.socket()
+        sleeper.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        sleeper.connect((HERE, port))
+        stack.enter_context(connect(f"ws://{HERE}:{port}", sock=sleeper, max_queue=1,
+                                    subprotocols=[f"viser-v{viser.__version__}"]))  # fmt: skip
+        page = stack.enter_context(browser(url))
+
+        ros.wait(lambda: f"{N} of {N} cubes" in text(page) and "live" in text(page), 40)
+        assert "pressure −σzz in kPa" in text(page)
+        ros.wait(lambda: "state" in text(page), 40)
+        assert len(yellow(page)) == 0
+
+        skin.press(-20e3)
+        seen: list[np.ndarray] = []
+        ros.wait(lambda: seen.append(yellow(page)) or len(seen[-1]) > 200, 40)
+        # the legend's top follows: 20 kPa
+        ros.wait(lambda: "\n20\n" in text(page), 40)
+
+        # another cube is shown until this one is clicked
+        assert shown(page) > -100
+        y, x = np.median(seen[-1], axis=0)
+        body = page.find_element("tag name", "body")
+        ActionChains(page).move_to_element_with_offset(
+            body, int(x) - body.size["width"] // 2, int(y) - body.size["height"] // 2
+        ).click().perform()
+        ros.wait(lambda: abs(shown(page) + 20e3) < 200, 40)
+        assert page.execute_script("return document.querySelectorAll('.uplot canvas').length") == 4
+
+        # what the page shows as tared is tared on the topic
+        ros.wait(lambda: heard and abs(newest(heard) + 20e3) < 200)
+        clicked_ns = time.time_ns()
+        press(page, "tare")
+        ros.wait(lambda: "tare done" in text(page) and abs(shown(page)) < 200, 40)
+        ros.wait(lambda: abs(newest(heard)) < 200)
+        tared_ns = min(at for at, zz in rows(heard) if at > clicked_ns and abs(zz) < 200)
+        print(f"from the click on tare to the first tared row: {1e-6 * (tared_ns - clicked_ns):.0f} ms")
+        press(page, "clear tare")
+        ros.wait(lambda: abs(shown(page) + 20e3) < 200, 40)
+        ros.wait(lambda: abs(newest(heard) + 20e3) < 200)
+
+        # the browser that reads nothing has cost the topic not a row
+        sequence = np.array([message.sequence[0] for message in heard], int)
+        assert len(sequence) > 100 and (np.diff(sequence) == 1).all()
+        asked = hosts(page)
+        assert asked == {HERE}, f"the page asks {asked}"
+        children.check()
+
+
+def test_a_replay_is_steered_from_the_page(ros, tmp_path):
+    """A bag of 6 s whose cubes swing with a period of 2 s."""
+    path = make_bag(tmp_path / "bag", CONFIG, 600)
+    heard = ros.listen(SkinStress, "stress")
+    replay = subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--view"],
+                              cwd=ROOT, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # fmt: skip
+    try:
+        url = next(line for line in replay.stderr if "http://" in line).split()[0]
+        with browser(url) as page:
+
+            def position() -> float:
+                """Of the newest row in the bag, s."""
+                return 1e-9 * (to_ns(heard[-1].header.stamp) - START_NS)
+
+            # it has come to the end, and holds there without its cubes growing stale
+            ros.wait(lambda: heard and position() > 5.9 and "play" in buttons(page), 40)
+            ros.wait(lambda: f"{N} of {N} cubes" in text(page), 40)
+            slider = page.find_element("css selector", "[role=slider]")
+
+            def key(one: str) -> None:
+                page.execute_script("arguments[0].focus()", slider)
+                slider.send_keys(one)
+
+            key(Keys.HOME)
+            ros.wait(lambda: position() < 0.3, 40)
+            assert "play" in buttons(page)
+            count, at = len(heard), position()
+            press(page, "play")
+            ros.wait(lambda: len(heard) > count + 20 and position() > at + 0.2, 40)
+            ros.wait(lambda: "hold" in buttons(page), 40)
+            press(page, "hold")
+            ros.wait(lambda: "play" in buttons(page), 40)
+            key(Keys.HOME)
+            ros.wait(lambda: position() < 0.3, 40)
+            key(Keys.END)
+            ros.wait(lambda: position() > 5.8, 40)
+            ros.wait(lambda: float(slider.get_attribute("aria-valuenow")) > 5.8, 40)
+            assert f"{N} of {N} cubes" in text(page)
+        refused = ros.call(SteerReplay, "player/steer", SteerReplay.Request(position=6.5, paused=True))
+        assert not refused.success and "6.5 s is not in the bag, which is 5.990 s long" in refused.message
+        replay.terminate()
+        assert replay.wait(timeout=10) == 0
+        assert "Traceback" not in replay.stderr.read()
+    finally:
+        replay.kill()
+        replay.wait()
+
+
+def text(page: webdriver.Chrome) -> str:
+    return page.execute_script("return document.body.innerText")
+
+
+def buttons(page: webdriver.Chrome) -> list[str]:
+    return page.execute_script("return [...document.querySelectorAll('button')].map(b => b.innerText.trim())")
+
+
+def press(page: webdriver.Chrome, label: str) -> None:
     script = "for (const b of document.querySelectorAll('button')) if (b.innerText.trim() == arguments[0]) b.click()"
-    browser.execute_script(script, label)
+    page.execute_script(script, label)
+
+
+def shown(page: webdriver.Chrome) -> float:
+    """zz of the chosen cube as the page has it, Pa."""
+    found = re.search(r"^zz\s+([+-][0-9.]+)\s+kPa", text(page), re.MULTILINE)
+    return 1e3 * float(found[1]) if found else np.nan
+
+
+def rows(heard: list) -> list[tuple[int, float]]:
+    """When each message was measured, ns, and zz of its pressed cube, Pa."""
+    return [(to_ns(message.header.stamp), float(message.stress[6 * PRESSED + 2])) for message in heard]
+
+
+def newest(heard: list) -> float:
+    return rows(heard[-1:])[0][1]
+
+
+def yellow(page: webdriver.Chrome) -> np.ndarray:
+    """Pixels (y, x) of the 3-D part with the colour of the range's top."""
+    image = Image.open(io.BytesIO(page.get_screenshot_as_png())).convert("RGB")
+    red, green, blue = np.asarray(image)[:, : image.width // 2].astype(int).transpose(2, 0, 1)
+    return np.argwhere((red > 150) & (green > 130) & (blue < 90))
+
+
+def hosts(page: webdriver.Chrome) -> set[str | None]:
+    """Whom the page has asked for anything, or tried to."""
+    events = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
+    urls = [
+        event["params"].get("request", event["params"])["url"]
+        for event in events
+        if event["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated")
+    ]
+    return {urlparse(url).hostname for url in urls if urlparse(url).scheme not in ("data", "blob", "chrome")}

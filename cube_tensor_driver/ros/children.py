@@ -18,6 +18,9 @@ END_S = 1.2
 """How long a process has to end by itself before it is killed: hung rclpy ignores SIGTERM."""
 
 
+LOOK_S = 0.05
+
+
 class ChildError(CubeError):
     """A process of the skin ended by itself."""
 
@@ -50,6 +53,19 @@ class Children:
 
     def log(self, executable: str) -> str:
         return (self._logs / f"{executable}.log").read_text(errors="replace")
+
+    def said(self, executable: str, text: str, seconds: float) -> str:
+        """The first line of its log with `text`, once it is there. ChildError: it ended before, or takes too long."""
+        until = time.monotonic() + seconds
+        while True:
+            for line in self.log(executable).splitlines():
+                if text in line:
+                    return line
+            self.check()
+            if time.monotonic() > until:
+                raise ChildError(f"the {executable} did not say {text!r} within {seconds:g} s:\n{self.log(executable)}")
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._processes[executable].wait(LOOK_S)
 
     def check(self) -> None:
         """ChildError with the end of its log if one has ended."""

@@ -50,9 +50,9 @@ class Follower:
         """The node's clock in s."""
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
-    def health(self) -> np.ndarray:
+    def health(self, stale: float = STALE_S) -> np.ndarray:
         """(cubes,) as `Newest.health` has it."""
-        return self.newest.health(self.now(), STALE_S)
+        return self.newest.health(self.now(), stale)
 
     def _take_info(self, info: SkinInfo) -> None:
         before, self.info = self.info, info

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -21,6 +20,8 @@ CLOCK_S = 0.01
 """Of real time, at least so often the clock is sent; and before every message."""
 DISCOVERY_S, NOBODY_S, LOOK_S = 1.0, 3.0, 0.1
 """Before the first message: no further subscriber has found the publishers for so long, or none at all."""
+SHOWN_NS = 100_000_000
+"""So much of the bag is published after a jump, though the player is paused: enough for every link to deliver."""
 MADE = (f"{PACKAGE}/msg/SkinStress", f"{PACKAGE}/msg/StressTensorStamped", "geometry_msgs/msg/WrenchStamped")
 """Types that a reconstruction makes, of topics that are left out unless stress is asked for."""
 
@@ -29,14 +30,17 @@ class Player:
     """Publishes a bag; `run` once, from one thread, the rest from any.
 
     rate: times the recorded speed. stress: also what a reconstruction made. clock: publish /clock.
-    paused: an event; progress: called with the seconds of the bag that have passed.
+    position and length are in s after the begin of the bag.
     BagError: the bag cannot be read, or has nothing to publish.
     """
 
     def __init__(self, node: Node, bag: Bag, *, rate: float, stress: bool, clock: bool) -> None:
         self.stop = threading.Event()
         self.published = 0
+        self.position, self.length = 0.0, (bag.end_ns - bag.start_ns) / SECOND
         self._paused, self._steps = False, 0
+        self._jump_ns: int | None = None
+        self._shown_ns = 0
         self._wake = threading.Condition()
         self._node, self._bag, self._rate = node, bag, rate
         self._publishers: dict[str, Any] = {}
@@ -72,28 +76,47 @@ class Player:
             self._steps += 1
             self._wake.notify()
 
+    def jump(self, position: float, paused: bool) -> None:
+        """Go on from there, or hold there once what stands there has been published. BagError: not in the bag."""
+        to_ns = max(self._bag.start_ns, min(self._at(position), self._bag.end_ns - SHOWN_NS))
+        with self._wake:
+            self._jump_ns, self._paused, self._steps = to_ns, paused, 0
+            self._wake.notify()
+
     def end(self) -> None:
         """End `run` soon."""
         with self._wake:
             self.stop.set()
             self._wake.notify()
 
-    def run(self, start_s: float, loop: bool, progress: Callable[[float], None]) -> None:
-        """Publish from start_s after the begin of the bag to its end, over and over with `loop`. BagError: damaged."""
-        start_ns = self._bag.start_ns + round(start_s * SECOND)
-        if start_ns > self._bag.end_ns:
-            length = (self._bag.end_ns - self._bag.start_ns) / SECOND
-            raise BagError(f"{self._bag.path}: --start {start_s:g}: the bag is {length:.3f} s long")
+    def run(self, start: float, loop: bool, hold: bool = False) -> None:
+        """Publish from `start` to the end of the bag, over and over with `loop`; with `hold` wait there to be steered.
+
+        BagError: damaged, or start is not in the bag.
+        """
+        begin_ns: int | None = self._at(start)
         publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
         found, since = 0, time.monotonic()
         while time.monotonic() - since < (DISCOVERY_S if found else NOBODY_S) and not self.stop.wait(LOOK_S):
             now = sum(publisher.get_subscription_count() for publisher in publishers)
             if now != found:
                 found, since = now, time.monotonic()
-        while not self.stop.is_set():
-            self._once(start_ns, progress)
-            if not loop:
-                break
+        next_ns = begin_ns
+        while next_ns is not None and not self.stop.is_set():
+            self._once(next_ns)
+            with self._wake:
+                if hold and not loop and self._jump_ns is None:
+                    self._paused = True
+                    self._wake.wait_for(lambda: self.stop.is_set() or self._jump_ns is not None or not self._paused)
+                next_ns, self._shown_ns = begin_ns if loop or hold else None, 0
+                if self._jump_ns is not None:
+                    next_ns, self._jump_ns = self._jump_ns, None
+                    self._shown_ns = next_ns + SHOWN_NS
+
+    def _at(self, position: float) -> int:
+        if not 0 <= position <= self.length:
+            raise BagError(f"{self._bag.path}: {position:g} s is not in the bag, which is {self.length:.3f} s long")
+        return self._bag.start_ns + round(position * SECOND)
 
     def _add(self, topic: str, connection: Any) -> None:
         offered = connection.ext.offered_qos_profiles
@@ -108,7 +131,7 @@ class Player:
         if latched:
             self._latched.add(topic)
 
-    def _once(self, start_ns: int, progress: Callable[[float], None]) -> None:
+    def _once(self, start_ns: int) -> None:
         # What was latched before the start is true at the start.
         for entry in self._bag.entries(self._latched, None, start_ns):
             self._publish(entry)
@@ -118,7 +141,7 @@ class Player:
                 return
             self._say(entry.time_ns)
             self._publish(entry)
-            progress((entry.time_ns - self._bag.start_ns) / SECOND)
+            self.position = (entry.time_ns - self._bag.start_ns) / SECOND
             if self._steps and entry.topic.endswith("frequencies"):
                 with self._wake:
                     self._steps -= 1
@@ -128,11 +151,11 @@ class Player:
         self._bag_ns, self._begun = bag_ns, time.monotonic()
 
     def _wait(self, bag_ns: int) -> bool:
-        """Until a message is due; False: asked to end."""
+        """Until a message is due; False: asked to end or to jump."""
         with self._wake:
-            while not self.stop.is_set():
+            while not self.stop.is_set() and self._jump_ns is None:
                 if self._paused:
-                    if self._steps:
+                    if self._steps or bag_ns <= self._shown_ns:
                         self._anchor(bag_ns)
                         return True
                     self._wake.wait()

@@ -20,10 +20,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-from cube_tensor_driver.srv import Tare
+from cube_tensor_driver.msg import ReplayState
+from cube_tensor_driver.srv import SteerReplay, Tare
 
 from ..core.errors import ConfigError
-from ..ros.follow import Follower
+from ..ros.follow import STALE_S, Follower
 from ..ros.node import make_executor
 from .history import History
 from .markup import Facts
@@ -35,6 +36,8 @@ PICTURES_HZ, NUMBERS_HZ = 20.0, 4.0
 HISTORY_S = 10.0
 WAIT_S = 10.0
 """How long a service may take to answer before the page says that it does not."""
+HELD_S = 1e9
+"""After which cubes are stale while a replay holds."""
 
 
 class Browser:
@@ -57,6 +60,12 @@ class Browser:
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 10)
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
         self._clear = self._node.create_client(Trigger, "reconstruction/clear_tare")
+        self._steer = self._node.create_client(SteerReplay, "player/steer")
+        self._node.create_subscription(ReplayState, "player/state", self._take_replay, 1)
+        self._replay: ReplayState | None = None
+        self._replay_at = -np.inf
+        self._jump: float | None = None
+        self._steered: Any = None
         self._wishes: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._answers: list[tuple[str, Any, float]] = []
         self._recorder: subprocess.Popen[bytes] | None = None
@@ -93,10 +102,13 @@ class Browser:
             tare=lambda: wish(lambda: self._ask("tare", self._tare, Tare.Request())),
             clear_tare=lambda: wish(lambda: self._ask("clear tare", self._clear, Trigger.Request())),
             record=lambda: wish(self._record),
+            hold=lambda: wish(self._hold),
+            jump=lambda position: wish(lambda: setattr(self, "_jump", position)),
         )
         names = [cube.name for cube in info.cubes]
         self._page = Page(self._server, info.name, names, self._follower.places, self._depth, buttons)
         self._history = History(len(names), round(HISTORY_S * PICTURES_HZ))
+        self._page.steer(self._replay)
         self._count, self._counted_at = np.zeros(len(names), np.int64), time.monotonic()
         self._rate = np.full(len(names), np.nan)
 
@@ -104,9 +116,11 @@ class Browser:
         page = self._page
         if page is None:
             return
+        self._make_jump()
         newest = self._follower.newest
-        health = self._follower.health()
-        if not page.paused:
+        held = self._replay is not None and self._replay.paused
+        health = self._follower.health(HELD_S if held else STALE_S)
+        if not page.paused and not held:
             self._history.add(self._follower.now(), newest)
         # Without a browser there is nobody to draw for.
         if not self._server.get_clients():
@@ -119,6 +133,10 @@ class Browser:
                 self._rate = (newest.count - self._count) / (now - self._counted_at)
                 self._count, self._counted_at = newest.count.copy(), now
             self._look_at_answers(now)
+            if now - self._replay_at > STALE_S:
+                self._replay = self._steered = self._jump = None
+            if self._jump is None and self._steered is None:
+                page.steer(self._replay)
             self._facts.links = list(self._links.values())
             page.write(newest, health, self._rate, self._history, self._facts)
 
@@ -128,6 +146,25 @@ class Browser:
             return
         self._facts.action = f"{what}: asked …"
         self._answers.append((what, client.call_async(request), time.monotonic()))
+
+    def _take_replay(self, message: ReplayState) -> None:
+        self._replay, self._replay_at = message, time.monotonic()
+
+    def _hold(self) -> None:
+        if self._replay is not None:
+            request = SteerReplay.Request(position=np.nan, paused=not self._replay.paused)
+            self._ask("replay", self._steer, request)
+
+    def _make_jump(self) -> None:
+        """The last place that the slider was drawn to, once the place before it has been reached."""
+        if self._steered is not None and self._steered.done():
+            self._steered = None
+        if self._jump is None or self._steered is not None or self._replay is None:
+            return
+        request = SteerReplay.Request(position=min(self._jump, self._replay.length), paused=self._replay.paused)
+        self._jump, self._steered = None, self._steer.call_async(request)
+        self._replay.position = request.position
+        self._history.clear()
 
     def _look_at_answers(self, now: float) -> None:
         waiting = []

@@ -25,6 +25,10 @@ class History:
         self._times[at] = now
         self._next += 1
 
+    def clear(self) -> None:
+        """Forget them: what comes does not follow on them."""
+        self._next = 0
+
     def of(self, cube: int) -> tuple[np.ndarray, np.ndarray]:
         """Times (M,) in s before the last one, never positive, and values (M, 16) of a cube, oldest first."""
         count = len(self._times)

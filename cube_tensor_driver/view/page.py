@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Protocol
 
 import numpy as np
 import viser
@@ -21,6 +22,7 @@ SPAN = 2.0
 """The longest side of a skin in the scene: cameras and clipping planes of viewers are made for metres, skins for cm."""
 LEAST_PA = 300.0
 """Pressure at the cubes that counts as contact."""
+STEP_S = 0.1
 MOST_POINTS = 5000
 """Of the field's carpet."""
 PLOTS = (
@@ -48,6 +50,16 @@ class Buttons:
     tare: Callable[[], None]
     clear_tare: Callable[[], None]
     record: Callable[[], None]
+    hold: Callable[[], None]
+    jump: Callable[[float], None]
+
+
+class Replay(Protocol):
+    """How far a replay is, as ReplayState.msg says."""
+
+    position: float
+    length: float
+    paused: bool
 
 
 class Page:
@@ -82,6 +94,14 @@ class Page:
     def close(self) -> None:
         self._server.scene.reset()
         self._server.gui.reset()
+
+    def steer(self, replay: Replay | None) -> None:
+        """Show where a replay is, or that there is none."""
+        self._replay.visible = replay is not None
+        if replay is not None:
+            self._place.max = max(replay.length, STEP_S)
+            self._place.value = min(replay.position, self._place.max)  # type: ignore[misc]  # As below.
+            self._hold.label = "play" if replay.paused else "hold"
 
     def _make_scene(self, to: viser.SceneApi) -> None:
         places, n = self._places, len(self._names)
@@ -134,6 +154,12 @@ class Page:
                 {"tare": buttons.tare, "clear tare": buttons.clear_tare, "record": buttons.record}[row.value]()
 
         self._action = gui.add_html("")
+        with gui.add_folder("replay", visible=False) as self._replay:
+            self._place = gui.add_slider("s", 0.0, 1.0, STEP_S, 0.0)
+            self._hold = gui.add_button("hold")
+        self._hold.on_click(lambda _: buttons.hold())
+        # What `steer` shows has no client.
+        self._place.on_update(lambda event: buttons.jump(self._place.value) if event.client else None)
         self._quantity = gui.add_dropdown("colour", [q.label for q in QUANTITIES.values()])
         self._quantity.on_update(lambda _: setattr(self, "_top", 0.0))
         self._range = gui.add_number("range (0: auto)", 0.0, min=0.0, step=0.1)

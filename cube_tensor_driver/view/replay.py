@@ -1,4 +1,4 @@
-"""./cube replay: a bag onto its topics, with a progress bar and keys to pause, step and quit."""
+"""./cube replay: a bag onto its topics, with a progress bar, keys to pause, step and quit, and the browser view."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import select
 import signal
 import sys
+import tempfile
 import termios
 import threading
 import tty
@@ -20,17 +21,20 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from ..core.errors import BagError
-from ..files.bags import Bag
-from ..ros.messages import SECOND
+from ..files.bags import PACKAGE, Bag
+from ..ros.children import Children
+from ..ros.node import make_executor
 from ..ros.player import Player
+from ..ros.start import Process
+from ..ros.steering import Steering
 
 KEYS = "space: pause, s: step, q: quit"
-LOOK_S = 0.1
+LOOK_S, START_S = 0.05, 30.0
 
 
 @dataclass(frozen=True)
 class Options:
-    """As on the command line. start in s after the begin of the bag."""
+    """As on the command line. start in s after the begin of the bag. view: show the recorded stress in the browser."""
 
     bag: Path
     rate: float
@@ -38,44 +42,63 @@ class Options:
     start: float
     clock: bool
     stress: bool
+    view: bool = False
 
 
 def run_replay(options: Options) -> int:
     """Replay until the bag ends or asked to end. BagError: what is wrong with the bag."""
-    ended = threading.Event()
     failed: list[BagError] = []
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = rclpy.create_node("player")
-        with Bag(options.bag) as bag, _keys() as keys:
-            player = Player(node, bag, rate=options.rate, stress=options.stress, clock=options.clock)
+        with Bag(options.bag) as bag, _view(options, bag) as children, _keys() as keys:
+            node = rclpy.create_node("player")
+            player = Player(node, bag, rate=options.rate, stress=options.stress or options.view, clock=options.clock)
+            Steering(node, player)
+            executor = make_executor()
+            executor.add_node(node)
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 signal.signal(number, lambda *_: player.end())
-            seconds = (bag.end_ns - bag.start_ns) / SECOND
-            passed = [0.0]
 
             def play() -> None:
                 try:
-                    player.run(options.start, options.loop, lambda now: passed.__setitem__(0, now))
+                    player.run(options.start, options.loop, hold=options.view)
                 except BagError as error:
                     failed.append(error)
-                ended.set()
 
             thread = threading.Thread(target=play, name="player")
             thread.start()
-            with _progress(bool(keys)) as progress:
-                task = progress.add_task("", total=seconds)
-                while not ended.wait(0 if keys else LOOK_S):
-                    _obey(keys, player)
-                    progress.update(task, completed=passed[0], description="paused" if player.paused else "replaying")
-                progress.update(task, completed=passed[0])
-            thread.join()
-        node.destroy_node()
+            try:
+                with _progress(bool(keys)) as progress:
+                    task = progress.add_task("", total=player.length)
+                    while thread.is_alive():
+                        executor.spin_once(timeout_sec=LOOK_S)
+                        children.check()
+                        _obey(keys, player)
+                        shown = "paused" if player.paused else "replaying"
+                        progress.update(task, completed=player.position, description=shown)
+                    progress.update(task, completed=player.position)
+            finally:
+                player.end()
+                thread.join()
+            executor.remove_node(node)
+            node.destroy_node()
     finally:
         rclpy.try_shutdown()
     if failed:
         raise failed[0]
     return 0
+
+
+@contextmanager
+def _view(options: Options, bag: Bag) -> Iterator[Children]:
+    """The browser view as a child, if asked for. BagError: it would have nothing to show."""
+    with tempfile.TemporaryDirectory(prefix="cube_replay_") as name, Children(Path(name)) as children:
+        if options.view:
+            if not bag.topics(f"{PACKAGE}/msg/SkinStress"):
+                raise BagError(f"{bag.path}: no stress to show; ./cube reprocess makes it of the frequencies")
+            children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
+            print(children.said("view", "http://", START_S), file=sys.stderr)
+        yield children
 
 
 def _progress(keys: bool) -> Progress:
@@ -84,8 +107,8 @@ def _progress(keys: bool) -> Progress:
 
 
 def _obey(keys: bool, player: Player) -> None:
-    """Wait a moment for a key, and do what it says."""
-    if not keys or not select.select([sys.stdin], [], [], LOOK_S)[0]:
+    """Do what the key says that was pressed, if any."""
+    if not keys or not select.select([sys.stdin], [], [], 0)[0]:
         return
     key = os.read(sys.stdin.fileno(), 1)
     if key == b" ":
