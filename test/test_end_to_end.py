@@ -113,7 +113,7 @@ def test_every_topic_of_a_skin(ros, tmp_path):
             children.start(process)
         ros.wait(lambda: len(batches) > 50 and len(raw) > 80 and len(tensors) > 20 and len(wrenches) > 20)
         ros.wait(lambda: {status.name for array in diagnostics for status in array.status} >= {
-            "/driver", "/driver: link hub0", "/driver: link hub1", "/reconstruction"})  # fmt: skip
+            "/driver: rows", "/driver: link hub0", "/driver: link hub1", "/reconstruction: rows"})  # fmt: skip
         # who comes late still gets the latched info, of both nodes
         infos = ros.listen(SkinInfo, "info", LATCHED)
         ros.wait(lambda: len(infos) == 2)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from ..core.health import LEFT_OUT, WORDS, Health
 from ..core.pipeline import Pipeline
 from ..files.skin import Skin
+from .diagnostics import make_status
 
 MAX_STATUSES = 64
 """In one message: on a skin whose hubs are all gone, a status for each of 1000 cubes helps nobody."""
@@ -18,8 +19,8 @@ MAX_STATUSES = 64
 class CubeHealth:
     """Turns what `Health` found since the last time into words."""
 
-    def __init__(self, node: str, skin: Skin, pipeline: Pipeline, health: Health) -> None:
-        self._node, self._skin, self._pipeline, self._health = node, skin, pipeline, health
+    def __init__(self, skin: Skin, pipeline: Pipeline, health: Health) -> None:
+        self._skin, self._pipeline, self._health = skin, pipeline, health
         self._came = np.zeros(len(skin.cubes), bool)
         self._words: dict[int, str] = {}
 
@@ -44,10 +45,8 @@ class CubeHealth:
             if text != self._words.get(cube, "fine"):
                 lines.append(f"cube {name}: {text}")
             uid = self._skin.cubes[cube].uid or uids.get(cube, 0)
-            status = DiagnosticStatus(name=f"{self._node}: cube {name}", hardware_id=f"{uid:#x}" if uid else "")
-            status.level, status.message = bytes([level]), text
-            status.values = [KeyValue(key="rows since the last", value=str(int(rows[cube])))]
-            statuses.append(status)
+            values = {"rows since the last": int(rows[cube])}
+            statuses.append(make_status(f"cube {name}", f"{uid:#x}" if uid else "", bytes([level]), text, values))
         self._words = words
         return statuses, lines
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
@@ -19,7 +19,8 @@ from ..device.reader import Reader
 from ..device.scan import Place, Rows, Scan
 from ..device.sequence import Account, Verdict
 from ..files.skin import Skin, read_skin
-from .messages import frequencies_message, info_message, to_time
+from .diagnostics import Diagnostics, make_status
+from .messages import frequencies_message, info_message
 from .node import LATCHED, CubeNode, queue, run
 
 LEVELS = {
@@ -49,6 +50,7 @@ class Driver(CubeNode):
                      live=True)  # fmt: skip
         self.declare("qos_reliability", "reliable", "Reliability of the batch topics.", choices="reliable, best_effort")
         self._reader: Reader | None = None
+        self._diagnostics = Diagnostics(self, self._statuses)
 
     def configure(self) -> None:
         skin = read_skin(self.config())
@@ -73,10 +75,8 @@ class Driver(CubeNode):
         quality = queue(self._rate, self.value("qos_reliability"))
         self._frequencies = self.create_lifecycle_publisher(SkinFrequencies, "frequencies", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._uids: dict[int, int] = {}
         self._publish_info()
-        self._timer = self.create_timer(1.0, self._publish_diagnostics)
 
     def activate(self) -> None:
         period_us = None if self._rate is None else round(1e6 / self._rate)
@@ -99,11 +99,10 @@ class Driver(CubeNode):
             self._reader = None
 
     def cleanup(self) -> None:
-        if hasattr(self, "_timer"):
-            self.destroy_timer(self._timer)
-            for publisher in (self._frequencies, self._info, self._diagnostics):
+        if hasattr(self, "_info"):
+            for publisher in (self._frequencies, self._info):
                 self.destroy_publisher(publisher)
-            del self._timer
+            del self._info
 
     def _link_configs(self, skin: Skin) -> list[LinkConfig]:
         port, folder = self.value("port"), self.value("port_directory")
@@ -181,12 +180,13 @@ class Driver(CubeNode):
         now_ns = self.get_clock().now().nanoseconds
         self._info.publish(info_message(self._skin, pipeline, now_ns, self._uids, "driver"))
 
-    def _publish_diagnostics(self) -> None:
+    def _statuses(self) -> list[DiagnosticStatus]:
+        """For diagnostics, of the whole and of each link; what happened since the last time is in them."""
+        if not self.configured:
+            return []
         if self._scan.uids != self._uids:
             self._uids = dict(self._scan.uids)
             self._publish_info()
-        message = DiagnosticArray()
-        message.header.stamp = to_time(self.get_clock().now().nanoseconds)
         rate, self._published_before = self._published - self._published_before, self._published
         totals: dict[str, object] = {
             "rows published": self._published,
@@ -197,7 +197,7 @@ class Driver(CubeNode):
         }
         wrong = f"{self._unaccounted_rows} rows are lost in the driver: please report it" * bool(self._unaccounted_rows)
         level = DiagnosticStatus.ERROR if wrong else DiagnosticStatus.OK
-        message.status.append(_status(self.get_fully_qualified_name(), self._skin.name, level, wrong, totals))
+        statuses = [make_status("rows", self._skin.name, level, wrong, totals)]
         reader = self._reader
         for number, link in enumerate(reader.links if reader else ()):
             other = link.decoder.other_version
@@ -231,14 +231,9 @@ class Driver(CubeNode):
             if stats is not None:
                 values |= {"hub uptime s": stats.uptime_ms / 1000, "hub supply mV": stats.supply_mv or "unknown"}
             uid = "" if link.hello is None else f"{link.hello.hub_uid:#x}"
-            name = f"{self.get_fully_qualified_name()}: link {link.config.name}"
-            message.status.append(_status(name, uid, level, "; ".join(notes) or link.state.value, values))
-        self._diagnostics.publish(message)
-
-
-def _status(name: str, hardware_id: str, level: bytes, text: str, values: dict[str, object]) -> DiagnosticStatus:
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticStatus(name=name, hardware_id=hardware_id, level=level, message=text, values=pairs)
+            text = "; ".join(notes) or link.state.value
+            statuses.append(make_status(f"link {link.config.name}", uid, level, text, values))
+        return statuses
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 
@@ -16,7 +16,8 @@ from ..core.tare import DriftTracker
 from ..files.skin import read_skin
 from .cube_health import CubeHealth
 from .cube_topics import CubeTopics
-from .messages import info_message, read_frequencies, stress_message, to_time
+from .diagnostics import Diagnostics, make_status
+from .messages import info_message, read_frequencies, stress_message
 from .node import LATCHED, CubeNode, queue, run
 from .taring import Taring, tare_folder
 
@@ -44,6 +45,7 @@ class Reconstruction(CubeNode):
         self._active = False
         # In one process with the driver its thread calls `take`, while services run in the main thread.
         self._lock = threading.Lock()
+        self._diagnostics = Diagnostics(self, self._statuses)
 
     def configure(self) -> None:
         skin = self._skin = read_skin(self.config())
@@ -52,23 +54,19 @@ class Reconstruction(CubeNode):
         quality = queue(skin.rate, self.value("qos_reliability"))
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._cubes = CubeTopics(self, skin, self._pipeline, self.value("wrench_side") or None)
         self._health = Health(self._pipeline)
         self._drift = DriftTracker(self._pipeline, self._health)
         self._drift_time = float(self.value("drift_time"))
         self._drifted, self._ticks = False, 0
-        self._words = CubeHealth(self.get_fully_qualified_name(), skin, self._pipeline, self._health)
+        self._words = CubeHealth(skin, self._pipeline, self._health)
         folder = tare_folder(self.value("tare_folder"))
         self._taring = Taring(self, skin, self._pipeline, self._health, folder,
                               lambda: float(self.value("tare_duration")), self._publish_info, self._lock)  # fmt: skip
         self._listening = self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
         if self._subscribes:
             self._subscription = self.create_subscription(SkinFrequencies, "frequencies", self.take, quality)
-        self._own_timers = [
-            self.create_timer(1.0, self._publish_diagnostics),
-            self.create_timer(LISTENERS_S, self._cubes.find_listeners),
-        ]
+        self._looking = self.create_timer(LISTENERS_S, self._cubes.find_listeners)
         self._publish_info()
 
     def changed(self, name: str) -> None:
@@ -81,17 +79,16 @@ class Reconstruction(CubeNode):
         self._active = False
 
     def cleanup(self) -> None:
-        if hasattr(self, "_own_timers"):
+        if hasattr(self, "_looking"):
             if self._subscribes:
                 self.destroy_subscription(self._subscription)
             self.destroy_subscription(self._listening)
             self._taring.close()
-            for timer in self._own_timers:
-                self.destroy_timer(timer)
-            for publisher in (self._stress, self._info, self._diagnostics):
+            self.destroy_timer(self._looking)
+            for publisher in (self._stress, self._info):
                 self.destroy_publisher(publisher)
             self._cubes.close()
-            del self._own_timers
+            del self._looking
 
     def take(self, message: SkinFrequencies) -> None:
         """Publish the tensors of one message of frequencies."""
@@ -122,7 +119,10 @@ class Reconstruction(CubeNode):
         since_ns = self._health.newest_ns + 1 if self._health.newest_ns else self.get_clock().now().nanoseconds
         self._info.publish(info_message(self._skin, self._pipeline, since_ns, self._taring.uids))
 
-    def _publish_diagnostics(self) -> None:
+    def _statuses(self) -> list[DiagnosticStatus]:
+        """For diagnostics, of the whole and of cubes that are not fine; what was found since the last time."""
+        if not self.configured:
+            return []
         self._ticks += 1
         if self._drifted and self._ticks % DRIFT_INFO_S == 0:
             self._drifted = False
@@ -141,12 +141,8 @@ class Reconstruction(CubeNode):
             **self._taring.age(),
             **summary,
         }
-        status = DiagnosticStatus(name=self.get_fully_qualified_name(), hardware_id=self._skin.name)
-        status.level = DiagnosticStatus.WARN if self._bad_messages else DiagnosticStatus.OK
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        message = DiagnosticArray(status=[status, *statuses])
-        message.header.stamp = to_time(self.get_clock().now().nanoseconds)
-        self._diagnostics.publish(message)
+        level = DiagnosticStatus.WARN if self._bad_messages else DiagnosticStatus.OK
+        return [make_status("rows", self._skin.name, level, "", values), *statuses]
 
 
 def main() -> None:
