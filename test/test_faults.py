@@ -238,7 +238,7 @@ def skin(tmp_path_factory):
     return read_skin(path)
 
 
-def judged(skin, spoil=lambda k, sequence, stamp, frequency, rows: None, skip=(), faults=(), counted=0):
+def judged(skin, spoil=lambda k, sequence, stamp, frequency, rows: None, skip=(), faults=(), counted=0, published=0):
     """What the judge says of COUNT samples of both hubs, after `spoil` had its hands on them."""
     reckoning = Reckoning(skin, INSTANTS)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
@@ -254,7 +254,7 @@ def judged(skin, spoil=lambda k, sequence, stamp, frequency, rows: None, skip=()
         reckoning.stress(cube, sequence, stamp, rows)
     run = {"first": 0, "last": COUNT - 1, "start_us": PERIOD_US, "period_us": PERIOD_US, "boot": 0}
     links = {name: {"runs": [run], "dropped": 0, "cubes": []} for name in ("hub0", "hub1")}
-    return reckoning.close({"start_time_ns": 0, "links": links, "faults": list(faults)}, 10**12, counted)
+    return reckoning.close({"start_time_ns": 0, "links": links, "faults": list(faults)}, 10**12, counted, published)
 
 
 def test_the_judge_finds_nothing_where_nothing_is(skin):
@@ -268,6 +268,9 @@ def test_the_judge_finds_nothing_where_nothing_is(skin):
 def test_the_judge_finds_what_is_wrong(skin):
     assert judged(skin, skip=[50, 51])["unaccounted"] == 8
     assert judged(skin, counted=3)["unaccounted"] == 3
+    # what the driver published and the judge did not hear is the judge's fault, not the driver's
+    starved = judged(skin, skip=[50, 51], published=4 * COUNT)
+    assert (starved["unaccounted"], starved["missed_by_judge"]) == (0, 8)
 
     def bit(k, sequence, stamp, frequency, rows):
         if k == 70:
@@ -305,7 +308,9 @@ def test_the_judge_finds_what_is_wrong(skin):
 
 
 def test_limits_of_the_figures():
-    good = dict.fromkeys(("unaccounted", "wrong", "wrong_tensors", "false_alarms", "crashes", "threads_leaked"), 0)
+    good = dict.fromkeys(
+        ("missed_by_judge", "unaccounted", "wrong", "wrong_tensors", "false_alarms", "crashes", "threads_leaked"), 0
+    )
     good |= {"rss_growth_mb": 1.0, "worst_reconnect_s": 1.0, "stamp_error_p99_ms": 0.5}
     assert failures(good) == []
     assert failures({**good, "unaccounted": 1, "stamp_error_p99_ms": 1.2}) == ["unaccounted", "stamp_error_p99_ms"]

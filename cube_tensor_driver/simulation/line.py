@@ -1,11 +1,15 @@
-"""The line of a simulated hub: a pseudo-terminal that can be unplugged, held up, and taken in bursts."""
+"""The line of a simulated hub: a pseudo-terminal or TCP, that can be unplugged, held up, and taken in bursts."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import tty
 from pathlib import Path
+
+from ..core.errors import ConfigError
+from ..device.tcp import parse_url
 
 OUT_LIMIT = 1 << 16
 """Bytes that wait for the line at most: what is sampled beyond is dropped in the hub, and counted there."""
@@ -87,3 +91,64 @@ class Line:
             return os.read(self.fd, 65536)
         except BlockingIOError:
             return b""
+
+
+class TcpLine(Line):
+    """The same behind a bridge that listens at `url`: what is unplugged is the bridge, and it has no other name."""
+
+    def __init__(self, url: str) -> None:
+        """LinkError: no address; ConfigError: it cannot be listened at."""
+        self._address = parse_url(url)
+        self._listener: socket.socket | None = None
+        self._connection: socket.socket | None = None
+        super().__init__(Path(url))
+
+    def plug(self, port: Path | None = None) -> None:
+        """Listen."""
+        try:
+            self._listener = socket.create_server(self._address, backlog=1)
+        except OSError as error:
+            host, number = self._address
+            raise ConfigError(f"{host}:{number}: {error.strerror}; name an address that is free here") from None
+        self._listener.setblocking(False)
+        self.fd = self._listener.fileno()
+
+    def unplug(self) -> None:
+        """Vanish, with all that was on its way."""
+        self._hang_up()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener, self.fd = None, -1
+        self._out.clear()
+
+    def flush(self, now_us: int) -> None:
+        """Write what the line takes now; without a connection it waits."""
+        if self._connection is None:
+            return
+        try:
+            super().flush(now_us)
+        except ConnectionError:
+            self._hang_up()
+
+    def read(self) -> bytes:
+        """What the host sent; the first time its connection is taken up."""
+        if self._connection is None and self._listener is not None:
+            with contextlib.suppress(OSError):  # it went away again
+                self._connection, _ = self._listener.accept()
+                self._connection.setblocking(False)
+                self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self.fd = self._connection.fileno()
+            return b""
+        try:
+            data = super().read()
+        except ConnectionError:
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
+
+    def _hang_up(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+            self.fd = self._listener.fileno() if self._listener is not None else -1

@@ -1,7 +1,7 @@
 """The simulator: one process that plays all hubs of a skin on pseudo-terminals, under a load that moves over the skin.
 
-Each link's port appears as PORTS/<link name>. On SIGINT or SIGTERM it ends and writes its book: what was sampled when,
-so that others can tell what should have arrived.
+Each link's port appears as PORTS/<link name>; with --tcp, links that the skin file has on TCP are played there. On
+SIGINT or SIGTERM it ends and writes its book: what was sampled when, so that others can tell what should have arrived.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..files.yaml import parse_yaml, read_yaml
 from .cubes import SimulatedCubes
 from .faults import Fault, Injector, parse_faults
 from .hub import SimulatedHub
-from .line import Line
+from .line import Line, TcpLine
 from .load import CIRCUIT_S, MovingLoad
 
 ABSENT = -1
@@ -60,11 +60,13 @@ class Simulator:
         instants: int | None = None,
         faults: Sequence[Fault] = (),
         seed: int = 0,
+        tcp: bool = False,
     ) -> None:
         """instants: compute the load at so many instants of its circuit beforehand and go round them, one a sample.
 
-        faults: to carry out; seed: of what is random in them. ConfigError: cubes of one hub have different numbers of
-        pads, the folder for the ports cannot be used, or a fault is of what there is not.
+        faults: to carry out; seed: of what is random in them; tcp: play links whose port is socket://host:port there.
+        ConfigError: cubes of one hub have different numbers of pads, the folder for the ports or a TCP address cannot
+        be used, or a fault is of what there is not.
         """
         self._load = MovingLoad(skin)
         self._ports = ports
@@ -89,7 +91,8 @@ class Simulator:
                 # Clocks that started at different times, as those of real hubs.
                 hub = SimulatedHub(link.hub_uid or number + 1, uids, widths.pop(), boot_us=1_000_003 * (number + 1))
                 simulated = SimulatedCubes([cube.calibration for cube in cubes], noise, drift, seed=number)
-                self.benches.append(Bench(link.name, hub, Line(ports / link.name), members, simulated))
+                line = TcpLine(link.port) if tcp and link.port.startswith("socket://") else Line(ports / link.name)
+                self.benches.append(Bench(link.name, hub, line, members, simulated))
             control = ports / CONTROL
             control.unlink(missing_ok=True)
             os.mkfifo(control)
@@ -260,12 +263,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--instants", type=int, help="compute the load at so many instants only, and go round them")
     parser.add_argument("--faults", type=Path, help="faults to carry out: YAML, a list, see simulation/faults.py")
     parser.add_argument("--seed", type=int, default=0, help="of what is random in the faults")
+    parser.add_argument("--tcp", action="store_true", help="play links whose port is socket://host:port there")
     options = parser.parse_args(arguments)
     stop = Stop()
     try:
         faults = parse_faults(read_yaml(options.faults), str(options.faults)) if options.faults else []
         simulator = Simulator(read_skin(options.config), options.ports, options.noise, options.drift, options.instants,
-                              faults, options.seed)  # fmt: skip
+                              faults, options.seed, options.tcp)  # fmt: skip
     except CubeError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 1

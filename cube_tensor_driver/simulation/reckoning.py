@@ -23,10 +23,12 @@ SETTLE_S = 10.0
 """After a restart or a jump of a hub's clock, until its stamps are judged."""
 HOLD_S = 6.0
 """How long a pad that works again may still be left out: 2 s of rows, and its link may be cut for 2 s meanwhile."""
-INDEX_KEPT = 10_000
-"""Samples remembered until their tensors come: 5 s of 4 hubs at 500 Hz."""
+INDEX_KEPT = 40_000
+"""Samples remembered until their tensors come: 20 s of 4 hubs at 500 Hz, more than queues hold."""
 CLOCK = ("reset", "wrap", "unplug", "rename", "step", "drift")
 CUT = ("unplug", "rename")
+UNKNOWN = 3
+"""Kind of an odd tensor whose frequencies did not come."""
 
 
 class Reckoning:
@@ -60,12 +62,12 @@ class Reckoning:
         same = self._table[index, cube] == frequency
         first = np.flatnonzero(np.diff(hub << 32 | number, prepend=-1))
         if not same.all():
-            ends = [*first[1:].tolist(), len(cube)]
-            for start, end in zip(first.tolist(), ends, strict=True):
+            share = np.add.reduceat(same.mean(axis=1), first) / np.diff(first, append=len(cube))
+            ends = np.append(first[1:], len(cube))
+            for start, end in np.stack([first, ends], axis=1)[share < 0.5].tolist():
                 part = slice(start, end)
-                if same[part].mean() < 0.5:
-                    index[part] = self._find(int(hub[start]), int(number[start]), cube[part], frequency[part])
-                    same[part] = (index[part] >= 0)[:, None] & (self._table[index[part], cube[part]] == frequency[part])
+                index[part] = self._find(int(hub[start]), int(number[start]), cube[part], frequency[part])
+                same[part] = (index[part] >= 0)[:, None] & (self._table[index[part], cube[part]] == frequency[part])
             bad = np.flatnonzero(~same.all(axis=1))
             bits = (~same[bad]) @ (1 << np.arange(same.shape[1]))
             self._odd.append(np.stack([cube[bad], bits, stamp_ns[bad], np.zeros(len(bad), int)], axis=1))
@@ -92,11 +94,14 @@ class Reckoning:
         # A healthy cube tells all its components and has no status.
         bad = np.flatnonzero(~right | (rows.status != 0))
         if len(bad):
-            kind = 1 + (right[bad])
+            kind = np.where(index[bad] < 0, UNKNOWN, 1 + right[bad])
             self._odd.append(np.stack([cube[bad], np.zeros(len(bad), int), stamp_ns[bad], kind], axis=1))
 
     def _find(self, hub: int, number: int, cube: NDArray[Any], frequency: NDArray[np.float32]) -> int:
         """Where in the table a hub stands now, -1 if nowhere."""
+        known = (number + int(self._offset[hub])) % len(self._table)
+        if (self._table[known, cube] == frequency).mean() >= 0.5:  # found for a sample before
+            return known
         share = (self._table[:, cube] == frequency).mean(axis=(1, 2))
         best = int(share.argmax())
         if share[best] < 0.5:
@@ -104,15 +109,20 @@ class Reckoning:
         self._offset[hub] = best - number
         return best
 
-    def close(self, book: dict[str, Any], end_ns: int, counted: int) -> dict[str, Any]:
-        """Figures of all samples taken before end_ns (wall clock). counted: rows the driver says it did not deliver.
+    def close(self, book: dict[str, Any], end_ns: int, counted: int, published: int) -> dict[str, Any]:
+        """Figures of all samples taken before end_ns (wall clock).
 
-        Counts are in rows (one cube, one sample). lost_with_power: rows a hub took last before it lost its power or
-        restarted, which nobody can count; all others must be delivered or counted.
+        counted: rows the driver says it did not deliver; published: rows it says it did. Counts are in rows (one cube,
+        one sample). missed_by_judge: rows published that did not come here, because whoever calls got no processor for
+        longer than queues last: of these nothing can be said. lost_with_power: rows a hub took last before it lost its
+        power or restarted, which nobody can count; all others must be delivered or counted.
         """
         start_ns = book["start_time_ns"]
         samples = np.concatenate(self._samples) if self._samples else np.empty((0, 4), np.int64)
         odd = np.concatenate(self._odd) if self._odd else np.empty((0, 4), np.int64)
+        missed = max(0, published - self.rows)
+        if missed:  # tensors of rows that did not come cannot be judged; else they are of rows that never were
+            odd = odd[odd[:, 3] != UNKNOWN]
         faults = book["faults"]
         sent = delivered = last = invented = misplaced = 0
         errors: list[NDArray[np.float64]] = []
@@ -152,12 +162,14 @@ class Reckoning:
             "samples_sent": sent * self._each,
             "delivered": delivered * self._each,
             "counted": counted,
-            "unaccounted": max(0, left - last * self._each) + max(0, -left),
+            "missed_by_judge": missed,
+            "unaccounted": max(0, left - last * self._each - missed) + max(0, -left),
             "lost_with_power": max(0, min(left, last * self._each)),
             "wrong": unexplained[0] + (invented + misplaced) * self._each,
             "wrong_tensors": unexplained[1],
             "false_alarms": unexplained[2],
             "unexplained": unexplained[3],
+            "tensors": self.tensors,
             "reconnects": len(gaps),
             "worst_reconnect_s": round(max(gaps, default=0.0), 3),
             "stamp_error_p99_ms": round(float(np.percentile(error, 99)), 3) if len(error) else None,
@@ -184,7 +196,8 @@ class Reckoning:
                 open_bits[near] &= ~(1 << fault["pad"])
                 explained |= near & (open_bits == 0)
         left = np.flatnonzero(~explained)
-        frequency, tensor, status = (int(np.count_nonzero(odd[left, 3] == kind)) for kind in (0, 1, 2))
+        kinds = ((0,), (1, UNKNOWN), (2,))
+        frequency, tensor, status = (int(np.isin(odd[left, 3], kind).sum()) for kind in kinds)
         some = [(int(odd[row, 0]), round(float(seconds[row]), 3)) for row in left[:: max(1, len(left) // 8)][:8]]
         return frequency, tensor, status, some
 
