@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import itertools
-import os
+import socket
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,17 +14,24 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-# Domains up to 101 leave the ports of the system alone; where two suites run at once they rarely meet.
-_domains = itertools.cycle(range(1 + os.getpid() % 50, 100))
+# Domains up to 101 leave the ports of the system alone.
+_domains = itertools.cycle(range(1, 101))
 
 
 @pytest.fixture
-def domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A DDS domain that no other test uses, in the environment of this process and its children."""
-    number = next(_domains)
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    return number
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A DDS domain that no other test uses, of no other suite either, in the environment of this process and below."""
+    for number in itertools.islice(_domains, 100):
+        with (Path(tempfile.gettempdir()) / f"cube_tensor_domain_{number}").open("w") as mine:
+            try:
+                fcntl.flock(mine, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+            monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+            yield number
+            return
+    pytest.fail("all 100 domains are in use: end the other suites")
 
 
 @pytest.fixture
@@ -37,6 +47,17 @@ def ros(domain: int) -> Iterator[Ros]:
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+@pytest.fixture
+def deaf() -> Iterator[str]:
+    """A TCP port where connecting neither succeeds nor fails, as of a host that is switched off: its queue is full."""
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as server, contextlib.ExitStack() as stack:
+        for _ in range(4):
+            waiting = stack.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(server.getsockname())
+        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
 
 
 class Ros:
