@@ -42,6 +42,7 @@ def parser() -> argparse.ArgumentParser:
         "--config", type=Path, metavar="FILE", help="skin file to simulate (default: sixteen planar cubes)"
     )
     sub.add_argument("--cubes", type=int, metavar="N", help="simulate a grid of N planar cubes instead")
+    sub.add_argument("--load", type=Path, metavar="FILE", help="load script (default: something wanders over the skin)")
     sub.add_argument("--rate", type=positive, metavar="HZ", help="samples per second (default: the skin file's, 100)")
     sub.add_argument(
         "--duration",

@@ -18,7 +18,16 @@ def demo(options: argparse.Namespace) -> int:
     if duration is None and (options.headless or options.json):
         duration = 10.0
     return run_demo(
-        Options(options.config, options.cubes, options.rate, duration, options.headless, options.json, options.view)
+        Options(
+            options.config,
+            options.cubes,
+            options.rate,
+            duration,
+            options.headless,
+            options.json,
+            options.view,
+            options.load,
+        )
     )
 
 

@@ -15,6 +15,9 @@ def generate_launch_description() -> LaunchDescription:
             "rate", default_value="0.0", description="Samples per second; 0.0: as the skin file says."
         ),
         switch("simulate", "Simulate the skin's hubs on pseudo-terminals instead of opening its ports."),
+        DeclareLaunchArgument(
+            "load", default_value="", description="Load script (YAML) of the simulated skin; empty: something wanders."
+        ),
         switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
         switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),

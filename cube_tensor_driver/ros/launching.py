@@ -13,6 +13,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from ..core.errors import ConfigError
+from ..files.script import read_script
 from ..files.share import share
 from ..files.skin import Skin, read_skin
 from ..files.urdf import skin_urdf
@@ -31,8 +32,8 @@ def switch(name: str, description: str) -> DeclareLaunchArgument:
 def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list[LaunchDescriptionEntity]:
     """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask for.
 
-    arguments: config and namespace; port, rate, simulate, composed, markers, contacts, record, rviz, state_publisher
-    if the launch file has them. ConfigError: the skin file or an argument is wrong.
+    arguments: config and namespace; port, rate, simulate, load, composed, markers, contacts, record, rviz,
+    state_publisher if the launch file has them. ConfigError: the skin file, load script or an argument is wrong.
     """
     given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
     path = Path(given["config"]).expanduser().resolve()
@@ -42,6 +43,10 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
         rate = float(given.get("rate", 0))
     except ValueError:
         raise ConfigError(f"rate:={given['rate']}: must be a number of samples per second") from None
+
+    load = Path(given["load"]).expanduser().resolve() if given.get("load") else None
+    if load is not None:
+        read_script(load)
 
     def wanted(name: str) -> bool:
         return given.get(name) == "true"
@@ -53,6 +58,7 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
         composed=wanted("composed"),
         markers=wanted("markers") or wanted("rviz"),
         contacts=wanted("contacts"),
+        load=load,
         simulated_ports=Path(tempfile.mkdtemp(prefix="cube_ports_")) if wanted("simulate") else None,
     )
     # Nodes first: where one cannot be started launch gives up, and leaves what it has started already.

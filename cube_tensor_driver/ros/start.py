@@ -34,12 +34,14 @@ def skin_processes(
     simulated_ports: Path | None = None,
     book: Path | None = None,
     instants: int | None = None,
+    load: Path | None = None,
 ) -> list[Process]:
     """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
 
     port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
     for the file's. composed: driver and reconstruction in one process. markers, contacts: those nodes, too. book: where
-    the simulator writes what it sampled; instants: see `simulation.main.Simulator`.
+    the simulator writes what it sampled; instants: see `simulation.main.Simulator`; load: its load script, None for the
+    shipped one.
     """
     skin: dict[str, Value] = {"config": str(config)}
     driver: dict[str, Value] = {**skin, "port": port, "rate": rate, "port_directory": str(simulated_ports or "")}
@@ -55,6 +57,8 @@ def skin_processes(
             processes.append(Process(name, f"cube_tensor_driver.ros.{name}"))
     if simulated_ports is not None:
         arguments = ["--config", str(config), "--ports", str(simulated_ports)]
+        if load is not None:
+            arguments += ["--load", str(load)]
         if book is not None:
             arguments += ["--book", str(book)]
         if instants is not None:

@@ -12,7 +12,7 @@ from ..core.modes import COMPONENTS
 from ..core.pipeline import StressRows
 from ..files.skin import Skin
 from .cubes import true_components
-from .load import MovingLoad
+from .load import Load
 
 TIMES_CHECKED = 500
 """Instants at most whose tensors are compared with the load: each costs a contact problem."""
@@ -21,9 +21,9 @@ TIMES_CHECKED = 500
 class Judge:
     """Takes rows as they arrive; `read_book` then fixes what should have arrived in a span of time."""
 
-    def __init__(self, skin: Skin) -> None:
+    def __init__(self, skin: Skin, load: Load) -> None:
         self.contradictions = 0
-        self._skin = skin
+        self._skin, self._load = skin, load
         self._tensors: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int]] = []
         self._samples: list[tuple[NDArray[Any], NDArray[Any]]] = []
         self._sent = 0
@@ -116,7 +116,6 @@ class Judge:
 
     def _errors(self, cube: NDArray[Any], values: NDArray[Any], true_ns: NDArray[Any]) -> tuple[float, float]:
         """Root mean square and worst deviation of the observed components, relative to the range that was applied."""
-        load = MovingLoad(self._skin)
         calibrations = {c.calibration.id: c.calibration for c in self._skin.cubes}
         kind = np.array([c.calibration.id for c in self._skin.cubes])
         times = np.unique(true_ns)
@@ -124,7 +123,7 @@ class Judge:
         found, applied = [], []
         for time_ns in times:
             rows = np.flatnonzero(true_ns == time_ns)
-            stress, gradient = load.at((time_ns - self._book_start) * 1e-9)
+            stress, gradient = self._load.at((time_ns - self._book_start) * 1e-9)
             truth = np.empty((len(rows), len(COMPONENTS)))
             for name, calibration in calibrations.items():
                 chosen = kind[cube[rows]] == name

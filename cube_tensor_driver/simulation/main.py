@@ -1,4 +1,4 @@
-"""The simulator: one process that plays all hubs of a skin on pseudo-terminals, under a load that moves over the skin.
+"""The simulator: one process that plays all hubs of a skin on pseudo-terminals, under the load of a script.
 
 Each link's port appears as PORTS/<link name>; with --tcp, links that the skin file has on TCP are played there. On
 SIGINT or SIGTERM it ends and writes its book: what was sampled when, so that others can tell what should have arrived.
@@ -22,13 +22,14 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import ConfigError, CubeError
+from ..files.script import read_script
 from ..files.skin import Skin, read_skin
 from ..files.yaml import parse_yaml, read_yaml
 from .cubes import SimulatedCubes
 from .faults import Fault, Injector, parse_faults
 from .hub import SimulatedHub
 from .line import Line, TcpLine
-from .load import CIRCUIT_S, MovingLoad
+from .load import Load, default_script
 
 ABSENT = -1
 FIRST_UID = 0xC0BE_0000_0000_0001
@@ -61,14 +62,15 @@ class Simulator:
         faults: Sequence[Fault] = (),
         seed: int = 0,
         tcp: bool = False,
+        load: Load | None = None,
     ) -> None:
-        """instants: compute the load at so many instants of its circuit beforehand and go round them, one a sample.
+        """instants: compute the load at so many instants of its script beforehand and go round them, one a sample.
 
-        faults: to carry out; seed: of what is random in them; tcp: play links whose port is socket://host:port there.
-        ConfigError: cubes of one hub have different numbers of pads, the folder for the ports or a TCP address cannot
-        be used, or a fault is of what there is not.
+        faults: to carry out; seed: of what is random in them; tcp: play links whose port is socket://host:port there;
+        load: None is the shipped script's. ConfigError: cubes of one hub have different numbers of pads, the folder
+        for the ports or a TCP address cannot be used, or a fault is of what there is not.
         """
-        self._load = MovingLoad(skin)
+        self._load = load or Load(skin, default_script())
         self._ports = ports
         self._field: tuple[int, tuple[np.ndarray, np.ndarray]] | None = None
         self._start_ns = time.monotonic_ns()
@@ -108,7 +110,7 @@ class Simulator:
 
     def _prepare(self, instants: int) -> None:
         for number in range(instants):
-            stress, gradient = self._load.at(number * CIRCUIT_S / instants)
+            stress, gradient = self._load.at(number * self._load.period / instants)
             for bench in self.benches:
                 bench.prepared.append(self._frequency(bench, stress, gradient, 0.0))
 
@@ -260,6 +262,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--drift", type=float, default=0.0, help="relative drift of the rest frequencies per second")
     parser.add_argument("--book", type=Path, help="file for the book of what was sampled (JSON), written at the end")
+    parser.add_argument("--load", type=Path, help="load script; docs/simulation.md (default: something that wanders)")
     parser.add_argument("--instants", type=int, help="compute the load at so many instants only, and go round them")
     parser.add_argument("--faults", type=Path, help="faults to carry out: YAML, a list, see simulation/faults.py")
     parser.add_argument("--seed", type=int, default=0, help="of what is random in the faults")
@@ -268,8 +271,10 @@ def main(arguments: list[str] | None = None) -> int:
     stop = Stop()
     try:
         faults = parse_faults(read_yaml(options.faults), str(options.faults)) if options.faults else []
-        simulator = Simulator(read_skin(options.config), options.ports, options.noise, options.drift, options.instants,
-                              faults, options.seed, options.tcp)  # fmt: skip
+        skin = read_skin(options.config)
+        load = Load(skin, read_script(options.load) if options.load else default_script())
+        simulator = Simulator(skin, options.ports, options.noise, options.drift, options.instants, faults,
+                              options.seed, options.tcp, load)  # fmt: skip
     except CubeError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 1

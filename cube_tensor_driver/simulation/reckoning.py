@@ -15,7 +15,7 @@ from ..core.pipeline import StressRows
 from ..files.skin import Skin
 from .cubes import SimulatedCubes, true_components
 from .faults import PAD
-from .load import CIRCUIT_S, MovingLoad
+from .load import Load, default_script
 
 TOLERANCE = 1e-3
 """Of a component's range: float32 leaves 1e-6, a wrong sample 1e-1."""
@@ -37,10 +37,11 @@ class Reckoning:
     def __init__(self, skin: Skin, instants: int) -> None:
         n, hubs = len(skin.cubes), len(skin.links)
         self._hubs, self._each = hubs, n // hubs
-        load, cubes = MovingLoad(skin), SimulatedCubes([cube.calibration for cube in skin.cubes])
+        load = Load(skin, default_script())
+        cubes = SimulatedCubes([cube.calibration for cube in skin.cubes])
         table, truth = [], []
         for number in range(instants):
-            stress, gradient = load.at(number * CIRCUIT_S / instants)
+            stress, gradient = load.at(number * load.period / instants)
             millihertz = cubes.frequency(stress, gradient, 0.0)
             table.append((millihertz * 1e-3).astype(np.float32))
             truth.append(true_components(skin.cubes[0].calibration, stress, gradient))

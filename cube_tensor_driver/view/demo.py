@@ -22,6 +22,7 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
 from ..core.errors import ConfigError, CubeError, MessageError
 from ..files.grid import grid
+from ..files.script import read_script
 from ..files.share import share
 from ..files.skin import Skin, read_skin
 from ..files.yaml import write_yaml
@@ -30,6 +31,7 @@ from ..ros.messages import read_stress
 from ..ros.node import make_executor, queue
 from ..ros.start import Process, skin_processes
 from ..simulation.judge import Judge
+from ..simulation.load import Load, default_script
 from .table import LiveTable
 
 FIRST_TENSORS_S = 20.0
@@ -48,6 +50,7 @@ class Options:
     headless: bool
     json: Path | None
     view: bool = False
+    load: Path | None = None
 
 
 class Interrupted(CubeError):
@@ -94,9 +97,10 @@ def run_demo(options: Options) -> int:
 def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: threading.Event) -> int:
     rate = options.rate or skin.rate or RATE
     book = folder / "book.json"
-    judge = Judge(skin)
+    script = read_script(options.load) if options.load else default_script()
+    judge = Judge(skin, Load(skin, script))
     with LiveTable(skin, show=not options.headless) as table, Children(folder) as children:
-        for process in skin_processes(path, rate=rate, simulated_ports=folder / "ports", book=book):
+        for process in skin_processes(path, rate=rate, simulated_ports=folder / "ports", book=book, load=options.load):
             children.start(process)
         if options.view:
             children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
