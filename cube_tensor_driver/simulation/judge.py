@@ -22,7 +22,7 @@ class Judge:
     """Takes rows as they arrive; `read_book` then fixes what should have arrived in a span of time."""
 
     def __init__(self, skin: Skin, load: Load) -> None:
-        self.contradictions = 0
+        self.contradictions = self.newest_ns = 0
         self._skin, self._load = skin, load
         self._tensors: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int]] = []
         self._samples: list[tuple[NDArray[Any], NDArray[Any]]] = []
@@ -36,6 +36,7 @@ class Judge:
     ) -> None:
         """Rows of one stress message, received at received_ns (wall clock)."""
         values = np.concatenate([rows.stress, rows.gradient], axis=1)
+        self.newest_ns = max(self.newest_ns, int(stamp_ns.max(initial=0)))
         self._tensors.append((np.array(cube), np.array(sequence), np.array(stamp_ns), values, received_ns))
 
     def frequencies(self, cube: ArrayLike, sequence: ArrayLike) -> None:
