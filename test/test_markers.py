@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import numpy as np
 import pytest
 
-from conftest import ROOT
 from cube_tensor_driver.core import scene
 from cube_tensor_driver.core.pipeline import INVALID, PAD_FAULT, StressRows
 from cube_tensor_driver.core.scene import QUANTITIES, Newest, Places
@@ -148,22 +146,3 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     contact = contacts[-1]
     assert contact.header.frame_id == "skin_base" and len(contact.position) == 1
     assert contact.normal_force[0] > 0 and contact.force[0].z < 0 < contact.force[0].x
-
-
-def test_rviz_and_foxglove_layouts_name_our_topics():
-    yaml = pytest.importorskip("yaml")
-    rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
-    displays = {display["Class"]: display for display in rviz["Visualization Manager"]["Displays"]}
-    assert displays["rviz_default_plugins/MarkerArray"]["Topic"]["Value"] == "markers"
-    assert displays["rviz_default_plugins/RobotModel"]["Description Topic"]["Value"] == "robot_description"
-    assert displays["rviz_default_plugins/Wrench"]["Topic"]["Value"].endswith("/wrench")
-    assert rviz["Visualization Manager"]["Global Options"]["Fixed Frame"] == "skin_base"
-    foxglove = json.loads((ROOT / "config" / "foxglove_skin.json").read_text())
-    panels = foxglove["configById"]
-    scene_panel = next(panel for name, panel in panels.items() if name.startswith("3D!"))
-    assert scene_panel["topics"]["/markers"]["visible"] and scene_panel["followTf"] == "skin_base"
-
-    def leaves(node: object) -> list[str]:
-        return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
-
-    assert set(leaves(foxglove["layout"])) == set(panels)

@@ -1,0 +1,124 @@
+"""The set-ups for RViz and Foxglove, whose programs are not here: every name in them is one that their sources read.
+
+Names from ros2/rviz, branch jazzy (14.1): plugins_description.xml, panel_factory.cpp and the constructors of displays
+and properties; from Lichtblick (Foxglove Studio's open sources), March 2025: the panels' index and config types.
+"""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from conftest import ROOT
+
+yaml = pytest.importorskip("yaml")
+
+DISPLAY = {"Class", "Name", "Enabled"}
+QUALITY = {
+    "Depth": range(1, 1000),
+    "History Policy": ("System Default", "Keep Last", "Keep All"),
+    "Reliability Policy": ("System Default", "Reliable", "Best Effort"),
+    "Durability Policy": ("System Default", "Transient Local", "Volatile"),
+}
+DISPLAYS = {
+    "Grid": {"Reference Frame", "Plane Cell Count", "Normal Cell Count", "Cell Size", "Line Style", "Color", "Alpha",
+             "Plane", "Offset"},
+    "RobotModel": {"Visual Enabled", "Collision Enabled", "Mass Properties", "Update Interval", "Alpha",
+                   "Description Source", "Description File", "Description Topic", "TF Prefix"},
+    "MarkerArray": {"Namespaces", "Topic"},
+    "Wrench": {"Accept NaN Values", "Force Color", "Torque Color", "Alpha", "Force Arrow Scale", "Torque Arrow Scale",
+               "Arrow Width", "History Length", "Topic"},
+    "TF": {"Show Names", "Show Axes", "Show Arrows", "Marker Scale", "Update Interval", "Frame Timeout", "Frames"},
+}  # fmt: skip
+TOOLS = {"Interact", "MoveCamera", "Select", "FocusCamera", "Measure", "SetInitialPose", "SetGoal", "PublishPoint"}
+PANELS = {"Displays", "Help", "Selection", "Time", "Tool Properties", "Transformation", "Views"}
+ORBIT = {"Class", "Name", "Distance", "Focal Shape Size", "Focal Shape Fixed Size", "Yaw", "Pitch", "Focal Point",
+         "Near Clip Distance", "Target Frame", "Invert Z Axis", "Enable Stereo Rendering"}  # fmt: skip
+
+PLOT = {"foxglovePanelTitle", "paths", "minXValue", "maxXValue", "minYValue", "maxYValue", "showLegend",
+        "legendDisplay", "showPlotValuesInLegend", "showXAxisLabels", "showYAxisLabels", "isSynced", "xAxisVal",
+        "xAxisPath", "followingViewWidth", "sidebarDimension"}  # fmt: skip
+FOXGLOVE = {
+    "3D": {"cameraState", "followTf", "followMode", "scene", "publish", "transforms", "topics", "layers", "imageMode"},
+    "Plot": PLOT,
+    "DiagnosticSummary": {"topicToRender", "minLevel", "pinnedIds", "hardwareIdFilter", "sortByLevel"},
+}
+CAMERA = {"distance", "perspective", "phi", "target", "targetOffset", "targetOrientation", "thetaOffset", "fovy",
+          "near", "far"}  # fmt: skip
+GRID = {"visible", "frameLocked", "label", "instanceId", "layerId", "frameId", "size", "divisions", "lineWidth",
+        "color", "position", "rotation"}  # fmt: skip
+PATH = {"value", "enabled", "color", "label", "timestampMethod", "showLine", "lineSize"}
+
+
+def topic_of(display: dict) -> dict | None:
+    return display.get("Topic") or display.get("Description Topic")
+
+
+def test_rviz_reads_every_name_of_ours():
+    rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
+    assert {panel["Class"] for panel in rviz["Panels"]} <= {f"rviz_common/{name}" for name in PANELS}
+    manager = rviz["Visualization Manager"]
+    assert set(manager["Global Options"]) <= {"Fixed Frame", "Background Color", "Frame Rate"}
+    for display in manager["Displays"]:
+        package, name = display["Class"].split("/")
+        assert package == "rviz_default_plugins" and set(display) - DISPLAY <= DISPLAYS[name], display["Name"]
+        topic = topic_of(display)
+        if topic is not None:
+            assert set(topic) == {"Value", *QUALITY}
+            assert all(topic[key] in allowed for key, allowed in QUALITY.items())
+    assert {tool["Class"] for tool in manager["Tools"]} <= {f"rviz_default_plugins/{name}" for name in TOOLS}
+    assert manager["Transformation"]["Current"]["Class"] == "rviz_default_plugins/TF"
+    view = manager["Views"]["Current"]
+    assert view["Class"] == "rviz_default_plugins/Orbit" and set(view) <= ORBIT
+
+
+def test_rviz_shows_our_topics_as_they_are_offered():
+    """A latched topic wants a latched subscription; and a reliable one a reliable publisher."""
+    rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
+    displays = {display["Class"].split("/")[1]: display for display in rviz["Visualization Manager"]["Displays"]}
+    assert topic_of(displays["MarkerArray"])["Value"] == "markers"
+    model = topic_of(displays["RobotModel"])
+    assert model["Value"] == "robot_description" and model["Durability Policy"] == "Transient Local"
+    wrench = displays["Wrench"]
+    assert wrench["Topic"]["Value"] == "cubes/c05/wrench" and wrench["Topic"]["Reliability Policy"] == "Best Effort"
+    assert wrench["Accept NaN Values"] is False
+    assert rviz["Visualization Manager"]["Global Options"]["Fixed Frame"] == "skin_base"
+
+
+def test_foxglove_reads_every_name_of_ours():
+    layout = json.loads((ROOT / "config" / "foxglove_skin.json").read_text())
+    assert set(layout) <= {"configById", "layout", "globalVariables", "playbackConfig", "userNodes", "version"}
+    panels = layout["configById"]
+    for name, panel in panels.items():
+        kind = name.partition("!")[0]
+        assert set(panel) <= FOXGLOVE[kind], name
+        for path in panel.get("paths", []):
+            assert set(path) <= PATH and path["timestampMethod"] in ("receiveTime", "headerStamp")
+    (scene,) = (panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert set(scene["cameraState"]) <= CAMERA and set(scene["layers"]["grid"]) <= GRID
+    assert scene["followMode"] in ("follow-pose", "follow-position", "follow-none")
+    assert scene["topics"]["/markers"]["visible"] and scene["followTf"] == "skin_base"
+
+    def leaves(node: object) -> list[str]:
+        return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
+
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+
+
+def test_what_foxglove_plots_are_fields_of_our_messages():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from geometry_msgs.msg import WrenchStamped
+
+    from cube_tensor_driver.msg import StressTensorStamped
+
+    kinds = {"stress": StressTensorStamped, "wrench": WrenchStamped}
+    layout = json.loads((ROOT / "config" / "foxglove_skin.json").read_text())
+    paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", [])]
+    assert paths
+    for path in paths:
+        topic, *fields = path.split(".")
+        value = kinds[topic.rpartition("/")[2]]()
+        for field in fields:
+            value = getattr(value, field)
+        assert isinstance(value, float)
