@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
@@ -20,7 +22,9 @@ LEAST_N, WAIT_S = 2.2, 20.0
 """The load comes and goes: the picture waits until it presses."""
 
 
-def photograph(url: str, path: str) -> None:
+@contextmanager
+def chromium(url: str) -> Iterator[webdriver.Chrome]:
+    """A headless browser that shows the page."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or shutil.which("google-chrome") or ""
     for flag in FLAGS:
@@ -29,6 +33,13 @@ def photograph(url: str, path: str) -> None:
     try:
         browser.set_script_timeout(60)
         browser.get(url)
+        yield browser
+    finally:
+        browser.quit()
+
+
+def photograph(url: str, path: str) -> None:
+    with chromium(url) as browser:
         time.sleep(LOOK_S)
         browser.execute_script(CLEAR)
         until = time.monotonic() + WAIT_S
@@ -37,8 +48,6 @@ def photograph(url: str, path: str) -> None:
         browser.execute_script(CLICK)
         time.sleep(SETTLE_S)
         browser.save_screenshot(path)
-    finally:
-        browser.quit()
 
 
 if __name__ == "__main__":

@@ -128,45 +128,42 @@ class Surface:
         inside = pressure > max(least, FLOOR * float(pressure.max()))
         if not inside.any():
             return []
-        label = self._parts(inside)
-        # Each patch counts for the contact nearest to its cube, points of a contact for their own.
-        own = cKDTree(self.points[inside]).query(self.places.position)[1]
-        owner = label[own][self.cube]
-        owner[inside] = label
         field = Field(pressure, np.nan_to_num(self._shear(values)))
         doubt, alike = self.uncertainty(values), -np.nan_to_num(self._interpolate(values, PRESSURE[:1]))
         sheared = bool(np.isfinite(values[:, SHEAR]).any())
-        found = [self._contact(np.flatnonzero(owner == k), field, alike, doubt, sheared) for k in np.unique(label)]
+        owner = self._owners(inside)
+        found = [self._contact(owner == k, field, alike, doubt, sheared) for k in np.unique(owner)]
         return sorted(found, key=lambda contact: -contact.normal_force)
 
-    def _parts(self, inside: NDArray[np.bool_]) -> NDArray[np.int32]:
-        """Number of the connected part of each of the points `inside`."""
+    def _owners(self, inside: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """(cubes,) number of the contact that each patch counts for; what meets in a patch is one contact."""
+        n = len(self._near)
         joined = inside[self._from] & inside[self._to]
-        number, n = np.cumsum(inside) - 1, np.count_nonzero(inside)
-        links = coo_matrix(
-            (np.ones(joined.sum()), (number[self._from[joined]], number[self._to[joined]])), shape=(n, n)
-        )
-        labels: NDArray[np.int32] = connected_components(links, directed=False)[1]
-        return labels
+        links = coo_matrix((joined[joined], (self.cube[self._from[joined]], self.cube[self._to[joined]])), shape=(n, n))
+        part = connected_components(links, directed=False)[1]
+        touched = inside.reshape(n, -1).any(axis=1)
+        nearest = cKDTree(self.places.position[touched]).query(self.places.position)[1]
+        owners: NDArray[np.int32] = part[touched][nearest]
+        return owners
 
-    def _contact(self, mine: NDArray[np.intp], field: Field, alike: Array, doubt: Array, sheared: bool) -> Contact:
-        pressure, points, cubes = field.pressure[mine], self.points[mine], self.cube[mine]
+    def _contact(self, mine: NDArray[np.bool_], field: Field, alike: Array, doubt: Array, sheared: bool) -> Contact:
+        """The contact of the patches `mine` (cubes,)."""
 
-        def per_cube(x: Array) -> Array:
-            return np.bincount(cubes, x * self.area, len(self.places.position)).astype(float)
+        def of_mine(on_points: Array) -> Array:
+            return on_points.reshape(len(mine), -1)[mine]
 
+        turn, points = self.places.rotation[mine], self.points.reshape(len(mine), -1, 3)[mine]
+        pressure, weight = of_mine(field.pressure), of_mine(alike) * self.area
         normal_force = float(pressure.sum() * self.area)
-        normal = per_cube(pressure) @ self.places.rotation[:, :, 2]
+        normal = _total(pressure.sum(axis=1), turn[:, :, 2])
         normal /= np.linalg.norm(normal)
-        shear = sum(per_cube(field.shear[mine, k]) @ self.places.rotation[:, :, k] for k in (0, 1))
+        shear = sum(_total(of_mine(field.shear[:, k]).sum(axis=1), turn[:, :, k]) for k in (0, 1)) * self.area
         shear -= normal * (shear @ normal)
-        moment = alike[mine] * self.area
-        centre = moment @ points / moment.sum()
-        position = centre + self.depth * (normal - shear / moment.sum())
+        centre = _total(weight, points) / weight.sum()
+        position = centre + self.depth * (normal - shear / weight.sum())
         # errors between cubes are as wide as the pitch is: so many points are wrong together
-        sigma = doubt[mine] * np.abs(pressure) * self.area
-        together = (self.pitch / self.spacing) ** 2
-        apart = ((points - centre) ** 2).sum(axis=1) / 2
+        variance = (of_mine(doubt) * pressure * self.pitch * self.spacing) ** 2
+        apart = ((points - centre) ** 2).sum(axis=2) / 2
         return Contact(
             position,
             normal,
@@ -174,8 +171,8 @@ class Surface:
             normal_force,
             float(np.linalg.norm(shear)) if sheared else np.nan,
             float(np.count_nonzero(pressure > 0.5 * pressure.max()) * self.area),
-            float(np.sqrt(together * (sigma**2 @ apart)) / normal_force),
-            float(np.sqrt(together * (sigma**2).sum())),
+            float(np.sqrt((variance * apart).sum()) / normal_force),
+            float(np.sqrt(variance.sum())),
         )
 
     def _pressure(self, values: Array) -> Array:
@@ -187,6 +184,8 @@ class Surface:
     def _interpolate(self, values: Array, columns: list[int]) -> Array:
         """(M,) the first of the columns of values (cubes, 15) on all points; the others are its gradient."""
         known = np.isfinite(values)
+        if not known[:, columns[0]].any():
+            return np.full(len(self.points), np.nan)
         weights = self._weights(known, columns)
         scale = np.array([1.0, self._scale, self._scale])[: len(columns)]
         value: Array = weights.matrix @ (np.where(known, values, 0)[:, columns] * scale).ravel()
@@ -222,6 +221,12 @@ class Surface:
         to_points = to_points.reshape(n, -1, size) * seen[:, None]
         weights = np.swapaxes(np.linalg.solve(matrix, np.swapaxes(to_points, 1, 2)), 1, 2)
         return weights, np.sqrt(np.clip(1 - np.einsum("nqd,nqd->nq", weights, to_points), 0, 1))
+
+
+def _total(weights: Array, vectors: Array) -> Array:
+    """(3,) the sum of weights (...) times vectors (..., 3). Not by BLAS: its threads burn a second core over this."""
+    result: Array = np.einsum("n,ni->i", weights.ravel(), vectors.reshape(-1, 3))
+    return result
 
 
 def _covariance(d: Array, u: Array, v: Array) -> Array:

@@ -60,6 +60,7 @@ class Markers(FollowerNode):
         self._pitch = places.pitch
         self._canvas = Canvas(self.follower.info.header.frame_id, places, self._pitch, self.value("crosses"))
         self._top = self._longest = self._steepest = 0.0
+        self._health = np.empty(0)
 
     def message(self) -> bytes:
         canvas, places, newest = self._canvas, self.follower.places, self.follower.newest
@@ -77,8 +78,10 @@ class Markers(FollowerNode):
         canvas["traction"].points[:] = scene.heads(arrows, normal).reshape(-1, 3)
         arrows = scene.gradient_arrows(places, values, 0.8 * self._pitch / self._steepest)
         canvas["gradient"].points[:] = scene.heads(arrows, normal).reshape(-1, 3)
-        canvas["faults"].points[:] = scene.fault_crosses(places, health).reshape(-1, 3)
-        canvas["faults"].colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
+        if not np.array_equal(health, self._health):
+            self._health = health
+            canvas["faults"].points[:] = scene.fault_crosses(places, health).reshape(-1, 3)
+            canvas["faults"].colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
         if "crosses" in canvas:
             lines, pulls = scene.principal_crosses(places, values, self._pitch / self._longest)
             canvas["crosses"].points[:] = lines.reshape(-1, 3)

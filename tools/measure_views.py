@@ -1,0 +1,165 @@
+"""What those who look cost: markers, contacts and browser view beside a skin of so many cubes that sends at 100 Hz.
+
+measure_views.py CUBES [chromium]: one line of figures. The page is read by a client that draws nothing, or by headless
+Chromium, which draws on the processor; then fps is how often it did.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import psutil
+import rclpy
+import viser
+import zstandard
+from photograph import chromium
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from cube_tensor_driver.core.pipeline import Pipeline, StressRows
+from cube_tensor_driver.files.grid import grid
+from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.files.yaml import write_yaml
+from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
+from cube_tensor_driver.ros.children import Children
+from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
+from cube_tensor_driver.ros.node import LATCHED, make_executor, queue
+from cube_tensor_driver.ros.start import Process
+from cube_tensor_driver.simulation.load import CIRCUIT_S, MovingLoad
+
+RATE, INSTANTS, START_S, SETTLE_S, MEASURE_S = 100.0, 200, 30.0, 6.0, 15.0
+FRAMES = "window.frames_ = 0; (function f() { window.frames_++; requestAnimationFrame(f) })()"
+
+
+CAMERA = {"type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": (0, 0, 1), "fov": 1.0, "near": 0.01,
+          "far": 9.0, "image_height": 9, "image_width": 9, "look_at": (0, 0, 0), "up_direction": (0, 0, 1)}  # fmt: skip
+"""A page that has said where it looks from is one that the view draws for."""
+
+
+class Counter:
+    """Pictures that a reader of the page gets; it draws nothing."""
+
+    def __init__(self, url: str) -> None:
+        self.pictures = 0
+        address = url.replace("http", "ws", 1)
+        self._socket = connect(address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None)
+        self._socket.send(msgspec.msgpack.encode(CAMERA))
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            for data in self._socket:
+                assert isinstance(data, bytes)
+                length = int.from_bytes(data[8:16], "little")
+                self.pictures += zstandard.decompress(data[16 : 16 + length]).count(b"/cubes")
+
+
+def measure(cubes: int, browser: bool) -> dict[str, float]:
+    with tempfile.TemporaryDirectory(prefix="cube_views_") as name, contextlib.ExitStack() as stack:
+        folder = Path(name)
+        nx = math.ceil(math.sqrt(cubes))
+        while cubes % nx:
+            nx += 1
+        write_yaml(folder / "skin.yaml", grid("skin", nx, cubes // nx, 0.012, 1, "planar", "planar", RATE, "/dev/null"))
+        skin = read_skin(folder / "skin.yaml")
+        load = MovingLoad(skin)
+        node = rclpy.create_node("measure")
+        info = node.create_publisher(SkinInfo, "info", LATCHED)
+        info.publish(info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns()))
+        publisher = node.create_publisher(SkinStress, "stress", queue(RATE))
+        counts = {"markers": 0, "contacts": 0}
+        for topic, kind in (("markers", MarkerArray), ("contacts", SkinContacts)):
+            count = functools.partial(lambda topic, _: counts.__setitem__(topic, counts[topic] + 1), topic)
+            node.create_subscription(kind, topic, count, 10, raw=True)
+        index, none = np.arange(cubes, dtype=np.uint16), np.zeros(cubes, np.int32)
+        rows = [stress_rows(*load.at(k * CIRCUIT_S / INSTANTS)) for k in range(INSTANTS)]
+        ended = threading.Event()
+
+        def send() -> None:
+            number = 0
+            while not ended.wait(1 / RATE):
+                number += 1
+                times = Times(Header(stamp=to_time(time.time_ns())), index, (none + number).astype(np.uint32), none)
+                publisher.publish(stress_message(times, rows[number * INSTANTS // round(CIRCUIT_S * RATE) % INSTANTS]))
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        stack.callback(sender.join)
+        stack.callback(ended.set)
+        children = stack.enter_context(Children(folder))
+        for topic in counts:
+            children.start(Process(topic, f"cube_tensor_driver.ros.{topic}"))
+        children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
+        url = children.said("view", "http://", START_S).split()[0]
+        counter = Counter(url)
+        page = stack.enter_context(chromium(url)) if browser else None
+        executor = make_executor()
+        executor.add_node(node)
+
+        def spin(seconds: float) -> None:
+            until = time.monotonic() + seconds
+            while time.monotonic() < until:
+                executor.spin_once(timeout_sec=0.1)
+
+        spin(SETTLE_S)
+        if page:
+            page.execute_cdp_cmd("Performance.enable", {})
+            page.execute_script(FRAMES)
+            script = scripting(page)
+        names = (*counts, "view")
+        before = {name: cpu(children.pid(name)) for name in names}
+        counts_before, pictures, start = counts.copy(), counter.pictures, time.monotonic()
+        spin(MEASURE_S)
+        seconds = time.monotonic() - start
+        result = {f"cpu_{name}_percent": 100 * (cpu(children.pid(name)) - before[name]) / seconds for name in names}
+        result |= {f"{topic}_hz": (counts[topic] - counts_before[topic]) / seconds for topic in counts}
+        result["view_hz"] = (counter.pictures - pictures) / seconds
+        if page:
+            frames = page.execute_script("return window.frames_")
+            result |= {"fps": frames / seconds, "script_ms_per_frame": 1e3 * (scripting(page) - script) / frames}
+        result["rss_view_mb"] = psutil.Process(children.pid("view")).memory_info().rss / 2**20
+        children.check()
+        executor.remove_node(node)
+        ended.set()
+        sender.join()
+        node.destroy_node()
+        return {name: round(value, 1) for name, value in result.items()}
+
+
+def scripting(page: Any) -> float:
+    """Seconds that the page's main thread has spent in its own code, without drawing."""
+    metrics = page.execute_cdp_cmd("Performance.getMetrics", {})["metrics"]
+    return float(next(metric["value"] for metric in metrics if metric["name"] == "ScriptDuration"))
+
+
+def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
+    """As planar cubes would give them."""
+    n = len(stress)
+    stress, gradient = stress.astype(np.float32), gradient[:, :3].reshape(n, 9).astype(np.float32)
+    stress[:, [1, 3, 5]], gradient[:, [1, 3, 4, 5, 7]] = np.nan, np.nan
+    return StressRows(stress, gradient, np.ones(n, np.float32), np.zeros(n, np.uint16), np.zeros(n, np.uint16))
+
+
+def cpu(pid: int) -> float:
+    times = psutil.Process(pid).cpu_times()
+    return float(times.user + times.system)
+
+
+if __name__ == "__main__":
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    print(sys.argv[1:], measure(int(sys.argv[1]), "chromium" in sys.argv), flush=True)
+    rclpy.try_shutdown()
