@@ -39,7 +39,7 @@ from cube_tensor_driver.ros.children import Children
 from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
 from cube_tensor_driver.ros.node import LATCHED, make_executor, queue
 from cube_tensor_driver.ros.start import Process
-from cube_tensor_driver.simulation.load import CIRCUIT_S, MovingLoad
+from cube_tensor_driver.simulation.load import Load, default_script
 
 RATE, INSTANTS, START_S, SETTLE_S, MEASURE_S = 100.0, 200, 30.0, 6.0, 15.0
 FRAMES = "window.frames_ = 0; (function f() { window.frames_++; requestAnimationFrame(f) })()"
@@ -76,7 +76,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
             nx += 1
         write_yaml(folder / "skin.yaml", grid("skin", nx, cubes // nx, 0.012, 1, "planar", "planar", RATE, "/dev/null"))
         skin = read_skin(folder / "skin.yaml")
-        load = MovingLoad(skin)
+        load = Load(skin, default_script())
         node = rclpy.create_node("measure")
         info = node.create_publisher(SkinInfo, "info", LATCHED)
         info.publish(info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns()))
@@ -86,7 +86,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
             count = functools.partial(lambda topic, _: counts.__setitem__(topic, counts[topic] + 1), topic)
             node.create_subscription(kind, topic, count, 10, raw=True)
         index, none = np.arange(cubes, dtype=np.uint16), np.zeros(cubes, np.int32)
-        rows = [stress_rows(*load.at(k * CIRCUIT_S / INSTANTS)) for k in range(INSTANTS)]
+        rows = [stress_rows(*load.at(k * load.period / INSTANTS)) for k in range(INSTANTS)]
         ended = threading.Event()
 
         def send() -> None:
@@ -94,7 +94,9 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
             while not ended.wait(1 / RATE):
                 number += 1
                 times = Times(Header(stamp=to_time(time.time_ns())), index, (none + number).astype(np.uint32), none)
-                publisher.publish(stress_message(times, rows[number * INSTANTS // round(CIRCUIT_S * RATE) % INSTANTS]))
+                publisher.publish(
+                    stress_message(times, rows[number * INSTANTS // round(load.period * RATE) % INSTANTS])
+                )
 
         sender = threading.Thread(target=send)
         sender.start()
