@@ -9,6 +9,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.scene import Places
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.elastic import contact
+from cube_tensor_driver.elastic.field_study import field_study
 from cube_tensor_driver.elastic.surface import Surface
 
 DEPTH, POISSON, HALF_SIDE = 4e-3, 0.48, 2e-3
@@ -53,6 +54,17 @@ def test_gradients_make_the_field_better(pitch, width, factor):
     without, with_them = errors(pitch, width)
     assert with_them < 0.2
     assert without > factor * with_them
+
+
+def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
+    """One gradient is better than none and worse than two, for the field; a planar cube knows less of the place."""
+    study = field_study(np.array([0.006, 0.012]), np.array([0.02]), cases=3)
+    alone, whole, planar = np.moveaxis(study.error[0], 1, 0)
+    assert (whole < planar).all() and (planar < alone).all()
+    assert (study.position[0, :, 1] < study.position[0, :, 2]).all()
+    ((one, saved, some),) = study.cubes_saved(0.15)
+    assert one == 1 and 1 < some < saved
+    assert np.isnan(study.cubes_saved(0.9)).all()
 
 
 def test_value_and_gradient_are_met_at_the_cubes():

@@ -1,4 +1,8 @@
-"""What gradients buy: error of the field between the cubes against the contact model, with them and without."""
+"""What gradients buy: error of the field between the cubes against the contact model, with them and without.
+
+Three kinds of skin: of values alone, of cubes that see all of stress and gradient, and of planar cubes, whose section
+lies along x: of the gradients in the plane they see ∂σzz/∂x, of the shear σzx.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.modes import COMPONENTS
 from ..core.scene import Places
 from . import contact
 from .surface import Array, Surface
@@ -18,11 +23,14 @@ CASES = 16
 SKIN = 0.1
 """Side of the skin, m; all that is compared lies in the middle of it, WINDOW wide."""
 WINDOW = 0.04
+KINDS = ("values alone", "values and gradients", "planar cubes")
+UNSEEN = [k for k, name in enumerate(COMPONENTS) if "y" in name]
+"""By planar cubes."""
 
 
 @dataclass(frozen=True)
 class FieldStudy:
-    """Rows per width, columns per pitch; the last axis: values alone, values and gradients.
+    """Rows per width, columns per pitch; the last axis: KINDS.
 
     error: rms of the pressure's error over rms of the pressure, in the window. position: 95th percentile of the
     contact's position error, m. force: rms error of its normal force over the force. Contacts that were not found count
@@ -36,8 +44,8 @@ class FieldStudy:
     force: Array
 
     def cubes_saved(self, error: float) -> Array:
-        """Per width: how many times fewer cubes per area give this error with gradients; NaN out of range."""
-        saved = np.full(len(self.widths), np.nan)
+        """(widths, kinds) how many times fewer cubes per area give this error than with values alone; NaN: no pitch."""
+        saved = np.full((len(self.widths), len(KINDS)), np.nan)
         for row, curves in enumerate(self.error):
             pitch = []
             for curve in curves.T:
@@ -46,7 +54,7 @@ class FieldStudy:
                 pitch.append(
                     np.exp(np.interp(np.log(error), np.log(rising), np.log(self.pitches))) if inside else np.nan
                 )
-            saved[row] = (pitch[1] / pitch[0]) ** 2
+            saved[row] = (np.array(pitch) / pitch[0]) ** 2
         return saved
 
 
@@ -66,23 +74,26 @@ def truth(points: Array, width: float, force: Array, centre: Array) -> Array:
 
 
 def field_study(pitches: Array = PITCHES, widths: Array = WIDTHS, cases: int = CASES) -> FieldStudy:
-    """Run it; the same numbers every time. About a minute with the defaults."""
-    shape = len(widths), len(pitches), 2
+    """Run it; the same numbers every time. About two minutes with the defaults."""
+    shape = len(widths), len(pitches), len(KINDS)
     error, position, force = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for column, pitch in enumerate(pitches):
         skin = flat_skin(pitch)
         side = round(pitch / 2e-3)
-        surfaces = [Surface(skin, DEPTH, side, gradients) for gradients in (False, True)]
+        surfaces = [Surface(skin, DEPTH, side, kind != KINDS[0]) for kind in KINDS]
         window = np.abs(surfaces[0].points[:, :2]).max(axis=1) < WINDOW / 2
         points = surfaces[0].points[window]
         for row, width in enumerate(widths):
             random = np.random.default_rng(8)
-            squares, places, forces = np.zeros((3, cases, 2))
+            squares, places, forces = np.zeros((3, cases, len(KINDS)))
             for case in range(cases):
                 centre, angle = pitch * (random.random(2) - 0.5), 2 * np.pi * random.random()
                 load = FORCE * np.array([0.3 * np.cos(angle), 0.3 * np.sin(angle), -1.0])
                 pressure, values = -truth(points, width, load, centre)[:, 2], truth(skin.position, width, load, centre)
                 for k, surface in enumerate(surfaces):
+                    if KINDS[k] == "planar cubes":
+                        values = values.copy()
+                        values[:, UNSEEN] = np.nan
                     made = surface.field(values).pressure[window]
                     squares[case, k] = ((made - pressure) ** 2).mean() / (pressure**2).mean()
                     found = surface.contacts(values, 300.0)[:1]

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from ..core.errors import ConfigError, CubeError
-from ..elastic.field_study import DEPTH, FORCE, FieldStudy, field_study, flat_skin, truth
+from ..elastic.field_study import DEPTH, FORCE, KINDS, FieldStudy, field_study, flat_skin, truth
 from ..elastic.surface import Surface
 from ..files.share import share
 from ..ros.children import Children
@@ -38,7 +39,7 @@ def run_pictures(folder: Path) -> int:
     save(draw_study(study), folder / "field_error.png")
     table = {name: getattr(study, name).tolist() for name in ("pitches", "widths", "error", "position", "force")}
     (folder / "field.json").write_text(json.dumps(table) + "\n")
-    print(f"wrote {folder}/field.png, field_error.png, field.json\n{table_text(study)}")
+    print(f"wrote {folder}/field.png, field_error.png, field.json\n{tables_text(study)}")
     if not shutil.which("chromedriver"):
         print("no view.png: needs Chromium, apt-get install chromium chromium-driver", file=sys.stderr)
         return 0
@@ -78,26 +79,45 @@ def draw_field(pitch: float = 0.010, width: float = 0.012) -> Figure:
 
 
 def draw_study(study: FieldStudy) -> Figure:
-    """Error of the field over pitch for each width, dashed without gradients."""
-    figure, axis = plt.subplots(figsize=(5.5, 3.8))
-    for row, (width, marker) in enumerate(zip(study.widths, "os^Dv", strict=True)):
-        style = {"color": str(0.7 * row / len(study.widths)), "marker": marker, "ms": 4, "lw": 1}
-        axis.loglog(1e3 * study.pitches, study.error[row, :, 0], ls="--", mfc="none", **style)
-        axis.loglog(1e3 * study.pitches, study.error[row, :, 1], label=f"{1e3 * width:.0f} mm", **style)
-    axis.set(xlabel="pitch of the cubes / mm", ylabel="rms error / rms pressure")
-    axis.set_xticks(1e3 * study.pitches, [f"{1e3 * pitch:.0f}" for pitch in study.pitches], minor=False)
-    axis.minorticks_off()
-    axis.legend(title="contact width\n(dashed: values alone)", fontsize=7, title_fontsize=7)
+    """Error of the field over pitch for each width, dashed without gradients: of whole cubes, and of planar ones."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True)
+    for kind, axis in zip((1, 2), axes, strict=True):
+        for row, (width, marker) in enumerate(zip(study.widths, "os^Dv", strict=True)):
+            style = {"color": str(0.7 * row / len(study.widths)), "marker": marker, "ms": 4, "lw": 1}
+            axis.loglog(1e3 * study.pitches, study.error[row, :, 0], ls="--", mfc="none", **style)
+            axis.loglog(1e3 * study.pitches, study.error[row, :, kind], label=f"{1e3 * width:.0f} mm", **style)
+        axis.set(xlabel="pitch of the cubes / mm", title=("cubes that see every gradient", "planar cubes")[kind - 1])
+        axis.set_xticks(1e3 * study.pitches, [f"{1e3 * pitch:.0f}" for pitch in study.pitches], minor=False)
+        axis.minorticks_off()
+    axes[0].set_ylabel("rms error / rms pressure")
+    axes[0].legend(title="contact width\n(dashed: values alone)", fontsize=7, title_fontsize=7)
     return figure
 
 
-def table_text(study: FieldStudy) -> str:
-    """Markdown: error of the field without → with gradients."""
-    head = "| width \\ pitch | " + " | ".join(f"{1e3 * pitch:.0f} mm" for pitch in study.pitches) + " |"
-    lines = [head, "|---" * (1 + len(study.pitches)) + "|"]
-    for width, row in zip(study.widths, study.error, strict=True):
-        lines.append(f"| {1e3 * width:.0f} mm | " + " | ".join(f"{a:.2f} → {b:.2f}" for a, b in row) + " |")
-    return "\n".join(lines)
+def tables_text(study: FieldStudy) -> str:
+    """Markdown: the field's error of each kind, place and force of a contact, cubes saved."""
+
+    def table(cell: Callable[[int, int], str]) -> str:
+        head = "| width \\ pitch | " + " | ".join(f"{1e3 * pitch:.0f} mm" for pitch in study.pitches) + " |"
+        lines = [head, "|---" * (1 + len(study.pitches)) + "|"]
+        for row, width in enumerate(study.widths):
+            cells = " | ".join(cell(row, column) for column in range(len(study.pitches)))
+            lines.append(f"| {1e3 * width:.0f} mm | {cells} |")
+        return "\n".join(lines)
+
+    error, position, force = study.error, 1e3 * study.position, study.force
+    parts = [
+        "field: " + " / ".join(KINDS),
+        table(lambda i, j: " / ".join(f"{one:.2f}" for one in error[i, j])),
+        "place, p95 in mm: all components / planar",
+        table(lambda i, j: " / ".join(f"{one:.2g}" for one in position[i, j, 1:])),
+        "force, rms: all components / planar",
+        table(lambda i, j: " / ".join(f"{one:.2f}" for one in force[i, j, 1:])),
+    ]
+    for level in (0.1, 0.2, 0.3, 0.5):
+        saved = study.cubes_saved(level)[:, 1:]
+        parts.append(f"cubes saved at an error of {level}, per width, all / planar: {np.round(saved, 1).tolist()}")
+    return "\n\n".join(parts)
 
 
 def photograph(path: Path) -> None:
