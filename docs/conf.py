@@ -11,8 +11,6 @@ myst_enable_extensions = ["dollarmath"]
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "undoc-members": False}
 exclude_patterns = ["_build"]
-# Links to files of the repository that are no pages.
-suppress_warnings = ["myst.xref_missing"]
 
 
 def setup(app) -> None:

@@ -1,65 +1,178 @@
-"""The documentation builds without a warning, and the commands on its pages run."""
+"""The documentation builds without a warning, and every command on its pages runs: here, or in a test named here."""
 
 from __future__ import annotations
 
+import os
+import pty
 import re
+import select
 import shlex
+import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from conftest import ROOT
 
-# What is run here, page by page; the others need hardware, a recording or minutes, and have tests of their own.
-LONG = ("./cube demo", "./cube view", "./cube pictures", "./cube docs", "./cube exec", "./cube test", "./cube bench",
-        "./cube record", "./cube replay", "./cube fem", "./cube paper", "./cube study", "./cube fit LOADS")  # fmt: skip
-PAGES = ("start.md", "robot.md", "build.md", "calibrate.md")
+PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+ELSEWHERE = {
+    "./cube demo": "test_end_to_end.py::test_interrupted_demo_leaves_no_process",
+    "./cube record -o run1": "test_bags_ros.py::test_recorded_is_published_and_reprocessed_is_live",
+    "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml":
+        "test_bags_files.py::test_fit_from_a_bag",
+    "./cube inject kind=unplug link=hub0 seconds=2":
+        "test_faults.py::test_inject_speaks_to_the_pipe_or_says_that_nobody_listens",
+    "./cube inject kind=stuck link=hub1 cube=3 pad=5 seconds=10":
+        "test_faults.py::test_inject_speaks_to_the_pipe_or_says_that_nobody_listens",
+    "./cube torture --duration 600 --seed 7 --json torture.json":
+        "test_reliability_torture.py::test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong",
+    "./cube test": ".ci/run",
+    "./cube lint": ".ci/run",
+    "./cube exec CMD": ".ci/run",
+}  # fmt: skip
+"""What runs for minutes, needs what a page of its own does not have, or is this suite: where it is run instead."""
+ENDLESS = {
+    "./cube demo --view": "shows it",
+    "./cube demo --config skin.yaml --load load.yaml": "│ c0",
+    "./cube view": "http://",
+}
+"""Commands that Ctrl-C ends, and what they say once they run."""
 
 
 def commands(page: Path) -> list[str]:
-    """Lines of a page that call ./cube, without what follows a #."""
-    return re.findall(r"^ {4,}(\./cube [^#\n]*?) *(?:#.*)?$", page.read_text(), re.MULTILINE)
+    """Lines of a page that call ./cube, each once, without what follows a # or several spaces."""
+    lines = re.findall(r"^ {4,}(\./cube [^#\n]*?)(?: {2,}.*| *#.*)?$", page.read_text(), re.MULTILINE)
+    return list(dict.fromkeys(lines))
 
 
-def cube(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+def named(page: Path) -> list[str]:
+    """Commands within sentences: names and options, not whole."""
+    return [" ".join(text.split()) for text in re.findall(r"`(\./cube\s[^`]+)`", page.read_text())]
+
+
+def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "cube_tensor_driver.cli", *arguments], cwd=folder, text=True,
                           capture_output=True, timeout=120, check=False)  # fmt: skip
 
 
+def run_until(arguments: list[str], folder: Path, said: str) -> None:
+    """In a terminal of its own, until it has said that; then Ctrl-C, and it ends well."""
+    near, far = pty.openpty()
+    process = subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", *arguments], cwd=folder, stdin=far,
+                               stdout=far, stderr=far, start_new_session=True)  # fmt: skip
+    os.close(far)
+    heard, until = "", time.monotonic() + 60
+    try:
+        while said not in heard:
+            assert time.monotonic() < until and process.poll() is None, heard[-2000:]
+            if select.select([near], [], [], 0.1)[0]:
+                heard += os.read(near, 65536).decode(errors="replace")
+        process.send_signal(signal.SIGINT)
+        while process.poll() is None:
+            assert time.monotonic() < until, heard[-2000:]
+            if select.select([near], [], [], 0.1)[0]:
+                os.read(near, 65536)
+        assert process.returncode == 0
+    except OSError:  # the terminal is gone with the process
+        assert process.wait(10) == 0
+    finally:
+        process.kill()
+        process.wait()
+        os.close(near)
+
+
+def stage(page: Path, folder: Path) -> None:
+    """What a page speaks of as there already."""
+    (folder / "config").symlink_to(ROOT / "config")
+    (folder / "docs").symlink_to(ROOT / "docs")
+    if page.name == "bags.md":
+        from bag_maker import make_bag
+
+        for name in ("run1", "run2"):
+            make_bag(folder / name, ROOT / "config" / "skin_demo.yaml", 100)
+        shutil.copy(ROOT / "config" / "calibration" / "planar.yaml", folder / "new.yaml")
+    if page.name == "simulation.md":
+        shutil.copy(ROOT / "config" / "cube.yaml", folder / "skin.yaml")
+        (folder / "load.yaml").write_text(re.search(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S)[1])
+
+
 def test_documentation_builds_without_a_warning(tmp_path):
     pytest.importorskip("sphinx", reason="needs sphinx: run this with ./cube test")
-    done = cube(["docs", "-o", str(tmp_path / "html")], ROOT)
+    done = run(["docs", "-o", str(tmp_path / "html")], ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "html" / "index.html").is_file()
     api = (tmp_path / "html" / "api.html").read_text()
     assert "rest_frequency" in api and "contacts" in api
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.name)
 def test_commands_of_a_page_run(page, tmp_path, domain):
-    (tmp_path / "config").symlink_to(ROOT / "config")
-    found = commands(ROOT / "docs" / page)
-    assert found
-    for command in found:
+    stage(page, tmp_path)
+    for command in commands(page):
         arguments = shlex.split(command)[1:]
-        measured = command.startswith("./cube demo") and "--duration" in arguments
-        if measured or not command.startswith(LONG):
-            done = cube(arguments, tmp_path)
+        if command in ENDLESS:
+            run_until(arguments, tmp_path, ENDLESS[command])
+        elif command not in ELSEWHERE:
+            done = run(arguments, tmp_path)
             assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
-def test_commands_of_every_page_are_ones_that_exist(page):
-    """Every command and option of a page is one that the parser knows."""
+def test_what_is_run_elsewhere_is_on_a_page_and_is_run_there():
+    every = {command for page in PAGES for command in commands(page)}
+    assert set(ELSEWHERE) | set(ENDLESS) <= every, set(ELSEWHERE) | set(ENDLESS) - every
+    for command, where in ELSEWHERE.items():
+        file, _, name = where.partition("::")
+        text = (ROOT / ("test" if name else "") / file).read_text()
+        assert f"def {name}(" in text if name else command.removesuffix(" CMD") in text, command
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_in_sentences_exist_with_their_options(page):
     from cube_tensor_driver.cli import parser
 
-    for command in commands(page):
-        words = shlex.split(command)[1:]
-        if words[0] in ("exec", "--help"):
+    for command in named(page):
+        words = command.split()[1:]
+        if words[0].startswith("-"):
             continue
-        try:
-            parser().parse_args([word for word in words if word != "…"])
-        except SystemExit as error:
-            pytest.fail(f"{page.name}: {command}: the parser ends with {error.code}")
+        sub, names = parser(), []
+        while words and (found := choices(sub)) is not None and words[0] in found:
+            names.append(words[0])
+            sub = found[words.pop(0)]
+        assert names, f"{page.name}: {command}"
+        options = {word.strip("[],|…").partition("=")[0] for word in words if word.strip("[").startswith("-")}
+        assert options <= set(sub._option_string_actions), f"{page.name}: {command}"
+
+
+def choices(parser) -> dict | None:
+    """Commands below a parser."""
+    return next((action.choices for action in parser._actions if hasattr(action, "add_parser")), None)
+
+
+def test_ros_commands_name_what_the_package_has():
+    """ros2 itself is not on every machine; test_launch.py runs it where it is."""
+    text = "\n".join(page.read_text() for page in PAGES)
+    runs = re.findall(r"ros2 run cube_tensor_driver (\S+?)[`\s]", text)
+    assert runs and all((ROOT / "scripts" / name).is_file() for name in runs)
+    launches = re.findall(r"ros2 launch cube_tensor_driver (\S+)((?: \S+:=[^\s`]+)*)", text)
+    assert launches
+    for file, arguments in launches:
+        source = (ROOT / "launch" / file).read_text()
+        for name in re.findall(r"(\w+):=", arguments):
+            assert f'"{name}"' in source, f"{file} {name}"
+
+
+@pytest.mark.parametrize("name", ["calibrate.md", "contacts.md"])
+def test_programs_of_a_page_run(name):
+    import numpy as np
+
+    from cube_tensor_driver.core.scene import Places
+
+    there = {"places": Places(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002)), "values": np.zeros((1, 15))}
+    programs = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / name).read_text(), re.MULTILINE | re.DOTALL)
+    assert programs
+    for program in programs:
+        exec(program, there)
