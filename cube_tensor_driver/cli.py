@@ -48,9 +48,12 @@ def parser() -> argparse.ArgumentParser:
         "--duration",
         type=positive,
         metavar="S",
-        help="end after S seconds and print the figures (default: until Ctrl-C; 10 with --headless or --json)",
+        help="end after S seconds and print the figures (default: until Ctrl-C; 10 with --headless, --json, --figure)",
     )
     sub.add_argument("--headless", action="store_true", help="no live table")
+    sub.add_argument(
+        "--figure", type=Path, metavar="FILE", help="draw force and centre of pressure beside the script's"
+    )
     sub.add_argument("--view", action="store_true", help="show it in the browser too, as ./cube view does")
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE instead of printing them")
 

@@ -15,20 +15,10 @@ def demo(options: argparse.Namespace) -> int:
     from .view.demo import Options, run_demo
 
     duration = options.duration
-    if duration is None and (options.headless or options.json):
+    if duration is None and (options.headless or options.json or options.figure):
         duration = 10.0
-    return run_demo(
-        Options(
-            options.config,
-            options.cubes,
-            options.rate,
-            duration,
-            options.headless,
-            options.json,
-            options.view,
-            options.load,
-        )
-    )
+    return run_demo(Options(options.config, options.cubes, options.rate, duration, options.headless, options.json,
+                            options.view, options.load, options.figure))  # fmt: skip
 
 
 def config_grid(options: argparse.Namespace) -> int:

@@ -126,6 +126,10 @@ class SimulatedHub:
         self.next_us += self.period_us
         return encode(frame, self.version)
 
+    def skip(self, now_us: int) -> None:
+        """Take the next sample after now_us; those before are never taken."""
+        self._schedule(now_us)
+
     def _schedule(self, now_us: int) -> None:
         """Samples fall on whole multiples of the period, so that hubs sample together."""
         self.next_us = (now_us // self.period_us + 1) * self.period_us

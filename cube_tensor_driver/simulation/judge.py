@@ -3,26 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.errors import MessageError
 from ..core.modes import COMPONENTS
 from ..core.pipeline import StressRows
+from ..elastic.surface import Surface
 from ..files.skin import Skin
 from .cubes import true_components
 from .load import Load
 
 TIMES_CHECKED = 500
 """Instants at most whose tensors are compared with the load: each costs a contact problem."""
+LEAST = 300.0
+"""Pressure at the cubes that counts as contact, Pa."""
+
+
+class Forces(NamedTuple):
+    """Over T times: seconds (T,) of simulated time; force (T, 3) N on the skin and centre of pressure (T, 3) m.
+
+    In the skin's parent frame, the script's, with the normal (T, 3) there, and as found; a centre is NaN where nothing
+    presses.
+    """
+
+    seconds: NDArray[Any]
+    force: NDArray[Any]
+    centre: NDArray[Any]
+    normal: NDArray[Any]
+    found_force: NDArray[Any]
+    found_centre: NDArray[Any]
+
+    def figures(self) -> dict[str, object]:
+        """Greatest force and root mean square error per axis, N; of the centre along the skin under load, mm."""
+        size = np.linalg.norm(self.force, axis=1)
+        pressed = (size > 0.2 * size.max()) & np.isfinite(self.found_centre).all(axis=1)
+        error = np.sqrt(np.mean((self.found_force - self.force) ** 2, axis=0))
+        apart, normal = (self.found_centre - self.centre)[pressed], self.normal[pressed]
+        apart -= np.einsum("ti,ti->t", apart, normal)[:, None] * normal
+        return {
+            "force_peak_n": np.abs(self.force).max(axis=0).round(2).tolist(),
+            "force_error_n": error.round(2).tolist(),
+            "centre_error_mm": round(1e3 * float(np.sqrt(np.mean((apart**2).sum(axis=1)))), 2),
+        }
 
 
 class Judge:
     """Takes rows as they arrive; `read_book` then fixes what should have arrived in a span of time."""
 
     def __init__(self, skin: Skin, load: Load) -> None:
-        self.contradictions = self.newest_ns = 0
+        self.contradictions = 0
+        self._newest_ns = np.zeros(len(skin.cubes), np.int64)
         self._skin, self._load = skin, load
         self._tensors: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], int]] = []
         self._samples: list[tuple[NDArray[Any], NDArray[Any]]] = []
@@ -36,7 +69,7 @@ class Judge:
     ) -> None:
         """Rows of one stress message, received at received_ns (wall clock)."""
         values = np.concatenate([rows.stress, rows.gradient], axis=1)
-        self.newest_ns = max(self.newest_ns, int(stamp_ns.max(initial=0)))
+        np.maximum.at(self._newest_ns, cube, stamp_ns)
         self._tensors.append((np.array(cube), np.array(sequence), np.array(stamp_ns), values, received_ns))
 
     def frequencies(self, cube: ArrayLike, sequence: ArrayLike) -> None:
@@ -75,6 +108,10 @@ class Judge:
     def sampled(self) -> bool:
         """Whether any frequencies have arrived."""
         return bool(self._samples)
+
+    def beyond(self, end_ns: int) -> bool:
+        """Whether of every cube a tensor has arrived that was sampled after end_ns, as far as stamps tell."""
+        return bool(self._newest_ns.min() > end_ns)
 
     def complete(self) -> bool:
         """Whether a tensor of every sample sent has arrived."""
@@ -119,10 +156,8 @@ class Judge:
         """Root mean square and worst deviation of the observed components, relative to the range that was applied."""
         calibrations = {c.calibration.id: c.calibration for c in self._skin.cubes}
         kind = np.array([c.calibration.id for c in self._skin.cubes])
-        times = np.unique(true_ns)
-        times = times[:: max(1, len(times) // TIMES_CHECKED)]
         found, applied = [], []
-        for time_ns in times:
+        for time_ns in _checked(true_ns):
             rows = np.flatnonzero(true_ns == time_ns)
             stress, gradient = self._load.at((time_ns - self._book_start) * 1e-9)
             truth = np.empty((len(rows), len(COMPONENTS)))
@@ -135,10 +170,43 @@ class Judge:
         if not found:
             return float("nan"), float("nan")
         got, want = np.concatenate(found), np.concatenate(applied)
-        observed = np.isfinite(got).all(axis=0)
-        span = np.ptp(want[:, observed], axis=0)
-        relative = (got[:, observed] - want[:, observed])[:, span > 0] / span[span > 0]
-        return float(np.sqrt(np.mean(relative**2))), float(np.abs(relative).max())
+        observed = np.isfinite(got)
+        want[~observed] = np.nan
+        seen = observed.any(axis=0)
+        span = np.nanmax(want[:, seen], axis=0) - np.nanmin(want[:, seen], axis=0)
+        relative = (got[:, seen] - want[:, seen])[:, span > 0] / span[span > 0]
+        return float(np.sqrt(np.nanmean(relative**2))), float(np.nanmax(np.abs(relative)))
+
+    def forces(self) -> Forces:
+        """The force on the whole skin and its centre from the tensors that arrived, beside the script's."""
+        cube, _, _, values, _, true_ns = self._received()
+        times, counts = np.unique(true_ns, return_counts=True)
+        times = _checked(times[counts == len(self._skin.cubes)])
+        if not len(times):
+            raise MessageError("no tensors of all cubes at one time have arrived: there are no forces to draw")
+        surface = Surface(self._load.places, self._load.script.depth)
+        seconds = (times - self._book_start) * 1e-9
+        truth = [self._load.total(time) for time in seconds.tolist()]
+        found = []
+        for time_ns in times:
+            rows = np.flatnonzero(true_ns == time_ns)
+            of_cubes = np.full((len(self._skin.cubes), len(COMPONENTS)), np.nan)
+            of_cubes[cube[rows]] = values[rows]
+            contacts = surface.contacts(of_cubes, LEAST)
+            weight = np.array([contact.normal_force for contact in contacts])
+            places = np.reshape([contact.position for contact in contacts], (-1, 3))
+            centre = weight @ places / weight.sum() if contacts else np.full(3, np.nan)
+            found.append((np.sum([np.zeros(3), *(contact.force for contact in contacts)], axis=0), centre))
+        sides = [
+            np.reshape([one[part] for one in some], (-1, 3)) for some in (truth, found) for part in range(len(some[0]))
+        ]
+        return Forces(seconds, *sides)
+
+
+def _checked(true_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """At most TIMES_CHECKED of the times, or a few more, at equal intervals."""
+    times = np.unique(true_ns)
+    return times[:: max(1, len(times) // TIMES_CHECKED)]
 
 
 def _joined(parts: list[tuple[Any, ...]], columns: int) -> list[NDArray[Any]]:

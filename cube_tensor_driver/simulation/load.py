@@ -21,6 +21,10 @@ from ..files.skin import Skin
 Array = NDArray[np.float64]
 SLOW = 1e-3
 """Speed at which friction has reached 0.7 of its full size, m/s: it turns round smoothly where a slide does."""
+WIDEST = 12
+"""Contact's radius over the cubes' depth at most: wider ones take more points than anybody can wait for."""
+_STEPS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
+"""Orders of quadrature in use: few different ones, so that cubes are computed together."""
 
 
 def default_script() -> Script:
@@ -53,7 +57,7 @@ class Load:
     """
 
     def __init__(self, skin: Skin, script: Script) -> None:
-        """ConfigError: a sphere sinks in deeper than Hertz's contact holds."""
+        """ConfigError: a sphere sinks in deeper than Hertz's contact holds, or a disc is too wide for its depth."""
         self.script = script
         self.period = script.period or script.end
         self._position = np.array([cube.xyz for cube in skin.cubes])
@@ -61,7 +65,8 @@ class Load:
         half = np.array([cube.calibration.half_side for cube in skin.cubes])
         low, high = (self._position - half[:, None]).min(axis=0), (self._position + half[:, None]).max(axis=0)
         self._centre, self._span = (low + high) / 2, (high - low) / 2
-        self._pitch = Places(self._position, self._turn, half).pitch
+        self.places = Places(self._position, self._turn, half)
+        self._pitch = self.places.pitch
         self._paths = {id(a): self._path(a) for i in script.indenters for a in i.actions}
         for indenter in script.indenters:
             most = max(action.force.max() for action in indenter.actions)
@@ -69,6 +74,11 @@ class Load:
                 raise ConfigError(
                     f"{indenter.name}: under {most:g} N the contact's radius is {1e3 * radius:.3g} mm, the sphere's "
                     f"only {1e3 * indenter.radius:g} mm; take less force or a larger radius"
+                )
+            if radius > WIDEST * script.depth:
+                raise ConfigError(
+                    f"{indenter.name}: the contact's radius is {1e3 * radius:g} mm, the cubes' depth "
+                    f"{1e3 * script.depth:g} mm; take several contacts of at most {WIDEST} times the depth"
                 )
 
     def at(self, seconds: float) -> tuple[Array, Array]:
@@ -102,14 +112,18 @@ class Load:
                     found += [press] if press.force.any() else []
         return found
 
-    def total(self, seconds: float) -> tuple[Array, Array]:
-        """Sum (3,) of all forces on the skin in N and their centre of pressure (3,) in m, NaN without load."""
+    def total(self, seconds: float) -> tuple[Array, Array, Array]:
+        """Sum (3,) of all forces on the skin in N, their centre of pressure (3,) in m and the mean normal (3,) there.
+
+        Without load centre and normal are NaN.
+        """
         presses = self.presses(seconds)
         weight = np.array([-press.force @ press.normal for press in presses])
         if not presses:
-            return np.zeros(3), np.full(3, np.nan)
+            return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
         centre = weight @ np.array([press.place for press in presses]) / weight.sum()
-        return np.sum([press.force for press in presses], axis=0), centre
+        normal = weight @ np.array([press.normal for press in presses])
+        return np.sum([press.force for press in presses], axis=0), centre, normal / np.linalg.norm(normal)
 
     def _press(self, indenter: Indenter, action: Action, seconds: float) -> Press:
         when = (seconds - action.start) / (action.end - action.start)
@@ -158,8 +172,9 @@ def _orders(shape: str, radius: float, depth: float, away: Array) -> NDArray[np.
 
     Stress and gradient are within 1e-3 of their greatest value; what point forces make is in balance in any case.
     """
-    near = math.ceil(5 * radius / depth + 1) if shape == "sphere" else math.ceil(3.3 * radius / depth + 0.5)
-    return np.select([away > 8 * radius + depth, away > 3 * radius + depth], [1, min(near, 3)], near)
+    near = radius / np.hypot(depth, np.maximum(away - radius, 0.0))
+    wanted = 5 * near + 1 if shape == "sphere" else 3.3 * near + 0.5
+    return np.where(near < 0.15, 1, _STEPS[np.searchsorted(_STEPS, wanted)])
 
 
 @lru_cache(maxsize=64)

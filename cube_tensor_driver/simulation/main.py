@@ -33,6 +33,9 @@ from .load import Load, default_script
 
 ABSENT = -1
 FIRST_UID = 0xC0BE_0000_0000_0001
+LATE_US = 500_000
+"""A simulator that cannot keep up lets a hub miss samples rather than take them ever later."""
+KEPT_BYTES = 64 << 20
 CONTROL = ".faults"
 """A pipe in the folder of the ports: each line written to it is a fault, as YAML."""
 
@@ -72,7 +75,7 @@ class Simulator:
         """
         self._load = load or Load(skin, default_script())
         self._ports = ports
-        self._field: tuple[int, tuple[np.ndarray, np.ndarray]] | None = None
+        self._fields: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._start_ns = time.monotonic_ns()
         self.start_time_ns = time.time_ns()
         self.benches: list[Bench] = []
@@ -134,7 +137,9 @@ class Simulator:
                         key.data()
                 now = self.now_us()
                 for bench in self.benches:
-                    while bench.hub.started and bench.hub.next_us <= now:
+                    if bench.hub.started and not bench.prepared and now - bench.hub.next_us > LATE_US:
+                        bench.hub.skip(now)
+                    while bench.hub.started and bench.hub.next_us <= now and not stop.requested:
                         # Faults fall between the samples where they belong, however late this loop comes.
                         self._injector.step(bench.hub.next_us)
                         if bench.hub.started:
@@ -182,14 +187,23 @@ class Simulator:
         if bench.prepared:
             frequency = bench.prepared[hub.next_us // hub.period_us % len(bench.prepared)]
         else:
-            if self._field is None or self._field[0] != hub.next_us:
-                self._field = hub.next_us, self._load.at(hub.next_us * 1e-6)
-            stress, gradient = self._field[1]
+            stress, gradient = self._field_at(hub.next_us)
             frequency = self._frequency(bench, stress, gradient, hub.next_us * 1e-6)
         frame = hub.sample(self._injector.values(bench, frequency, hub.next_us))
         data = self._injector.frame(bench, frame)
         if not bench.line.send(data, now_us):
             hub.dropped += 1
+
+    def _field_at(self, time_us: int) -> tuple[np.ndarray, np.ndarray]:
+        """The field at a time, kept for the next time that the script comes by there."""
+        if self._load.script.period is not None:
+            time_us %= round(1e6 * self._load.script.period)
+        if time_us not in self._fields:
+            stress, gradient = self._load.at(time_us * 1e-6)
+            if (len(self._fields) + 1) * (stress.nbytes + gradient.nbytes) > KEPT_BYTES:
+                self._fields.clear()
+            self._fields[time_us] = stress, gradient
+        return self._fields[time_us]
 
     def _frequency(self, bench: Bench, stress: np.ndarray, gradient: np.ndarray, seconds: float) -> np.ndarray:
         there = bench.members != ABSENT

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import signal
 import tempfile
 import threading
@@ -32,6 +33,7 @@ from ..ros.node import make_executor, queue
 from ..ros.start import Process, skin_processes
 from ..simulation.judge import Judge
 from ..simulation.load import Load, default_script
+from .plots import draw_forces, save
 from .table import LiveTable
 
 FIRST_TENSORS_S = 20.0
@@ -51,6 +53,7 @@ class Options:
     json: Path | None
     view: bool = False
     load: Path | None = None
+    figure: Path | None = None
 
 
 class Interrupted(CubeError):
@@ -98,13 +101,24 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
     rate = options.rate or skin.rate or RATE
     book = folder / "book.json"
     script = read_script(options.load) if options.load else default_script()
-    judge = Judge(skin, Load(skin, script))
+    load = Load(skin, script)
+    judge = Judge(skin, load)
     with LiveTable(skin, show=not options.headless) as table, Children(folder) as children:
         for process in skin_processes(path, rate=rate, simulated_ports=folder / "ports", book=book, load=options.load):
             children.start(process)
         if options.view:
             children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         node = rclpy.create_node("demo", automatically_declare_parameters_from_overrides=False)
+
+        strangers = threading.Event()
+
+        def alone() -> None:
+            """CubeError: another skin publishes here."""
+            if strangers.is_set() or node.count_publishers("stress") > 1:
+                raise CubeError(
+                    f"another skin publishes stress in DDS domain {os.environ.get('ROS_DOMAIN_ID', 0)}: end it, or set "
+                    "another ROS_DOMAIN_ID for this one"
+                )
 
         def on_stress(message: SkinStress) -> None:
             received_ns = time.time_ns()
@@ -113,6 +127,9 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
             except MessageError as error:
                 judge.contradictions += 1
                 node.get_logger().error(str(error))
+                return
+            if int(times.cube.max(initial=0)) >= len(skin.cubes):
+                strangers.set()
                 return
             if options.duration is not None:
                 judge.stress(times.cube, times.sequence, times.stamp_ns, rows, received_ns)
@@ -139,7 +156,11 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
         try:
             # What is measured starts when every topic has reached us: discovery takes up to seconds.
             live = options.duration is None
-            spin(FIRST_TENSORS_S, lambda: table.seen_all and (live or (judge.sampled and bool(crc))))
+            spin(
+                FIRST_TENSORS_S,
+                lambda: strangers.is_set() or (table.seen_all and (live or (judge.sampled and bool(crc)))),
+            )
+            alone()
             if not table.seen_all:
                 raise CubeError(
                     f"after {FIRST_TENSORS_S:g} s only {table.seen} of {len(skin.cubes)} cubes have a tensor.\n"
@@ -154,13 +175,16 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
             start_ns, processes = time.time_ns(), _processes(children)
             cpu = {name: _cpu(process) for name, process in processes.items()}
             spin(options.duration or 0.0, lambda: False)
+            alone()
             seconds = (time.time_ns() - start_ns) * 1e-9
             used = {name: 100 * (_cpu(process) - cpu[name]) / seconds for name, process in processes.items()}
             memory = {name: process.memory_info().rss / 2**20 for name, process in processes.items()}
             end_ns = start_ns + round((options.duration or 0) * 1e9)
             # Where the machine is busy the simulator takes its samples late.
-            spin(LAST_TENSORS_S, lambda: judge.newest_ns > end_ns)
+            spin(LAST_TENSORS_S, lambda: judge.beyond(end_ns))
             children.end(["simulator"])
+            if not book.exists():
+                raise CubeError(f"the simulator did not end as asked:\n{children.log('simulator')[-1500:]}")
             judge.read_book(json.loads(book.read_text()), start_ns, end_ns)
             spin(LAST_TENSORS_S, judge.complete)
         finally:
@@ -175,6 +199,10 @@ def _run(options: Options, path: Path, skin: Skin, folder: Path, interrupted: th
         **{f"cpu_{name}_percent": round(value, 1) for name, value in used.items()},
         **{f"rss_{name}_mb": round(value, 1) for name, value in memory.items()},
     }
+    if options.figure is not None:
+        forces = judge.forces()
+        result |= forces.figures()
+        save(draw_forces(forces, load.places.position), options.figure)
     _report(result, options)
     return 0
 

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from ..core.errors import ConfigError
 from ..core.fit import Fit
 from ..core.layout import Layout
+from ..simulation.judge import Forces
 
 plt.rcParams |= {
     "font.size": 9,
@@ -95,6 +96,30 @@ def draw_fit(fit: Fit, measured: NDArray[np.float64]) -> Figure:
     right.axhline(0, color="0.5", lw=0.8)
     right.set(xlabel="fitted pad stress / kPa", ylabel="measured − fitted / Pa")
     right.set_title(f"scatter {fit.scale:.2f} × stated noise, held-out error {100 * fit.held_out:.2g} %", fontsize=9)
+    return figure
+
+
+def draw_forces(forces: Forces, cubes: NDArray[np.float64]) -> Figure:
+    """Force on a skin and its centre over time, the script's and as measured, and the centre's way over the cubes."""
+    figure, axes = plt.subplot_mosaic([["force", "way"], ["centre", "way"]], figsize=(9, 5), width_ratios=[2.2, 1])
+    seconds = forces.seconds - forces.seconds.min()
+    for name, unit, truth, found in (("force", 1.0, forces.force, forces.found_force),
+                                     ("centre", 1e3, forces.centre, forces.found_centre)):  # fmt: skip
+        for axis, (letter, mark, color) in enumerate(zip("xyz", "osD", ("C0", "C2", "black"), strict=True)):
+            axes[name].plot(seconds, unit * truth[:, axis], color=color, lw=1)
+            axes[name].plot(seconds, unit * found[:, axis], mark, color=color, mfc="none", ms=3, label=letter)
+    handles, labels = axes["force"].get_legend_handles_labels()
+    axes["force"].legend(handles, labels, title="lines: script, marks: measured", ncols=3, loc="lower left",
+                         bbox_to_anchor=(0, 1))  # fmt: skip
+    axes["force"].set(ylabel="force on the skin / N")
+    axes["centre"].set(xlabel="time / s", ylabel="centre of pressure / mm", xlim=axes["force"].get_xlim())
+    axes["way"].plot(1e3 * cubes[:, 1], 1e3 * cubes[:, 0], "s", color="0.8", ms=3)
+    axes["way"].plot(1e3 * forces.centre[:, 1], 1e3 * forces.centre[:, 0], color="black", lw=1)
+    axes["way"].plot(
+        1e3 * forces.found_centre[:, 1], 1e3 * forces.found_centre[:, 0], "o", color="C3", mfc="none", ms=3
+    )
+    axes["way"].set(xlabel="y / mm", ylabel="x / mm", aspect="equal")
+    axes["way"].set_title("centre of pressure, cubes", fontsize=9)
     return figure
 
 
