@@ -30,6 +30,10 @@ ELSEWHERE = {
         "test_faults.py::test_inject_speaks_to_the_pipe_or_says_that_nobody_listens",
     "./cube torture --duration 600 --seed 7 --json torture.json":
         "test_reliability_torture.py::test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong",
+    "./cube demo --config config/examples/sole.yaml --load config/examples/gait.yaml --duration 3.3 --figure gait.png":
+        "test_examples.py::test_sole_finds_the_ground_reaction_force_and_its_centre",
+    "./cube demo --config config/examples/forearm.yaml --load config/examples/forearm_load.yaml --view":
+        "test_examples.py::test_forearm_runs_with_both_layouts",
     "./cube test": ".ci/run",
     "./cube lint": ".ci/run",
     "./cube exec CMD": ".ci/run",
