@@ -19,6 +19,11 @@ def generate_launch_description() -> LaunchDescription:
             "load", default_value="", description="Load script (YAML) of the simulated skin; empty: something wanders."
         ),
         switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
+        switch(
+            "autostart",
+            "Nodes configure and activate themselves; false: by lifecycle transitions from elsewhere.",
+            "true",
+        ),
         switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),
         switch("state_publisher", "Publish the cubes' frames (robot_state_publisher, URDF of the skin file)."),

@@ -71,3 +71,46 @@ def test_a_simulated_skin_starts_and_ends(domain):
         assert output.count("process has finished cleanly") == 3
     finally:
         process.kill()
+
+
+def test_transitions_by_events_of_launch(domain):
+    """A LifecycleNode of launch_ros drives a node that does not start by itself, each step when the last is done."""
+    pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
+    from launch import LaunchDescription, LaunchService
+    from launch.actions import EmitEvent, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
+    from launch.event_handlers import OnProcessStart
+    from launch.events import matches_action
+    from launch_ros.actions import LifecycleNode
+    from launch_ros.event_handlers import OnStateTransition
+    from launch_ros.events.lifecycle import ChangeState
+    from lifecycle_msgs.msg import Transition
+
+    node = LifecycleNode(package="cube_tensor_driver", executable="reconstruction", name="reconstruction", namespace="",
+                         parameters=[{"config": str(SKIN), "autostart": False}])  # fmt: skip
+    seen = []
+
+    def change(number: int) -> EmitEvent:
+        return EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=number))
+
+    def then(state: str, action: object) -> RegisterEventHandler:
+        note = OpaqueFunction(function=lambda _: seen.append(state))
+        return RegisterEventHandler(
+            OnStateTransition(target_lifecycle_node=node, goal_state=state, entities=[note, action])
+        )
+
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(
+        LaunchDescription(
+            [
+                node,
+                RegisterEventHandler(
+                    OnProcessStart(target_action=node, on_start=[change(Transition.TRANSITION_CONFIGURE)])
+                ),
+                then("inactive", change(Transition.TRANSITION_ACTIVATE)),
+                then("active", Shutdown(reason="done")),
+                TimerAction(period=30.0, actions=[Shutdown(reason="too late")]),
+            ]
+        )
+    )
+    assert service.run() == 0
+    assert seen == ["inactive", "active"]

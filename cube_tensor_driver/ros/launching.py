@@ -24,16 +24,16 @@ TOPICS = ("frequencies", "stress", "info")
 """What a recording needs: `frequencies` and `info` make everything again, `stress` is what was seen."""
 
 
-def switch(name: str, description: str) -> DeclareLaunchArgument:
-    """A launch argument that is true or false, false unless given."""
-    return DeclareLaunchArgument(name, default_value="false", choices=["true", "false"], description=description)
+def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
+    """A launch argument that is true or false."""
+    return DeclareLaunchArgument(name, default_value=default, choices=["true", "false"], description=description)
 
 
 def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list[LaunchDescriptionEntity]:
     """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask for.
 
-    arguments: config and namespace; port, rate, simulate, load, composed, markers, contacts, record, rviz,
-    state_publisher if the launch file has them. ConfigError: the skin file, load script or an argument is wrong.
+    arguments: config and namespace; port, rate, simulate, load, composed, autostart, markers, contacts, record,
+    rviz, state_publisher if the launch file has them. ConfigError: skin file, load script or an argument is wrong.
     """
     given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
     path = Path(given["config"]).expanduser().resolve()
@@ -56,6 +56,7 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
         port=given.get("port", ""),
         rate=rate,
         composed=wanted("composed"),
+        autostart=given.get("autostart") != "false",
         markers=wanted("markers") or wanted("rviz"),
         contacts=wanted("contacts"),
         load=load,

@@ -29,6 +29,7 @@ def skin_processes(
     port: str = "",
     rate: float = 0.0,
     composed: bool = False,
+    autostart: bool = True,
     markers: bool = False,
     contacts: bool = False,
     simulated_ports: Path | None = None,
@@ -39,11 +40,13 @@ def skin_processes(
     """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
 
     port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
-    for the file's. composed: driver and reconstruction in one process. markers, contacts: those nodes, too. book: where
+    for the file's. composed: driver and reconstruction in one process. autostart: False leaves nodes to be
+    configured and activated by lifecycle transitions. markers, contacts: those nodes, too. book: where
     the simulator writes what it sampled; instants: see `simulation.main.Simulator`; load: its load script, None for the
     shipped one.
     """
-    skin: dict[str, Value] = {"config": str(config)}
+    start: dict[str, Value] = {} if autostart else {"autostart": False}
+    skin: dict[str, Value] = {"config": str(config), **start}
     driver: dict[str, Value] = {**skin, "port": port, "rate": rate, "port_directory": str(simulated_ports or "")}
     if composed:
         processes = [Process("composed", "cube_tensor_driver.ros.composed", parameters=driver)]
@@ -54,7 +57,7 @@ def skin_processes(
         ]
     for name, wanted in {"markers": markers, "contacts": contacts}.items():
         if wanted:
-            processes.append(Process(name, f"cube_tensor_driver.ros.{name}"))
+            processes.append(Process(name, f"cube_tensor_driver.ros.{name}", parameters=start))
     if simulated_ports is not None:
         arguments = ["--config", str(config), "--ports", str(simulated_ports)]
         if load is not None:

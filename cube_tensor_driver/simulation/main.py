@@ -139,11 +139,18 @@ class Simulator:
                 for bench in self.benches:
                     if bench.hub.started and not bench.prepared and now - bench.hub.next_us > LATE_US:
                         bench.hub.skip(now)
-                    while bench.hub.started and bench.hub.next_us <= now and not stop.requested:
-                        # Faults fall between the samples where they belong, however late this loop comes.
-                        self._injector.step(bench.hub.next_us)
-                        if bench.hub.started:
-                            self._sample(bench, now)
+                behind = True
+                while behind and not stop.requested:
+                    # One of each hub in turn: where this loop comes late no hub falls silent behind the others.
+                    behind = False
+                    for bench in self.benches:
+                        if bench.hub.started and bench.hub.next_us <= now:
+                            # Faults fall between the samples where they belong, however late this loop comes.
+                            self._injector.step(bench.hub.next_us)
+                            if bench.hub.started:
+                                self._sample(bench, now)
+                            behind |= bench.hub.started and bench.hub.next_us <= now
+                for bench in self.benches:
                     bench.line.flush(now)
                 self._injector.step(now)
                 if now >= second_us:
