@@ -78,8 +78,7 @@ def test_not_measured_is_nan_and_millihertz_survive():
 def test_strangers_are_counted_and_left_out():
     scan = Scan(1, [Place("a", 0, 1, None, 2)])
     assert scan.hello(0, hello([1, 2, 3])) == [
-        "the hub's cube 0 (uid 0x1) is not in the skin file",
-        "the hub's cube 2 (uid 0x3) is not in the skin file",
+        "the hub's cubes 0 (uid 0x1), 2 (uid 0x3) not in the skin file: add it there",
     ]
     scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]]), 0)
     rows = scan.take()
@@ -102,8 +101,8 @@ def test_another_number_of_pads_names_both_and_invents_nothing():
     ("place", "words"),
     [
         (Place("a", 0, 5, None, 2), ["index 5", "2 cubes"]),
-        (Place("a", 0, None, 99, 2), ["no cube with uid 0x63"]),
-        (Place("a", 1, None, 5, 2), ["uid 0x5 is on this link", "another one"]),
+        (Place("a", 0, None, 99, 2), ["a (uid 0x63)", "no cube of this uid"]),
+        (Place("a", 1, None, 5, 2), ["uid 0x5", "on this link", "file on another"]),
     ],
 )
 def test_what_does_not_fit_is_said(place, words):
@@ -117,6 +116,36 @@ def test_a_repeated_hello_says_nothing_and_a_changed_one_counts():
     scan = Scan(1, [Place("a", None, None, 5, 2)])
     assert scan.hello(0, hello([5])) == []
     assert scan.hello(0, hello([5])) is None
-    assert scan.hello(0, hello([4, 5])) == ["the hub's cube 0 (uid 0x4) is not in the skin file"]
+    assert scan.hello(0, hello([4, 5])) == ["the hub's cube 0 (uid 0x4) not in the skin file: add it there"]
     scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0]]), 0)
     assert scan.take().frequency.tolist() == [[2.0, 2.0]]
+
+
+def test_two_cubes_with_one_uid_give_rows_of_one():
+    """On one hub, and on two: the second takes over only when the first is gone."""
+    scan = Scan(2, [Place("a", None, None, 5, 2), Place("b", None, None, 6, 2)])
+    (problem,) = scan.hello(0, hello([5, 5, 6]))
+    assert problem == "the hub's cube 1 (uid 0x5) left out: an earlier one has the same uid"
+    (problem, *_) = scan.hello(1, hello([5, 7]))
+    assert problem == "cube a (uid 0x5) left out here: another link has a cube of the same uid"
+    scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]), 0)
+    scan.add(1, sample(0, [[4.0, 4.0], [5.0, 5.0]]), 0)
+    rows = scan.take()
+    assert rows.cube.tolist() == [0, 1] and rows.frequency[:, 0].tolist() == [1.0, 3.0]
+    assert scan.unknown_cube == 3 and scan.unaccounted() == 0
+    assert scan.hello(1, hello([5, 7])) is None
+    scan.live(0, False)
+    assert scan.hello(1, hello([5, 7])) == ["the hub's cube 1 (uid 0x7) not in the skin file: add it there"]
+    scan.add(1, sample(1, [[4.0, 4.0], [5.0, 5.0]]), 0)
+    assert scan.take().cube.tolist() == [0]
+    # the first comes back: now it is the second
+    assert "cube a (uid 0x5) left out here" in scan.hello(0, hello([5, 5, 6]))[0]
+
+
+def test_a_hub_of_strangers_is_one_line():
+    scan = Scan(1, [Place("a", 0, 0, None, 2), Place("b", None, None, 1000, 2)])
+    problems = scan.hello(0, hello(range(1, 41)))
+    assert problems == [
+        "the hub's cubes 1 (uid 0x2), 2 (uid 0x3), 3 (uid 0x4), 4 (uid 0x5), 5 (uid 0x6), 6 (uid 0x7), 7 (uid 0x8), "
+        "8 (uid 0x9) and 31 more not in the skin file: add it there"
+    ]

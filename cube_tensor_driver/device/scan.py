@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from .protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Hello, Sample
 
+NAMED = 8
+"""Cubes that a message names; of more it says how many."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -60,41 +63,63 @@ class Scan:
         self._whole: list[tuple[NDArray[np.uint16], int] | None] = [None] * n_links
         self._hellos: list[Hello | None] = [None] * n_links
         self._live = [False] * n_links
+        self._here = [False] * n_links  # has said HELLO since it was last closed or silent
+        self._waits = [False] * n_links  # has a cube that another link has too, and may have it alone later
         self._gathered: list[list[tuple[Sample, int]]] = [[] for _ in range(n_links)]
 
     def hello(self, link: int, frame: Hello) -> list[str] | None:
         """Learn which cubes a link carries. Returns what does not fit the skin, in words; None if nothing changed."""
         last = self._hellos[link]
-        if last is not None and last.n_pads == frame.n_pads and np.array_equal(last.cube_uids, frame.cube_uids):
+        same = last is not None and last.n_pads == frame.n_pads and np.array_equal(last.cube_uids, frame.cube_uids)
+        if same and self._here[link] and not self._waits[link]:
             return None
-        self._hellos[link] = frame
+        self._hellos[link], self._here[link] = frame, True
+        others = [self._cubes[other] for other in range(len(self._cubes)) if other != link and self._here[other]]
+        taken = {cube for cubes in others for cube in cubes.tolist()}
         cubes = np.full(frame.n_cubes, -1, np.int32)
-        uids = {int(uid): index for index, uid in enumerate(frame.cube_uids)}
-        problems = []
+        first: dict[int, int] = {}
+        twice = []
+        wrong: dict[str, list[str]] = {}  # what is wrong: with which cubes
+        for at, uid in enumerate(frame.cube_uids.tolist()):
+            if first.setdefault(uid, at) != at:
+                twice.append(f"{at} (uid {uid:#x})")
+        self._waits[link] = False
+        index: int | None
         for number, place in enumerate(self._places):
-            if place.uid is not None:
-                index = uids.get(place.uid)
-                if index is None and place.link == link:
-                    problems.append(f"cube {place.name}: the hub has no cube with uid {place.uid:#x}")
-                elif index is not None and place.link not in (None, link):
-                    problems.append(f"cube {place.name}: uid {place.uid:#x} is on this link, the skin says another one")
-                    index = None
-            else:
+            name = f"{place.name} ({f'index {place.index}' if place.uid is None else f'uid {place.uid:#x}'})"
+            if place.uid is None:
                 index = place.index if place.link == link else None
                 if index is not None and index >= frame.n_cubes:
-                    problems.append(f"cube {place.name}: index {index}, but the hub has {frame.n_cubes} cubes")
-                    index = None
+                    wrong.setdefault(f"not found: the hub has {frame.n_cubes} cubes", []).append(name)
+                    continue
+            else:
+                index = first.get(place.uid)
+                if index is None and place.link == link:
+                    wrong.setdefault("not found: the hub has no cube of this uid", []).append(name)
+                elif index is not None and place.link not in (None, link):
+                    wrong.setdefault("left out: by uid on this link, by the skin file on another", []).append(name)
+                    continue
+                elif index is not None and number in taken:
+                    self._waits[link] = True
+                    wrong.setdefault("left out here: another link has a cube of the same uid", []).append(name)
+                    continue
             if index is None:
                 continue
             cubes[index] = number
             if place.n_pads != frame.n_pads:
-                problems.append(
-                    f"cube {place.name}: the hub reports {frame.n_pads} pads, its layout has {place.n_pads}; "
+                text = (
+                    f"left out: the hub reports {frame.n_pads} pads, its layout has {place.n_pads}; "
                     "correct the layout and calibration in the skin file"
                 )
-        for stranger in np.flatnonzero(cubes < 0).tolist():
-            uid = int(frame.cube_uids[stranger])
-            problems.append(f"the hub's cube {stranger} (uid {uid:#x}) is not in the skin file")
+                wrong.setdefault(text, []).append(name)
+        strangers = [f"{i} (uid {frame.cube_uids[i]:#x})" for i in first.values() if cubes[i] < 0]
+        problems = [_named("cube", names, text) for text, names in wrong.items()]
+        if twice:
+            problems.append(_named("the hub's cube", twice, "left out: an earlier one has the same uid"))
+        if strangers:
+            problems.append(_named("the hub's cube", strangers, "not in the skin file: add it there"))
+        if same and np.array_equal(cubes, self._cubes[link]):
+            return None
         self._cubes[link] = cubes
         fits = (cubes >= 0).all() and (self._pads[cubes] == frame.n_pads).all()
         self._whole[link] = (cubes.astype(np.uint16), frame.n_pads) if fits else None
@@ -105,6 +130,7 @@ class Scan:
     def live(self, link: int, live: bool) -> None:
         """Whether a link delivers samples now, so that a scan waits for it."""
         self._live[link] = live
+        self._here[link] &= live
 
     def add(self, link: int, sample: Sample, stamp_ns: int) -> None:
         """One sample, with the time it was taken at in the node's clock."""
@@ -182,3 +208,9 @@ class Scan:
         if millihertz.size and millihertz.min() == NOT_MEASURED:
             hertz[millihertz == NOT_MEASURED] = np.nan
         return hertz
+
+
+def _named(what: str, names: Sequence[str], text: str) -> str:
+    """One line about several, the first few by name."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f"{what}{'s' * (len(names) > 1)} {', '.join(names[:NAMED])}{more} {text}"

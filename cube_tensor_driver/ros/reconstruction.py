@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.event_handler import SubscriptionEventCallbacks
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 
@@ -51,6 +53,7 @@ class Reconstruction(CubeNode):
         skin = self._skin = read_skin(self.config())
         self._pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
         self._rows = self._rows_before = self._invalid = self._bad_messages = 0
+        self._lost_messages = self._lost_before = 0
         quality = queue(skin.rate, self.value("qos_reliability"))
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
@@ -65,7 +68,10 @@ class Reconstruction(CubeNode):
                               lambda: float(self.value("tare_duration")), self._publish_info, self._lock)  # fmt: skip
         self._listening = self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
         if self._subscribes:
-            self._subscription = self.create_subscription(SkinFrequencies, "frequencies", self.take, quality)
+            lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
+            self._subscription = self.create_subscription(
+                SkinFrequencies, "frequencies", self.take, quality, event_callbacks=lost
+            )
         self._looking = self.create_timer(LISTENERS_S, self._cubes.find_listeners)
         self._publish_info()
 
@@ -119,6 +125,10 @@ class Reconstruction(CubeNode):
         since_ns = self._health.newest_ns + 1 if self._health.newest_ns else self.get_clock().now().nanoseconds
         self._info.publish(info_message(self._skin, self._pipeline, since_ns, self._taring.uids))
 
+    def _on_lost(self, event: Any) -> None:
+        """DDS says that messages are gone for good: the network or this node was away for longer than queues hold."""
+        self._lost_messages = event.total_count
+
     def _statuses(self) -> list[DiagnosticStatus]:
         """For diagnostics, of the whole and of cubes that are not fine; what was found since the last time."""
         if not self.configured:
@@ -137,12 +147,15 @@ class Reconstruction(CubeNode):
             "rows": self._rows,
             "rows per second": rate,
             "invalid rows": self._invalid,
+            "messages lost on the way": self._lost_messages,
             "messages that contradict themselves": self._bad_messages,
             **self._taring.age(),
             **summary,
         }
-        level = DiagnosticStatus.WARN if self._bad_messages else DiagnosticStatus.OK
-        return [make_status("rows", self._skin.name, level, "", values), *statuses]
+        news, self._lost_before = self._lost_messages - self._lost_before, self._lost_messages
+        text = f"{news} messages lost on the way: see the network" if news > 0 else ""
+        level = DiagnosticStatus.WARN if self._bad_messages or text else DiagnosticStatus.OK
+        return [make_status("rows", self._skin.name, level, text, values), *statuses]
 
 
 def main() -> None:
