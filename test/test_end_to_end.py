@@ -324,6 +324,31 @@ def test_another_number_of_pads_is_an_error_that_names_both(ros, hub, tmp_path):
         children.check()
 
 
+def test_a_hub_with_more_cubes_than_the_skin_gives_those_it_has(ros, hub, tmp_path):
+    frequencies = ros.listen(SkinFrequencies, "frequencies")
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    with Children(tmp_path) as children:
+        start_single(children, tmp_path)
+        ros.wait(lambda: 1 in hub.listen())
+        hub.send(encode(Hello(0xAB, 1, 8, 10_000, np.array([0xCD, 0xCD, 0xEF], "<u8"))))
+        ros.wait(lambda: 2 in hub.listen())
+        sequence = itertools.count()
+
+        def arrived() -> bool:
+            number = next(sequence)
+            frequency = np.full((3, 8), 100_000_000, "<u4")
+            hub.send(encode(Sample(number, 0, 10_000 * number, frequency, np.zeros(3, "<u4"), np.zeros(3, "<i2"))))
+            return bool(frequencies)
+
+        ros.wait(arrived)
+        ros.wait(lambda: link_status(diagnostics).get(""))
+        text = link_status(diagnostics)[""]
+        assert "cube 1 (uid 0xcd) left out: an earlier one has the same uid" in text
+        assert "cube 2 (uid 0xef) not in the skin file: add it there" in text
+        assert all(set(message.cube) == {0} for message in frequencies)
+        children.check()
+
+
 def test_another_protocol_version_is_an_error_that_names_both(ros, hub, tmp_path):
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     with Children(tmp_path) as children:

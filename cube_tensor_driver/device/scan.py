@@ -78,11 +78,8 @@ class Scan:
         taken = {cube for cubes in others for cube in cubes.tolist()}
         cubes = np.full(frame.n_cubes, -1, np.int32)
         first: dict[int, int] = {}
-        twice = []
         wrong: dict[str, list[str]] = {}  # what is wrong: with which cubes
-        for at, uid in enumerate(frame.cube_uids.tolist()):
-            if first.setdefault(uid, at) != at:
-                twice.append(f"{at} (uid {uid:#x})")
+        twins = [at for at, uid in enumerate(frame.cube_uids.tolist()) if first.setdefault(uid, at) != at]
         self._waits[link] = False
         index: int | None
         for number, place in enumerate(self._places):
@@ -112,7 +109,9 @@ class Scan:
                     "correct the layout and calibration in the skin file"
                 )
                 wrong.setdefault(text, []).append(name)
-        strangers = [f"{i} (uid {frame.cube_uids[i]:#x})" for i in first.values() if cubes[i] < 0]
+        twice, strangers = (
+            [f"{at} (uid {frame.cube_uids[at]:#x})" for at in some if cubes[at] < 0] for some in (twins, first.values())
+        )
         problems = [_named("cube", names, text) for text, names in wrong.items()]
         if twice:
             problems.append(_named("the hub's cube", twice, "left out: an earlier one has the same uid"))
