@@ -101,6 +101,14 @@ def test_demo_says_what_is_wrong_in_one_line(domain, arguments, words):
         assert word in errors
 
 
+def test_demo_does_not_mix_with_another_skin(ros):
+    ros.node.create_publisher(SkinStress, "stress", 10)
+    process = demo("--headless", "--cubes", "4", "--duration", "1")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1 and "Traceback" not in errors
+    assert "another skin publishes stress in DDS domain" in errors and "ROS_DOMAIN_ID" in errors
+
+
 def test_every_topic_of_a_skin(ros, tmp_path):
     skin = read_skin(SKIN)
     batches = ros.listen(SkinStress, "stress")
