@@ -54,8 +54,8 @@ def test_sole_finds_the_ground_reaction_force_and_its_centre(domain, tmp_path):
     # float32 carries 6e-8, see test_end_to_end
     assert result["error_rel_rms"] < 1e-5
     error = np.divide(result["force_error_n"], result["force_peak_n"])
-    # what the half space carries beyond the outline: (1 + R²/h²)^-1.5 of the pressure, 1.5 h/R of the shear, with the
-    # greatest loss at the heel, whose middle is R = 30 mm from the edge, h = 6 mm
+    # what the half space carries beyond the outline, 1 to 2 % of the pressure and 20 to 35 % of the shear, and what the
+    # field sags between cubes, 3 %: docs/examples.md
     assert error[2] < 0.04 and error[0] < 0.3 and error[1] < 0.3
     assert result["centre_error_mm"] < 1.5
     assert picture.stat().st_size > 10_000
