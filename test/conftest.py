@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import itertools
 import socket
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -32,6 +33,16 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
             yield number
             return
     pytest.fail("all 100 domains are in use: end the other suites")
+
+
+def end(process: subprocess.Popen) -> None:
+    """Asked first: a process that is killed leaves its own children behind."""
+    process.terminate()
+    try:
+        process.wait(10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from conftest import ROOT
+from conftest import ROOT, end
 
 PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 ELSEWHERE = {
@@ -84,8 +84,7 @@ def run_until(arguments: list[str], folder: Path, said: str) -> None:
     except OSError:  # the terminal is gone with the process
         assert process.wait(10) == 0
     finally:
-        process.kill()
-        process.wait()
+        end(process)
         os.close(near)
 
 

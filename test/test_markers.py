@@ -98,6 +98,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from cube_tensor_driver.ros.children import Children
     from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
     from cube_tensor_driver.ros.start import Process
+    from cube_tensor_driver.view.figures import draw_markers
 
     skin = read_skin(share() / "config" / "skin_demo.yaml")
     n, pressed, silent = len(skin.cubes), 6, 15
@@ -142,6 +143,11 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
     assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
     assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
+
+    figure = draw_markers(pictures[-1])
+    drawn = sum(len(collection.get_paths()) for collection in figure.axes[0].collections)
+    assert drawn >= 6 * n  # as ./cube pictures shows it: the faces of every cube, at least
+    assert "kPa" in figure.axes[0].texts[0].get_text()
 
     contact = contacts[-1]
     assert contact.header.frame_id == "skin_base" and len(contact.position) == 1

@@ -30,7 +30,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from websockets.sync.client import connect
 
-from conftest import ROOT
+from conftest import ROOT, end
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.device.scan import Rows
 from cube_tensor_driver.files.share import share
@@ -207,8 +207,7 @@ def test_a_replay_is_steered_from_the_page(ros, tmp_path):
         assert replay.wait(timeout=10) == 0
         assert "Traceback" not in replay.stderr.read()
     finally:
-        replay.kill()
-        replay.wait()
+        end(replay)
 
 
 def text(page: webdriver.Chrome) -> str:

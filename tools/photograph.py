@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from selenium import webdriver
+from selenium.common.exceptions import TimeoutException
 from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.support.wait import WebDriverWait
 
 FLAGS = ("--headless", "--no-sandbox", "--disable-background-networking", "--enable-unsafe-swiftshader",
          "--use-gl=angle", "--use-angle=swiftshader", "--window-size=1400,950")  # fmt: skip
-LOOK_S, SETTLE_S = 12.0, 2.0
-"""The plots show 10 s; a machine without a graphics card takes a while to draw."""
+PLOTS_S = 10.0
+"""What the plots show."""
+READY = "return /of \\d+ cubes/.test(document.body.innerText) && document.body.innerText.includes('live')"
+HELD = """return new Promise(drawn => {
+  if (!document.body.innerText.includes('paused')) return drawn(false)
+  let left = 3
+  const next = () => left-- ? requestAnimationFrame(next) : drawn(true)
+  next() })"""
+"""Paused, and drawn since."""
 CLICK = "for (const b of document.querySelectorAll('button')) if (b.innerText.trim() == 'pause') b.click()"
 CLEAR = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 LOADED = "return Number((/([0-9.]+) N, shear/.exec(document.body.innerText) || [0, 0])[1])"
-LEAST_N, WAIT_S = 2.2, 20.0
+LEAST_N, WAIT_S = 2.2, 60.0
 """The load comes and goes: the picture waits until it presses."""
 
 
@@ -40,13 +49,15 @@ def chromium(url: str) -> Iterator[webdriver.Chrome]:
 
 def photograph(url: str, path: str) -> None:
     with chromium(url) as browser:
-        time.sleep(LOOK_S)
+        wait = WebDriverWait(browser, WAIT_S, poll_frequency=0.02)
+        wait.until(lambda _: browser.execute_script(READY))
+        # Nothing to wait for but time itself: the plots fill from right to left.
+        with contextlib.suppress(TimeoutException):
+            WebDriverWait(browser, PLOTS_S).until(lambda _: False)
         browser.execute_script(CLEAR)
-        until = time.monotonic() + WAIT_S
-        while browser.execute_script(LOADED) < LEAST_N and time.monotonic() < until:
-            time.sleep(0.02)
+        wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
         browser.execute_script(CLICK)
-        time.sleep(SETTLE_S)
+        wait.until(lambda _: browser.execute_script(HELD))
         browser.save_screenshot(path)
 
 

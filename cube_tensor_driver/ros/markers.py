@@ -19,7 +19,9 @@ from ..core.errors import ConfigError
 from .follow import FollowerNode
 from .node import run
 
-LEGEND_BYTES = 160
+LINE_BYTES = 79
+LEGEND_BYTES = 2 * LINE_BYTES + 1
+"""Two lines, filled up on both sides: viewers centre them."""
 LIFETIME_S = 2
 """Viewers drop the picture so long after the node is gone: no old load stands there as if it were true."""
 BAR = 32
@@ -88,16 +90,16 @@ class Markers(FollowerNode):
             canvas["crosses"].colours[:, :3] = np.repeat(np.where(pulls.reshape(-1, 1), PULL, PUSH), 2, axis=0)
         bar = np.linspace(-self._top if self._quantity.signed else 0.0, self._top, BAR)
         canvas["legend bar"].colours[:, :3] = scene.colours(self._quantity, bar, self._top)
-        canvas.write(self._legend(health))
+        canvas.write(*self._legend(health))
         return bytes(canvas.message)
 
-    def _legend(self, health: np.ndarray) -> str:
+    def _legend(self, health: np.ndarray) -> tuple[str, str]:
         quantity = self._quantity
         top = self._top / quantity.size
         counts = [f"{np.count_nonzero(health == k)} {word}" for k, word in enumerate(scene.HEALTH)]
         states = ", ".join(text for k, text in enumerate(counts) if k == scene.FINE or np.any(health == k))
         low = -top if quantity.signed else 0
-        return f"{quantity.label}: {low:.3g} to {top:.3g} {quantity.unit}\n{states}"
+        return f"{quantity.label}: {low:.3g} to {top:.3g} {quantity.unit}", states
 
 
 class Canvas:
@@ -150,8 +152,9 @@ class Canvas:
         for k, members in enumerate(self._groups):
             self[f"cubes {k}"].colours[:, :3] = colours[members]
 
-    def write(self, legend: str) -> None:
-        self._legend[:] = np.frombuffer(legend.encode()[:LEGEND_BYTES].ljust(LEGEND_BYTES), np.uint8)
+    def write(self, *legend: str) -> None:
+        lines = [line.encode()[:LINE_BYTES].center(LINE_BYTES) for line in legend]
+        self._legend[:] = np.frombuffer(b"\n".join(lines), np.uint8)
 
     def _add(self, name: str, kind: int, n: int, many: bool, colour: tuple[float, float, float] = WHITE) -> Marker:
         """A marker whose points, and colours if `many`, are its number until `_serialise` finds them by it."""
