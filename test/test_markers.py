@@ -145,6 +145,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
 
     figure = draw_markers(pictures[-1])
+    figure.canvas.draw()
     drawn = sum(len(collection.get_paths()) for collection in figure.axes[0].collections)
     assert drawn >= 6 * n  # as ./cube pictures shows it: the faces of every cube, at least
     assert "kPa" in figure.axes[0].texts[0].get_text()

@@ -14,9 +14,11 @@ from ..core.modes import COMPONENTS, STRESS
 from ..core.pipeline import INVALID, RESIDUAL
 from ..files.bags import Bag
 from ..files.reprocess import Recording
-from .plots import save
+from .plots import MARKERS, save
 
 STYLES = ("-", "--", "-.", ":")
+MARKS = 12
+"""Of a line."""
 POINTS = 20_000
 """More do not show on paper."""
 
@@ -107,7 +109,11 @@ def draw_series(series: Series, title: str) -> Figure:
 
 
 def _lines(axes, seconds: np.ndarray, columns: np.ndarray, names: list[str]) -> None:  # type: ignore[no-untyped-def]
-    for number, (values, name) in enumerate(zip(columns.T, names, strict=True)):
-        if np.isfinite(values).any():
-            axes.plot(seconds, values, STYLES[number % len(STYLES)], lw=0.9, color=f"C{number % 10}", label=name)
+    """Told apart by dashes, markers and lightness: a copier knows no colour."""
+    shown = [(values, name) for values, name in zip(columns.T, names, strict=True) if np.isfinite(values).any()]
+    step = max(1, len(seconds) // MARKS)
+    for number, (values, name) in enumerate(shown):
+        axes.plot(seconds, values, STYLES[number % len(STYLES)], lw=0.9, color=str(0.6 * number / len(shown)), ms=4,
+                  marker=MARKERS[number % len(MARKERS)], mfc="white", markevery=(number * step // len(shown), step),
+                  label=name)  # fmt: skip
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, ncols=1 if len(names) <= 12 else 2)
