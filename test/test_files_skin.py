@@ -124,6 +124,13 @@ def test_uids_once_in_any_spelling(tmp_path):
     ]
 
 
+def test_a_hub_reads_one_number_of_pads(tmp_path):
+    data = copy.deepcopy(GOOD)
+    data["cubes"][1].update(layout="cube", calibration="cube")
+    with pytest.raises(ConfigError, match="those on the link 'hub0' have 8 and 24 pads; a hub reads one number"):
+        read(tmp_path, data)
+
+
 def test_every_mistake_is_told_at_once(tmp_path):
     data = copy.deepcopy(GOOD)
     del data["parent_frame"]

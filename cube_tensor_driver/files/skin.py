@@ -162,6 +162,11 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
     mistakes += _twice(
         "cubes", "link and index", [f"{cube.link!r}, {cube.index}" for cube in cubes if cube.index is not None]
     )
+    for link in links:
+        pads = {cube.calibration.layout.n_pads for cube in cubes if cube.link == link.name}
+        if len(pads) > 1:
+            both = " and ".join(map(str, sorted(pads)))
+            mistakes.append(f"cubes: those on the link {link.name!r} have {both} pads; a hub reads one number of pads")
     if mistakes:
         return None, mistakes
     rate = data.get("rate")
