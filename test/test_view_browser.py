@@ -179,7 +179,7 @@ def test_a_replay_is_steered_from_the_page(ros, tmp_path):
 
             # it has come to the end, and holds there without its cubes growing stale
             ros.wait(lambda: heard and position() > 5.9 and "play" in buttons(page), 40)
-            ros.wait(lambda: f"{N} of {N} cubes" in text(page), 40)
+            ros.wait(lambda: "paused" in text(page) and f"{N} of {N} cubes" in text(page), 40)
             slider = page.find_element("css selector", "[role=slider]")
 
             def key(one: str) -> None:

@@ -97,6 +97,7 @@ class Page:
 
     def steer(self, replay: Replay | None) -> None:
         """Show where a replay is, or that there is none."""
+        self._held = replay is not None and replay.paused
         self._replay.visible = replay is not None
         if replay is not None:
             self._place.max = max(replay.length, STEP_S)
@@ -143,7 +144,7 @@ class Page:
 
     def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
         self._head = gui.add_html("")
-        self._paused = False
+        self._paused = self._held = False
         row = gui.add_button_group("", ("pause", "tare", "clear tare", "record"))
 
         @row.on_click
@@ -251,7 +252,7 @@ class Page:
         if not self._paused:
             self._load = next(iter(self._surface.contacts(newest.believed(health), LEAST_PA)), None)
         hertz = float(np.nanmax(rate, initial=0.0))
-        self._head.content = markup.head(health, hertz, self._load, self._paused, facts.recording)
+        self._head.content = markup.head(health, hertz, self._load, self._paused or self._held, facts.recording)
         self._action.content = markup.box(escape(facts.action)) if facts.action else ""
         if self._paused:
             return
