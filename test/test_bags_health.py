@@ -22,19 +22,19 @@ def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
     if faults:
         frequency[50:90, 2, 1], frequency[200, 4, 3], frequency[300:, 1, 0] = np.nan, 1e9, 98_000.0
         pad_fault[120, 3] = 4
-    stamp_ns = 10_000_000 * np.arange(count)
+    stamp_ns = np.repeat(10_000_000 * np.arange(count)[:, None], n, axis=1)
     stamp_ns[250:] -= 2_000_000_000  # played again from further back
-    cube = np.broadcast_to(np.arange(n, dtype=np.uint16), (count, n))
+    cube = np.arange(n, dtype=np.uint16)
     temperature = np.full((count, n), np.nan, np.float32)
     single, many = Health(pipeline), Health(pipeline)
-    rows = zip(cube, frequency, pad_fault, stamp_ns.tolist(), temperature, strict=True)
-    expected = [single.update(*one) for one in rows]
-    masks = []
-    for part in np.array_split(np.arange(count), 9):
-        mask, _ = many.update_many(cube[part], frequency[part], pad_fault[part], stamp_ns[part], temperature[part])
-        masks.append(mask)
-    np.testing.assert_array_equal(np.concatenate(masks), expected)
-    assert bool(np.any(expected)) == faults
+    expected = [single.update(cube, *one) for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)]
+    found = [
+        many.update_many(cube, frequency[part], pad_fault[part], stamp_ns[part], temperature[part])
+        for part in np.array_split(np.arange(count), 9)
+    ]
+    for of_many, of_single in zip(zip(*found, strict=True), zip(*expected, strict=True), strict=True):
+        np.testing.assert_array_equal(np.concatenate(of_many), of_single)
+    assert bool(np.any([mask for mask, _ in expected])) == faults
     assert many.closed == single.closed
     for a, b in zip(many.history, single.history, strict=True):
         for one, other in zip(a, b, strict=True):

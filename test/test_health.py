@@ -42,7 +42,8 @@ class Skin:
             harm(frequency, self.row)
             faults = np.zeros(len(self.cube), np.uint32)
             faults[2] = pad_fault
-            mask = self.health.update(self.cube, frequency.astype(np.float32), faults, self.row * PERIOD_NS)
+            stamp_ns = np.full(len(self.cube), self.row * PERIOD_NS)
+            mask, _ = self.health.update(self.cube, frequency.astype(np.float32), faults, stamp_ns)
             rows = self.pipeline.process(self.cube, frequency, mask)
             self.health.residual(self.cube, rows.status)
             self.row += 1
@@ -181,11 +182,11 @@ def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
     frequency = (100e3 * (1 + 1e-5 * generator.standard_normal((6, 8)))).astype(np.float32)
     together, singly = (Health(Pipeline([CALIBRATION] * 6, np.float32)) for _ in range(2))
     none = np.zeros(6, np.uint32)
-    together.update(cube, frequency, none, 0)
+    together.update(cube, frequency, none, np.zeros(6))
     for row in range(6):
-        singly.update(cube[row : row + 1], frequency[row : row + 1], none[:1], 0)
-    for name in ("last", "_before", "_lowest", "_highest", "_count", "_bend"):
-        np.testing.assert_array_equal(getattr(together, name), getattr(singly, name))
+        singly.update(cube[row : row + 1], frequency[row : row + 1], none[:1], np.zeros(1))
+    for one, other in zip((together.last, *together.window()), (singly.last, *singly.window()), strict=True):
+        np.testing.assert_array_equal(one, other)
     assert together.rows.tolist() == [1, 2, 0, 0, 3, 0]
 
 
@@ -194,7 +195,7 @@ def test_mixed_layouts_and_pads_that_do_not_exist():
     watch = Health(pipeline)
     frequency = np.full((2, 8), 100e3, np.float32)
     frequency[0, 4:] = np.nan
-    watch.update(np.arange(2), frequency, np.array([0xF0, 0], np.uint32), 0)
+    watch.update(np.arange(2), frequency, np.array([0xF0, 0], np.uint32), np.zeros(2))
     assert not watch.state.any()
 
 

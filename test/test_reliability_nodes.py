@@ -163,7 +163,7 @@ def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
     stage.pads = loaded(5000.0)
     stage.pads[2] = 0
     pad = CALIBRATION.layout.pads[2]
-    stage.wait(lambda: stage.says(f"pad {pad} short"))
+    stage.wait(lambda: raw and stage.says(f"pad {pad} short"))
     stage.zz()
     _, rows = read_stress(stage.stress[-1])
     assert rows.status[0] == SkinStress.PAD_FAULT | SkinStress.PAD_SHORT

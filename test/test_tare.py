@@ -41,7 +41,8 @@ class Skin:
             f = f * (1 + self.noise * self._random.standard_normal((3, 8)))
             windows = self.health.closed
             faults = np.array([0, fault, 0], np.uint32)
-            self.health.update(np.arange(3), f.astype(np.float32), faults, round(self.seconds * 1e9), temperature)
+            stamp_ns = np.full(3, round(self.seconds * 1e9))
+            self.health.update(np.arange(3), f.astype(np.float32), faults, stamp_ns, temperature)
             if time_constant and self.health.closed != windows:
                 self.tracker.step(time_constant)
             self.seconds += 1 / RATE
@@ -137,7 +138,7 @@ def test_a_cube_that_is_silent_is_refused_and_bad_pads_keep_their_rest():
         skin.tare()
     for _ in range(3 * RATE):
         f = pads()[:1].astype(np.float32)
-        skin.health.update(np.arange(1), f, np.zeros(1, np.uint32), round(skin.seconds * 1e9))
+        skin.health.update(np.arange(1), f, np.zeros(1, np.uint32), np.array([round(skin.seconds * 1e9)]))
         skin.seconds += 1 / RATE
     with pytest.raises(TareError, match="cube b: no data"):
         skin.tare([1])

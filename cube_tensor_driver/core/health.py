@@ -4,9 +4,7 @@ Every row is looked at when it comes: a pad that cannot be (open, short, out of 
 What needs statistics (stuck, noisy, drifting) is judged over windows of WINDOW_S of the rows' own time. A condition
 lasts until it was absent for HOLD windows. All arrays are (cubes, pads); nothing loops over cubes.
 
-    noise of a pad    sqrt(mean((f[n] - 2 f[n-1] + f[n-2])²) / 6), each term bounded so that one jump is no noise; a
-                      load that moves slowly leaves no second difference
-    strain            d/d_rest - 1 of the pad's law (oscillator.py)
+    strain    d/d_rest - 1 of the pad's law (oscillator.py)
 """
 
 from __future__ import annotations
@@ -18,7 +16,8 @@ import numpy as np
 
 from .errors import LayoutError
 from .oscillator import pad_frequency, stress_slope
-from .pipeline import RESIDUAL, Pipeline
+from .pipeline import COLUMNS_KEPT, RESIDUAL, Pipeline, turns
+from .window import Statistics, Window
 
 OPEN, SHORT, RANGE, STUCK, NOISY, REPORTED, DRIFT = 16, 32, 64, 128, 256, 512, 1024
 WORDS = {
@@ -34,6 +33,8 @@ LEFT_OUT = OPEN | SHORT | RANGE | STUCK | NOISY | REPORTED
 """A pad with one of these is not used; one that drifts still is: only tare knows better."""
 
 WINDOW_S = 0.5
+BACK_NS = round(2e9 * WINDOW_S)
+"""Times that lie further back than this before the window's end are another time: a recording played again."""
 HOLD = 3
 HISTORY = 20
 """Windows remembered, for tare: 10 s."""
@@ -56,14 +57,16 @@ RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
 """Shares of a window's rows with a residual above its limit."""
 
 
-class Window(NamedTuple):
-    """What is kept of a window: rows (cubes,) that came, and (cubes, P) in Hz, NaN where nothing was measured."""
+class _Column(NamedTuple):
+    """What depends on the cube column of a message alone."""
 
-    rows: np.ndarray
-    mean: np.ndarray
-    lowest: np.ndarray
-    highest: np.ndarray
-    noise: np.ndarray
+    turns: int  # how many times the same rising cubes stand in it, 0: not so
+    cube: np.ndarray  # (n,) of one turn
+    cubes: slice | np.ndarray  # the same, as a slice where they are neighbours: numpy does not copy those
+    low: np.ndarray  # (n, P)
+    high: np.ndarray
+    pads: int  # how many there are in a turn
+    fine: np.ndarray  # (n,) status 0
 
 
 class Health:
@@ -81,17 +84,15 @@ class Health:
         width = pipeline.n_pads
         self._shape = len(calibrations), width
         self._exists = np.array([np.arange(width) < c.layout.n_pads for c in calibrations])
-        self._n_pads = self._exists.sum(axis=1)
         self._one = np.uint32(1) << np.arange(width, dtype=np.uint32)
         self.state = np.zeros(self._shape, np.uint16)
-        self.last = np.full(self._shape, np.nan, np.float32)
         self.rows = np.zeros(self._shape[0], int)
         self.strained = np.zeros(self._shape[0], bool)
         self.still = np.zeros(self._shape[0], bool)
-        self._before = self.last.copy()
         self._recent = np.zeros((HOLD, *self._shape), np.uint16)
         self._seen = np.zeros(self._shape, np.uint16)
         self._strained_seen = self.strained.copy()
+        self._bad_residual = np.zeros(self._shape[0], int)
         self._reference = np.full(self._shape, np.nan)
         self._middle = np.full(self._shape, np.nan)  # means of the window before
         self._window_end: int | None = None
@@ -99,11 +100,15 @@ class Health:
         self.closed = 0
         self.newest_ns = 0
         self.temperature = np.full(self._shape[0], np.nan)
+        self._columns: dict[bytes, _Column] = {}
         self.refresh()
-        self._base = np.nan_to_num(self._rest).astype(np.float32)  # sums are of what is above it
-        self._jump = ((JUMP * self.noise) ** 2).astype(np.float32)
-        self._clear_window()
+        self._statistics = Statistics(self._rest, self._bound(self.noise))
+        self.window = self._statistics.window
         self._publish()
+
+    @property
+    def last(self) -> np.ndarray:
+        return self._statistics.last
 
     def refresh(self) -> None:
         """Take the pipeline's rest frequencies anew, after tare."""
@@ -119,57 +124,33 @@ class Health:
             for strain in (*STRAIN_RANGE, STRAIN_OPEN)
         )
         self.noise = noise / stress_slope(rest, rest, beta, modulus)
+        self._columns.clear()
 
     def update(
         self,
         cube: np.ndarray,
         frequency: np.ndarray,
         pad_fault: np.ndarray,
-        stamp_ns: int,
+        stamp_ns: np.ndarray,
         temperature: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Look at rows, before they are reconstructed. Returns (N,) uint32: bits of the pads to leave out of each.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Look at the rows of a message, before they are reconstructed.
 
-        cube (N,) indices; frequency (N, P) Hz; pad_fault (N,) bits; stamp_ns: time of the rows; temperature (N,) °C.
+        cube (N,) indices; frequency (N, P) Hz; pad_fault (N,) bits; stamp_ns (N,) times; temperature (N,) °C.
+        Cubes that stand in it several times, always in the same order, are looked at turn by turn.
+        Returns (N,) uint32, bits of the pads to leave out of each row, and (N,) uint16, status bits of its cube.
         LayoutError: a shape or a cube that the pipeline does not have.
         """
-        if frequency.shape != (len(cube), self._shape[1]) or (len(cube) and int(cube.max()) >= self._shape[0]):
-            raise LayoutError(
-                f"frequencies of shape {frequency.shape} for cubes up to {max(cube, default=0)}; this skin has "
-                f"{self._shape[0]} cubes of {self._shape[1]} pads: use the skin file of the driver"
-            )
-        if not len(cube):
-            return pad_fault
-        if self._window_end is None or stamp_ns < self._window_end - 2e9 * WINDOW_S:
-            self._window_end = stamp_ns + round(1e9 * WINDOW_S)
-        elif stamp_ns >= self._window_end:
-            self._close_window()
-            self._window_end = stamp_ns + round(1e9 * WINDOW_S)
-        self.newest_ns = stamp_ns
-        rising = len(cube) == 1 or bool((cube[1:] > cube[:-1]).all())
-        if rising:
-            self._add(cube, frequency)
-        else:
-            # A cube may stand in one batch several times: first all first ones, then all second ones …
-            order = np.argsort(cube, kind="stable")
-            ordered = cube[order]
-            turn = np.arange(len(cube)) - np.searchsorted(ordered, ordered)
-            for k in range(int(turn.max()) + 1):
-                chosen = order[turn == k]
-                self._add(cube[chosen], frequency[chosen])
-        index = _index(cube, rising)
-        if temperature is not None:
-            self.temperature[index] = temperature
-        possible = (frequency > self._low[index]) & (frequency < self._high[index])
-        if not possible.all():
-            self._mark_impossible(cube, frequency, possible)
-        if pad_fault.any():
-            bits = (pad_fault[:, None] & self._one > 0) & self._exists[cube]
-            self._mark(cube, bits * np.uint16(REPORTED))
-        if not self._any:
-            return pad_fault
-        mask: np.ndarray = pad_fault | self.mask[cube]
-        return mask
+        column = self._column(cube, frequency.shape)
+        if column.turns == 1:
+            return self._look(column, frequency, pad_fault, int(stamp_ns.max()), temperature)
+        if column.turns == 0:
+            return self._look_at_any(cube, frequency, pad_fault, stamp_ns, temperature)
+        batches = column.turns, len(column.cube)
+        known = None if temperature is None else temperature.reshape(batches)
+        mask, status = self._look_at_many(column, frequency.reshape(*batches, -1), pad_fault.reshape(batches),
+                                          stamp_ns.reshape(batches).max(axis=1), known)  # fmt: skip
+        return mask.ravel(), status.ravel()
 
     def update_many(
         self,
@@ -179,39 +160,137 @@ class Health:
         stamp_ns: np.ndarray,
         temperature: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`update` of B batches one after the other, to the same bits, for what was recorded.
+        """`update` of B messages with the same cubes one after the other, to the same bits, for what was recorded.
 
-        cube (B, N), frequency (B, N, P), pad_fault (B, N), stamp_ns (B,), temperature (B, N). Returns (B, N) bits of
-        the pads to leave out, as `update`, and (B, N) status after each.
+        cube (N,), frequency (B, N, P), pad_fault, stamp_ns and temperature (B, N). Returns (B, N) bits of the pads to
+        leave out, and (B, N) status.
         """
-        masks, bits = np.empty(cube.shape, np.uint32), np.empty(cube.shape, np.uint16)
-        # What is possible and no fault, of the same rising cubes all along, changes nothing but sums within a window.
-        quiet = np.zeros(len(cube), bool)
-        if (
-            cube.size
-            and (cube == cube[0]).all()
-            and (cube[0, 1:] > cube[0, :-1]).all()
-            and frequency.shape[2] == self._shape[1]
-            and cube[0, -1] < self._shape[0]
-        ):
-            possible = (frequency > self._low[cube[0]]) & (frequency < self._high[cube[0]])
-            quiet = possible.all(axis=(1, 2)) & ~pad_fault.any(axis=1)
+        column = self._column(cube, frequency.shape[1:])
+        if column.turns == 0:
+            parts = [
+                self._look_at_any(cube, *one) for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)
+            ]
+            masks, statuses = (np.array(part) for part in zip(*parts, strict=True))
+            return masks, statuses
+        batches = len(frequency) * column.turns, len(column.cube)
+        mask, status = self._look_at_many(
+            column, frequency.reshape(*batches, -1), pad_fault.reshape(batches), stamp_ns.reshape(batches).max(axis=1),
+            temperature.reshape(batches),
+        )  # fmt: skip
+        return mask.reshape(pad_fault.shape), status.reshape(pad_fault.shape)
+
+    def _look(
+        self,
+        column: _Column,
+        frequency: np.ndarray,
+        pad_fault: np.ndarray,
+        stamp_ns: int,
+        temperature: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of one turn."""
+        self._go_on(stamp_ns)
+        self._statistics.add(column.cubes, frequency)
+        self.rows[column.cubes] += 1
+        if temperature is not None:
+            self.temperature[column.cubes] = temperature
+        possible = frequency > column.low
+        possible &= frequency < column.high
+        if np.count_nonzero(possible) != column.pads:
+            self._mark_impossible(column.cube, frequency, possible)
+        if np.count_nonzero(pad_fault):
+            self._mark_reported(column.cube, pad_fault)
+        if not self._any:
+            return pad_fault, column.fine
+        return pad_fault | self.mask[column.cubes], self.status[column.cubes]
+
+    def _look_at_any(
+        self,
+        cube: np.ndarray,
+        frequency: np.ndarray,
+        pad_fault: np.ndarray,
+        stamp_ns: np.ndarray,
+        temperature: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of cubes in any order: first all first ones, then all second ones …"""
+        if not len(cube):
+            return pad_fault, np.zeros(0, np.uint16)
+        self._go_on(int(stamp_ns.max()))
+        order = np.argsort(cube, kind="stable")
+        ordered = cube[order]
+        turn = np.arange(len(cube)) - np.searchsorted(ordered, ordered)
+        for k in range(int(turn.max()) + 1):
+            chosen = order[turn == k]
+            self._statistics.add(cube[chosen], frequency[chosen])
+            self.rows[cube[chosen]] += 1
+        if temperature is not None:
+            self.temperature[cube] = temperature
+        self._mark_impossible(cube, frequency, (frequency > self._low[cube]) & (frequency < self._high[cube]))
+        self._mark_reported(cube, pad_fault)
+        return pad_fault | self.mask[cube], self.status[cube]
+
+    def _look_at_many(
+        self,
+        column: _Column,
+        frequency: np.ndarray,
+        pad_fault: np.ndarray,
+        stamp_ns: np.ndarray,
+        temperature: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of (B, n) turns, to the same bits as `_look` of one after the other."""
+        masks, statuses = np.empty(pad_fault.shape, np.uint32), np.empty(pad_fault.shape, np.uint16)
+        possible = (frequency > column.low) & (frequency < column.high)
+        # What is possible and no fault changes nothing but sums within a window.
+        quiet = (np.count_nonzero(possible, axis=(1, 2)) == column.pads) & ~pad_fault.any(axis=1)
         k = 0
-        while k < len(cube):
-            masks[k] = self.update(cube[k], frequency[k], pad_fault[k], int(stamp_ns[k]), temperature[k])
-            bits[k] = self.status[cube[k]]
+        while k < len(frequency):
+            known = None if temperature is None else temperature[k]
+            masks[k], statuses[k] = self._look(column, frequency[k], pad_fault[k], int(stamp_ns[k]), known)
             end = k = k + 1
-            low, high = (self._window_end or 0) - 2e9 * WINDOW_S, self._window_end or 0
-            while end < len(cube) and quiet[end] and low <= stamp_ns[end] < high:
+            low, high = (self._window_end or 0) - BACK_NS, self._window_end or 0
+            while end < len(frequency) and quiet[end] and low <= stamp_ns[end] < high:
                 end += 1
             if end > k:
-                self._add_many(cube[k], frequency[k:end])
-                self.temperature[cube[k]] = temperature[end - 1]
+                self._statistics.add_many(column.cubes, frequency[k:end])
+                self.rows[column.cubes] += end - k
+                if temperature is not None:
+                    self.temperature[column.cubes] = temperature[end - 1]
                 self.newest_ns = int(stamp_ns[end - 1])
-                masks[k:end] = self.mask[cube[k]] if self._any else 0
-                bits[k:end] = self.status[cube[k]]
+                masks[k:end], statuses[k:end] = self.mask[column.cubes], self.status[column.cubes]
                 k = end
-        return masks, bits
+        return masks, statuses
+
+    def _column(self, cube: np.ndarray, shape: tuple[int, ...]) -> _Column:
+        """Of a message whose frequencies have this shape."""
+        key = cube.tobytes()
+        column = self._columns.get(key)
+        if column is None or shape != (len(cube), self._shape[1]):
+            if shape != (len(cube), self._shape[1]) or (len(cube) and int(cube.max()) >= self._shape[0]):
+                raise LayoutError(
+                    f"frequencies of shape {shape} for cubes up to {max(cube, default=0)}; this skin has "
+                    f"{self._shape[0]} cubes of {self._shape[1]} pads: use the skin file of the driver"
+                )
+            if len(self._columns) >= COLUMNS_KEPT:
+                self._columns.clear()
+            count = turns(cube)
+            one = cube[: len(cube) // count].copy() if count else cube[:0]
+            together = count and int(one[-1]) - int(one[0]) + 1 == len(one)
+            cubes = slice(int(one[0]), int(one[-1]) + 1) if together else one
+            column = self._columns[key] = _Column(
+                count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
+                np.zeros(len(one), np.uint16),
+            )  # fmt: skip
+        return column
+
+    def _go_on(self, stamp_ns: int) -> None:
+        """Time goes on; the window ends where it is over. What fell back in time begins a new one."""
+        end = self._window_end
+        if end is None or stamp_ns < end - BACK_NS:
+            self._clear_window()
+        elif stamp_ns >= end:
+            self._close_window()
+        if end is None or not end - BACK_NS <= stamp_ns < end:
+            self._window_end = stamp_ns + round(1e9 * WINDOW_S)
+        self.newest_ns = stamp_ns
 
     def residual(self, cube: np.ndarray, status: np.ndarray) -> None:
         """Take the status of reconstructed rows."""
@@ -227,58 +306,24 @@ class Health:
         self.rows = np.zeros_like(self.rows)
         return found
 
-    def window(self) -> Window:
-        """The window that is not over yet."""
-        count = np.maximum(self._count, 1)[:, None]
-        with np.errstate(invalid="ignore"):
-            mean = np.where(self._count[:, None] > 0, self._base + self._sum / count, np.nan)
-        return Window(self._count, mean, self._lowest, self._highest, np.sqrt(self._bend / count / 6))
-
-    def _add(self, cube: np.ndarray, frequency: np.ndarray) -> None:
-        """Rows of different cubes, rising."""
-        i = _index(cube, True)
-        last = self.last[i]
-        bend = frequency - last
-        bend -= last
-        bend += self._before[i]
-        bend *= bend
-        self._bend[i] += np.minimum(bend, self._jump[i])
-        self._before[i] = last
-        self.last[i] = frequency
-        self._lowest[i] = np.fmin(self._lowest[i], frequency)
-        self._highest[i] = np.fmax(self._highest[i], frequency)
-        self._sum[i] += frequency - self._base[i]
-        self._count[i] += 1
-        self.rows[i] += 1
-
-    def _add_many(self, cube: np.ndarray, frequency: np.ndarray) -> None:
-        """`_add` of (B, N, P) of the same rising cubes; sums go batch by batch, so that their rounding is the same."""
-        i = _index(cube, True)
-        before = np.concatenate([self._before[i][None], self.last[i][None], frequency])
-        last = before[1:-1]
-        bend = frequency - last
-        bend -= last
-        bend += before[:-2]
-        bend *= bend
-        bend = np.minimum(bend, self._jump[i])
-        self._bend[i] = np.add.reduce(np.concatenate([self._bend[i][None], bend]), axis=0)
-        self._sum[i] = np.add.reduce(np.concatenate([self._sum[i][None], frequency - self._base[i]]), axis=0)
-        self._lowest[i] = np.fmin(self._lowest[i], np.fmin.reduce(frequency, axis=0))
-        self._highest[i] = np.fmax(self._highest[i], np.fmax.reduce(frequency, axis=0))
-        self._before[i], self.last[i] = before[-2], before[-1]
-        self._count[i] += len(frequency)
-        self.rows[i] += len(frequency)
-
     def _mark_impossible(self, cube: np.ndarray, frequency: np.ndarray, possible: np.ndarray) -> None:
+        rows = np.flatnonzero((~possible & self._exists[cube]).any(axis=1))
+        cube, frequency, possible = cube[rows], frequency[rows], possible[rows]
         bits = np.where(frequency >= self._open[cube], OPEN, RANGE)
         bits[~(frequency > 0)] = SHORT
         bits[possible | ~self._exists[cube]] = 0
-        if bits.any():
-            self._mark(cube, bits.astype(np.uint16))
+        self._mark(cube, bits.astype(np.uint16))
+
+    def _mark_reported(self, cube: np.ndarray, pad_fault: np.ndarray) -> None:
+        rows = np.flatnonzero(pad_fault)
+        bits = (pad_fault[rows, None] & self._one > 0) & self._exists[cube[rows]]
+        self._mark(cube[rows], bits * np.uint16(REPORTED))
 
     def _mark(self, cube: np.ndarray, bits: np.ndarray) -> None:
-        np.bitwise_or.at(self._recent[0], cube, bits)
-        self._publish()
+        # A pad that is broken for good says nothing new.
+        if (bits & ~self._recent[0][cube]).any():
+            np.bitwise_or.at(self._recent[0], cube, bits)
+            self._publish()
 
     def _publish(self) -> None:
         self.state = np.bitwise_or.reduce(self._recent, axis=0)
@@ -288,17 +333,19 @@ class Health:
         self._any = bool(self.state.any())
 
     def _clear_window(self) -> None:
-        self._bend = np.zeros(self._shape, np.float32)
-        self._sum = self._bend.copy()
-        self._lowest = np.full(self._shape, np.nan, np.float32)
-        self._highest = self._lowest.copy()
-        self._count = np.zeros(self._shape[0], int)
-        self._bad_residual = np.zeros(self._shape[0], int)
+        self._statistics.clear()
+        self._bad_residual[:] = 0
+
+    @staticmethod
+    def _bound(noise: np.ndarray) -> np.ndarray:
+        bound: np.ndarray = ((JUMP * noise) ** 2).astype(np.float32)
+        return bound
 
     def _close_window(self) -> None:
         """Judge the statistics of the window that ended."""
-        enough = self._count >= MIN_COUNT
         window = self.window()
+        count = window.rows
+        enough = count >= MIN_COUNT
         self.history.append(window)
         self.closed += 1
         noise, span, middle = window.noise, window.highest - window.lowest, window.mean
@@ -307,7 +354,7 @@ class Health:
             times = np.where(self.state & NOISY, NOISY_LEAVE, NOISY_ENTER)
             usual = np.fmax(self.noise, self._median(noise))
             found[noise > times * usual] |= NOISY
-            self._jump = ((JUMP * usual) ** 2).astype(np.float32)
+            self._statistics.bound[:] = self._bound(usual)
             moving = self._median(span / self.noise) > STUCK_MOVING
             # What comes and goes shows a single value now and then, which is not stuck.
             found[(span == 0) & moving & (self.state & (OPEN | SHORT | RANGE) == 0)] |= STUCK
@@ -317,21 +364,21 @@ class Health:
             unmoved = (span < STILL * self.noise) & ~jumped
             self.still = enough & (unmoved | ~healthy | ~self._exists).all(axis=1)
             self._middle = np.where(np.isnan(middle), self._middle, middle)
-            self._reference[~self.still & (self._count > 0)] = np.nan
+            self._reference[~self.still & (count > 0)] = np.nan
             fresh = self.still[:, None] & np.isnan(self._reference)
             self._reference[fresh] = middle[fresh]
             wander = (middle - self._reference) / self._rest
             found[np.abs(wander - self._median(wander)) > np.maximum(DRIFT_LIMIT, STILL * self.noise / self._rest)] |= (
                 DRIFT
             )
-            share = self._bad_residual / np.maximum(self._count, 1)
+            share = self._bad_residual / np.maximum(count, 1)
             limit = np.where(self.strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
-        self.strained = np.where(self._count > 0, share > limit, self.strained)
+        self.strained = np.where(count > 0, share > limit, self.strained)
         self._strained_seen |= self.strained
         self._recent[0] |= found * (enough[:, None] & self._exists)
         self._publish()
         # Cubes of which nothing came keep what was found: silence is no recovery.
-        silent = self._count == 0
+        silent = count == 0
         kept = self._recent[:, silent]
         self._recent = np.roll(self._recent, 1, axis=0)
         self._recent[0] = 0
@@ -343,10 +390,3 @@ class Health:
         ordered = np.sort(values, axis=1)  # NaN last
         known = self._shape[1] - np.isnan(ordered).sum(axis=1)
         return np.take_along_axis(ordered, np.maximum((known - 1) // 2, 0)[:, None], axis=1)
-
-
-def _index(cube: np.ndarray, rising: bool) -> slice | np.ndarray:
-    """Rows of neighbouring cubes as a slice, which numpy does not copy."""
-    if rising and int(cube[-1]) - int(cube[0]) + 1 == len(cube):
-        return slice(int(cube[0]), int(cube[-1]) + 1)
-    return cube

@@ -1,9 +1,10 @@
 """Pipeline: frequencies of many cubes in, stress and gradients out, without a loop over rows or cubes.
 
 One table per calibration holds a stacked matrix: 15 rows that give the components, then the whitened
-null-space rows of the residual. Rows with all pads good are one pad law and one matrix product. Rows with
-bad pads are done again with the estimator of their mask, one product per distinct (calibration, mask).
-Nothing a row holds raises an error.
+null-space rows of the residual. Rows with all pads good are one pad law and one matrix product per calibration.
+Rows with bad pads are done again with the estimator of their mask, one product per distinct (calibration, mask).
+Nothing a row holds raises an error. A row's bits do not depend on how many batches are processed with it: products
+are made batch by batch, because the last bit of a matrix product may depend on its shape.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ STATUS = {"PAD_FAULT": PAD_FAULT, "RESIDUAL": RESIDUAL, "INVALID": INVALID, "TEM
 N = len(COMPONENTS)
 MASKS_KEPT = 1024  # estimators of pad masks remembered at a time
 BETA_FLOOR = 1e-12  # so that every pad has a highest frequency; changes the law by 1e-12 of a strain
-PATTERNS_KEPT = 64  # cube columns remembered at a time: one per hub
+COLUMNS_KEPT = 64  # cube columns remembered at a time: one per hub
+FEW_KINDS = 8  # up to so many calibrations: a product for each; more: one einsum for all of as many pads
 
 
 class StressRows(NamedTuple):
@@ -56,18 +58,35 @@ class _Table(NamedTuple):
     observed: int
 
 
-class _Rows(NamedTuple):
+class _Block(NamedTuple):
+    """Rows of a column that share a product. matrix: (pads, 15 + D), or (pads, seen, rows) of many calibrations."""
+
+    rows: slice | np.ndarray
+    pads: int
+    matrix: np.ndarray
+
+
+class _Column(NamedTuple):
     """What depends on the cube column alone, kept from call to call because a hub's cubes do not change."""
 
-    cube: np.ndarray
+    turns: int  # how many times the same cubes stand in it
     strange: np.ndarray  # (N,) bool: the index is none of our cubes
-    all_known: bool
     kind: np.ndarray  # (N,) which calibration
     rest: np.ndarray  # (N, P)
     top: np.ndarray  # (N, P) highest frequency of the law
-    matrix: np.ndarray  # (P, 15 + D) when all rows share it, else (P, seen rows, N): the rows' axis last is fastest
-    limit: np.ndarray  # (N,), or one number
+    pads: int  # how many pads there are in all rows
+    blocks: list[_Block]
+    limit: np.ndarray  # (N,)
     observed: np.ndarray
+
+
+def turns(cube: np.ndarray) -> int:
+    """How many times the same rising cubes stand one after the other in a column (N,); 0: it is none such."""
+    falls = np.flatnonzero(cube[1:] <= cube[:-1])
+    n = int(falls[0]) + 1 if len(falls) else len(cube)
+    if not n or len(cube) % n or (cube.reshape(-1, n) != cube[:n]).any():
+        return 0
+    return len(cube) // n
 
 
 class Pipeline:
@@ -98,7 +117,7 @@ class Pipeline:
         self._seen = np.flatnonzero(~np.isnan(self._matrices).all(axis=(0, 2)))
         self._limits = np.array([t.limit for t in full], dtype=self.dtype)
         self._observed = np.array([t.observed for t in full], dtype=np.uint16)
-        self._kept: dict[tuple, _Rows] = {}
+        self._kept: dict[bytes, _Column] = {}
         self.rest_frequency = self._per_pad([c.rest_frequency for c in self.calibrations], np.nan)
 
     def _per_pad(self, values: Sequence[np.ndarray], missing: float) -> np.ndarray:
@@ -135,33 +154,48 @@ class Pipeline:
 
         cube: (N,) index; frequency: (N, P) Hz; pad_fault: (N,) bits of pads that the device reports broken
         temperature: (N,) degrees Celsius, NaN where unknown, or None
+        B batches of the same cubes at once: frequency (B, N, P) and so on give B * N rows, to the same bits.
         Raises LayoutError for arrays of the wrong shape; all that a row can hold ends in its status.
         """
         with np.errstate(all="ignore"):
-            rows, v, mask, cold = self._law(cube, frequency, pad_fault, temperature)
-            if rows.matrix.ndim == 2:
-                out = v @ rows.matrix
-            else:
-                out = np.full((N + self._depth, len(v)), np.nan, dtype=self.dtype)
-                out[self._seen] = np.einsum("pin,pn->in", rows.matrix, np.ascontiguousarray(v.T))
-                out = out.T
-            limit, observed = rows.limit, rows.observed.copy()
+            column, v, mask, cold = self._law(cube, frequency, pad_fault, temperature)
+            out = self._products(column, v)
+            limit: np.ndarray = column.limit
+            observed = column.observed.copy() if len(v) == 1 else np.tile(column.observed, len(v))
             if mask is not None:
-                limit = np.array(np.broadcast_to(limit, len(v)))
-                for kind, bits, chosen in _distinct(rows.kind, mask):
+                limit = np.tile(column.limit, (len(v), 1))
+                flat, flat_limit, flat_v = out.reshape(-1, out.shape[2]), limit.reshape(-1), v.reshape(-1, self.n_pads)
+                for kind, bits, chosen in _distinct(np.tile(column.kind, len(v)), mask.ravel()):
                     table = self._table(kind, bits)
-                    out[chosen] = v[chosen] @ table.matrix.T
-                    limit[chosen], observed[chosen] = table.limit, table.observed
-                out[rows.strange], observed[rows.strange] = np.nan, 0
-            rest = out[:, N:]
-            residual = np.abs(rest[:, 0]) if self._depth == 1 else np.sqrt(np.einsum("nd,nd->n", rest, rest))
-            status = (residual > limit).astype(np.uint16) * np.uint16(RESIDUAL)
+                    flat[chosen] = np.einsum("cp,pn->nc", table.matrix, np.ascontiguousarray(flat_v[chosen].T))
+                    flat_limit[chosen], observed[chosen] = table.limit, table.observed
+                out[:, column.strange] = np.nan
+                observed.reshape(len(v), -1)[:, column.strange] = 0
+            rest = out[:, :, N:]
+            residual = np.abs(rest[:, :, 0]) if self._depth == 1 else np.sqrt(np.einsum("bnd,bnd->bn", rest, rest))
+            status = ((residual > limit) * np.uint16(RESIDUAL)).ravel()
         if mask is not None:
-            status[mask != 0] |= PAD_FAULT
+            status[mask.ravel() != 0] |= PAD_FAULT
             status[observed == 0] |= INVALID
         if cold is not None:
-            status[cold] |= TEMPERATURE
-        return StressRows(out[:, : len(STRESS)], out[:, len(STRESS) : N], residual, status, observed)
+            status[cold.ravel()] |= TEMPERATURE
+        out = out.reshape(-1, out.shape[2])
+        return StressRows(out[:, : len(STRESS)], out[:, len(STRESS) : N], residual.ravel(), status, observed)
+
+    def _products(self, column: _Column, v: np.ndarray) -> np.ndarray:
+        """(B, N, 15 + D) components and residual rows of v (B, N, P)."""
+        if len(column.blocks) == 1 and column.blocks[0].matrix.ndim == 2:
+            return v[:, :, : column.blocks[0].pads] @ column.blocks[0].matrix
+        out = np.full((*v.shape[:2], N + self._depth), np.nan, dtype=self.dtype)
+        for rows, pads, matrix in column.blocks:
+            if matrix.ndim == 2:
+                out[:, rows] = v[:, rows, :pads] @ matrix
+            else:
+                part = out[:, rows]
+                of_pads = np.ascontiguousarray(v[:, rows, :pads].transpose(2, 0, 1))
+                part[:, :, self._seen] = np.einsum("pin,pbn->bni", matrix, of_pads)
+                out[:, rows] = part
+        return out
 
     def pad_stress(
         self,
@@ -171,11 +205,9 @@ class Pipeline:
         temperature: np.ndarray | None = None,
     ) -> np.ndarray:
         """(N, P) pad stresses in Pa as the law gives them, before gains; NaN for bad and missing pads."""
-        with np.errstate(all="ignore"):
-            rows, v, mask, _ = self._law(cube, frequency, pad_fault, temperature)
-        pads = v * self._stiffness[rows.kind]
-        bad = ~self._exists[rows.kind] | rows.strange[:, None]
-        return np.where(bad if mask is None else bad | _bits(mask, self.n_pads), np.nan, pads)
+        column, pads, mask = self._pads(cube, frequency, pad_fault, temperature)
+        bad = ~self._exists[column.kind] | column.strange[:, None] | _bits(mask, self.n_pads)
+        return np.where(bad, np.nan, pads)
 
     def suspects(
         self,
@@ -185,15 +217,19 @@ class Pipeline:
         temperature: np.ndarray | None = None,
     ) -> np.ndarray:
         """(N, P) bool, pads of which one alone explains a bad residual; see Estimator.suspects."""
-        with np.errstate(all="ignore"):
-            rows, v, mask, _ = self._law(cube, frequency, pad_fault, temperature)
-        result = np.zeros(v.shape, dtype=bool)
-        pads = v * self._stiffness[rows.kind]
-        mask = np.zeros(len(v), dtype=np.int64) if mask is None else mask
-        for kind, bits, chosen in _distinct(rows.kind, mask, everything=True):
+        column, pads, mask = self._pads(cube, frequency, pad_fault, temperature)
+        result = np.zeros(pads.shape, dtype=bool)
+        for kind, bits, chosen in _distinct(column.kind, mask, everything=True):
             n = self._kinds[kind].layout.n_pads
             result[chosen, :n] = self._estimator(kind, bits).suspects(pads[chosen, :n])
-        return result & ~rows.strange[:, None]
+        return result & ~column.strange[:, None]
+
+    def _pads(self, cube, frequency, pad_fault, temperature):
+        """The column, pad stresses (N, P) in Pa, and masks (N,) of bad pads."""
+        with np.errstate(all="ignore"):
+            column, v, mask, _ = self._law(cube, frequency, pad_fault, temperature, keep=True)
+        none = np.zeros(len(v[0]), dtype=np.int64)
+        return column, v[0] * self._stiffness[column.kind], none if mask is None else mask[0]
 
     def covariance(self, cube: int, pad_fault: int = 0) -> np.ndarray:
         """(15, 15) of one cube's components from its pads' noise, in Pa and Pa/m; NaN where unobserved."""
@@ -202,72 +238,83 @@ class Pipeline:
         mask = int(pad_fault) & int(_mask(self._exists[kind]))
         return self._estimator(kind, mask).covariance * np.outer(scale, scale)
 
-    def _law(self, cube, frequency, pad_fault, temperature):
-        """Rows, v / stiffness (bad pads 0), and, or None, masks of bad pads and rows that lack their temperature."""
+    def _law(self, cube, frequency, pad_fault, temperature, keep=False):
+        """The column, v / stiffness (B, N, P), and, or None, masks (B, N) of bad pads and rows without temperature.
+
+        Bad pads are 0; pads that a cube has not are NaN, or 0 where any pad is bad. A column of several turns becomes
+        as many batches, unless it is to be kept as it is.
+        """
         f, cube = np.asarray(frequency, dtype=self.dtype), np.asarray(cube)
-        if cube.ndim != 1 or f.shape != (len(cube), self.n_pads):
+        if cube.ndim != 1 or f.shape[-2:] != (len(cube), self.n_pads):
             raise LayoutError(
                 f"pipeline: cube has shape {cube.shape} and frequency {f.shape}; "
                 f"this skin needs (N,) and (N, {self.n_pads})"
             )
-        rows = self._rows(cube)
-        rest, top, cold = rows.rest, rows.top, None
+        column = self._column(cube)
+        if column.turns > 1 and not keep:
+            n = len(cube) // column.turns
+            column = self._column(cube[:n])
+        f = f.reshape(-1, len(column.kind), self.n_pads) if len(cube) else f.reshape(1, 0, self.n_pads)
+        rest, top, cold = column.rest, column.top, None
         if self._any_thermal:
-            known = np.full(len(f), np.nan) if temperature is None else np.asarray(temperature, dtype=float)
-            cold = self._thermal[rows.kind] & ~np.isfinite(known)
-            factor = self._factor(rows.kind, known)
+            known = np.full(f.shape[:2], np.nan)
+            if temperature is not None:
+                known = np.asarray(temperature, dtype=float).reshape(f.shape[:2])
+            cold = self._thermal[column.kind] & ~np.isfinite(known)
+            factor = self._factor(column.kind, known)
             rest, top = (rest * factor).astype(self.dtype), (top * factor).astype(self.dtype)
         # the law of oscillator.py in three passes: v = E (1 + beta) / beta (f - f0) / (top - f)
         v = f - rest
         below = top - f
         v /= below
         # NaN, Inf and frequencies beyond the law's range all fail one of the two comparisons
-        if (
-            len(f)
-            and f.min() > 0
-            and below.min() > 0
-            and rows.all_known
-            and (pad_fault is None or not np.count_nonzero(pad_fault))
-        ):
-            return rows, v, None, cold
-        good = (f > 0) & (below > 0)
-        if pad_fault is not None:
-            good &= ~_bits(np.asarray(pad_fault), self.n_pads)
+        good = f > 0
+        good &= below > 0
+        reported = pad_fault is not None and np.count_nonzero(pad_fault) > 0
+        if np.count_nonzero(good) == len(f) * column.pads and not reported:
+            return column, v, None, cold
+        if reported:
+            good &= ~_bits(np.asarray(pad_fault).reshape(f.shape[:2]), self.n_pads)
         v[~good] = 0
-        return rows, v, _mask(self._exists[rows.kind] & ~good), cold
+        return column, v, _mask(self._exists[column.kind] & ~good), cold
 
-    def _rows(self, cube: np.ndarray) -> _Rows:
-        key = (len(cube), cube[0], cube[-1]) if len(cube) else (0,)  # cheap; the comparison below makes it sure
+    def _column(self, cube: np.ndarray) -> _Column:
+        key = cube.tobytes()
         kept = self._kept.get(key)
-        if kept is not None and (kept.cube == cube).all():
+        if kept is not None:
             return kept
-        if len(self._kept) >= PATTERNS_KEPT:
+        if len(self._kept) >= COLUMNS_KEPT:
             self._kept.clear()
         strange = (cube < 0) | (cube >= len(self.calibrations))
         index = np.where(strange, 0, cube).astype(int)
         kind, rest = self._kind[index], self._rest[index]
-        if len(kind) and (kind == kind[0]).all():
-            matrix, limit = np.ascontiguousarray(self._matrices[kind[0]].T), self._limits[kind[0]]
-        else:
-            matrix, limit = (
-                np.ascontiguousarray(self._matrices[:, self._seen][kind].transpose(2, 1, 0)),
-                self._limits[kind],
-            )
-        rows = self._kept[key] = _Rows(
-            cube.copy(),
-            strange,
-            not strange.any(),
-            kind,
-            rest.astype(self.dtype),
-            highest_frequency(rest, self._beta[kind]).astype(self.dtype),
-            matrix,
-            limit,
-            self._observed[kind],
-        )
-        return rows
+        top = highest_frequency(rest, self._beta[kind])
+        # A strange row never counts as good, so it always takes the slow way, where it is made NaN.
+        pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
+        column = self._kept[key] = _Column(
+            turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), pads, self._blocks(kind),
+            self._limits[kind], self._observed[kind],
+        )  # fmt: skip
+        return column
+
+    def _blocks(self, kind: np.ndarray) -> list[_Block]:
+        few = len(self._kinds) <= FEW_KINDS
+        n_pads = self._exists.sum(axis=1)[kind]
+        blocks = []
+        for value in np.unique(kind if few else n_pads).tolist():
+            index = np.flatnonzero((kind if few else n_pads) == value)
+            together = index[-1] - index[0] + 1 == len(index)
+            rows = slice(int(index[0]), int(index[-1]) + 1) if together else index
+            pads = int(n_pads[index[0]])
+            if few:
+                matrix = self._matrices[value, :, :pads].T
+            else:
+                matrix = self._matrices[:, self._seen][kind[index], :, :pads].transpose(2, 1, 0)
+            blocks.append(_Block(rows, pads, np.ascontiguousarray(matrix)))
+        return blocks
 
     def _factor(self, kind: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-        factor = np.ones((len(kind), self.n_pads))
+        factor = np.ones((*temperature.shape, self.n_pads))
         for k, calibration in enumerate(self._kinds):
             if calibration.temperature is not None:
                 rows = (kind == k) & np.isfinite(temperature)

@@ -11,10 +11,8 @@ always there cannot be told from the offset: stamps are late by it.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from itertools import pairwise
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 BUCKET_NS = 1_000_000_000
 WINDOW = 120
@@ -33,7 +31,7 @@ RESTART_US = 1_000_000
 
 
 class ClockMap:
-    """Maps one hub's clock to the host's. Bounded memory; amortised constant time per call, plus O(n).
+    """Maps one hub's clock to the host's. Bounded memory; amortised constant time per sample.
 
     Read-only: offset_ns, host minus device time at the newest sample, 0 before the first; drift_ppm, positive
     when host time runs faster than the hub's, 0 until known; jitter_ns, mean delay above the line (over the
@@ -73,20 +71,19 @@ class ClockMap:
             return 0
         return self._first_ns - 1000 * self._first_us + round(self._offset + self._drift * self._newest)
 
-    def update(self, device_us: ArrayLike, arrival_ns: int) -> NDArray[np.int64]:
-        """Host times, int64 ns, of samples taken at device_us (n,) µs that arrived together at arrival_ns.
+    def update(self, device_us: Sequence[int], arrival_ns: int) -> list[int]:
+        """Host times, ns, of samples taken at device_us, µs, that arrived together at arrival_ns.
 
         Along device time stamps never go backward, and none is later than its arrival. Begins anew by itself
         when device time falls back by over 1 s or either clock was set; only a host clock set back makes
         stamps go backward.
         """
-        times: list[int] = np.atleast_1d(np.asarray(device_us)).tolist()
-        for k in range(1, len(times)):
-            if times[k] < times[k - 1] - RESTART_US:
-                return np.concatenate((self.update(times[:k], arrival_ns), self.update(times[k:], arrival_ns)))
-        return np.array(self._stamps(times, arrival_ns) if times else [], np.int64)
+        for k in range(1, len(device_us)):
+            if device_us[k] < device_us[k - 1] - RESTART_US:
+                return self.update(device_us[:k], arrival_ns) + self.update(device_us[k:], arrival_ns)
+        return self._stamps(device_us, arrival_ns) if device_us else []
 
-    def _stamps(self, times: list[int], arrival_ns: int) -> list[int]:
+    def _stamps(self, times: Sequence[int], arrival_ns: int) -> list[int]:
         if arrival_ns < self._last_arrival:
             self._last_stamp = _NEVER
             self.reset()

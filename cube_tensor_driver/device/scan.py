@@ -6,8 +6,9 @@ counted and left out. Nothing here looks at a value.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ class Place:
 
 
 class Rows(NamedTuple):
-    """Rows of one scan, earliest first within a link.
+    """Rows of one scan, or of several: then first the first sample of every link, then the second …
 
     cube (N,) uint16 index in the skin; sequence (N,) uint32; stamp_ns (N,) int64, node clock;
     frequency (N, P) float32 Hz, NaN not measured; temperature (N,) float32 °C, NaN unknown; pad_fault (N,) uint32.
@@ -43,6 +44,14 @@ class Rows(NamedTuple):
     frequency: NDArray[np.float32]
     temperature: NDArray[np.float32]
     pad_fault: NDArray[np.uint32]
+
+
+def room_for(rows: int, n_pads: int) -> Rows:
+    """Arrays that `Scan.take` can fill."""
+    return Rows(
+        np.empty(rows, np.uint16), np.empty(rows, np.uint32), np.empty(rows, np.int64),
+        np.empty((rows, n_pads), np.float32), np.empty(rows, np.float32), np.empty(rows, np.uint32),
+    )  # fmt: skip
 
 
 class Scan:
@@ -137,36 +146,41 @@ class Scan:
         self.added += sample.n_cubes
         self._gathered[link].append((sample, stamp_ns))
 
-    def complete(self) -> bool:
-        """Whether every live link has given a sample, or one has given a second before another gave its first."""
+    def complete(self, turns: int = 1) -> bool:
+        """Whether every live link has given `turns` samples, or one has given one more."""
         counts = [len(samples) for samples in self._gathered]
-        return max(counts) > 1 or all(count or not live for count, live in zip(counts, self._live, strict=True))
+        return max(counts) > turns or all(n >= turns or not live for n, live in zip(counts, self._live, strict=True))
 
-    def take(self) -> Rows | None:
-        """The rows gathered since the last time; None if there are none."""
+    def take(self, room: Callable[[int, int], Rows] = room_for, turns: int | None = None) -> Rows | None:
+        """The rows gathered since the last time, of at most so many samples of each link; None if there are none.
+
+        room: makes arrays for so many rows of so many pads to fill, the message's own where there is one.
+        """
         parts: list[tuple[NDArray[np.uint16], Sample, int]] = []
-        for link, samples in enumerate(self._gathered):
-            for sample, stamp_ns in samples:
-                part = self._select(link, sample)
-                if part is not None:
-                    parts.append((*part, stamp_ns))
-            samples.clear()
+        longest = max(map(len, self._gathered))
+        for turn in range(longest if turns is None else min(longest, turns)):
+            for link, samples in enumerate(self._gathered):
+                if turn < len(samples):
+                    part = self._select(link, samples[turn][0])
+                    if part is not None:
+                        parts.append((*part, samples[turn][1]))
+        for samples in self._gathered:
+            del samples[:turns]
         if not parts:
             return None
-        counts = [len(cube) for cube, _, _ in parts]
-        cube = np.concatenate([cube for cube, _, _ in parts])
-        self.rows += len(cube)
-        temperature = np.concatenate([sample.temperature for _, sample, _ in parts])
-        celsius = temperature.astype(np.float32) * np.float32(0.01)
-        celsius[temperature == TEMPERATURE_UNKNOWN] = np.nan
-        return Rows(
-            cube,
-            np.repeat(np.array([sample.sequence for _, sample, _ in parts], np.uint32), counts),
-            np.repeat(np.array([stamp_ns for _, _, stamp_ns in parts], np.int64), counts),
-            self._frequency([sample.frequency for _, sample, _ in parts]),
-            celsius,
-            np.concatenate([sample.pad_fault for _, sample, _ in parts]),
-        )
+        cubes, taken, stamps = zip(*parts, strict=True)
+        counts = [len(cube) for cube in cubes]
+        rows = room(sum(counts), self.n_pads)
+        self.rows += len(rows.cube)
+        np.concatenate(cubes, out=rows.cube)
+        rows.sequence[:] = np.repeat(np.array([sample.sequence for sample in taken], np.uint32), counts)
+        rows.stamp_ns[:] = np.repeat(np.array(stamps, np.int64), counts)
+        self._hertz([sample.frequency for sample in taken], rows.frequency)
+        temperature = np.concatenate([sample.temperature for sample in taken])
+        np.multiply(temperature, np.float32(0.01), out=rows.temperature)
+        rows.temperature[temperature == TEMPERATURE_UNKNOWN] = np.nan
+        np.concatenate([sample.pad_fault for sample in taken], out=rows.pad_fault)
+        return rows
 
     def unaccounted(self) -> int:
         """Rows that came in and are neither delivered, nor gathered, nor counted as left out: always 0."""
@@ -196,17 +210,18 @@ class Scan:
         kept = Sample(sample.sequence, sample.first_cube, sample.device_us, frequency, pad_fault, temperature)
         return cubes[rows].astype(np.uint16), kept
 
-    def _frequency(self, parts: list[NDArray[np.uint32]]) -> NDArray[np.float32]:
-        if all(part.shape[1] == self.n_pads for part in parts):
-            millihertz = np.concatenate(parts)
-        else:
-            narrow = [(part, self.n_pads - part.shape[1]) for part in parts]
-            millihertz = np.concatenate([np.pad(part, ((0, 0), (0, pads))) for part, pads in narrow])
-        # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.
-        hertz = (millihertz * 1e-3).astype(np.float32)
-        if millihertz.size and millihertz.min() == NOT_MEASURED:
-            hertz[millihertz == NOT_MEASURED] = np.nan
-        return hertz
+    def _hertz(self, parts: list[NDArray[np.uint32]], hertz: NDArray[np.float32]) -> None:
+        """Fill hertz (N, n_pads) with frequencies in mHz; pads that a cube has not are NaN."""
+        start = 0
+        for width, alike in groupby(parts, lambda part: part.shape[1]):
+            millihertz = np.concatenate(list(alike))
+            rows = hertz[start : start + len(millihertz)]
+            start += len(millihertz)
+            # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.
+            np.multiply(millihertz, 1e-3, out=rows[:, :width], casting="same_kind")
+            rows[:, width:] = np.nan
+            if millihertz.size and millihertz.min() == NOT_MEASURED:
+                rows[:, :width][millihertz == NOT_MEASURED] = np.nan
 
 
 def _named(what: str, names: Sequence[str], text: str) -> str:

@@ -51,6 +51,42 @@ class Batch(NamedTuple):
         return times
 
 
+class Blank:
+    """A serialised message of one shape to fill in place, again and again. field: views on its bytes, by name."""
+
+    def __init__(self, fields: tuple[tuple[str, str, int], ...], shape: Shape, frame_id: bytes) -> None:
+        self._record = np.zeros(1, _record(fields, shape))
+        self.field: dict[str, NDArray[Any]] = {name: self._record[name][0] for name, _, width in fields if width}
+        self._record["encapsulation"] = LITTLE_ENDIAN
+        self._record["n of frame_id"] = shape.frame
+        self._record["frame_id"] = np.void(frame_id)
+        for name, _, width in fields:
+            if width:
+                self._record[f"n of {name}"] = shape.rows * (shape.pads if width < 0 else width)
+            elif name == "n_pads":
+                self._record[name] = shape.pads
+
+    def fill(self, *values: NDArray[Any]) -> None:
+        """Set all fields, in the order of the message."""
+        for field, value in zip(self.field.values(), values, strict=True):
+            field[:] = value
+
+    def data(self, stamp_ns: int) -> bytes:
+        """The message as it is now, stamped."""
+        self._record["sec"], self._record["nanosec"] = divmod(stamp_ns, SECOND)
+        return self._record.tobytes()
+
+
+def blank_frequencies(frame_id: bytes, rows: int, pads: int) -> Blank:
+    """A SkinFrequencies to fill; frame_id with its closing zero."""
+    return Blank(_FREQUENCIES, Shape(len(frame_id), rows, pads), frame_id)
+
+
+def blank_stress(frame_id: bytes, rows: int) -> Blank:
+    """A SkinStress to fill; frame_id with its closing zero."""
+    return Blank(_STRESS, Shape(len(frame_id), rows, 0), frame_id)
+
+
 @lru_cache(maxsize=256)
 def _record(fields: tuple[tuple[str, str, int], ...], shape: Shape) -> np.dtype[Any]:
     """The record type of a shape. Counts of sequences are fields named `n of` them."""
@@ -72,6 +108,16 @@ def _record(fields: tuple[tuple[str, str, int], ...], shape: Shape) -> np.dtype[
         formats.append((f"<{kind}", () if not width else (shape.rows,) if width == 1 else (shape.rows, columns)))  # type: ignore[arg-type]
         place += item.itemsize * (shape.rows * columns if width else 1)
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": place})
+
+
+@lru_cache(maxsize=256)
+def _counts(
+    fields: tuple[tuple[str, str, int], ...], shape: Shape
+) -> tuple[np.dtype[Any], np.dtype[Any], tuple[int, ...]]:
+    """The record type of a shape, the same with nothing but its fields' counts, and what those must be."""
+    record = _record(fields, shape)
+    widths = {f"n of {name}": shape.pads if width < 0 else width for name, _, width in fields if width}
+    return record, record[list(widths)], tuple(shape.rows * width for width in widths.values())  # type: ignore[return-value]
 
 
 def frequencies_shape(data: bytes) -> Shape:
@@ -149,15 +195,11 @@ def _checked(data: bytes, fields: tuple[tuple[str, str, int], ...], shape: Shape
 
 
 def _read(data: Sequence[bytes], fields: tuple[tuple[str, str, int], ...], shape: Shape) -> Batch:
-    record = _record(fields, shape)
+    record, counts, expected = _counts(fields, shape)
     size = record.itemsize
     whole = b"".join(data if len(data[0]) == size else [one[:size] for one in data])
     field = np.frombuffer(whole, record)
-    for name, _, width in fields:
-        if width:
-            expected = shape.rows * (shape.pads if width < 0 else width)
-            wrong = field[f"n of {name}"] != expected
-            if wrong.any():
-                found = int(field[f"n of {name}"][wrong][0])
-                raise MessageError(f"a message of {shape.rows} rows has {found} values of {name}, they need {expected}")
+    for found in set(field.view(counts).tolist()) - {expected}:
+        name, n, wanted = next((k, a, b) for k, a, b in zip(counts.names or (), found, expected, strict=True) if a != b)
+        raise MessageError(f"a message of {shape.rows} rows has {n} values of {name[5:]}, they need {wanted}")
     return Batch(shape, field["sec"].astype(np.int64) * SECOND + field["nanosec"], field)

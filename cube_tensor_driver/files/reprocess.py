@@ -96,20 +96,23 @@ class Recording:
     def _process(self, number: int, batch: cdr.Batch) -> StressRows:
         """Stress of all rows of a batch, as the reconstruction node makes it message by message."""
         of, health = self._use(number)
-        field = batch.field
-        newest_ns = batch.times_ns.max(axis=1, initial=0)
+        field, times_ns = batch.field, batch.times_ns
+        edges = np.flatnonzero((field["cube"][1:] != field["cube"][:-1]).any(axis=1)) + 1
+        made = []
         try:
-            masks, bits = health.update_many(
-                field["cube"], field["frequency"], field["pad_fault"], newest_ns, field["temperature"]
-            )
-            rows = of.process(
-                field["cube"].ravel(), field["frequency"].reshape(-1, batch.shape.pads), masks.ravel(),
-                field["temperature"].ravel(),
-            )  # fmt: skip
+            for run in np.split(np.arange(len(field)), edges):
+                cube, part = field["cube"][run[0]], field[run[0] : run[-1] + 1]
+                masks, bits = health.update_many(
+                    cube, part["frequency"], part["pad_fault"], times_ns[run], part["temperature"]
+                )
+                rows = of.process(cube, part["frequency"], masks, part["temperature"])
+                rows.status[:] |= bits.ravel()
+                made.append(rows)
         except CubeError as error:
             raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
-        rows.status[:] |= bits.ravel()
-        return rows
+        return (
+            made[0] if len(made) == 1 else StressRows(*(np.concatenate(column) for column in zip(*made, strict=True)))
+        )
 
     def _use(self, number: int) -> tuple[Pipeline, Health]:
         """The pipeline under an info, and the health that goes with it: a tare changes rest frequencies only."""

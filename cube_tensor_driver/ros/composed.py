@@ -8,9 +8,9 @@ from .reconstruction import Reconstruction
 
 
 def nodes() -> list[CubeNode]:
-    """Both nodes, the driver handing its messages over."""
+    """Both nodes, the driver handing its rows over."""
     reconstruction = Reconstruction(subscribes=False)
-    return [reconstruction, Driver(reconstruction.take)]
+    return [reconstruction, Driver(reconstruction.take_rows)]
 
 
 def main() -> None:

@@ -14,8 +14,9 @@ from cube_tensor_driver.msg import StressTensorStamped
 
 from ..core.pipeline import INVALID, Pipeline, StressRows
 from ..core.tensor import contact_wrench
+from ..device.scan import Rows
 from ..files.skin import Skin
-from .messages import Times, tensor_message, to_time, wrench_message
+from .messages import tensor_message, to_time, wrench_message
 
 ALL_AT_ONCE = 64
 """Skins up to so many cubes announce all their topics; in larger ones a topic is announced once somebody asks."""
@@ -50,7 +51,7 @@ class CubeTopics:
             self._announce({name for name, _ in self._node.get_topic_names_and_types()} & self._wanted.keys())
         self._listened = (_heard(self._tensors), _heard(self._wrenches))
 
-    def publish(self, times: Times, rows: StressRows, pad_fault: NDArray[np.uint32]) -> None:
+    def publish(self, times: Rows, rows: StressRows, pad_fault: NDArray[np.uint32]) -> None:
         """Send the rows of cubes that somebody listens to; wrenches of valid ones only."""
         tensors, wrenches = self._listened
         if wrenches:
@@ -75,7 +76,7 @@ class CubeTopics:
             kind, publishers, number = self._wanted.pop(name)
             publishers[number] = self._node.create_publisher(kind, name, DEPTH)
 
-    def _header(self, times: Times, row: int, cube: int) -> Header:
+    def _header(self, times: Rows, row: int, cube: int) -> Header:
         stamp = to_time(int(times.stamp_ns[row]))
         return Header(stamp=stamp, frame_id=self._skin.frame(self._skin.cubes[cube]))
 

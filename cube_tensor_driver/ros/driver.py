@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,11 @@ from ..device.protocol import VERSION, Command, Frame, Hello, Request, Sample, S
 from ..device.reader import Reader
 from ..device.scan import Place, Rows, Scan
 from ..device.sequence import Account, Verdict
+from ..files.cdr import blank_frequencies
 from ..files.skin import Skin, read_skin
 from .diagnostics import Diagnostics, make_status
-from .messages import frequencies_message, info_message
-from .node import LATCHED, CubeNode, queue, run
+from .messages import info_message
+from .node import BLANKS_KEPT, LATCHED, CubeNode, queue, run, scans_per_message
 
 LEVELS = {
     LinkState.OPEN: DiagnosticStatus.OK,
@@ -32,14 +34,14 @@ LEVELS = {
 
 
 MAX_SCANS = 4
-"""Scans in one message at most: DDS keeps the largest message of each place in its queues for ever."""
+"""Scans in one message at most, or as many as make a batch: DDS keeps the largest one of each place of a queue."""
 
 
 class Driver(CubeNode):
     """Publishes `frequencies`, `info` and diagnostics. The reader's thread publishes; the main thread spins."""
 
-    def __init__(self, take: Callable[[SkinFrequencies], None] | None = None) -> None:
-        """take: called with each message in the reader's thread, by a reconstruction in the same process."""
+    def __init__(self, take: Callable[[Rows, int, bytes], None] | None = None) -> None:
+        """take: called in the reader's thread with what each message holds: a reconstruction in the same process."""
         super().__init__("driver")
         self._take = take
         self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
@@ -48,6 +50,7 @@ class Driver(CubeNode):
         self.declare("port_directory", "", "Folder with the links' ports under the links' names: simulated hubs.")
         self.declare("rate", 0.0, "Samples per second to ask of the hubs; 0: as the skin file says.", (0.0, 10_000.0),
                      live=True)  # fmt: skip
+        self.declare("publish_period", 0.0, "Time that one message covers, s; 0: a message for each scan.", (0.0, 1.0))
         self.declare("qos_reliability", "reliable", "Reliability of the batch topics.", choices="reliable, best_effort")
         self._reader: Reader | None = None
         self._diagnostics = Diagnostics(self, self._statuses)
@@ -72,7 +75,11 @@ class Driver(CubeNode):
         self._other_versions: list[int | None] = [None] * len(names)
         self._problems: list[list[str]] = [[] for _ in names]
         self._published = self._published_before = 0
-        quality = queue(self._rate, self.value("qos_reliability"))
+        self._turns = scans_per_message(self.value("publish_period"), self._rate)
+        self._frame_id = skin.parent_frame.encode() + b"\0"
+        self._blank = lru_cache(maxsize=BLANKS_KEPT)(partial(blank_frequencies, self._frame_id))
+        rate = None if self._rate is None else self._rate / self._turns
+        quality = queue(rate, self.value("qos_reliability"), self._turns * len(skin.cubes))
         self._frequencies = self.create_lifecycle_publisher(SkinFrequencies, "frequencies", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._uids: dict[int, int] = {}
@@ -133,24 +140,30 @@ class Driver(CubeNode):
             elif isinstance(frame, Stats):
                 self._accounts[link].stats(frame)
         for link, (arrival_ns, several) in samples.items():
-            stamps = self._clocks[link].update(np.array([sample.device_us for sample in several]), arrival_ns)
-            for sample, stamp_ns in zip(several, stamps.tolist(), strict=True):
+            stamps = self._clocks[link].update([sample.device_us for sample in several], arrival_ns)
+            for sample, stamp_ns in zip(several, stamps, strict=True):
                 self._scan.add(link, sample, stamp_ns)
-        if samples and self._scan.complete():
+        if samples and self._scan.complete(self._turns):
             self._publish()
             self._unaccounted_rows = self._scan.unaccounted()
 
     def _publish(self) -> None:
-        gathered = self._scan.take()
-        most = MAX_SCANS * len(self._skin.cubes)
-        for start in range(0, 0 if gathered is None else len(gathered.cube), most):
-            rows = Rows(*(column[start : start + most] for column in gathered or ()))  # type: ignore[arg-type]
-            message = frequencies_message(rows, self._skin.parent_frame)
+        most = max(MAX_SCANS, self._turns + 1)
+        while (rows := self._scan.take(self._room, most)) is not None:
+            first_ns = int(rows.stamp_ns.min())
             if self._take is None or self._frequencies.get_subscription_count():
-                self._frequencies.publish(message)
+                self._message.field["time_offset"][:] = rows.stamp_ns - first_ns
+                self._frequencies.publish(self._message.data(first_ns))
             if self._take is not None:
-                self._take(message)
+                self._take(rows, first_ns, self._frame_id)
             self._published += len(rows.cube)
+
+    def _room(self, rows: int, n_pads: int) -> Rows:
+        """The fields of a message: what the scan writes there is not copied any more."""
+        self._message = self._blank(rows, n_pads)
+        field = self._message.field
+        return Rows(field["cube"], field["sequence"], np.empty(rows, np.int64),
+                    field["frequency"], field["temperature"], field["pad_fault"])  # fmt: skip
 
     def _learn(self, link: int, frame: Hello) -> None:
         problems = self._scan.hello(link, frame)

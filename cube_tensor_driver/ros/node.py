@@ -22,21 +22,31 @@ from ..core.errors import ConfigError, CubeError
 
 PAUSE_S = 2.0
 """The longest pause of a reader that no message is lost in: queue depths are rate times this."""
+QUEUE_BYTES = 64_000_000
+"""What a queue may hold of the largest skins, so that no process grows beyond 200 MB: there the pause is shorter."""
+ROW_BYTES = 78
 UNKNOWN_RATE = 1000.0
+BLANKS_KEPT = 8
+"""Shapes of messages whose bytes are kept to be filled again."""
 SPIN_S = 0.2
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def queue(rate: float | None, reliability: str = "reliable") -> QoSProfile:
-    """Quality of service of the batch topics at `rate` messages per second, None when it is not known.
+def queue(rate: float | None, reliability: str = "reliable", rows: int = 1) -> QoSProfile:
+    """Quality of service of the batch topics at `rate` messages of so many rows per second, None: not known.
 
     ConfigError: no such reliability.
     """
-    depth = min(max(10, math.ceil((rate or UNKNOWN_RATE) * PAUSE_S)), 1000)
+    depth = max(10, math.ceil(min((rate or UNKNOWN_RATE) * PAUSE_S, QUEUE_BYTES / (rows * ROW_BYTES))))
     policies = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
     if reliability not in policies:
         raise ConfigError(f"parameter qos_reliability is {reliability!r}, allowed: {', '.join(policies)}")
     return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=policies[reliability])
+
+
+def scans_per_message(publish_period: float, rate: float | None) -> int:
+    """How many samples of each cube a message holds; at `rate` samples per second, None: not known."""
+    return max(1, round(publish_period * (rate or UNKNOWN_RATE)))
 
 
 class CubeNode(LifecycleNode):

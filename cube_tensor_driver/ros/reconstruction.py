@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,14 @@ from ..core.errors import CubeError
 from ..core.health import Health
 from ..core.pipeline import INVALID, Pipeline
 from ..core.tare import DriftTracker
+from ..device.scan import Rows
+from ..files.cdr import Shape, blank_stress, frequencies_shape, read_frequencies, same_shape
 from ..files.skin import read_skin
 from .cube_health import CubeHealth
 from .cube_topics import CubeTopics
 from .diagnostics import Diagnostics, make_status
-from .messages import info_message, read_frequencies, stress_message
-from .node import LATCHED, CubeNode, queue, run
+from .messages import info_message
+from .node import BLANKS_KEPT, LATCHED, CubeNode, queue, run, scans_per_message
 from .taring import Taring, tare_folder
 
 LISTENERS_S = 0.5
@@ -39,6 +42,7 @@ class Reconstruction(CubeNode):
         self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
         self.declare("config", "", "Skin file (YAML).")
         self.declare("wrench_side", 0.0, "Side of the face that wrenches refer to, m; 0: the cube's own.", (0.0, 10.0))
+        self.declare("publish_period", 0.0, "The driver's, for how long queues must be, s.", (0.0, 1.0))
         self.declare("qos_reliability", "reliable", "Reliability of the batch topics.", choices="reliable, best_effort")
         self.declare("tare_duration", 1.0, "What ~/tare averages over unless it is told, s.", (0.5, 10.0), live=True)
         self.declare("tare_folder", "", "Where tare is kept, by uid; empty: ~/.ros/cube_tensor_driver/tare.")
@@ -54,7 +58,11 @@ class Reconstruction(CubeNode):
         self._pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
         self._rows = self._rows_before = self._invalid = self._bad_messages = 0
         self._lost_messages = self._lost_before = 0
-        quality = queue(skin.rate, self.value("qos_reliability"))
+        turns = scans_per_message(self.value("publish_period"), skin.rate)
+        rate = None if skin.rate is None else skin.rate / turns
+        quality = queue(rate, self.value("qos_reliability"), turns * len(skin.cubes))
+        self._blank = lru_cache(maxsize=BLANKS_KEPT)(blank_stress)
+        self._shape: tuple[bytes, Shape] | None = None
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._cubes = CubeTopics(self, skin, self._pipeline, self.value("wrench_side") or None)
@@ -70,7 +78,7 @@ class Reconstruction(CubeNode):
         if self._subscribes:
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
             self._subscription = self.create_subscription(
-                SkinFrequencies, "frequencies", self.take, quality, event_callbacks=lost
+                SkinFrequencies, "frequencies", self.take, quality, raw=True, event_callbacks=lost
             )
         self._looking = self.create_timer(LISTENERS_S, self._cubes.find_listeners)
         self._publish_info()
@@ -96,29 +104,49 @@ class Reconstruction(CubeNode):
             self._cubes.close()
             del self._looking
 
-    def take(self, message: SkinFrequencies) -> None:
-        """Publish the tensors of one message of frequencies."""
+    def take(self, data: bytes) -> None:
+        """Publish the tensors of one message of frequencies, as it comes: serialised."""
+        try:
+            if self._shape is None or not same_shape(data, *self._shape):
+                self._shape = data, frequencies_shape(data)
+            batch = read_frequencies([data], self._shape[1])
+        except CubeError as error:
+            self._refuse(error)
+            return
+        field = batch.field[0]
+        given = Rows(field["cube"], field["sequence"], batch.times_ns[0], field["frequency"], field["temperature"],
+                     field["pad_fault"])  # fmt: skip
+        self.take_rows(given, int(batch.stamp_ns[0]), bytes(field["frame_id"]))
+
+    def take_rows(self, given: Rows, stamp_ns: int, frame_id: bytes) -> None:
+        """Publish the tensors of rows; stamp and frame of their message are its own, too."""
         if not self._active:
             return
+        cube = given.cube
         try:
-            times, frequency, pad_fault, temperature = read_frequencies(message)
             with self._lock:
-                stamp_ns = int(times.stamp_ns.max(initial=0))
                 windows = self._health.closed
-                pad_fault = self._health.update(times.cube, frequency, pad_fault, stamp_ns, temperature)
-                rows = self._pipeline.process(times.cube, frequency, pad_fault, temperature)
-                self._health.residual(times.cube, rows.status)
-                rows.status[:] |= self._health.status[times.cube]
+                pad_fault, status = self._health.update(
+                    cube, given.frequency, given.pad_fault, given.stamp_ns, given.temperature
+                )
+                rows = self._pipeline.process(cube, given.frequency, pad_fault, given.temperature)
+                self._health.residual(cube, rows.status)
+                rows.status[:] |= status
                 if self._drift_time and self._health.closed != windows:
                     self._drifted |= self._drift.step(self._drift_time)
         except CubeError as error:
-            self._bad_messages += 1
-            self.get_logger().error(f"frequencies: {error}", throttle_duration_sec=5.0)
+            self._refuse(error)
             return
-        self._stress.publish(stress_message(times, rows))
-        self._rows += len(times.cube)
+        message = self._blank(frame_id, len(cube))
+        message.fill(cube, given.sequence, given.stamp_ns - stamp_ns, *rows)
+        self._stress.publish(message.data(stamp_ns))
+        self._rows += len(cube)
         self._invalid += int(np.count_nonzero(rows.status & INVALID))
-        self._cubes.publish(times, rows, pad_fault)
+        self._cubes.publish(given, rows, pad_fault)
+
+    def _refuse(self, error: CubeError) -> None:
+        self._bad_messages += 1
+        self.get_logger().error(f"frequencies: {error}", throttle_duration_sec=5.0)
 
     def _publish_info(self) -> None:
         # Just behind the last row that was made without it: so a bag says from which row on it holds.
