@@ -46,6 +46,9 @@ NOISE = {
     "mostly zeros and ones": lambda size: np.random.default_rng(4).integers(0, 2, size).astype(np.uint8).tobytes(),
     "harmed frames": harmed,
     "no zero at all": lambda size: b"\x55" * size,
+    # The shortest runs that could be frames, and fail in their last byte.
+    "late failures": lambda size: (b"\1" * 14 + b"\2\0") * (size // 16),
+    "late failures, sound ones between": lambda size: (b"\1" * 14 + b"\2\0" + b"\2\7" * 7 + b"\1\0") * (size // 32),
     "zeros and ones in turn": lambda size: b"\0\1" * (size // 2),
 }
 
@@ -70,6 +73,10 @@ def test_ten_million_bytes_of_noise(name: str) -> None:
     counted = sum(value for key, value in counters.as_dict().items() if key != "bytes")
     runs = sum(1 for run in bad.split(b"\0") if run)
     assert counted == runs and counters.bytes == len(bad) + 1
+    alone = Decoder()
+    for run in bad.split(b"\0"):
+        alone.feed(run + b"\0")
+    assert alone.counters == counters  # runs in a crowd are counted as what they are one by one
     part = bad[: EACH // 4]
     # The best of several, one after the other: other processes only ever add.
     ratios = [(feed(Decoder(), part) / len(part)) / (feed(Decoder(), good) / len(good)) for _ in range(5)]

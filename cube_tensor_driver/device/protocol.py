@@ -46,6 +46,8 @@ _U16, _U32, _U64, _I16 = (np.dtype(code) for code in ("<u2", "<u4", "<u8", "<i2"
 _OVERHEAD = _HEADER.size + 4
 MIN_RUN = _OVERHEAD + _REQUEST.size + 1
 """Shortest run that can be a frame, of any version: to try shorter ones would let noise slow the decoder down."""
+SHORT_RUN, CROWD = 32, 32
+"""More runs in a feed than CROWD that are shorter than any SAMPLE are noise: see `Decoder._without_torn`."""
 # CRC-32 over data followed by its own CRC is this constant: no slice, no second look at the frame's end.
 _CRC_RESIDUE = 0x2144DF1C
 
@@ -286,7 +288,7 @@ class Decoder:
             # Noise can be all short runs: they are counted without a step in Python each.
             long = [run for run in runs if len(run) >= MIN_RUN]
             self.counters.length += len(runs) - runs.count(b"") - len(long)
-            for run in long:
+            for run in long if len(long) <= CROWD else self._without_torn(long):
                 frame = self._decode(run)
                 if frame is not None:
                     frames.append(frame)
@@ -303,6 +305,25 @@ class Decoder:
         self.counters.framing += bool(self._tail)
         self._tail.clear()
         self._discarding = False
+
+    def _without_torn(self, runs: list[bytes]) -> list[bytes]:
+        """Of a crowd of short runs those that are COBS; the others are counted as framing, all in one go.
+
+        The cobs package tells by raising, which takes longer than decoding a good frame of the same size.
+        """
+        short = [run for run in runs if len(run) < SHORT_RUN]
+        if len(short) <= CROWD:
+            return runs
+        # Each code word says where the next one is; a run is COBS where that leads to its end, a zero, which stays.
+        code = np.frombuffer(b"\0".join(short) + b"\0", np.uint8)
+        ends = np.flatnonzero(code == 0)
+        at = np.minimum(np.arange(len(code) + 1) + np.append(code, 0), len(code))
+        for _ in range(SHORT_RUN.bit_length()):
+            at = at[at]
+        good = at[np.append(0, ends[:-1] + 1)] == ends
+        self.counters.framing += len(short) - int(np.count_nonzero(good))
+        verdicts = iter(good.tolist())
+        return [run for run in runs if len(run) >= SHORT_RUN or next(verdicts)]
 
     def _decode(self, run: bytes) -> Frame | None:
         counters = self.counters

@@ -30,6 +30,9 @@ REOPEN_S = 5.0
 """A link without a single byte for so long is opened anew; hubs say HELLO every second."""
 LOOK_S = 0.25
 """How often a waiting link looks whether its port has come back."""
+GATHER = 0.2, 2e-4
+"""Hubs sample together, but their bytes come one by one. Who comes first waits so long for the others, as a share of
+the sample period and in s at most: one wake-up for all instead of one for each. Arrival may look later by that."""
 DRAIN_S = 0.05
 """How long closing waits for the last requests to leave the serial ports."""
 CLOSE_S = 1.5
@@ -132,14 +135,12 @@ class Reader:
             tick_at = 0.0
             while not self._stopping:
                 ready = selector.select(max(0.0, tick_at - time.monotonic()))
-                batch: list[tuple[int, int, Frame]] = []
-                for key, events in ready:
-                    if key.data is None:
-                        os.read(wake_read, 4096)
-                        self._send_requests(selector)
-                    else:
-                        self._serve(selector, key.data, events, batch)
+                batch = self._serve(selector, ready, wake_read)
                 if batch:
+                    pause = self._gathering({i for i, _, _ in batch})
+                    if pause:
+                        time.sleep(pause)
+                        batch += self._serve(selector, selector.select(0), wake_read)
                     self._call(self._on_frames, batch)
                 now = time.monotonic()
                 if now >= tick_at:
@@ -150,32 +151,56 @@ class Reader:
             self._shut(selector, wake_read)
 
     def _serve(
-        self, selector: selectors.BaseSelector, i: int, events: int, batch: list[tuple[int, int, Frame]]
-    ) -> None:
-        link, session = self.links[i], self._sessions[i]
-        if not link.is_open:  # dropped since select returned
-            return
-        try:
-            if events & selectors.EVENT_WRITE:
-                link.flush()
-            if events & selectors.EVENT_READ:
-                data = link.read()
-                arrival_ns = self._clock_ns()
-                if data:
-                    session.last_byte = time.monotonic()
-                    for frame in link.decoder.feed(data):
-                        if self._note(i, frame):
-                            batch.append((i, arrival_ns, frame))
-            self._watch(selector, i)
-        except LinkError as error:
-            self._drop(selector, i, error)
+        self, selector: selectors.BaseSelector, ready: list[tuple[selectors.SelectorKey, int]], wake_read: int
+    ) -> list[tuple[int, int, Frame]]:
+        """Take all there is of the links that are ready, then look at it."""
+        taken: list[tuple[int, bytes]] = []
+        for key, events in ready:
+            if key.data is None:
+                os.read(wake_read, 4096)
+                self._send_requests(selector)
+                continue
+            link = self.links[key.data]
+            try:
+                if events & selectors.EVENT_WRITE and link.is_open:
+                    link.flush()
+                if events & selectors.EVENT_READ and link.is_open:  # else dropped since select returned
+                    data = link.read()
+                    if data:
+                        taken.append((key.data, data))
+                self._watch(selector, key.data)
+            except LinkError as error:
+                self._drop(selector, key.data, error)
+        batch: list[tuple[int, int, Frame]] = []
+        arrival_ns, now = self._clock_ns(), time.monotonic()
+        for i, data in taken:
+            self._sessions[i].last_byte = now
+            try:
+                for frame in self.links[i].decoder.feed(data):
+                    if self._note(i, frame):
+                        batch.append((i, arrival_ns, frame))
+                self._watch(selector, i)
+            except LinkError as error:
+                self._drop(selector, i, error)
+        return batch
+
+    def _gathering(self, came: set[int]) -> float:
+        """How long to wait for links that deliver but have not yet, s."""
+        late = [
+            session.actual_us
+            for i, (link, session) in enumerate(zip(self.links, self._sessions, strict=True))
+            if i not in came and link.state is LinkState.OPEN and session.greeted and session.started
+        ]
+        share, most = GATHER
+        return min(1e-6 * share * min(late), most) if late else 0.0
 
     def _note(self, i: int, frame: Frame) -> bool:
         """What a frame means for the link itself; whether to deliver it. LinkError: close the link."""
         link, session = self.links[i], self._sessions[i]
         if isinstance(frame, Sample):
             session.last_sample = session.last_byte
-            self._set_state(i, LinkState.OPEN, None)
+            if link.state is not LinkState.OPEN or link.error is not None:
+                self._set_state(i, LinkState.OPEN, None)
             # After a replug it may be another hub: nothing is delivered under the old one's name.
             link.before_hello += not session.greeted
             return session.greeted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import math
 import signal
 import sys
@@ -183,6 +184,9 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
             for transition in (node.trigger_configure, node.trigger_activate) if node.value("autostart") else ():
                 if not stopping and transition() != TransitionCallbackReturn.SUCCESS:
                     stopping, code = True, 1
+        # What is there by now stays: no collection has to look at it, which would take 20 ms.
+        gc.collect()
+        gc.freeze()
         while not stopping:
             # EventsExecutor.spin() can burn a core and does not return on a signal; spin_once in the main thread does.
             with contextlib.suppress(ExternalShutdownException):

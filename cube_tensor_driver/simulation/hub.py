@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from cobs import cobs  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from ..device.protocol import (
@@ -23,6 +26,9 @@ from ..device.protocol import (
 )
 
 FIRMWARE = 0x00010000
+_HEAD = 24
+"""Bytes of a SAMPLE before its frequencies; the last one is spare and 0."""
+_U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 PERIOD_LIMITS_US = (100, 10_000_000)
 
 
@@ -38,6 +44,34 @@ class Run:
     start_us: int
     period_us: int
     boot: int = 0
+
+
+class _Prepared:
+    """A SAMPLE that is encoded but for sequence, time and checksum.
+
+    COBS codes what lies between two zeros alike wherever it stands, so the frame is coded in three parts: up to the
+    last byte of the header, up to the last zero before the checksum, and the rest.
+    """
+
+    def __init__(self, sample: Sample) -> None:
+        whole = encode(sample)
+        body = cobs.decode(whole[1:-1])[:-4]
+        self._head, self._tail = bytearray(body[:_HEAD]), body[_HEAD:]
+        last = body.rindex(b"\0", _HEAD)
+        self._middle, self._rest = cobs.encode(body[_HEAD:last]), body[last + 1 :]
+        # 254 bytes without a zero before one of those two are coded otherwise.
+        self._whole: Sample | None = None
+        if self.encode(sample.sequence, sample.device_us) != whole:
+            self._whole = sample
+
+    def encode(self, sequence: int, device_us: int) -> bytes:
+        if self._whole is not None:
+            return encode(replace(self._whole, sequence=sequence, device_us=device_us))
+        _U32.pack_into(self._head, 4, sequence)
+        _U64.pack_into(self._head, 12, device_us)
+        crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(4, "little")
+        start, end = cobs.encode(bytes(self._head[:-1])), cobs.encode(self._rest + crc)
+        return b"".join((b"\0", start, self._middle, end, b"\0"))
 
 
 @dataclass
@@ -67,6 +101,7 @@ class SimulatedHub:
     extra_pads: int = 0
     celsius: int = TEMPERATURE_UNKNOWN
     _drift_since_us: int = 0
+    _prepared: dict[int, tuple[NDArray[np.uint32], _Prepared]] = field(default_factory=dict)
 
     def hello(self) -> bytes:
         """Bytes of the HELLO frame."""
@@ -107,6 +142,12 @@ class SimulatedHub:
         answers = [self._answer(frame, now_us) for frame in self.decoder.feed(data) if isinstance(frame, Request)]
         return b"".join(answers)
 
+    def prepare(self, frequency: NDArray[np.uint32]) -> None:
+        """Encode now what will be the same in every SAMPLE of these very frequencies."""
+        n = len(frequency)
+        plain = Sample(0, 0, 0, frequency, np.zeros(n, "<u4"), np.full(n, TEMPERATURE_UNKNOWN, "<i2"))
+        self._prepared[id(frequency)] = frequency, _Prepared(plain)
+
     def sample(self, frequency: NDArray[np.uint32]) -> bytes:
         """Take the sample of next_us: bytes of its SAMPLE frame. frequency: (cubes, pads) in mHz."""
         run = self.runs[-1] if self.runs else None
@@ -119,12 +160,15 @@ class SimulatedHub:
             run.last = self.sequence
         else:
             self.runs.append(Run(self.sequence, self.sequence, self.next_us, self.period_us, self.boots))
-        n = len(frequency)
-        temperature, device_us = np.full(n, self.celsius, "<i2"), max(0, self.device_us(self.next_us))
-        frame = Sample(self.sequence & 0xFFFFFFFF, 0, device_us, frequency, np.zeros(n, "<u4"), temperature)
+        sequence, device_us = self.sequence & 0xFFFFFFFF, max(0, self.device_us(self.next_us))
         self.sequence += 1
         self.next_us += self.period_us
-        return encode(frame, self.version)
+        _, prepared = self._prepared.get(id(frequency), (None, None))
+        if prepared is not None and self.celsius == TEMPERATURE_UNKNOWN and self.version == VERSION:
+            return prepared.encode(sequence, device_us)
+        n = len(frequency)
+        temperature = np.full(n, self.celsius, "<i2")
+        return encode(Sample(sequence, 0, device_us, frequency, np.zeros(n, "<u4"), temperature), self.version)
 
     def skip(self, now_us: int) -> None:
         """Take the next sample after now_us; those before are never taken."""

@@ -116,6 +116,7 @@ class Simulator:
             stress, gradient = self._load.at(number * self._load.period / instants)
             for bench in self.benches:
                 bench.prepared.append(self._frequency(bench, stress, gradient, 0.0))
+                bench.hub.prepare(bench.prepared[-1])
 
     def now_us(self) -> int:
         """Simulated time: µs since the start."""
@@ -123,7 +124,7 @@ class Simulator:
 
     def run(self, stop: Stop) -> None:
         """Play the hubs until `stop` is set: HELLO and STATS at 1 Hz, samples when asked for."""
-        with selectors.DefaultSelector() as selector:
+        with selectors.SelectSelector() as selector:  # epoll counts in ms
             watched: dict[str, int] = {}
             selector.register(stop.fd, selectors.EVENT_READ, None)
             selector.register(self._control, selectors.EVENT_READ, self._take_orders)
