@@ -16,7 +16,7 @@ import numpy as np
 
 from .errors import LayoutError
 from .oscillator import pad_frequency, stress_slope
-from .pipeline import COLUMNS_KEPT, RESIDUAL, Pipeline, turns
+from .pipeline import COLUMNS_KEPT, RESIDUAL, Pipeline, column_key, turns
 from .window import Statistics, Window
 
 OPEN, SHORT, RANGE, STUCK, NOISY, REPORTED, DRIFT = 16, 32, 64, 128, 256, 512, 1024
@@ -60,6 +60,7 @@ RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
 class _Column(NamedTuple):
     """What depends on the cube column of a message alone."""
 
+    whole: np.ndarray  # (N,)
     turns: int  # how many times the same rising cubes stand in it, 0: not so
     cube: np.ndarray  # (n,) of one turn
     cubes: slice | np.ndarray  # the same, as a slice where they are neighbours: numpy does not copy those
@@ -100,7 +101,7 @@ class Health:
         self.closed = 0
         self.newest_ns = 0
         self.temperature = np.full(self._shape[0], np.nan)
-        self._columns: dict[bytes, _Column] = {}
+        self._columns: dict[tuple, _Column] = {}
         self.refresh()
         self._statistics = Statistics(self._rest, self._bound(self.noise))
         self.window = self._statistics.window
@@ -261,9 +262,9 @@ class Health:
 
     def _column(self, cube: np.ndarray, shape: tuple[int, ...]) -> _Column:
         """Of a message whose frequencies have this shape."""
-        key = cube.tobytes()
+        key = column_key(cube)
         column = self._columns.get(key)
-        if column is None or shape != (len(cube), self._shape[1]):
+        if column is None or not (column.whole == cube).all() or shape != (len(cube), self._shape[1]):
             if shape != (len(cube), self._shape[1]) or (len(cube) and int(cube.max()) >= self._shape[0]):
                 raise LayoutError(
                     f"frequencies of shape {shape} for cubes up to {max(cube, default=0)}; this skin has "
@@ -276,7 +277,7 @@ class Health:
             together = count and int(one[-1]) - int(one[0]) + 1 == len(one)
             cubes = slice(int(one[0]), int(one[-1]) + 1) if together else one
             column = self._columns[key] = _Column(
-                count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
+                cube.copy(), count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
                 np.zeros(len(one), np.uint16),
             )  # fmt: skip
         return column

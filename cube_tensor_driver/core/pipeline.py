@@ -69,6 +69,7 @@ class _Block(NamedTuple):
 class _Column(NamedTuple):
     """What depends on the cube column alone, kept from call to call because a hub's cubes do not change."""
 
+    cube: np.ndarray
     turns: int  # how many times the same cubes stand in it
     strange: np.ndarray  # (N,) bool: the index is none of our cubes
     kind: np.ndarray  # (N,) which calibration
@@ -78,6 +79,11 @@ class _Column(NamedTuple):
     blocks: list[_Block]
     limit: np.ndarray  # (N,)
     observed: np.ndarray
+
+
+def column_key(cube: np.ndarray) -> tuple:
+    """What a kept column is found by; it may be another one with the same ends, which a comparison tells."""
+    return (len(cube), cube[0], cube[-1]) if len(cube) else (0,)
 
 
 def turns(cube: np.ndarray) -> int:
@@ -117,7 +123,7 @@ class Pipeline:
         self._seen = np.flatnonzero(~np.isnan(self._matrices).all(axis=(0, 2)))
         self._limits = np.array([t.limit for t in full], dtype=self.dtype)
         self._observed = np.array([t.observed for t in full], dtype=np.uint16)
-        self._kept: dict[bytes, _Column] = {}
+        self._kept: dict[tuple, _Column] = {}
         self.rest_frequency = self._per_pad([c.rest_frequency for c in self.calibrations], np.nan)
 
     def _per_pad(self, values: Sequence[np.ndarray], missing: float) -> np.ndarray:
@@ -252,14 +258,15 @@ class Pipeline:
             )
         column = self._column(cube)
         if column.turns > 1 and not keep:
-            n = len(cube) // column.turns
-            column = self._column(cube[:n])
-        f = f.reshape(-1, len(column.kind), self.n_pads) if len(cube) else f.reshape(1, 0, self.n_pads)
+            column = self._column(cube[: len(cube) // column.turns])
+        n = len(column.kind)
+        count = f.size // (n * self.n_pads) if n else 1
+        f = f.reshape((n, self.n_pads) if count == 1 else (count, n, self.n_pads))  # numpy is faster with two axes
         rest, top, cold = column.rest, column.top, None
         if self._any_thermal:
-            known = np.full(f.shape[:2], np.nan)
+            known = np.full((count, n), np.nan)
             if temperature is not None:
-                known = np.asarray(temperature, dtype=float).reshape(f.shape[:2])
+                known = np.asarray(temperature, dtype=float).reshape(count, n)
             cold = self._thermal[column.kind] & ~np.isfinite(known)
             factor = self._factor(column.kind, known)
             rest, top = (rest * factor).astype(self.dtype), (top * factor).astype(self.dtype)
@@ -268,20 +275,22 @@ class Pipeline:
         below = top - f
         v /= below
         # NaN, Inf and frequencies beyond the law's range all fail one of the two comparisons
-        good = f > 0
-        good &= below > 0
         reported = pad_fault is not None and np.count_nonzero(pad_fault) > 0
-        if np.count_nonzero(good) == len(f) * column.pads and not reported:
+        v = v.reshape(count, n, self.n_pads)
+        if f.size == count * column.pads and n and not reported and f.min() > 0 and below.min() > 0:
+            return column, v, None, cold
+        good = ((f > 0) & (below > 0)).reshape(v.shape)
+        if np.count_nonzero(good) == count * column.pads and not reported:
             return column, v, None, cold
         if reported:
-            good &= ~_bits(np.asarray(pad_fault).reshape(f.shape[:2]), self.n_pads)
+            good &= ~_bits(np.asarray(pad_fault).reshape(count, n), self.n_pads)
         v[~good] = 0
         return column, v, _mask(self._exists[column.kind] & ~good), cold
 
     def _column(self, cube: np.ndarray) -> _Column:
-        key = cube.tobytes()
+        key = column_key(cube)
         kept = self._kept.get(key)
-        if kept is not None:
+        if kept is not None and (kept.cube == cube).all():
             return kept
         if len(self._kept) >= COLUMNS_KEPT:
             self._kept.clear()
@@ -292,8 +301,8 @@ class Pipeline:
         # A strange row never counts as good, so it always takes the slow way, where it is made NaN.
         pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
         column = self._kept[key] = _Column(
-            turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), pads, self._blocks(kind),
-            self._limits[kind], self._observed[kind],
+            cube.copy(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), pads,
+            self._blocks(kind), self._limits[kind], self._observed[kind],
         )  # fmt: skip
         return column
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-from cobs import cobs  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
+from ..device.prepared import Prepared
 from ..device.protocol import (
     TEMPERATURE_UNKNOWN,
     VERSION,
@@ -26,9 +24,6 @@ from ..device.protocol import (
 )
 
 FIRMWARE = 0x00010000
-_HEAD = 24
-"""Bytes of a SAMPLE before its frequencies; the last one is spare and 0."""
-_U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 PERIOD_LIMITS_US = (100, 10_000_000)
 
 
@@ -44,34 +39,6 @@ class Run:
     start_us: int
     period_us: int
     boot: int = 0
-
-
-class _Prepared:
-    """A SAMPLE that is encoded but for sequence, time and checksum.
-
-    COBS codes what lies between two zeros alike wherever it stands, so the frame is coded in three parts: up to the
-    last byte of the header, up to the last zero before the checksum, and the rest.
-    """
-
-    def __init__(self, sample: Sample) -> None:
-        whole = encode(sample)
-        body = cobs.decode(whole[1:-1])[:-4]
-        self._head, self._tail = bytearray(body[:_HEAD]), body[_HEAD:]
-        last = body.rindex(b"\0", _HEAD)
-        self._middle, self._rest = cobs.encode(body[_HEAD:last]), body[last + 1 :]
-        # 254 bytes without a zero before one of those two are coded otherwise.
-        self._whole: Sample | None = None
-        if self.encode(sample.sequence, sample.device_us) != whole:
-            self._whole = sample
-
-    def encode(self, sequence: int, device_us: int) -> bytes:
-        if self._whole is not None:
-            return encode(replace(self._whole, sequence=sequence, device_us=device_us))
-        _U32.pack_into(self._head, 4, sequence)
-        _U64.pack_into(self._head, 12, device_us)
-        crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(4, "little")
-        start, end = cobs.encode(bytes(self._head[:-1])), cobs.encode(self._rest + crc)
-        return b"".join((b"\0", start, self._middle, end, b"\0"))
 
 
 @dataclass
@@ -101,7 +68,7 @@ class SimulatedHub:
     extra_pads: int = 0
     celsius: int = TEMPERATURE_UNKNOWN
     _drift_since_us: int = 0
-    _prepared: dict[int, tuple[NDArray[np.uint32], _Prepared]] = field(default_factory=dict)
+    _prepared: dict[int, tuple[NDArray[np.uint32], Prepared]] = field(default_factory=dict)
 
     def hello(self) -> bytes:
         """Bytes of the HELLO frame."""
@@ -146,7 +113,7 @@ class SimulatedHub:
         """Encode now what will be the same in every SAMPLE of these very frequencies."""
         n = len(frequency)
         plain = Sample(0, 0, 0, frequency, np.zeros(n, "<u4"), np.full(n, TEMPERATURE_UNKNOWN, "<i2"))
-        self._prepared[id(frequency)] = frequency, _Prepared(plain)
+        self._prepared[id(frequency)] = frequency, Prepared(plain)
 
     def sample(self, frequency: NDArray[np.uint32]) -> bytes:
         """Take the sample of next_us: bytes of its SAMPLE frame. frequency: (cubes, pads) in mHz."""
