@@ -12,7 +12,7 @@ from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import CalibrationError, CubeError, LayoutError
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency, pad_stress
-from cube_tensor_driver.core.pipeline import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE, Pipeline
+from cube_tensor_driver.core.pipeline import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE, Pipeline, StressRows
 
 DTYPES = [(np.float64, 1e-9), (np.float32, 3e-5)]
 QUAD_NEGLECT = ("xx", "xx_z", "xx_x")
@@ -260,6 +260,58 @@ def test_covariance_of_a_cube_with_a_bad_pad():
     assert np.all(less[seen] >= whole[seen] * (1 - 1e-9)) and np.isnan(np.diag(pipeline.covariance(0))[0])
     alone = make_estimator(c.response, c.noise, c.modes).covariance
     np.testing.assert_allclose(whole[6:], np.diag(alone)[6:] / c.half_side**2)
+
+
+def mixed_skin(kinds: int, count: int = 60):
+    """Cubes of three layouts with so many calibrations, and frequencies of seven scans."""
+    made = [individual(("planar", "cube", "quad")[seed % 3], seed) for seed in range(kinds)]
+    pipeline = Pipeline([made[k % kinds] for k in range(count)], np.float32)
+    random = np.random.default_rng(5)
+    frequency = pipeline.rest_frequency * (1 - 0.01 * random.random((7, count, pipeline.n_pads)))
+    return pipeline, np.arange(count, dtype=np.uint16), frequency.astype(np.float32)
+
+
+@pytest.mark.parametrize("kinds", [3, 12])
+@pytest.mark.parametrize("bad", [False, True])
+def test_scans_at_once_and_in_turn_are_one_by_one_to_the_bit(kinds, bad):
+    """As recorded batches, and as a message of several turns: with few and many calibrations, with bad pads."""
+    pipeline, cube, frequency = mixed_skin(kinds)
+    pad_fault = np.zeros(frequency.shape[:2], np.uint32)
+    if bad:
+        frequency[:, 7, 1], frequency[2, 30, 0], pad_fault[4:, 11] = np.nan, 1e9, 2
+    singly = [pipeline.process(cube, f, fault) for f, fault in zip(frequency, pad_fault, strict=True)]
+    at_once = pipeline.process(cube, frequency, pad_fault)
+    in_turn = pipeline.process(np.tile(cube, 7), frequency.reshape(-1, pipeline.n_pads), pad_fault.ravel())
+    for name, *several in zip(StressRows._fields, at_once, in_turn, strict=True):
+        expected = np.concatenate([getattr(rows, name) for rows in singly])
+        for found in several:
+            np.testing.assert_array_equal(found, expected, err_msg=name)
+    assert bool(np.any(at_once.status & PAD_FAULT)) == bad
+
+
+def test_one_cube_alone_is_the_same_cube_among_many_scans():
+    """numpy multiplies a single row by another routine."""
+    for layout in ("quad", "planar", "cube"):
+        pipeline = Pipeline([individual(layout, 1)], np.float32)
+        f = (pipeline.rest_frequency * (1 - 0.01 * np.random.default_rng(1).random((50, 1, pipeline.n_pads)))).astype(
+            "f4"
+        )
+        cube = np.zeros(1, np.uint16)
+        at_once = pipeline.process(cube, f)
+        np.testing.assert_array_equal(at_once.stress, [pipeline.process(cube, one).stress[0] for one in f])
+
+
+def test_mixed_layouts_cost_no_more_than_the_larger_one():
+    """Absent pads are no bad pads: half planar cubes among cubes of 24 pads are cheaper than all of 24 pads."""
+
+    def skin(layouts):
+        pipeline = Pipeline([illustrative(layouts[k * len(layouts) // 1024]) for k in range(1024)], np.float32)
+        f = (0.99 * pipeline.rest_frequency).astype(np.float32)
+        return lambda: pipeline.process(np.arange(1024, dtype=np.uint16), f)
+
+    mixed, wide = skin(["planar", "cube"]), skin(["cube"])
+    costs = np.min([[timeit.timeit(mixed, number=3), timeit.timeit(wide, number=3)] for _ in range(50)], axis=0)
+    assert costs[0] < 1.5 * costs[1], costs  # 0.8 measured; the slow way for bad pads took 5
 
 
 def cost_of(count: int, dtype) -> np.ndarray:

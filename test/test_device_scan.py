@@ -149,3 +149,29 @@ def test_a_hub_of_strangers_is_one_line():
         "the hub's cubes 1 (uid 0x2), 2 (uid 0x3), 3 (uid 0x4), 4 (uid 0x5), 5 (uid 0x6), 6 (uid 0x7), 7 (uid 0x8), "
         "8 (uid 0x9) and 31 more not in the skin file: add it there"
     ]
+
+
+def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
+    scan = two_links()
+    for link in (0, 1):
+        scan.live(link, True)
+    for turn in range(3):
+        for link in (0, 1):
+            assert not scan.complete(3)
+            scan.add(link, sample(turn, [[10 * link + turn + 1, 1.0]] * 2), 100 * turn + link)
+    assert scan.complete(3) and scan.complete(2) and not scan.complete(4)
+    first, second = scan.take(turns=2), scan.take()
+    assert first.stamp_ns.tolist() == [0, 0, 1, 1, 100, 100, 101, 101]
+    assert first.frequency[:, 0].tolist() == [1, 1, 11, 11, 2, 2, 12, 12]
+    assert second.sequence.tolist() == [2, 2, 2, 2]
+    assert scan.take() is None and scan.unaccounted() == 0
+
+
+def test_pads_that_a_cube_has_not_are_nan():
+    scan = Scan(2, [Place("wide", 0, 0, None, 3), Place("narrow", 1, 0, None, 2), Place("narrow", 1, 1, None, 2)])
+    scan.hello(0, hello([1], 3))
+    scan.hello(1, hello([2, 3], 2))
+    scan.add(0, sample(0, [[1.0, 0.0, 3.0]]), 0)
+    scan.add(1, sample(0, [[4.0, 5.0], [6.0, 7.0]]), 0)
+    expected = [[1, np.nan, 3], [4, 5, np.nan], [6, 7, np.nan]]
+    np.testing.assert_array_equal(scan.take().frequency, expected)

@@ -109,7 +109,9 @@ def test_demo_does_not_mix_with_another_skin(ros):
     assert "another skin publishes stress in DDS domain" in errors and "ROS_DOMAIN_ID" in errors
 
 
-def test_every_topic_of_a_skin(ros, tmp_path):
+@pytest.mark.parametrize("scans", [1, 5])
+def test_every_topic_of_a_skin(ros, tmp_path, scans):
+    """Also with batches of several samples of each cube in a message."""
     skin = read_skin(SKIN)
     batches = ros.listen(SkinStress, "stress")
     raw = ros.listen(SkinFrequencies, "frequencies")
@@ -118,6 +120,8 @@ def test_every_topic_of_a_skin(ros, tmp_path):
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     with Children(tmp_path) as children:
         for process in skin_processes(SKIN, simulated_ports=tmp_path / "ports"):
+            if process.node and scans > 1:
+                process.parameters["publish_period"] = scans / skin.rate
             children.start(process)
         ros.wait(lambda: len(batches) > 50 and len(raw) > 80 and len(tensors) > 20 and len(wrenches) > 20)
         ros.wait(lambda: {status.name for array in diagnostics for status in array.status} >= {
@@ -132,6 +136,7 @@ def test_every_topic_of_a_skin(ros, tmp_path):
         assert set(map(tuple, np.reshape(message.cube, (-1, 8)).tolist())) <= {tuple(range(8)), tuple(range(8, 16))}
     counts = np.bincount(np.concatenate([message.cube for message in batches]), minlength=16)
     assert counts.min() > 0.5 * counts.max()
+    assert np.median([len(message.cube) for message in batches]) == 16 * scans
     times, rows = read_stress(batches[-1])
     assert times.header.frame_id == "skin_base"
     assert (rows.status == 0).all()

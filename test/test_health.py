@@ -190,6 +190,41 @@ def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
     assert together.rows.tolist() == [1, 2, 0, 0, 3, 0]
 
 
+def test_a_batch_of_several_scans_is_the_scans_one_after_the_other():
+    together, singly = Skin(), Skin()
+    masks = []
+    for _ in range(12):
+        frequency = np.array([singly.frequency() for _ in range(10)], np.float32)
+        stamp_ns = PERIOD_NS * (singly.row + np.arange(10))[:, None] + np.arange(6)
+        frequency[4, 3, 2] = np.nan
+        faults = np.zeros((10, 6), np.uint32)
+        of_batch = together.health.update(
+            np.tile(singly.cube, 10), frequency.reshape(-1, 8), faults.ravel(), stamp_ns.ravel()
+        )
+        one_by_one = [singly.health.update(singly.cube, *one) for one in zip(frequency, faults, stamp_ns, strict=True)]
+        for whole, parts in zip(of_batch, zip(*one_by_one, strict=True), strict=True):
+            np.testing.assert_array_equal(whole, np.concatenate(parts))
+        masks.append(of_batch[0])
+        singly.row += 10
+    assert np.any(masks) and together.health.closed == singly.health.closed > 0
+    for one, other in zip(together.health.window(), singly.health.window(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_jump_back_in_time_begins_a_new_window():
+    """What was gathered before is of another time: it goes neither into sums nor into the share of bad residuals."""
+    skin = Skin()
+    skin.play(1.2)
+    before = skin.health.closed
+    skin.health.residual(skin.cube, np.full(6, RESIDUAL, np.uint16))
+    skin.row = 0
+    skin.play(0.1)
+    assert skin.health.window().rows.tolist() == [10] * 6
+    skin.play(0.5)
+    assert skin.health.closed == before + 1 and skin.health.history[-1].rows.max() == 50
+    assert skin.health.newest_ns == 59 * PERIOD_NS
+
+
 def test_mixed_layouts_and_pads_that_do_not_exist():
     pipeline = Pipeline([illustrative("quad"), CALIBRATION], np.float32)
     watch = Health(pipeline)

@@ -173,7 +173,8 @@ class Pipeline:
                 flat, flat_limit, flat_v = out.reshape(-1, out.shape[2]), limit.reshape(-1), v.reshape(-1, self.n_pads)
                 for kind, bits, chosen in _distinct(np.tile(column.kind, len(v)), mask.ravel()):
                     table = self._table(kind, bits)
-                    flat[chosen] = np.einsum("cp,pn->nc", table.matrix, np.ascontiguousarray(flat_v[chosen].T))
+                    # In this order of axes einsum adds pad by pad, however many rows there are.
+                    flat[chosen] = np.einsum("pc,pn->cn", table.matrix.T, np.ascontiguousarray(flat_v[chosen].T)).T
                     flat_limit[chosen], observed[chosen] = table.limit, table.observed
                 out[:, column.strange] = np.nan
                 observed.reshape(len(v), -1)[:, column.strange] = 0
@@ -350,7 +351,7 @@ class Pipeline:
             matrix[N : N + dof, :n] = null / np.sqrt(dof)
         matrix *= self._stiffness[kind]
         limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof) if dof else np.nan
-        return _Table(matrix.astype(self.dtype), limit, int(_mask(e.observed)))
+        return _Table(matrix.astype(self.dtype, order="F"), limit, int(_mask(e.observed)))
 
 
 def _bits(mask, count: int) -> np.ndarray:
