@@ -12,7 +12,8 @@ from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import CalibrationError, CubeError, LayoutError
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency, pad_stress
-from cube_tensor_driver.core.pipeline import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE, Pipeline, StressRows
+from cube_tensor_driver.core.pipeline import Pipeline, StressRows
+from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE
 
 DTYPES = [(np.float64, 1e-9), (np.float32, 3e-5)]
 QUAD_NEGLECT = ("xx", "xx_z", "xx_x")

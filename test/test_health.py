@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cube_tensor_driver.core import health
+from cube_tensor_driver.core import status
 from cube_tensor_driver.core.calibration import illustrative
-from cube_tensor_driver.core.health import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK, Health
+from cube_tensor_driver.core.health import WINDOW_S, Health
 from cube_tensor_driver.core.oscillator import pad_frequency
-from cube_tensor_driver.core.pipeline import PAD_FAULT, RESIDUAL, Pipeline
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, PAD_FAULT, RANGE, REPORTED, RESIDUAL, SHORT, STUCK
 
 PERIOD_NS = 10_000_000  # 100 Hz
 CALIBRATION = illustrative("planar")
@@ -146,14 +147,14 @@ def test_one_pad_that_wanders_while_all_rest_is_drifting_and_still_used():
 
 def test_a_load_put_on_between_two_windows_is_no_drift():
     skin = Skin(moving=False)
-    skin.play(health.WINDOW_S * 4)
+    skin.play(WINDOW_S * 4)
     start = skin.row
 
     def load(frequency, row):
         frequency[2] *= 1 + 0.01 * np.arange(8) / 8
 
     skin.play(5, load)
-    assert start % round(health.WINDOW_S * 1e9 / PERIOD_NS) == 0
+    assert start % round(WINDOW_S * 1e9 / PERIOD_NS) == 0
     assert not skin.health.collect()[0].any()
 
 
@@ -238,4 +239,4 @@ def test_bits_are_those_of_the_message():
     message = pytest.importorskip("cube_tensor_driver.msg", exc_type=ImportError).SkinStress
     assert (message.PAD_FAULT, message.RESIDUAL) == (PAD_FAULT, RESIDUAL)
     for name in ("OPEN", "SHORT", "RANGE", "STUCK", "NOISY", "REPORTED", "DRIFT"):
-        assert getattr(message, f"PAD_{name}") == getattr(health, name)
+        assert getattr(message, f"PAD_{name}") == getattr(status, name)

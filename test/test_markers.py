@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.core import scene
-from cube_tensor_driver.core.pipeline import INVALID, PAD_FAULT, StressRows
+from cube_tensor_driver.core.pipeline import StressRows
 from cube_tensor_driver.core.scene import QUANTITIES, Newest, Places
+from cube_tensor_driver.core.status import INVALID, PAD_FAULT
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 
 

@@ -16,21 +16,9 @@ import numpy as np
 
 from .errors import LayoutError
 from .oscillator import pad_frequency, stress_slope
-from .pipeline import COLUMNS_KEPT, RESIDUAL, Pipeline, column_key, turns
-from .window import Statistics, Window
-
-OPEN, SHORT, RANGE, STUCK, NOISY, REPORTED, DRIFT = 16, 32, 64, 128, 256, 512, 1024
-WORDS = {
-    OPEN: "open",
-    SHORT: "short",
-    RANGE: "out of range",
-    STUCK: "stuck",
-    NOISY: "noisy",
-    REPORTED: "reported by the hub",
-    DRIFT: "drifting",
-}
-LEFT_OUT = OPEN | SHORT | RANGE | STUCK | NOISY | REPORTED
-"""A pad with one of these is not used; one that drifts still is: only tare knows better."""
+from .pipeline import COLUMNS_KEPT, Pipeline, column_key, turns
+from .status import LEFT_OUT, OPEN, RANGE, REPORTED, RESIDUAL, SHORT
+from .window import Judge, Statistics, Window
 
 WINDOW_S = 0.5
 BACK_NS = round(2e9 * WINDOW_S)
@@ -38,21 +26,9 @@ BACK_NS = round(2e9 * WINDOW_S)
 HOLD = 3
 HISTORY = 20
 """Windows remembered, for tare: 10 s."""
-MIN_COUNT = 20
-"""Rows in a window below which its statistics say nothing."""
 STRAIN_RANGE = (-0.8, 1.0)
 """Squeezed to a fifth or stretched to twice: elastomer tears before."""
 STRAIN_OPEN = 3.0
-NOISY_ENTER, NOISY_LEAVE = 10.0, 5.0
-"""Times the calibration's noise and times the cube's other pads, to become noisy and to stay so."""
-JUMP = 60.0
-"""Times the usual noise, to which a second difference is bounded: two of them in 20 rows stay below NOISY_ENTER."""
-STUCK_MOVING = 5.0
-"""Times its noise that the cube's pads must have moved, before one that did not move at all is called stuck."""
-STILL = 8.0
-"""Times its noise, peak to peak, within which a pad stands still: noise alone spans 6 in 1000 rows."""
-DRIFT_LIMIT = 2e-4
-"""Of the rest frequency: how far one pad wanders while all stand still, before it is called drifting."""
 RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
 """Shares of a window's rows with a residual above its limit."""
 
@@ -89,23 +65,29 @@ class Health:
         self.state = np.zeros(self._shape, np.uint16)
         self.rows = np.zeros(self._shape[0], int)
         self.strained = np.zeros(self._shape[0], bool)
-        self.still = np.zeros(self._shape[0], bool)
         self._recent = np.zeros((HOLD, *self._shape), np.uint16)
         self._seen = np.zeros(self._shape, np.uint16)
         self._strained_seen = self.strained.copy()
         self._bad_residual = np.zeros(self._shape[0], int)
-        self._reference = np.full(self._shape, np.nan)
-        self._middle = np.full(self._shape, np.nan)  # means of the window before
         self._window_end: int | None = None
         self.history: deque[Window] = deque(maxlen=HISTORY)
         self.closed = 0
         self.newest_ns = 0
         self.temperature = np.full(self._shape[0], np.nan)
         self._columns: dict[tuple, _Column] = {}
+        self._judge = Judge(self._exists)
         self.refresh()
-        self._statistics = Statistics(self._rest, self._bound(self.noise))
+        self._statistics = Statistics(self._rest, self._judge.bound)
         self.window = self._statistics.window
         self._publish()
+
+    @property
+    def still(self) -> np.ndarray:
+        return self._judge.still
+
+    @property
+    def noise(self) -> np.ndarray:
+        return self._judge.noise
 
     @property
     def last(self) -> np.ndarray:
@@ -124,7 +106,7 @@ class Health:
             pad_frequency(strain * modulus, rest, beta, modulus).astype(np.float32)
             for strain in (*STRAIN_RANGE, STRAIN_OPEN)
         )
-        self.noise = noise / stress_slope(rest, rest, beta, modulus)
+        self._judge.set(rest, noise / stress_slope(rest, rest, beta, modulus))
         self._columns.clear()
 
     def update(
@@ -337,57 +319,23 @@ class Health:
         self._statistics.clear()
         self._bad_residual[:] = 0
 
-    @staticmethod
-    def _bound(noise: np.ndarray) -> np.ndarray:
-        bound: np.ndarray = ((JUMP * noise) ** 2).astype(np.float32)
-        return bound
-
     def _close_window(self) -> None:
         """Judge the statistics of the window that ended."""
         window = self.window()
-        count = window.rows
-        enough = count >= MIN_COUNT
         self.history.append(window)
         self.closed += 1
-        noise, span, middle = window.noise, window.highest - window.lowest, window.mean
-        found = np.zeros(self._shape, np.uint16)
-        with np.errstate(invalid="ignore"):
-            times = np.where(self.state & NOISY, NOISY_LEAVE, NOISY_ENTER)
-            usual = np.fmax(self.noise, self._median(noise))
-            found[noise > times * usual] |= NOISY
-            self._statistics.bound[:] = self._bound(usual)
-            moving = self._median(span / self.noise) > STUCK_MOVING
-            # What comes and goes shows a single value now and then, which is not stuck.
-            found[(span == 0) & moving & (self.state & (OPEN | SHORT | RANGE) == 0)] |= STUCK
-            healthy = self.state & LEFT_OUT == 0
-            # A step that falls between two windows shows in neither.
-            jumped = np.abs(middle - self._middle) > STILL * self.noise
-            unmoved = (span < STILL * self.noise) & ~jumped
-            self.still = enough & (unmoved | ~healthy | ~self._exists).all(axis=1)
-            self._middle = np.where(np.isnan(middle), self._middle, middle)
-            self._reference[~self.still & (count > 0)] = np.nan
-            fresh = self.still[:, None] & np.isnan(self._reference)
-            self._reference[fresh] = middle[fresh]
-            wander = (middle - self._reference) / self._rest
-            found[np.abs(wander - self._median(wander)) > np.maximum(DRIFT_LIMIT, STILL * self.noise / self._rest)] |= (
-                DRIFT
-            )
-            share = self._bad_residual / np.maximum(count, 1)
-            limit = np.where(self.strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
-        self.strained = np.where(count > 0, share > limit, self.strained)
+        came = window.rows > 0
+        found = self._judge.judge(window, self.state)
+        self._statistics.bound[:] = self._judge.bound
+        share = self._bad_residual / np.maximum(window.rows, 1)
+        limit = np.where(self.strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
+        self.strained = np.where(came, share > limit, self.strained)
         self._strained_seen |= self.strained
-        self._recent[0] |= found * (enough[:, None] & self._exists)
+        self._recent[0] |= found
         self._publish()
         # Cubes of which nothing came keep what was found: silence is no recovery.
-        silent = count == 0
-        kept = self._recent[:, silent]
+        kept = self._recent[:, ~came]
         self._recent = np.roll(self._recent, 1, axis=0)
         self._recent[0] = 0
-        self._recent[:, silent] = kept
+        self._recent[:, ~came] = kept
         self._clear_window()
-
-    def _median(self, values: np.ndarray) -> np.ndarray:
-        """(cubes, 1): the lower median over each cube's pads that have a value."""
-        ordered = np.sort(values, axis=1)  # NaN last
-        known = self._shape[1] - np.isnan(ordered).sum(axis=1)
-        return np.take_along_axis(ordered, np.maximum((known - 1) // 2, 0)[:, None], axis=1)

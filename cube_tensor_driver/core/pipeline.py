@@ -20,12 +20,7 @@ from .errors import CalibrationError, CubeError, LayoutError
 from .estimator import FALSE_ALARM, Estimator, chi2_limit, make_estimator
 from .modes import COMPONENTS, STRESS
 from .oscillator import highest_frequency
-
-PAD_FAULT = 1  # at least one pad was left out: fault bit of the device, or a frequency that no pad can have
-RESIDUAL = 2  # chi-square above its false-alarm limit: a load outside the modes, or a broken pad
-INVALID = 4  # nothing recovered: all components NaN
-TEMPERATURE = 8  # the temperature is unknown though the calibration needs it; its reference was assumed
-STATUS = {"PAD_FAULT": PAD_FAULT, "RESIDUAL": RESIDUAL, "INVALID": INVALID, "TEMPERATURE": TEMPERATURE}
+from .status import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE
 
 N = len(COMPONENTS)
 MASKS_KEPT = 1024  # estimators of pad masks remembered at a time

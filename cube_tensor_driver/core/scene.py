@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .modes import COMPONENTS, STRESS
-from .pipeline import INVALID, StressRows
+from .pipeline import StressRows
+from .status import INVALID
 from .tensor import principal_stresses, quaternion_from_rotation
 
 # viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both read in grey.

@@ -13,8 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from .errors import TareError
-from .health import HISTORY, LEFT_OUT, MIN_COUNT, WINDOW_S, Health
+from .health import HISTORY, WINDOW_S, Health
 from .pipeline import Pipeline
+from .status import LEFT_OUT
+from .window import MIN_COUNT
 
 MOVED = 12.0
 """Times the calibration's noise, peak to peak, above which a pad moved: noise alone spans 9 in 10000 rows."""

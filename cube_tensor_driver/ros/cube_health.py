@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from ..core.health import LEFT_OUT, WORDS, Health
+from ..core.health import Health
 from ..core.pipeline import Pipeline
+from ..core.status import LEFT_OUT, WORDS
 from ..files.skin import Skin
 from .diagnostics import make_status
 

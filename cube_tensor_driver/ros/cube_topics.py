@@ -12,7 +12,8 @@ from std_msgs.msg import Header
 
 from cube_tensor_driver.msg import StressTensorStamped
 
-from ..core.pipeline import INVALID, Pipeline, StressRows
+from ..core.pipeline import Pipeline, StressRows
+from ..core.status import INVALID
 from ..core.tensor import contact_wrench
 from ..device.scan import Rows
 from ..files.skin import Skin

@@ -14,7 +14,8 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 
 from ..core.errors import CubeError
 from ..core.health import Health
-from ..core.pipeline import INVALID, Pipeline
+from ..core.pipeline import Pipeline
+from ..core.status import INVALID
 from ..core.tare import DriftTracker
 from ..device.scan import Rows
 from ..files.cdr import Shape, blank_stress, frequencies_shape, read_frequencies, same_shape

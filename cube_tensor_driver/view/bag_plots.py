@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ..core.errors import BagError
 from ..core.modes import COMPONENTS, STRESS
-from ..core.pipeline import INVALID, RESIDUAL
+from ..core.status import INVALID, RESIDUAL
 from ..files.bags import Bag
 from ..files.reprocess import Recording
 from .plots import MARKERS, save

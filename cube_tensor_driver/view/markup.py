@@ -10,8 +10,8 @@ import numpy as np
 
 from ..core import scene
 from ..core.modes import COMPONENTS
-from ..core.pipeline import STATUS
 from ..core.scene import Newest
+from ..core.status import STATUS
 from ..elastic.surface import Contact
 
 GREEN, AMBER, RED, YELLOW = "#51cf66", "#ffa94d", "#ff6b6b", "#ffd43b"

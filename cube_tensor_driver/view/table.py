@@ -13,7 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ..core.modes import COMPONENTS
-from ..core.pipeline import STATUS, StressRows
+from ..core.pipeline import StressRows
+from ..core.status import STATUS
 from ..files.skin import Skin
 
 REFRESH_S = 0.1
