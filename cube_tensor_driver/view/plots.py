@@ -138,5 +138,8 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
             cubes, [row[f"latency_{name}_ms"] for row in rows], style, color="black", mfc="white", ms=5, label=name
         )
     right.set(xscale="log", xlabel="cubes", ylabel="latency, pads read to tensor received / ms", ylim=(0, None))
+    for axis in (left, right):
+        axis.set_xticks(cubes, [str(count) for count in cubes])
+        axis.xaxis.minorticks_off()
     right.legend()
     return figure
