@@ -84,6 +84,19 @@ def test_a_layout_of_ones_own(tmp_path):
     )
 
 
+def test_a_layout_of_ones_own_in_space(coarse, tmp_path, capsys):
+    """One pad in the middle of each face tells the three normal stresses and their slopes along themselves."""
+    faces = [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]
+    path, out = tmp_path / "six.yaml", tmp_path / "fem.json"
+    path.write_text(f"name: six\npad_size: 0.6\npositions: {faces}\nnormals: {faces}\n")
+    arguments = ["fem", "--3d", "--width", "12", "--height", "12", "--meshes", "1", "--rigid", "--layout", str(path)]
+    assert cli.main([*arguments, "--json", str(out)]) == 0
+    result = json.loads(out.read_text())
+    assert np.array(result["matrix"]).shape == (6, 21) and result["symmetry"] == "full"
+    assert result["rank"] == 6 and {"zx", "zz_x"} <= set(result["unobservable"])
+    assert "6 pads, symmetry full" in capsys.readouterr().out
+
+
 @pytest.fixture
 def computed(monkeypatch):
     """What reaches compute_response, which ends there with an error."""

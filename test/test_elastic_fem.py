@@ -18,7 +18,7 @@ from cube_tensor_driver.elastic import fem, mesh
 from cube_tensor_driver.elastic.body import Body, strip_layout
 from cube_tensor_driver.elastic.fem import calibration_from_fem, compute_response
 from cube_tensor_driver.elastic.pads import interval_weights
-from cube_tensor_driver.elastic.solid import Solid, lame, stiffness
+from cube_tensor_driver.elastic.solid import Solid, brick_stiffness, lame, stiffness
 from cube_tensor_driver.files.calibration import read_calibration
 
 HALVES = strip_layout(LAYOUTS["planar"], 1.0)
@@ -212,6 +212,31 @@ def test_nearly_incompressible_body_does_not_lock():
 @pytest.fixture
 def coarse(monkeypatch):
     monkeypatch.setattr(bodies, "_SPACE_MESHES", ((1.0, 0.3, 6.0),) * 3)
+
+
+@pytest.fixture(scope="module")
+def bricks():
+    """A small solid with two equal axes."""
+    return Solid(mesh.block((3.0, 3.0, 2.5), (0.2, 0.7), 1.0, 0.3, 6.0), lame(1.0, 0.48), None)
+
+
+def test_bricks_are_the_stretched_unit_cube(bricks):
+    part = bricks._part(np.arange(bricks.basis.mesh.nelements) % 3 > 0)
+    whole, fast = stiffness(part, (2.0, 0.3)), brick_stiffness(part, (2.0, 0.3))
+    assert abs(whole - fast).max() < 1e-12 * abs(whole).max()
+
+
+@pytest.mark.parametrize("parity", [(1, -1, 1), (-1, 1, -1), (-1, -1, -1)])
+def test_traded_axes_solve_the_system(bricks, parity):
+    """What was solved with other axes fulfils the equations as they were put."""
+    free = np.flatnonzero(~bricks._held(parity))
+    forces = np.zeros((bricks.basis.N, 2))
+    forces[free] = np.random.default_rng(2).normal(size=(len(free), 2))
+    u = bricks.solve(parity, forces)
+    assert np.all(np.delete(u, free, axis=0) == 0)
+    left = (bricks.total @ u - forces)[free]
+    assert np.abs(left).max() < 1e-9 * np.abs(bricks.total).max() * np.abs(u).max()
+    assert bricks.alike((1, -1, 1))[0] == bricks.alike((-1, 1, 1))[0] != bricks.alike((1, 1, -1))[0]
 
 
 def test_space_without_a_cube(coarse):

@@ -13,8 +13,8 @@ from ..core.errors import ElasticError
 from ..core.layout import Layout
 from .mesh import block, section
 
-_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.1, 3.0), (0.25, 0.05, 2.5))  # brick on a face, at an edge, growth
-_BYTES = {2: 3e5, 3: 6e5}  # of memory per corner of an element at the peak, measured
+_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.2, 2.0), (0.25, 0.1, 1.5))  # brick on a face, at an edge, growth
+_BYTES = {2: 3e5, 3: 8e5}  # of memory per corner of an element at the peak, measured
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,8 @@ def pad_stresses(
 ) -> Array:
     """Mean normal stress (pads, n) under n loads; forces(parity) are their nodal forces (dofs, n) of a parity."""
     stresses: Array | float = 0.0
-    for parity in itertools.product((1, -1), repeat=solid.dim):
+    parities = itertools.product((1, -1), repeat=solid.dim)
+    for parity in sorted(parities, key=lambda parity: solid.alike(parity)[0], reverse=True):
         report("parity " + "".join("+" if sign > 0 else "-" for sign in parity))
         pads = [pad for pad in range(layout.n_pads) if _sees(layout, pad, parity)]
         load = forces(parity)

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_NEAR = 1.5
+_FAR = 3.0
 _DIRECTIONS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float)
 
 
@@ -57,11 +59,19 @@ def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
 
 
 def block(half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float) -> skfem.MeshHex:
-    """Bricks on the product of [0, half[k]]: `size` on a face, shrinking to `smallest` at its edges."""
+    """Bricks on the product of [0, half[k]]: `size` on a face, shrinking to `smallest` at its edges.
+
+    They grow by `growth` up to _NEAR from the face; what the cube adds to the stress has decayed there, and the
+    linear field that is left needs no fine mesh: beyond they grow by _FAR.
+    """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
     face = np.concatenate([_inner(inner, inner[-1], size), fine[1:]])
-    lines = [np.concatenate([face, 1.0 + _graded(h - 1.0, smallest, growth)[1:]]) for h in half]
+    lines = []
+    for h in half:
+        near = 1.0 + _graded(min(h - 1.0, _NEAR), smallest, growth)
+        far = _outer(near[-1], h, near[-1] - near[-2], _FAR, np.inf)
+        lines.append(np.concatenate([face, near[1:], far[1:]]))
     return skfem.MeshHex.init_tensor(*lines)
 
 
