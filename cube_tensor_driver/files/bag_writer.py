@@ -225,26 +225,35 @@ def write_metadata(folder: Path) -> int:
     topics: dict[tuple[str, str], dict[str, Any]] = {}
     for path in paths:
         with damage(path), Reader(path) as reader:
-            counted = reader.message_count
-            begun, length = reader.start_time, max(0, reader.duration - 1)
-            files.append({"path": path.name, "starting_time": {"nanoseconds_since_epoch": begun},
-                          "duration": {"nanoseconds": length}, "message_count": counted})  # fmt: skip
+            files.append(describe_file(path.name, reader.start_time, reader.end_time - 1, reader.message_count))
             for connection in reader.connections:
                 topic = topics.setdefault((connection.topic, connection.msgtype), _topic(connection))
                 topic["message_count"] += connection.msgcount
+    kind = next(name for name, suffix in SUFFIXES.items() if suffix in kinds)
+    described = describe(kind, files, list(topics.values()))
+    write_yaml(folder / "metadata.yaml", {"rosbag2_bagfile_information": described})
+    return int(described["message_count"])
+
+
+def describe_file(name: str, begin_ns: int, end_ns: int, messages: int) -> dict[str, Any]:
+    """A storage file, as metadata.yaml has it."""
+    return {"path": name, "starting_time": {"nanoseconds_since_epoch": begin_ns},
+            "duration": {"nanoseconds": max(0, end_ns - begin_ns)}, "message_count": messages}  # fmt: skip
+
+
+def describe(storage: str, files: list[dict[str, Any]], topics: list[dict[str, Any]]) -> dict[str, Any]:
+    """All that metadata.yaml says of storage files; mcap files say it of themselves, too. rosbag2 misses no key."""
     used = [file for file in files if file["message_count"]] or files[:1]
     start = min(file["starting_time"]["nanoseconds_since_epoch"] for file in used)
     end = max(file["starting_time"]["nanoseconds_since_epoch"] + file["duration"]["nanoseconds"] for file in used)
-    count = sum(file["message_count"] for file in files)
-    kind = next(name for name, suffix in SUFFIXES.items() if suffix in kinds)
-    write_yaml(folder / "metadata.yaml", {"rosbag2_bagfile_information": {
-        "version": METADATA_VERSION, "storage_identifier": kind, "duration": {"nanoseconds": end - start},
-        "starting_time": {"nanoseconds_since_epoch": start}, "message_count": count,
-        "topics_with_message_count": list(topics.values()), "compression_format": "", "compression_mode": "",
-        "relative_file_paths": [path.name for path in paths], "files": files,
+    return {
+        "version": METADATA_VERSION, "storage_identifier": storage, "duration": {"nanoseconds": end - start},
+        "starting_time": {"nanoseconds_since_epoch": start},
+        "message_count": sum(file["message_count"] for file in files),
+        "topics_with_message_count": topics, "compression_format": "", "compression_mode": "",
+        "relative_file_paths": [file["path"] for file in files], "files": files,
         "custom_data": None, "ros_distro": "rosbags",
-    }})  # fmt: skip
-    return count
+    }  # fmt: skip
 
 
 def _topic(connection: Connection) -> dict[str, Any]:

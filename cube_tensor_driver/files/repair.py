@@ -25,8 +25,9 @@ from rosbags.rosbag2.storage_mcap import (
 )
 
 from ..core.errors import BagError
-from .bag_writer import METADATA_VERSION, SUFFIXES, move_up, write_metadata
+from .bag_writer import METADATA_VERSION, SUFFIXES, describe, describe_file, move_up, write_metadata
 from .bags import DAMAGE, damage
+from .yaml import to_yaml
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, CHUNK, INDEX, DATA_END = 1, 2, 3, 4, 6, 7, 15
@@ -82,7 +83,11 @@ def _seal(path: Path, keep_rest: bool) -> tuple[int, int]:
         if scan.storage.chunks:
             bio.seek(scan.end)
             bio.truncate()
-            scan.storage.close(METADATA_VERSION, "{}")
+            # Its topics rosbag2 takes from the summary; without the other keys it reads nothing.
+            storage = scan.storage
+            count = sum(storage.channel_stats.values())
+            file = describe_file(path.name, storage.message_start_time, storage.message_end_time, count)
+            storage.close(METADATA_VERSION, to_yaml(describe("mcap", [file], [])))
     if not scan.storage.chunks:
         path.unlink()
     return 0 if complete else size - scan.end, scan.damaged
