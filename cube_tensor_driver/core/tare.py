@@ -28,6 +28,8 @@ CONTACT = 3e-4
 """Of the rest frequency: a pad further off is in contact, and drift is not followed (about 0.1 kPa for E = 0.3 MPa)."""
 RELEASE_S = 5.0
 """After contact elastomer creeps back for a while."""
+APPLY_WINDOWS = 20
+"""Drift that was followed comes into force every so many windows, and each time is told: so it can be replayed."""
 
 
 def measure_rest(
@@ -102,10 +104,15 @@ class DriftTracker:
     def __init__(self, pipeline: Pipeline, health: Health) -> None:
         self._pipeline, self._health = pipeline, health
         self._free = np.zeros(len(pipeline.calibrations), int)  # windows since the last contact
+        self._in_force = self._followed = pipeline.rest_frequency
+        self._windows = 0
 
     def step(self, time_constant: float) -> bool:
-        """After each window that `Health` closed; time_constant in s. Whether any rest frequency changed."""
-        health, rest = self._health, self._pipeline.rest_frequency
+        """After each window that `Health` closed; time_constant in s. Whether new rest frequencies came into force."""
+        health, in_force = self._health, self._pipeline.rest_frequency
+        if not np.array_equal(in_force, self._in_force, equal_nan=True):  # tare
+            self._in_force = self._followed = in_force
+        rest = self._followed
         window = health.history[-1]
         cubes = np.arange(len(rest))
         now = window.mean / self._pipeline.temperature_factor(cubes, health.temperature)
@@ -115,9 +122,11 @@ class DriftTracker:
         # Without data nothing is known: silence neither ends a contact nor begins one.
         self._free = np.where(window.rows == 0, self._free, np.where(near & health.still, self._free + 1, 0))
         follow = (self._free * WINDOW_S > RELEASE_S) & (window.rows > 0)
-        if not follow.any():
-            return False
         step = np.where(follow[:, None] & ~bad, (now - rest) * min(1.0, WINDOW_S / time_constant), 0.0)
-        self._pipeline.rest_frequency = np.where(np.isnan(rest), rest, rest + step)
+        self._followed = np.where(np.isnan(rest), rest, rest + step)
+        self._windows += 1
+        if self._windows % APPLY_WINDOWS or np.array_equal(self._followed, in_force, equal_nan=True):
+            return False
+        self._in_force = self._pipeline.rest_frequency = self._followed
         health.refresh()
         return True
