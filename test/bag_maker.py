@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from cube_tensor_driver.core.health import STUCK
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.files.bag_writer import BagWriter, quality
 from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, typestore
@@ -26,7 +28,7 @@ def header(stamp_ns: int, frame_id: str = "skin_base") -> object:
 
 
 def info_of(
-    skin: object, pipeline: Pipeline, stamp_ns: int, sender: str = "reconstruction", version: int = 1
+    skin: object, pipeline: Pipeline, stamp_ns: int, sender: str = "reconstruction", version: int = 2
 ) -> object:
     kinds = {cube.calibration.id: cube.calibration for cube in skin.cubes}
     pose = message("geometry_msgs/msg/Pose", position=message("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0),
@@ -51,14 +53,15 @@ def frequencies_of(k: int, stamp_ns: int, frequency: np.ndarray) -> object:
                    temperature=np.full(n, np.nan, np.float32), pad_fault=np.zeros(n, np.uint32))  # fmt: skip
 
 
-def stress_of(source: object, pipeline: Pipeline) -> object:
-    """Message by message, as the node does where no pad is bad."""
+def stress_of(source: object, pipeline: Pipeline, left_out: np.ndarray) -> object:
+    """Message by message, as the node does; left_out: pads that it found stuck."""
     n = len(source.cube)
-    rows = pipeline.process(source.cube, source.frequency.reshape(n, -1), source.pad_fault, source.temperature)
+    rows = pipeline.process(source.cube, source.frequency.reshape(n, -1), left_out, source.temperature)
+    rows.status[:] |= np.where(left_out > 0, STUCK, 0).astype(np.uint16)
     return message(STRESS, header=source.header, cube=source.cube, sequence=source.sequence,
                    time_offset=source.time_offset, stress=np.ascontiguousarray(rows.stress).ravel(),
                    gradient=np.ascontiguousarray(rows.gradient).ravel(), residual=rows.residual, status=rows.status,
-                   observed=rows.observed)  # fmt: skip
+                   observed=rows.observed, left_out=left_out)  # fmt: skip
 
 
 def loads(pipeline: Pipeline, seconds: float) -> np.ndarray:
@@ -67,8 +70,20 @@ def loads(pipeline: Pipeline, seconds: float) -> np.ndarray:
     return pipeline.rest_frequency * (1 - 0.015 * (1 - np.cos(3 * seconds + phase)))
 
 
-def make_bag(folder: Path, skin_file: Path, messages: int = 300, rate: float = 100.0, **options: object) -> Path:
-    """info, frequencies, stress, and on /force what cube 0 was pressed with: fz = 0.1 N · sin(3 t)."""
+def make_bag(
+    folder: Path,
+    skin_file: Path,
+    messages: int = 300,
+    rate: float = 100.0,
+    left_out: Callable[[int], np.ndarray | int] = lambda k: 0,
+    tare: tuple[int, float] | None = None,
+    **options: object,
+) -> Path:
+    """info, frequencies, stress, and on /force what cube 0 was pressed with: fz = 0.1 N · sin(3 t).
+
+    left_out: of each message, bits of the stuck pads of each cube; tare: from which message on all rest frequencies
+    are so many times those of the calibration.
+    """
     skin = read_skin(skin_file)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     store = typestore()
@@ -81,11 +96,19 @@ def make_bag(folder: Path, skin_file: Path, messages: int = 300, rate: float = 1
             writer.add_topic(topic, kind, [quality(depth=100)])
         writer.add_topic("/info", INFO, [quality(latched=True)])
         put("/info", START_NS, info_of(skin, pipeline, START_NS))
+        made = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
         for k in range(messages):
             stamp_ns = START_NS + round(k / rate * 1e9)
+            if tare is not None and k == tare[0]:
+                made.rest_frequency = tare[1] * pipeline.rest_frequency
+                put("/info", stamp_ns, info_of(skin, made, stamp_ns))
             raw = frequencies_of(k, stamp_ns, loads(pipeline, k / rate))
             put("/frequencies", stamp_ns + 1000, raw)
-            put("/stress", stamp_ns + 2000, stress_of(raw, pipeline))
+            put(
+                "/stress",
+                stamp_ns + 2000,
+                stress_of(raw, made, np.broadcast_to(left_out(k), len(raw.cube)).astype(np.uint32)),
+            )
             force = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.1 * np.sin(3 * k / rate))
             zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
             wrench = message("geometry_msgs/msg/Wrench", force=force, torque=zero)

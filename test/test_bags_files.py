@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -19,15 +20,18 @@ from rosbags.highlevel import AnyReader
 from conftest import ROOT
 from cube_tensor_driver.cli import main
 from cube_tensor_driver.core.errors import BagError
+from cube_tensor_driver.core.health import STUCK
 from cube_tensor_driver.core.oscillator import pad_frequency
-from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.pipeline import PAD_FAULT, Pipeline
 from cube_tensor_driver.files.bag_writer import BagWriter
 from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, Bag, typestore
 from cube_tensor_driver.files.calibration import read_calibration, write_calibration
+from cube_tensor_driver.files.cdr import stress_of_today
 from cube_tensor_driver.files.repair import repair
-from cube_tensor_driver.files.reprocess import Change, Job, reprocess
+from cube_tensor_driver.files.reprocess import Change, Job, Recording, reprocess
 from cube_tensor_driver.files.share import share
 from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.files.yaml import parse_yaml, read_yaml, write_yaml
 
 SKIN = share() / "config" / "skin_demo.yaml"
 KEPT = ROOT / "test" / "data" / "bag_v1"
@@ -52,7 +56,7 @@ def stress(path: Path) -> dict[int, np.ndarray]:
 
 def differing_bits(one: dict[int, np.ndarray], other: dict[int, np.ndarray]) -> int:
     assert one.keys() == other.keys()
-    names = ("cube", "sequence", "time_offset", "stress", "gradient", "residual", "status", "observed")
+    names = ("cube", "sequence", "time_offset", "stress", "gradient", "residual", "status", "observed", "left_out")
     count = 0
     for stamp, record in one.items():
         for name in names:
@@ -129,6 +133,33 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
         np.testing.assert_array_equal(record["stress"], expected.stress, err_msg=str(k))
 
 
+def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
+    """A pad that got stuck long ago, and moves again by now: nothing in the frequencies says that it was left out."""
+    path = make_bag(tmp_path / "bag", SKIN, 150, left_out=lambda k: np.where(np.arange(16) == 3, 1 << 2, 0) * (k < 80))
+    reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    recorded = stress(path)
+    assert differing_bits(recorded, stress(tmp_path / "out")) == 0
+    assert [int(one["left_out"][3]) for one in recorded.values()] == [4] * 80 + [0] * 70
+    assert recorded[START_NS]["status"][3] == PAD_FAULT | STUCK
+    reprocess(Job(path, tmp_path / "bag.parquet", "parquet", Change()))
+    table = pyarrow.parquet.read_table(tmp_path / "bag.parquet")
+    assert table["left_out"].to_numpy()[:16].tolist() == [0, 0, 0, 4] + [0] * 12
+    # another tare judges anew, and does not find it
+    with Bag(path) as bag:
+        ((_, _, rows, left_out), *_) = Recording(bag, "/frequencies", Change(tare=(0.0, 0.1))).batches()
+    assert not left_out.any() and (rows.status & STUCK == 0).all()
+
+
+def test_stress_of_version_1_is_made_one_of_today():
+    with Bag(KEPT) as bag:
+        assert bag.version == 1
+        entry = next(bag.entries({"/stress"}))
+        old, new = bag.decode(entry), typestore().deserialize_cdr(stress_of_today(entry.data), STRESS)
+    np.testing.assert_array_equal(old.stress, new.stress)
+    np.testing.assert_array_equal(old.observed, new.observed)
+    assert len(new.left_out) == len(old.cube) and not new.left_out.any()
+
+
 def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
     for form in ("parquet", "csv"):
         reprocess(Job(bag, tmp_path / f"bag.{form}", form, Change()))
@@ -164,6 +195,29 @@ def test_another_calibration_and_tare(bag, tmp_path, capsys):
     assert np.nanmax(np.abs(before[START_NS + 1_000_000_000]["stress"])) > 100
     assert main(["reprocess", str(bag), "-o", str(tmp_path / "late"), "--tare-from", "50", "51"]) == 1
     assert "0 to 2.990 s" in " ".join(capsys.readouterr().err.split())
+
+
+def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(bag, tmp_path, capsys):
+    """Twice the modulus for one cube; the cubes stand in another order in the file."""
+    known = read_skin(SKIN).cubes[0].calibration
+    write_calibration(tmp_path / "stiff.yaml", dataclasses.replace(known, modulus=2 * known.modulus))
+    data = read_yaml(SKIN)
+    data["cubes"][3]["calibration"] = "stiff.yaml"
+    data["cubes"].reverse()
+    write_yaml(tmp_path / "skin.yaml", data)
+    command = ["reprocess", str(bag), "--jobs", "1", "--skin", str(tmp_path / "skin.yaml")]
+    assert main([*command, "-o", str(tmp_path / "out")]) == 0
+    before, after = stress(bag), stress(tmp_path / "out" / "bag")
+    factor = np.where(np.arange(16) == 3, 2, 1)[:, None]
+    for stamp, record in after.items():
+        np.testing.assert_allclose(record["stress"], factor * before[stamp]["stress"], rtol=1e-5)  # float32
+    with Bag(tmp_path / "out" / "bag") as made:
+        ids = [cube.calibration_id for cube in made.infos("/info")[0].cubes]
+    assert len(set(ids)) == 2 and ids.count(ids[3]) == 1
+    del data["cubes"][5]
+    write_yaml(tmp_path / "skin.yaml", data)
+    assert main([*command, "-o", str(tmp_path / "less")]) == 1
+    assert "has no cubes c10" in " ".join(capsys.readouterr().err.split())
 
 
 def test_reprocess_goes_on_where_it_ended(bag, tmp_path, capsys):
@@ -222,6 +276,18 @@ def test_cut_off_anywhere_is_repaired(bag, tmp_path):
         assert next(path.glob("*.mcap")).read_bytes()[:kept] == data[:kept]
         assert sum(one.stat().st_size for one in path.glob("*.rest")) == done.cut
         assert repair(path).cut == 0
+        # rosbag2 reads nothing where one of these is missing
+        own, good = said_of_itself(next(path.glob("*.mcap"))), said_of_itself(next(bag.glob("*.mcap")))
+        assert own.keys() == good.keys() and own["message_count"] == complete
+        assert own["files"][0].keys() == good["files"][0].keys()
+
+
+def said_of_itself(path: Path) -> dict:
+    """The metadata inside an mcap file."""
+    data = path.read_bytes()
+    at = data.rindex(b"serialized_metadata") + len(b"serialized_metadata")
+    (length,) = struct.unpack_from("<I", data, at)
+    return parse_yaml(data[at + 4 : at + 4 + length].decode(), "metadata")
 
 
 def test_random_damage_is_one_message_or_no_harm(tmp_path):
@@ -285,16 +351,22 @@ def test_an_unknown_version_is_refused(tmp_path):
         bag.infos("/info")
 
 
-def test_the_kept_bag_of_version_1_can_be_read(tmp_path):
-    reprocess(Job(KEPT, tmp_path / "out", "bag", Change()))
-    recorded, again = stress(KEPT), stress(tmp_path / "out")
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_kept_bag_of_each_version_can_be_read(tmp_path, version):
+    """That of version 2 was recorded while a pad was stuck, which had been found before."""
+    kept = ROOT / "test" / "data" / f"bag_v{version}"
+    reprocess(Job(kept, tmp_path / "out", "bag", Change()))
+    recorded, again = stress(kept), stress(tmp_path / "out")
     common = recorded.keys() & again.keys()
     assert len(common) > 100
     for stamp in common:
         # not to the bit: another processor may round otherwise
         np.testing.assert_allclose(again[stamp]["stress"], recorded[stamp]["stress"], rtol=1e-4, atol=0.1)
-    with Bag(KEPT) as bag:
-        assert bag.infos("/info")[0].version == 1
+        np.testing.assert_array_equal(again[stamp]["status"], recorded[stamp]["status"])
+        assert (again[stamp]["left_out"] == np.where((version == 2) & (again[stamp]["cube"] == 1), 1 << 2, 0)).all()
+    with Bag(kept) as bag, Bag(tmp_path / "out") as made:
+        assert bag.version == bag.infos("/info")[0].version == version
+        assert made.version == made.infos("/info")[0].version == 2
 
 
 def test_fit_from_a_bag(tmp_path, capsys):

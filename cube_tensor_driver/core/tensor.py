@@ -90,6 +90,11 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
     return quaternions.quat2mat([w, x, y, z])
 
 
+def rpy_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
+    """(3,) roll, pitch, yaw of a quaternion x, y, z, w; CubeError as rotation_from_quaternion."""
+    return np.array(euler.mat2euler(rotation_from_quaternion(quaternion), "sxyz"))
+
+
 def contact_wrench(stress: np.ndarray, gradient: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
     """Force (N, 3) in N and torque (N, 3) in N m on the square face +z of a reference side in m.
 

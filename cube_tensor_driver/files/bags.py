@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from .yaml import parse_yaml
 
 PACKAGE = "cube_tensor_driver"
 FREQUENCIES, STRESS, INFO = (f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo"))
-VERSIONS = (1,)
+VERSIONS = (1, 2)
 """Of SkinInfo that this package reads. An older one that is not among them has to be converted here."""
 BATCH, BATCH_BYTES = 64, 1 << 19
 """Messages at a time: what numpy costs per call no longer counts, and they fit the cache."""
@@ -140,6 +140,12 @@ class Bag:
             raise BagError(f"{self.path}: damaged: {count} messages on {names}, the bag says {promised}; "
                            "./cube bag repair may help")  # fmt: skip
 
+    @property
+    def version(self) -> int:
+        """Of this package's messages, as the bag defines them."""
+        _, fields = self._types.fielddefs.get(STRESS, ((), ()))
+        return 1 if fields and all(name != "left_out" for name, _ in fields) else max(VERSIONS)
+
     def decode(self, entry: Entry) -> Any:
         """The message. BagError: its bytes do not fit its type."""
         with damage(self.path):
@@ -164,8 +170,9 @@ class Bag:
 
         MessageError: a message contradicts itself.
         """
-        stress = topic in self.topics(STRESS)
-        find, read = (cdr.stress_shape, cdr.read_stress) if stress else (cdr.frequencies_shape, cdr.read_frequencies)
+        find, read = cdr.frequencies_shape, cdr.read_frequencies
+        if topic in self.topics(STRESS):
+            find, read = partial(cdr.stress_shape, version=self.version), partial(cdr.read_stress, version=self.version)
         waiting: list[Entry] = []
         shape, most = cdr.Shape(0, 0, 0), 1
         for entry in self.entries({topic}):

@@ -26,7 +26,9 @@ _FREQUENCIES = (("cube", "u2", 1), ("sequence", "u4", 1), ("time_offset", "i4", 
                 ("frequency", "f4", -1), ("temperature", "f4", 1), ("pad_fault", "u4", 1))  # fmt: skip
 _STRESS = (("cube", "u2", 1), ("sequence", "u4", 1), ("time_offset", "i4", 1), ("stress", "f4", len(STRESS)),
            ("gradient", "f4", len(COMPONENTS) - len(STRESS)), ("residual", "f4", 1), ("status", "u2", 1),
-           ("observed", "u2", 1))  # fmt: skip
+           ("observed", "u2", 1), ("left_out", "u4", 1))  # fmt: skip
+_STRESS_1 = _STRESS[:-1]
+"""Of version 1 of the messages."""
 
 
 class Shape(NamedTuple):
@@ -128,9 +130,9 @@ def frequencies_shape(data: bytes) -> Shape:
     return _checked(data, _FREQUENCIES, Shape(frame, rows, data[place] if place < len(data) else 0))
 
 
-def stress_shape(data: bytes) -> Shape:
+def stress_shape(data: bytes, version: int = 2) -> Shape:
     """Shape of a serialised SkinStress. MessageError: too short, or its fields contradict each other."""
-    return _checked(data, _STRESS, Shape(*_begin(data), 0))
+    return _checked(data, _STRESS_1 if version == 1 else _STRESS, Shape(*_begin(data), 0))
 
 
 def same_shape(one: bytes, other: bytes, shape: Shape) -> bool:
@@ -148,15 +150,16 @@ def read_frequencies(data: Sequence[bytes], shape: Shape) -> Batch:
     return _read(data, _FREQUENCIES, shape)
 
 
-def read_stress(data: Sequence[bytes], shape: Shape) -> Batch:
-    """Serialised SkinStress of one shape. MessageError: fields contradict each other."""
-    return _read(data, _STRESS, shape)
+def read_stress(data: Sequence[bytes], shape: Shape, version: int = 2) -> Batch:
+    """Serialised SkinStress of one shape; version 1 has no left_out. MessageError: fields contradict each other."""
+    return _read(data, _STRESS_1 if version == 1 else _STRESS, shape)
 
 
 def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]]) -> list[bytes]:
     """The serialised SkinStress of each SkinFrequencies of a batch.
 
-    rows: stress, gradient, residual, status, observed of all rows of the batch in order, as a pipeline gives them.
+    rows: stress, gradient, residual, status, observed of all rows of the batch in order, as a pipeline gives them, and
+    the pads left out of each.
     """
     record = _record(_STRESS, batch.shape._replace(pads=0))
     out = np.zeros(len(batch.field), record)
@@ -169,6 +172,13 @@ def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]]) -> list[bytes]:
         out[f"n of {name}"] = batch.shape.rows * width
     whole, size = out.tobytes(), record.itemsize
     return [whole[at : at + size] for at in range(0, len(whole), size)]
+
+
+def stress_of_today(data: bytes) -> bytes:
+    """A serialised SkinStress of version 1 as one of today. MessageError: damaged."""
+    shape = stress_shape(data, version=1)
+    size = _record(_STRESS_1, shape).itemsize
+    return data[:size] + bytes(-size % 4) + struct.pack("<I", shape.rows) + bytes(4 * shape.rows)
 
 
 def _begin(data: bytes) -> tuple[int, int]:

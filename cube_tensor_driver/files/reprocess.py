@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.calibration import Calibration
 from ..core.errors import BagError, CalibrationError, CubeError
@@ -17,8 +18,9 @@ from ..core.health import Health
 from ..core.pipeline import Pipeline, StressRows
 from . import cdr
 from .bag_writer import BagWriter, quality
-from .bags import FREQUENCIES, INFO, STRESS, Bag, Entry, damage, pipeline, typestore
+from .bags import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, Entry, damage, pipeline, typestore
 from .calibration import calibration_text
+from .found import Found
 from .skin import Skin
 from .tables import TableWriter
 
@@ -58,7 +60,7 @@ class Done(NamedTuple):
 
 
 class Recording:
-    """The frequencies of a bag as a stream of stress; `topic` of frequencies.
+    """The frequencies of a bag as a stream of stress; `topic` of frequencies. infos, pipelines: by time.
 
     BagError: no info in the bag, or the change does not fit its cubes.
     """
@@ -77,42 +79,58 @@ class Recording:
             self.pipelines = [self._changed(info, change) for info in infos]
         if change.tare is not None:
             self._tare(*change.tare)
+        # What was found bad under other rest frequencies need not be so under these.
+        self.found = Found(bag, topic, change == Change())
 
-    def batches(self) -> Iterator[tuple[cdr.Batch, list[Entry], StressRows]]:
-        """Frequencies, the messages they came in, and the stress of all their rows in order."""
+    def batches(self) -> Iterator[tuple[cdr.Batch, list[Entry], StressRows, NDArray[np.uint32]]]:
+        """Frequencies, the messages they came in, the stress of all their rows in order, the pads left out of each."""
         for batch, entries in self.bag.batches(self.topic):
             # An info holds for what was sampled from its stamp on: the node stamps it just behind the last row before.
             newest_ns = batch.times_ns.max(axis=1, initial=0)
             which = np.maximum(np.searchsorted(self._since, newest_ns, side="right") - 1, 0)
-            for run in np.split(np.arange(len(which)), np.flatnonzero(np.diff(which)) + 1):
+            known, left_out, bits = self.found.of(batch.stamp_ns, batch.field["cube"])
+            for run in np.split(np.arange(len(which)), np.flatnonzero(np.diff(2 * which + known)) + 1):
                 part = cdr.Batch(batch.shape, batch.stamp_ns[run], batch.field[run])
-                rows = self._process(int(which[run[0]]), part)
-                yield part, entries[run[0] : run[-1] + 1], rows
+                found = (left_out[run], bits[run]) if known[run[0]] else None
+                rows, without = self._process(int(which[run[0]]), part, found)
+                yield part, entries[run[0] : run[-1] + 1], rows, without
+
+    def number(self, newest_ns: int) -> int:
+        """Which info holds for a message whose newest row was sampled then."""
+        return max(int(np.searchsorted(self._since, newest_ns, side="right")) - 1, 0)
 
     def info_messages(self) -> list[bytes]:
         """The SkinInfo messages that go with the stress, serialised."""
         return [_info(info, made) for info, made in zip(self.infos, self.pipelines, strict=True)]
 
-    def _process(self, number: int, batch: cdr.Batch) -> StressRows:
-        """Stress of all rows of a batch, as the reconstruction node makes it message by message."""
+    def _process(
+        self, number: int, batch: cdr.Batch, found: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None
+    ) -> tuple[StressRows, NDArray[np.uint32]]:
+        """Stress of all rows of a batch, as the reconstruction node makes it message by message; pads left out.
+
+        found: pads left out and status bits as the node found them, None to find them anew.
+        """
         of, health = self._use(number)
         field, times_ns = batch.field, batch.times_ns
+        left_out = np.empty(field["pad_fault"].shape, np.uint32)
         edges = np.flatnonzero((field["cube"][1:] != field["cube"][:-1]).any(axis=1)) + 1
         made = []
         try:
             for run in np.split(np.arange(len(field)), edges):
                 cube, part = field["cube"][run[0]], field[run[0] : run[-1] + 1]
-                masks, bits = health.update_many(
-                    cube, part["frequency"], part["pad_fault"], times_ns[run], part["temperature"]
-                )
-                rows = of.process(cube, part["frequency"], masks, part["temperature"])
+                if found is None:
+                    left_out[run], bits = health.update_many(
+                        cube, part["frequency"], part["pad_fault"], times_ns[run], part["temperature"]
+                    )
+                else:
+                    left_out[run], bits = found[0][run], found[1][run]
+                rows = of.process(cube, part["frequency"], left_out[run], part["temperature"])
                 rows.status[:] |= bits.ravel()
                 made.append(rows)
         except CubeError as error:
             raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
-        return (
-            made[0] if len(made) == 1 else StressRows(*(np.concatenate(column) for column in zip(*made, strict=True)))
-        )
+        whole = made[0] if len(made) == 1 else StressRows(*map(np.concatenate, zip(*made, strict=True)))
+        return whole, left_out.ravel()
 
     def _use(self, number: int) -> tuple[Pipeline, Health]:
         """The pipeline under an info, and the health that goes with it: a tare changes rest frequencies only."""
@@ -222,8 +240,8 @@ def _to_bag(bag: Bag, topics: list[str], change: Change, output: Path) -> Done:
             writer.add_topic(f"{skin}stress", STRESS, [quality()])
             for info, data in zip(recording.infos, recording.info_messages(), strict=True):
                 writer.write(f"{skin}info", max(bag.start_ns, min(bag.end_ns, _stamp_ns(info))), data)
-            for batch, entries, stress in recording.batches():
-                for entry, data in zip(entries, cdr.stress_messages(batch, stress), strict=True):
+            for batch, entries, stress, left_out in recording.batches():
+                for entry, data in zip(entries, cdr.stress_messages(batch, (*stress, left_out)), strict=True):
                     writer.write(f"{skin}stress", entry.time_ns, data)
                 messages += len(entries)
                 rows += len(stress.status)
@@ -234,8 +252,9 @@ def _to_table(bag: Bag, topic: str, change: Change, output: Path) -> Done:
     messages = rows = 0
     recording = Recording(bag, topic, change)
     with TableWriter(output, [cube.name for cube in recording.infos[-1].cubes] + ["unknown"]) as table:
-        for batch, entries, stress in recording.batches():
-            table.write(batch.times_ns.ravel(), batch.field["cube"].ravel(), batch.field["sequence"].ravel(), stress)
+        for batch, entries, stress, left_out in recording.batches():
+            field = batch.field
+            table.write(batch.times_ns.ravel(), field["cube"].ravel(), field["sequence"].ravel(), stress, left_out)
             messages += len(entries)
             rows += len(stress.status)
     return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
@@ -255,6 +274,7 @@ def _info(info: Any, made: Pipeline) -> bytes:
     ]  # fmt: skip
     changed = replace(
         info,
+        version=max(VERSIONS),
         sender="reconstruction",
         cubes=cubes,
         calibration_ids=list(distinct),

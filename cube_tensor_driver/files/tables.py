@@ -22,7 +22,8 @@ _SCHEMA = pyarrow.schema(
      ("sequence", pyarrow.uint32()),
      *((f"stress_{name}_Pa", pyarrow.float32()) for name in STRESS),
      *((f"gradient_{name}_Pa_per_m", pyarrow.float32()) for name in COMPONENTS[len(STRESS):]),
-     ("residual", pyarrow.float32()), ("status", pyarrow.uint16()), ("observed", pyarrow.uint16())]
+     ("residual", pyarrow.float32()), ("status", pyarrow.uint16()), ("observed", pyarrow.uint16()),
+     ("left_out", pyarrow.uint32())]
 )  # fmt: skip
 
 
@@ -54,11 +55,16 @@ class TableWriter:
             raise BagError(f"{self._path}: {error.strerror or error}; name a disk with room") from None
 
     def write(
-        self, stamp_ns: NDArray[np.int64], cube: NDArray[np.uint16], sequence: NDArray[np.uint32], rows: StressRows
+        self,
+        stamp_ns: NDArray[np.int64],
+        cube: NDArray[np.uint16],
+        sequence: NDArray[np.uint32],
+        rows: StressRows,
+        left_out: NDArray[np.uint32],
     ) -> None:
-        """Add rows: stamp_ns, cube and sequence (N,)."""
+        """Add rows: stamp_ns, cube, sequence and left_out (N,)."""
         names = pyarrow.DictionaryArray.from_arrays(np.minimum(cube, len(self._cubes)).astype(np.int32), self._cubes)
-        columns = [stamp_ns, names, sequence, *rows.stress.T, *rows.gradient.T, *rows[2:]]
+        columns = [stamp_ns, names, sequence, *rows.stress.T, *rows.gradient.T, *rows[2:], left_out]
         arrays = [pyarrow.array(column) if isinstance(column, np.ndarray) else column for column in columns]
         if self._csv:
             arrays[1] = names.dictionary_decode()

@@ -93,6 +93,7 @@ def read_frequencies(
 
 
 def stress_message(times: Times, rows: StressRows) -> SkinStress:
+    """Of rows that no pad was left out of."""
     return SkinStress(
         header=times.header,
         cube=packed("H", times.cube),
@@ -103,6 +104,7 @@ def stress_message(times: Times, rows: StressRows) -> SkinStress:
         residual=packed("f", rows.residual),
         status=packed("H", rows.status),
         observed=packed("H", rows.observed),
+        left_out=array("I", bytes(4 * len(times.cube))),
     )
 
 
@@ -110,7 +112,8 @@ def read_stress(message: SkinStress) -> tuple[Times, StressRows]:
     """Times and rows, views. MessageError: lengths that do not fit."""
     rows = len(message.cube)
     times = _times(message)
-    fields = {"stress": N_STRESS, "gradient": N_GRADIENT, "residual": 1, "status": 1, "observed": 1}
+    fields = {"stress": N_STRESS, "gradient": N_GRADIENT, "residual": 1, "status": 1, "observed": 1,
+              "left_out": 1}  # fmt: skip
     for name, per_row in fields.items():
         _check_length(message, name, rows * per_row)
     return times, StressRows(

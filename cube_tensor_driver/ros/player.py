@@ -12,7 +12,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from ..core.errors import BagError
-from ..files.bags import PACKAGE, Bag, Entry
+from ..files.bags import PACKAGE, STRESS, Bag, Entry
+from ..files.cdr import stress_of_today
 from .messages import SECOND
 from .recorder import DEPTH, message_class
 
@@ -175,5 +176,6 @@ class Player:
             self._clock.publish(Clock(clock=Time(sec=bag_ns // SECOND, nanosec=bag_ns % SECOND)))
 
     def _publish(self, entry: Entry) -> None:
-        self._publishers[entry.topic].publish(entry.data)
+        old = entry.msgtype == STRESS and self._bag.version == 1
+        self._publishers[entry.topic].publish(stress_of_today(entry.data) if old else entry.data)
         self.published += 1

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -27,10 +28,12 @@ from .messages import info_message
 from .node import BLANKS_KEPT, LATCHED, CubeNode, queue, run, scans_per_message
 from .taring import Taring, tare_folder
 
+if TYPE_CHECKING:
+    from ..files.recorded import RecordedHealth
+
+BAGS = (".mcap", ".db3")
 LISTENERS_S = 0.5
 """How often it is looked up which cubes' own topics anybody listens to."""
-DRIFT_INFO_S = 10
-"""How often rest frequencies that follow drift are published in `info`."""
 
 
 class Reconstruction(CubeNode):
@@ -41,7 +44,7 @@ class Reconstruction(CubeNode):
         super().__init__("reconstruction")
         self._subscribes = subscribes
         self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
-        self.declare("config", "", "Skin file (YAML).")
+        self.declare("config", "", "Skin file (YAML), or a bag: then replayed frequencies give the recorded stress.")
         self.declare("wrench_side", 0.0, "Side of the face that wrenches refer to, m; 0: the cube's own.", (0.0, 10.0))
         self.declare("publish_period", 0.0, "The driver's, for how long queues must be, s.", (0.0, 1.0))
         self.declare("qos_reliability", "reliable", "Reliability of the batch topics.", choices="reliable, best_effort")
@@ -50,13 +53,19 @@ class Reconstruction(CubeNode):
         self.declare("drift_time", 0.0, "Time constant with which rest frequencies follow slow drift while nothing "
                      "touches a cube, s; 0: never.", (0.0, 1e6), live=True)  # fmt: skip
         self._active = False
+        self._recorded: RecordedHealth | None = None
         # In one process with the driver its thread calls `take`, while services run in the main thread.
         self._lock = threading.Lock()
         self._diagnostics = Diagnostics(self, self._statuses)
 
     def configure(self) -> None:
-        skin = self._skin = read_skin(self.config())
-        self._pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+        path, folder = self.config(), tare_folder(self.value("tare_folder"))
+        recorded = self._recorded = _recorded(path)
+        skin = self._skin = recorded.skin if recorded else read_skin(path)
+        self._pipeline = (
+            recorded.pipeline if recorded else Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+        )
+        self._health = recorded or Health(self._pipeline)
         self._rows = self._rows_before = self._invalid = self._bad_messages = 0
         self._lost_messages = self._lost_before = 0
         turns = scans_per_message(self.value("publish_period"), skin.rate)
@@ -67,13 +76,10 @@ class Reconstruction(CubeNode):
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._cubes = CubeTopics(self, skin, self._pipeline, self.value("wrench_side") or None)
-        self._health = Health(self._pipeline)
         self._drift = DriftTracker(self._pipeline, self._health)
         self._drift_time = float(self.value("drift_time"))
-        self._drifted, self._ticks = False, 0
         self._words = CubeHealth(skin, self._pipeline, self._health)
-        folder = tare_folder(self.value("tare_folder"))
-        self._taring = Taring(self, skin, self._pipeline, self._health, folder,
+        self._taring = Taring(self, skin, self._pipeline, self._health, None if recorded else folder,
                               lambda: float(self.value("tare_duration")), self._publish_info, self._lock)  # fmt: skip
         self._listening = self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
         if self._subscribes:
@@ -103,6 +109,8 @@ class Reconstruction(CubeNode):
             for publisher in (self._stress, self._info):
                 self.destroy_publisher(publisher)
             self._cubes.close()
+            if self._recorded is not None:
+                self._recorded.close()
             del self._looking
 
     def take(self, data: bytes) -> None:
@@ -133,13 +141,13 @@ class Reconstruction(CubeNode):
                 rows = self._pipeline.process(cube, given.frequency, pad_fault, given.temperature)
                 self._health.residual(cube, rows.status)
                 rows.status[:] |= status
-                if self._drift_time and self._health.closed != windows:
-                    self._drifted |= self._drift.step(self._drift_time)
+                if self._drift_time and self._health.closed != windows and self._drift.step(self._drift_time):
+                    self._publish_info()
         except CubeError as error:
             self._refuse(error)
             return
         message = self._blank(frame_id, len(cube))
-        message.fill(cube, given.sequence, given.stamp_ns - stamp_ns, *rows)
+        message.fill(cube, given.sequence, given.stamp_ns - stamp_ns, *rows, pad_fault)
         self._stress.publish(message.data(stamp_ns))
         self._rows += len(cube)
         self._invalid += int(np.count_nonzero(rows.status & INVALID))
@@ -162,10 +170,6 @@ class Reconstruction(CubeNode):
         """For diagnostics, of the whole and of cubes that are not fine; what was found since the last time."""
         if not self.configured:
             return []
-        self._ticks += 1
-        if self._drifted and self._ticks % DRIFT_INFO_S == 0:
-            self._drifted = False
-            self._publish_info()
         with self._lock:
             statuses, lines = self._words.statuses(self._taring.uids)
             summary = self._words.summary()
@@ -185,6 +189,16 @@ class Reconstruction(CubeNode):
         text = f"{news} messages lost on the way: see the network" if news > 0 else ""
         level = DiagnosticStatus.WARN if self._bad_messages or text else DiagnosticStatus.OK
         return [make_status("rows", self._skin.name, level, text, values), *statuses]
+
+
+def _recorded(path: Path) -> RecordedHealth | None:
+    """What a bag says, None of a skin file. BagError: no bag."""
+    if not path.is_dir() and path.suffix not in BAGS:
+        return None
+    # Here, because it loads much that a node does not need otherwise.
+    from ..files.recorded import RecordedHealth
+
+    return RecordedHealth(path)
 
 
 def main() -> None:

@@ -35,7 +35,9 @@ def tare_folder(parameter: str) -> Path:
 
 
 class Taring:
-    """The services of one reconstruction. changed: called after rest frequencies have changed; lock: held meanwhile."""
+    """The services of one reconstruction. changed: called when rest frequencies have changed; lock: held meanwhile.
+
+    folder: None keeps and restores nothing."""
 
     def __init__(
         self,
@@ -43,7 +45,7 @@ class Taring:
         skin: Skin,
         pipeline: Pipeline,
         health: Health,
-        folder: Path,
+        folder: Path | None,
         duration: Callable[[], float],
         changed: Callable[[], None],
         lock: AbstractContextManager[Any],
@@ -51,7 +53,7 @@ class Taring:
         self._node, self._skin, self._pipeline, self._health = node, skin, pipeline, health
         self._folder, self._duration, self._changed, self._lock = folder, duration, changed, lock
         self._names = [cube.name for cube in skin.cubes]
-        self._calibrated = pipeline.rest_frequency
+        self._calibrated = Pipeline(pipeline.calibrations).rest_frequency
         self.uids: dict[int, int] = {}
         self.created: dict[int, datetime] = {}
         self._services = [
@@ -87,7 +89,7 @@ class Taring:
             self.uids[number] = uid
             calibration = self._skin.cubes[number].calibration
             try:
-                stored = read_tare(self._folder, uid, calibration)
+                stored = read_tare(self._folder, uid, calibration) if self._folder else None
             except ConfigError as error:
                 self._node.get_logger().warning(f"cube {self._names[number]}: tare not restored: {error}")
                 continue
@@ -124,8 +126,9 @@ class Taring:
         try:
             for number in range(len(self._names)):
                 self._forget(number, rest)
-            for uid in self.uids.values():
-                remove_tare(self._folder, uid)
+            if self._folder is not None:
+                for uid in self.uids.values():
+                    remove_tare(self._folder, uid)
         except ConfigError as error:
             response.success, response.message = False, str(error)
         self._set(rest)
@@ -141,9 +144,11 @@ class Taring:
     def _keep(self, cubes: list[int], rest: np.ndarray) -> str:
         """Write files; returns what the answer should say about it."""
         created = datetime.now(timezone.utc)
+        self.created.update(dict.fromkeys(cubes, created))
+        if self._folder is None:
+            return "; not kept"
         nameless = []
         for number in cubes:
-            self.created[number] = created
             if number not in self.uids:
                 nameless.append(self._names[number])
                 continue
@@ -164,4 +169,4 @@ class Taring:
         with self._lock:
             self._pipeline.rest_frequency = rest
             self._health.refresh()
-        self._changed()
+            self._changed()
