@@ -168,8 +168,8 @@ class Pipeline:
                 flat, flat_limit, flat_v = out.reshape(-1, out.shape[2]), limit.reshape(-1), v.reshape(-1, self.n_pads)
                 for kind, bits, chosen in _distinct(np.tile(column.kind, len(v)), mask.ravel()):
                     table = self._table(kind, bits)
-                    # In this order of axes einsum adds pad by pad, however many rows there are.
-                    flat[chosen] = np.einsum("pc,pn->cn", table.matrix.T, np.ascontiguousarray(flat_v[chosen].T)).T
+                    # Row by row: the last bit of one product for all may depend on how many there are, einsum's too.
+                    flat[chosen] = np.matmul(table.matrix, flat_v[chosen][:, :, None])[:, :, 0]
                     flat_limit[chosen], observed[chosen] = table.limit, table.observed
                 out[:, column.strange] = np.nan
                 observed.reshape(len(v), -1)[:, column.strange] = 0
