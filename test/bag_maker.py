@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.core.health import STUCK
 from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.files.bag_writer import BagWriter, quality
 from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, typestore
 from cube_tensor_driver.files.calibration import calibration_text

@@ -20,9 +20,9 @@ from rosbags.highlevel import AnyReader
 from conftest import ROOT
 from cube_tensor_driver.cli import main
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.core.health import STUCK
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import PAD_FAULT, Pipeline
+from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.files.bag_writer import BagWriter
 from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, Bag, typestore
 from cube_tensor_driver.files.calibration import read_calibration, write_calibration

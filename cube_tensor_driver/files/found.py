@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.health import WORDS
+from ..core.status import WORDS
 from . import cdr
 from .bags import STRESS, Bag
 
