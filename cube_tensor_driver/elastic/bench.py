@@ -6,14 +6,16 @@ Section of the body with the cube, or without it for the true field. Two materia
     finite      compressible neo-Hookean, W = mu/2 (tr F'F - 3 - 2 ln J) + lambda/2 (ln J)^2,
                 so P = mu (F - F^-T) + lambda ln J F^-T, the same lambda and mu at small strain
 
-Newton's method on int P : grad w dV = 0 with prescribed displacements, in steps of the load.
-Source: J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), 6.4.3.
+Newton's method on int P : grad w dV = 0 with prescribed displacements and contact with a rod, in steps of the load.
+No step of it may turn an element inside out, and each must lower the energy or the forces out of balance.
+Sources: J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), 6.4.3; J. Nocedal,
+S. J. Wright, Numerical Optimization (2006), 3.1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import skfem
@@ -26,15 +28,29 @@ from ..core.layout import LAYOUTS, Layout
 from .body import Body
 from .mesh import mirrored, section
 from .pads import interval_weights
+from .rod import Contact, Rod
 from .solid import lame
 
 Array = NDArray[np.float64]
-Prescribed = Callable[[Array, Array], Array]
 
 _TOLERANCE = 1e-9  # of Newton's correction over the largest displacement
-_ITERATIONS = 12
+_ITERATIONS = 30
+_LONGEST = 0.3  # correction of any node at once, d0
+_SHORTENINGS = 7
 _HALVINGS = 5
 _STIFF = 1e4  # cube over body: rigid to 1e-4, without spoiling Newton's numbers
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the load: `prescribed` maps node positions (2, n) in m to displacements (2, n) in m, NaN where a
+    component is free; a rod presses into the top. Gripped: displacements along x count from where the body was
+    after the last step that was not.
+    """
+
+    prescribed: Callable[[Array], Array]
+    rod: Rod | None = None
+    gripped: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +72,7 @@ class Run:
 class Bench:
     """The body on the bench. cube=False replaces the cube by elastomer; finite=True is the neo-Hookean body.
 
-    size: the longest side of an element away from the cube, in d0.
+    size: the longest side of an element away from the cube, in d0; below the top it is half of that.
     """
 
     def __init__(
@@ -65,7 +81,7 @@ class Bench:
         cube: bool = True,
         finite: bool = False,
         layout: Layout | None = None,
-        size: float = 0.7,
+        size: float = 0.5,
     ) -> None:
         self.body, self.cube, self.finite = body, cube, finite
         self.layout = layout or LAYOUTS["planar"]
@@ -73,8 +89,11 @@ class Bench:
         half = self.layout.pad_size / 2
         across = np.abs(self.layout.positions - self.layout.normals).max(axis=1)
         stops = np.unique(np.round([across - half, across + half], 9))
-        quarter = section([body.width / 2 / d0, body.height / 2 / d0], stops, 1, smallest=0.3, largest=size)
-        self.mesh = mirrored(quarter)
+        high = body.height / 2 / d0
+        quarter = section([body.width / 2 / d0, high], stops, 1, smallest=0.3, largest=size)
+        x, z = quarter.p[:, quarter.t].mean(axis=1)
+        quarter = quarter.refined(np.flatnonzero((z > high - 0.9) & (x < 6)))  # where rods press
+        self.mesh = mirrored(skfem.MeshTri(quarter.p.copy(), quarter.t.copy()))
         inside = np.all(np.abs(self.mesh.p[:, self.mesh.t].mean(axis=1)) < 1.0, axis=0)
         self.basis = skfem.Basis(self.mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=4)
         if finite and body.plane != "strain":
@@ -84,22 +103,30 @@ class Bench:
         self._lame = {"lam": lam * stiff, "mu": mu * stiff}
         self._outside = skfem.Basis(self.mesh, self.basis.elem, elements=np.flatnonzero(~inside), intorder=4)
         self._body_lame = {"lam": lam, "mu": mu}
-        self._inside = inside
+        top = self.mesh.facets_satisfying(lambda x: x[1] > high - 1e-9, boundaries_only=True)
+        self._top = skfem.FacetBasis(self.mesh, self.basis.elem, facets=top, intorder=8)
 
-    def run(self, steps: Sequence[Callable[[Array], Array]]) -> Run:
-        """Solve for prescribed displacements, one function for each step, each starting from the last solution.
+    def run(self, steps: Sequence[Step]) -> Run:
+        """Solve the steps, each starting from the last solution.
 
-        A step maps node positions (2, n) in m to displacements (2, n) in m, NaN where a component is free.
         Raises ElasticError when a step is too large for Newton's method.
         """
         d0, x = self.body.side / 2, self.basis.doflocs
         component = np.zeros(self.basis.N, dtype=int)
         component[self.basis.get_dofs(elements=True).all("u^2")] = 1
-        u, rows = np.zeros(self.basis.N), []
+        u = before = loose = np.zeros(self.basis.N)
+        rows, rod = [], None
         for number, step in enumerate(steps, 1):
-            prescribed = step(d0 * x)[component, np.arange(self.basis.N)] / d0
+            prescribed = step.prescribed(d0 * x)[component, np.arange(self.basis.N)] / d0
+            if step.gripped:
+                prescribed = prescribed + np.where(component == 0, loose, 0.0)
             held = ~np.isnan(prescribed)
-            u = self._advance(u, held, prescribed, number)
+            with np.errstate(all="ignore"):  # a failed try passes through inverted elements
+                found = self._newton(2 * u - before, held, prescribed, step.rod)  # as the last step went
+            if found is None:
+                found = self._advance(u, held, prescribed, (rod, step.rod), number)
+            u, before, rod = found, u, step.rod
+            loose = loose if step.gripped else u
             rows.append((self._pads(u), self._state(u), self._turn(u), d0 * u[self.basis.nodal_dofs]))
         return Run(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -123,32 +150,83 @@ class Bench:
         zz = _stress(f, False, self._lame["lam"], self._lame["mu"])[1, 1].mean(axis=1)
         return self.body.side / 2 * u[self.basis.nodal_dofs], zz
 
-    def _advance(self, u: Array, held: NDArray[np.bool_], prescribed: Array, number: int, halvings: int = 0) -> Array:
-        """Newton's method for one step of the load, in halves where it fails."""
+    def _advance(
+        self,
+        u: Array,
+        held: NDArray[np.bool_],
+        prescribed: Array,
+        rods: tuple[Rod | None, Rod | None],
+        number: int,
+        halvings: int = 0,
+    ) -> Array:
+        """Newton's method for one step of the load, from the first rod to the second, in halves where it fails."""
+        before, rod = rods
         with np.errstate(all="ignore"):  # a failed try passes through inverted elements
-            found = self._newton(u, held, prescribed)
+            found = self._newton(u, held, prescribed, rod)
         if found is not None:
             return found
         if halvings == _HALVINGS:
             raise ElasticError(f"step {number} of the load is too large even in {2**_HALVINGS} parts; press less")
-        middle = self._advance(u, held, (u + prescribed) / 2, number, halvings + 1)
-        return self._advance(middle, held, prescribed, number, halvings + 1)
+        half = rod and replace(rod, pressed=(rod.pressed + (before.pressed if before else 0.0)) / 2)
+        middle = self._advance(u, held, (u + prescribed) / 2, (before, half), number, halvings + 1)
+        return self._advance(middle, held, prescribed, (half, rod), number, halvings + 1)
 
-    def _newton(self, u: Array, held: NDArray[np.bool_], prescribed: Array) -> Array | None:
-        u, free = u.copy(), np.flatnonzero(~held)
-        jump = np.where(held, prescribed - u, 0.0)
+    def _newton(self, u: Array, held: NDArray[np.bool_], prescribed: Array, rod: Rod | None) -> Array | None:
+        free, jump = np.flatnonzero(~held), np.where(held, prescribed - u, 0.0)
+        d0 = self.body.side / 2
+        contact = Contact(self._top, rod, d0, self.body.young, self.finite) if rod else None
+        state = self._balance(u, contact)
         for _ in range(_ITERATIONS):
-            field = self.basis.interpolate(u)
-            matrix = _tangent(self.finite).assemble(self.basis, u0=field, **self._lame).tocsc()
-            force = _force(self.finite).assemble(self.basis, u0=field, **self._lame) + matrix @ jump
-            if not np.all(np.isfinite(force)):
+            if state is None:
                 return None
-            change = jump.copy()
-            change[free] = -splu(matrix[free][:, free], permc_spec="MMD_AT_PLUS_A").solve(force[free])
-            u, jump = u + change, np.zeros_like(u)
-            if not self.finite or np.abs(change).max() < _TOLERANCE * np.abs(u).max():
-                return u
+            field = self.basis.interpolate(u)
+            tangent = _tangent(self.finite).assemble(self.basis, u0=field, **self._lame)
+            tried = None
+            for curved in (True, False) if contact else (True,):
+                matrix = (tangent + contact.tangent(u, curved) if contact else tangent).tocsc()
+                change = jump.copy()
+                right = state[0] + matrix @ jump
+                change[free] = -splu(matrix[free][:, free], permc_spec="MMD_AT_PLUS_A").solve(right[free])
+                if (not self.finite and not contact) or np.abs(change).max() < _TOLERANCE * np.abs(u).max():
+                    return np.asarray(u + change)
+                if jump.any():  # the prescribed displacements are taken over whole
+                    tried = u + change, self._balance(u + change, contact)
+                else:
+                    tried = self._search(u, change, state, free, contact)
+                if tried is not None:
+                    break
+            if tried is None:
+                return None
+            (u, state), jump = tried, np.zeros_like(u)
         return None
+
+    def _search(
+        self, u: Array, change: Array, state: tuple[Array, float], free: NDArray[np.int64], contact: Contact | None
+    ) -> tuple[Array, tuple[Array, float]] | None:
+        """As much of a change of u as lowers the energy (by Armijo's rule) or the forces out of balance."""
+        force, energy = state
+        slope, size = float(force[free] @ change[free]), min(1.0, _LONGEST / np.abs(change).max())
+        for _ in range(_SHORTENINGS):
+            there = self._balance(u + size * change, contact)
+            if there is not None and (
+                np.linalg.norm(there[0][free]) < np.linalg.norm(force[free])
+                or (slope < 0 and there[1] <= energy + 1e-4 * size * slope)
+            ):
+                return u + size * change, there
+            size /= 2
+        return None
+
+    def _balance(self, u: Array, contact: Contact | None) -> tuple[Array, float] | None:
+        """Nodal forces out of balance (dofs,) and energy; None when an element is inside out."""
+        field = self.basis.interpolate(u)
+        f = field.grad + np.eye(2)[:, :, None, None]
+        if self.finite and det(f).min() <= 0:
+            return None
+        force = _force(self.finite).assemble(self.basis, u0=field, **self._lame)
+        energy = float((_energy(f, self.finite, **self._lame) * self.basis.dx).sum())
+        if contact:
+            return force + contact.force(u), energy + contact.energy(u)
+        return force, energy
 
     def _turn(self, u: Array) -> float:
         """Angle by which the cube has turned, from the line between the middles of its sides."""
@@ -212,6 +290,15 @@ def _stress(f: Array, finite: bool, lam: Array, mu: Array) -> Array:
     return np.asarray(mu * (f - to) + lam * np.log(det(f)) * to)
 
 
+def _energy(f: Array, finite: bool, lam: Array, mu: Array) -> Array:
+    """Strain energy per volume of the undeformed body (elements, points)."""
+    if not finite:
+        e = (f + transpose(f)) / 2 - eye(np.ones_like(f[0, 0]), 2)
+        return np.asarray(lam / 2 * trace(e) ** 2 + mu * ddot(e, e))
+    log = np.log(det(f))
+    return np.asarray(mu / 2 * (ddot(f, f) - 2 - 2 * log) + lam / 2 * log**2)
+
+
 @skfem.LinearForm
 def _load(w, p):
     return ddot(p.sigma, grad(w))
@@ -239,40 +326,35 @@ def _tangent(finite: bool) -> skfem.BilinearForm:
     return skfem.BilinearForm(form)
 
 
-# prescribed displacements of the bench's three experiments
+# steps of the bench's three experiments
 
 
-def plates(body: Body, pressed: float, sheared: float = 0.0, bonded: bool = True) -> Callable[[Array], Array]:
-    """The top plate pressed down and the bottom plate moved along x, in m; sliding plates leave x free."""
+def plates(body: Body, pressed: float, sheared: float = 0.0, bonded: bool = True, gripped: bool = False) -> Step:
+    """The top plate pressed down and the bottom plate moved along x, in m; sliding plates leave x free.
 
-    def step(x: Array) -> Array:
-        moved = np.full(x.shape, np.nan)
-        top, bottom = _surfaces(body, x)
-        moved[1, top], moved[1, bottom] = -pressed, 0.0
-        held = (top | bottom) if bonded else bottom & (np.abs(x[0]) < 1e-9)
-        moved[0, held] = np.where(bottom[held], sheared, 0.0)
-        return moved
+    gripped: plates that slid before hold the body from now on, as it stands between them.
+    """
 
-    return step
-
-
-def rod(
-    body: Body, pressed: float, place: float, width: float = 5e-3, bonded: bool = False
-) -> Callable[[Array], Array]:
-    """A flat rod of `width` pressed into the top at x = place, in m; the bottom is bonded to its plate."""
-
-    def step(x: Array) -> Array:
-        moved = np.full(x.shape, np.nan)
-        top, bottom = _surfaces(body, x)
-        under = top & (np.abs(x[0] - place) <= width / 2 + 1e-9)
-        moved[:, bottom] = 0.0
-        moved[1, under] = -pressed
+    def prescribed(x: Array) -> Array:
+        moved = _on_plate(body, x, bonded, sheared)
+        top = x[1] > body.height / 2 - 1e-9
+        moved[1, top] = -pressed
         if bonded:
-            moved[0, under] = 0.0
+            moved[0, top] = 0.0
         return moved
 
-    return step
+    return Step(prescribed, gripped=gripped)
 
 
-def _surfaces(body: Body, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    return x[1] > body.height / 2 - 1e-9, x[1] < -body.height / 2 + 1e-9
+def dent(body: Body, rod: Rod, bonded: bool = True) -> Step:
+    """A rod pressed into the top, the bottom bonded to its plate or sliding on it."""
+    return Step(lambda x: _on_plate(body, x, bonded, 0.0), rod)
+
+
+def _on_plate(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
+    """What the bottom plate prescribes; a sliding one holds the middle, for a sliding body to stay in place."""
+    moved = np.full(x.shape, np.nan)
+    bottom = x[1] < -body.height / 2 + 1e-9
+    moved[1, bottom] = 0.0
+    moved[0, bottom if bonded else bottom & (np.abs(x[0]) < 1e-9)] = sheared
+    return moved

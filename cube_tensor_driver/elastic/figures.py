@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,23 @@ from .fem import Progress, Response
 from .paper import Experiment, experiments, figure_4, loaded_modes, rod_sweep
 from .study import Study
 
+# told apart in grey too: the same colour never comes with the same marker and dashes
+_COLOURS = ("black", "tab:red", "tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "0.5")
+_MARKERS = "os^Dv<>p"
+_DASHES = ("-", "--", "-.", ":")
+
+
+def _style(k: int) -> dict[str, Any]:
+    """Colour, marker and dashes of the k-th curve of a panel."""
+    return {"color": _COLOURS[k % 8], "marker": _MARKERS[k % 8], "linestyle": _DASHES[k % 4],
+            "markersize": 4, "markerfacecolor": "none", "linewidth": 1.2}  # fmt: skip
+
 
 def plot_study(result: Study, path: Path) -> None:
-    """Error against indenter width, one panel per layout and cube side; grey: not better than a fifth."""
+    """Error against indenter width, one panel per layout and cube side; grey: not better than a fifth.
+
+    Full lines: stresses; dashed: gradients, the marker for the component and the colour for the direction.
+    """
     names = list(result.error)
     figure, axes = plt.subplots(
         len(result.sides), len(names), figsize=(4 * len(names), 3 * len(result.sides)), sharex=True, sharey=True,
@@ -37,15 +50,23 @@ def plot_study(result: Study, path: Path) -> None:
             for k, component in enumerate(COMPONENTS):
                 error = result.error[name][side, :, k]
                 if error[0] == error[0]:  # not NaN: observed
-                    style = "-" if k < 6 else "--"
-                    axis.loglog(1e3 * result.widths, error, style, color=f"C{k % 10}", label=component)
+                    axis.loglog(1e3 * result.widths, error, label=component, **_component_style(k))
             axis.set_title(f"{name}, side {1e3 * result.sides[side]:g} mm", fontsize="medium")
             axis.set_ylim(5e-3, 20)
-    axes[0][-1].legend(fontsize="x-small", ncols=3)
+    handles, labels = axes[0][-1].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize="small", ncols=1, loc="outside right center", handlelength=4)
     figure.supxlabel(f"width of the indenter, mm (cube's centre {1e3 * result.depth:g} mm deep)")
     figure.supylabel("largest error over all positions / range of the component")
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def _component_style(k: int) -> dict[str, Any]:
+    """Of component k of 15: six stresses, then the gradients xx_x, xx_y, xx_z, yy_x, ..."""
+    if k < 6:
+        return _style(k) | {"linestyle": "-"}
+    which, along = divmod(k - 6, 3)
+    return _style(which) | {"linestyle": ("--", "-.", ":")[along], "color": ("0.0", "0.35", "tab:cyan")[along]}
 
 
 def plot_convergence(result: Response, path: Path) -> None:
@@ -58,7 +79,7 @@ def plot_convergence(result: Response, path: Path) -> None:
     shown = sorted(last, key=lambda name: -abs(last[name]))[:12]
     for k, name in enumerate(shown):
         away = [100 * abs(row["coefficients"][name] - last[name]) / largest for row in rows[:-1]]
-        axis.loglog(unknowns, away, "osD^v<>p"[k % 8] + "-", color=f"C{k % 10}", markerfacecolor="none", label=name)
+        axis.loglog(unknowns, away, label=name, **_style(k) | {"linestyle": _DASHES[k // 8]})
     axis.set(xlabel="unknowns", ylabel=f"distance from {rows[-1]['unknowns']} unknowns, % of the largest")
     if unknowns:
         axis.set_xticks(unknowns, [str(n) for n in unknowns], minor=False)
@@ -133,9 +154,10 @@ def _draw_field(axis: Any, bench: Bench, moved: Array, stress: Array, window: fl
     total = np.bincount(outside.ravel(), np.tile(stress[around] / 1e3, 3), len(ring))
     kilopascal = total / np.maximum(np.bincount(outside.ravel(), minlength=len(ring)), 1)
     limit = np.percentile(np.abs(kilopascal[near & (ring >= 1)]), 95)
-    image = axis.tripcolor(
-        Triangulation(at[0], at[1], outside.T), kilopascal, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud"
-    )
+    triangles = Triangulation(at[0], at[1], outside.T)
+    image = axis.tripcolor(triangles, kilopascal, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud")
+    levels = limit * np.array([-0.75, -0.5, -0.25, 0.25, 0.5, 0.75])  # negative ones dashed: red and blue are one grey
+    axis.tricontour(triangles, kilopascal, levels, colors="black", linewidths=0.6)
     tall = min(window, bench.body.height / 2 / d0) - 0.25
     grid = np.mgrid[-window + 1 : window - 0.9, -tall : tall + 0.1 : tall / 2.5].reshape(2, -1, 1).swapaxes(0, 1)
     few = [np.argmin(np.hypot(*(bench.mesh.p - point))) for point in grid]
@@ -147,7 +169,7 @@ def _draw_field(axis: Any, bench: Bench, moved: Array, stress: Array, window: fl
     axis.fill(*outline, facecolor="0.8", edgecolor="black", linewidth=1.2)
     edge, top = 1e3 * d0 * window, min(1e3 * d0 * window, 600 * bench.body.height)
     axis.set(xlim=(-edge, edge), ylim=(-top, top), aspect="equal", ylabel="z, mm")
-    axis.figure.colorbar(image, ax=axis, label="sigma_zz, kPa")
+    axis.figure.colorbar(image, ax=axis, label="sigma_zz, kPa (dashed: negative)")
     return float(scale)
 
 
@@ -155,20 +177,22 @@ def plot_experiment(result: Experiment, path: Path) -> None:
     """Frequencies and P_normal, P_shear, P_grad as in Figs. 7 and 8, beside the reconstruction and the truth."""
     figure, axes = plt.subplots(1, 4, figsize=(15, 3.6), layout="constrained")
     x = 1e3 * result.displacement
-    axes[0].plot(x, result.frequency / 1e3, "o-", label=["C1", "C2", "C3", "C4"])
+    for k, label in enumerate(("C1", "C2", "C3", "C4")):
+        axes[0].plot(x, result.frequency[:, k] / 1e3, label=label, **_style(k))
     axes[0].set(title="frequencies", ylabel="kHz")
-    axes[1].plot(x, result.prototype / 1e3, "o-", label=["P_normal", "P_shear", "P_grad"])
+    for k, label in enumerate(("P_normal", "P_shear", "P_grad")):
+        axes[1].plot(x, result.prototype[:, k] / 1e3, label=label, **_style(k))
     axes[1].set(title="prototype, eqs. 8 to 10", ylabel="kHz")
     for axis, modes, title in ((axes[2], range(3), "stress"), (axes[3], range(3, 7), "gradient times d0")):
         for k, mode in enumerate(modes):
-            axis.plot(x, result.recovered[:, mode] / 1e3, "o-", color=f"C{k}", label=PLANE.names[mode])
-            axis.plot(x, result.truth[:, mode] / 1e3, "--", color=f"C{k}")
+            axis.plot(x, result.recovered[:, mode] / 1e3, label=PLANE.names[mode], **_style(k) | {"linestyle": "-"})
+            axis.plot(x, result.truth[:, mode] / 1e3, **_style(k) | {"linestyle": "--"})
         axis.set(title=f"{title} (dashed: true)", ylabel="kPa")
         floor = np.abs(result.recovered).max() / 1e5
         if max(map(abs, axis.get_ylim())) < floor:  # rounding, not a result
             axis.set_ylim(-floor, floor)
     for axis in axes:
-        axis.legend(fontsize="x-small")
+        axis.legend(fontsize="x-small", handlelength=3)
         axis.set_xlabel("displacement, mm")
     figure.suptitle(result.name)
     figure.savefig(path, dpi=110)
@@ -179,18 +203,21 @@ def plot_rod_sweep(table: dict[str, list[float]], path: Path) -> None:
     """The prototype's shear signal over rod positions, split into true shear and cross-talk."""
     figure, axis = plt.subplots(figsize=(6, 3.6), layout="constrained")
     place = 1e3 * np.array(table["place"])
-    for key, label in (("signal", "P_shear"), ("shear", "of it: true local shear"), ("crosstalk", "cross-talk")):
-        axis.plot(place, np.array(table[key]) / 1e3, "o-", label=label)
+    curves = {"signal": "P_shear", "shear": "of it: true local shear", "crosstalk": "cross-talk"}
+    for k, (key, label) in enumerate(curves.items()):
+        axis.plot(place, np.array(table[key]) / 1e3, label=label, **_style(k))
     axis.set(xlabel="rod's middle from the cube's middle, mm", ylabel="-v1 + v2 + v3 - v4, kPa")
     axis.legend()
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def make_paper(out: Path, progress: Progress | None = None) -> list[Path]:
-    """All pictures of docs/paper.md but the study's, and their numbers as paper.json, into the folder `out`."""
+def make_paper(out: Path, progress: Progress | None = None) -> tuple[list[Path], dict[str, object]]:
+    """All pictures of docs/paper.md but the study's into the folder `out`; returns their paths and the numbers."""
     out.mkdir(parents=True, exist_ok=True)
     made = [out / "figure_4.png"]
+    if progress is not None:
+        progress(0, 1, "figure 4")
     plot_figure_4(made[0])
     numbers: dict[str, object] = {}
     for half, kind in enumerate(("linear", "finite")):
@@ -210,8 +237,7 @@ def make_paper(out: Path, progress: Progress | None = None) -> list[Path]:
                 "truth": result.truth.tolist(),
             }
     table = rod_sweep()
-    made += [out / "rod_positions.png", out / "paper.json"]
-    plot_rod_sweep(table, made[-2])
+    made.append(out / "rod_positions.png")
+    plot_rod_sweep(table, made[-1])
     numbers["rod positions"] = table
-    made[-1].write_text(json.dumps(numbers, indent=1), encoding="utf-8")
-    return made
+    return made, numbers

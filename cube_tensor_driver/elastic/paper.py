@@ -17,9 +17,10 @@ from ..core.estimator import make_estimator
 from ..core.layout import LAYOUTS
 from ..core.modes import PLANE
 from ..core.oscillator import pad_frequency
-from .bench import Bench, Run, plates, rod
+from .bench import Bench, Run, dent, plates
 from .body import Body
 from .fem import Response, compute_response
+from .rod import Rod
 
 Array = NDArray[np.float64]
 
@@ -48,11 +49,11 @@ class Experiment:
 def experiments(
     body: Body | None = None, finite: bool = False, progress: Callable[[int, int, str], None] | None = None
 ) -> list[Experiment]:
-    """The three experiments, plates bonded and (where they only press) sliding."""
+    """The three experiments, plates bonded and (where they do not shear) sliding."""
     body = body or Body()
-    press = np.linspace(0.5e-3, 3e-3, 6)
-    shear = np.linspace(0.5e-3, 3e-3, 6)
-    dent = np.linspace(0.25e-3, 2e-3, 8)  # under its edges the finite body folds before 3 mm
+    press = shear = np.linspace(0.5e-3, 3e-3, 6)
+    deep = np.linspace(0.25e-3, 3e-3, 12)
+    rods = [Rod(depth, body.side / 4) for depth in deep]
     runs = [
         ("a, top plate pressed, bonded", press, [plates(body, p) for p in press]),
         ("a, top plate pressed, sliding", press, [plates(body, p, bonded=False) for p in press]),
@@ -61,8 +62,13 @@ def experiments(
             np.concatenate([press, 3e-3 + shear]),
             [plates(body, p) for p in press] + [plates(body, 3e-3, s) for s in shear],
         ),
-        ("c, 5 mm rod above C2, sliding", dent, [rod(body, p, body.side / 4) for p in dent]),
-        ("c, 5 mm rod above C2, bonded", dent, [rod(body, p, body.side / 4, bonded=True) for p in dent]),
+        (
+            "b, pressed 3 mm by sliding plates that then grip, sheared",
+            np.concatenate([press, 3e-3 + shear]),
+            [plates(body, p, bonded=False) for p in press] + [plates(body, 3e-3, s, gripped=True) for s in shear],
+        ),
+        ("c, 5 mm rod above C2, bonded bottom", deep, [dent(body, rod) for rod in rods]),
+        ("c, 5 mm rod above C2, sliding bottom", deep, [dent(body, rod, bonded=False) for rod in rods]),
     ]
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
     found = []
@@ -102,7 +108,7 @@ def prototype(frequency: Array) -> Array:
 def rod_sweep(
     body: Body | None = None, places: Sequence[float] = tuple(np.arange(9) * 1e-3), pressed: float = 1e-3
 ) -> dict[str, list[float]]:
-    """How much of the prototype's shear signal under a sliding rod is shear; linear body, per rod position.
+    """How much of the prototype's shear signal under a rod is shear; linear body on a bonded plate, per rod position.
 
     signal: -v1 + v2 + v3 - v4 in Pa; shear: what the true local sigma_zx would give, 4 (c+d) sigma_zx; the rest is
     cross-talk of how the stress varies over the cube, and of the plate that holds the body.
@@ -112,8 +118,9 @@ def rod_sweep(
     row = compute_response(body, LAYOUTS["planar"], "slab", meshes=1).matrix[:4, PLANE.names.index("zx")]
     table: dict[str, list[float]] = {"place": [], "signal": [], "shear": [], "crosstalk": [], "true_zx": []}
     for place in places:
-        pads = with_cube.run([rod(body, pressed, place)]).pads[0, :4]
-        zx = without.run([rod(body, pressed, place)]).state[0, 1]
+        step = dent(body, Rod(pressed, place))
+        pads = with_cube.run([step]).pads[0, :4]
+        zx = without.run([step]).state[0, 1]
         signal, shear = float(_SHEAR @ pads), float(_SHEAR @ row * zx)
         values = (float(place), signal, shear, signal - shear, float(zx))
         for key, value in zip(table, values, strict=True):

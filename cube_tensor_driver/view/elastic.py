@@ -100,7 +100,9 @@ def run_paper(out: Path) -> int:
     """All pictures and numbers of docs/paper.md into a folder."""
     _make_folder(out)
     with progress_bar() as report:
-        made = make_paper(out, report)
+        made, numbers = make_paper(out, report)
+    made.append(out / "paper.json")
+    _write_json(made[-1], numbers)
     Console().print(f"wrote {', '.join(path.name for path in made)} into {out}", highlight=False, soft_wrap=True)
     return 0
 
@@ -272,7 +274,9 @@ def _write_calibration(console: Console, options: Options, result: Response) -> 
 
 def _write_json(path: Path, value: Any) -> None:
     try:
-        path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+        partial = path.with_name(path.name + ".part")  # whole or not at all
+        partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+        partial.replace(path)
     except OSError as error:
         raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None
 

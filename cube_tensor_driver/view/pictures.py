@@ -46,7 +46,7 @@ def run_pictures(folder: Path) -> int:
         else:
             print("no view.png: needs Chromium, apt-get install chromium chromium-driver", file=sys.stderr)
     bench_scale(COUNTS, RATE, MEASURE_S, folder / "scale.json", folder / "scale.png")
-    a, _, b, c, _ = experiments()
+    a, _, b, _, c, _ = experiments()
     save(draw_prototype([a, b, c]), folder / "prototype.png")
     save(draw_field(), folder / "field.png")
     study = field_study()
