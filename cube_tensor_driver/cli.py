@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -233,4 +234,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    # Ended from outside as by Ctrl-C: processes that a command started are ended too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(main())
