@@ -13,7 +13,7 @@ from ..core.errors import ElasticError
 from ..core.layout import Layout
 from .mesh import block, section
 
-_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.2, 2.0), (0.25, 0.1, 1.5))  # brick on a face, at an edge, growth
+_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.2, 2.0), (0.25, 0.15, 1.5))  # brick on a face, at an edge, growth
 _BYTES = {2: 3e5, 3: 8e5}  # of memory per corner of an element at the peak, measured
 
 
