@@ -127,20 +127,22 @@ class Driver(CubeNode):
 
     def _on_frames(self, frames: list[tuple[int, int, Frame]]) -> None:
         """Reader's thread, once per wake-up."""
-        samples: dict[int, tuple[int, list[Sample]]] = {}
+        samples: dict[int, list[Sample]] = {}
+        arrived: dict[int, int] = {}  # of the newest: an earlier time than true would bend the clock's fit
         for link, arrival_ns, frame in frames:
             if isinstance(frame, Sample):
                 verdict = self._accounts[link].sample(frame)
                 if verdict is Verdict.RESET:
                     self._clocks[link].reset()
                 if verdict is not Verdict.DUPLICATE:
-                    samples.setdefault(link, (arrival_ns, []))[1].append(frame)
+                    samples.setdefault(link, []).append(frame)
+                    arrived[link] = arrival_ns
             elif isinstance(frame, Hello):
                 self._learn(link, frame)
             elif isinstance(frame, Stats):
                 self._accounts[link].stats(frame)
-        for link, (arrival_ns, several) in samples.items():
-            stamps = self._clocks[link].update([sample.device_us for sample in several], arrival_ns)
+        for link, several in samples.items():
+            stamps = self._clocks[link].update([sample.device_us for sample in several], arrived[link])
             for sample, stamp_ns in zip(several, stamps, strict=True):
                 self._scan.add(link, sample, stamp_ns)
         if samples and self._scan.complete(self._turns):
