@@ -256,6 +256,21 @@ def test_classified_through_termios() -> None:
         assert open_error("x", error).kind == "not_serial"
 
 
+@pytest.mark.parametrize("function", ["tcsetattr", "tcflush"])
+def test_a_hub_unplugged_while_its_port_is_opened(
+    function: str, pty: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """pyserial passes on what these two report, and it is no OSError."""
+
+    def gone(*_: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(termios, function, gone)
+    with pytest.raises(LinkError, match="plug the hub in") as failed:
+        Link(LinkConfig("a", pty[1])).open()
+    assert failed.value.kind == "no_port"
+
+
 def test_tcp_refused(server: socket.socket) -> None:
     port = url(server)
     server.close()

@@ -72,6 +72,8 @@ class Hosts:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+        for log in self.folder.glob("*.log"):  # pytest shows them when the test fails
+            print(f"{log.name}:\n{log.read_text(errors='replace')[-2000:]}")
         for name in self._names.values():
             subprocess.run(["ip", "netns", "del", name], check=False)
 
@@ -97,7 +99,7 @@ def hosts(domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Itera
         hosts.close()
 
 
-def wait(done: Callable[[], object], seconds: float = 30.0) -> None:
+def wait(done: Callable[[], object], seconds: float = 60.0) -> None:
     until = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < until, f"did not happen within {seconds} s"

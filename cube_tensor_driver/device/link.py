@@ -277,9 +277,10 @@ class Link:
 def open_error(path: str, error: BaseException) -> LinkError:
     """What a failed attempt to open `path` means, in words: kinds of the module's first line."""
     code = getattr(error, "errno", None)
-    if code is None and isinstance(error.__context__, termios.error):
-        # pyserial swallows the number of the errors that termios reports.
-        code = error.__context__.args[0]
+    for source in (error, error.__context__):
+        # pyserial lets some errors of termios through and hides the number of others.
+        if code is None and isinstance(source, termios.error):
+            code = source.args[0]
     if code in _OPEN_ERRORS:
         kind, fix = _OPEN_ERRORS[code]
         return LinkError(f"{path}: {os.strerror(code)}: {fix}", kind)
@@ -290,7 +291,7 @@ def _open_port(path: str, baud: int) -> serial.SerialBase:
     try:
         # inter_byte_timeout=0 is VMIN=1: reading nothing is then EAGAIN, and b"" only ever means unplugged.
         port = serial.serial_for_url(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
-    except OSError as error:
+    except (OSError, termios.error) as error:
         raise open_error(path, error) from error
     except ValueError as error:
         kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"

@@ -18,6 +18,8 @@ from .load import Load
 
 TIMES_CHECKED = 500
 """Instants at most whose tensors are compared with the load: each costs a contact problem."""
+RANGE_TIMES = 100
+"""Times of a script at which the range of what it applies is taken."""
 LEAST = 300.0
 """Pressure at the cubes that counts as contact, Pa."""
 
@@ -153,29 +155,28 @@ class Judge:
         return self._in_span(cube, sequence, stamp_ns, values, received_ns)
 
     def _errors(self, cube: NDArray[Any], values: NDArray[Any], true_ns: NDArray[Any]) -> tuple[float, float]:
-        """Root mean square and worst deviation of the observed components, relative to the range that was applied."""
-        calibrations = {c.calibration.id: c.calibration for c in self._skin.cubes}
-        kind = np.array([c.calibration.id for c in self._skin.cubes])
+        """Root mean square and worst deviation of observed components, relative to the range of the whole script."""
         found, applied = [], []
         for time_ns in _checked(true_ns):
             rows = np.flatnonzero(true_ns == time_ns)
-            stress, gradient = self._load.at((time_ns - self._book_start) * 1e-9)
-            truth = np.empty((len(rows), len(COMPONENTS)))
-            for name, calibration in calibrations.items():
-                chosen = kind[cube[rows]] == name
-                members = cube[rows][chosen]
-                truth[chosen] = true_components(calibration, stress[members], gradient[members])
+            applied.append(self._truth((time_ns - self._book_start) * 1e-9)[cube[rows]])
             found.append(values[rows])
-            applied.append(truth)
         if not found:
             return float("nan"), float("nan")
         got, want = np.concatenate(found), np.concatenate(applied)
-        observed = np.isfinite(got)
-        want[~observed] = np.nan
-        seen = observed.any(axis=0)
-        span = np.nanmax(want[:, seen], axis=0) - np.nanmin(want[:, seen], axis=0)
-        relative = (got[:, seen] - want[:, seen])[:, span > 0] / span[span > 0]
+        script = np.concatenate([self._truth(time) for time in np.linspace(0, self._load.period, RANGE_TIMES)])
+        span = np.nanmax(script, axis=0) - np.nanmin(script, axis=0)
+        relative = (got - want)[:, span > 0] / span[span > 0]
         return float(np.sqrt(np.nanmean(relative**2))), float(np.nanmax(np.abs(relative)))
+
+    def _truth(self, seconds: float) -> NDArray[np.float64]:
+        """Components (cubes, 15) that the load makes so many seconds after the start of the book."""
+        stress, gradient = self._load.at(seconds)
+        truth = np.empty((len(self._skin.cubes), len(COMPONENTS)))
+        for calibration in {c.calibration.id: c.calibration for c in self._skin.cubes}.values():
+            members = [i for i, cube in enumerate(self._skin.cubes) if cube.calibration.id == calibration.id]
+            truth[members] = true_components(calibration, stress[members], gradient[members])
+        return truth
 
     def forces(self) -> Forces:
         """The force on the whole skin and its centre from the tensors that arrived, beside the script's."""
