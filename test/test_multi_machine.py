@@ -48,6 +48,8 @@ class Hosts:
             ip("-n", name, "link", "set", "lo", "up")
             ip("-n", name, "address", "add", f"10.231.77.{number}/24", "dev", "cable")
             ip("-n", name, "link", "set", "cable", "up")
+        for name in (robot, desk):  # Fast DDS never takes up a network that was not there when it started
+            wait(lambda name=name: "state UP" in ip("-n", name, "link", "show", "cable"))
 
     def cable(self, state: str) -> None:
         """up or down."""
@@ -78,8 +80,8 @@ class Hosts:
             subprocess.run(["ip", "netns", "del", name], check=False)
 
 
-def ip(*arguments: str) -> None:
-    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+def ip(*arguments: str) -> str:
+    return subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True).stdout
 
 
 @pytest.fixture
