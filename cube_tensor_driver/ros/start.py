@@ -42,8 +42,8 @@ def skin_processes(
     port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
     for the file's. composed: driver and reconstruction in one process. autostart: False leaves nodes to be
     configured and activated by lifecycle transitions. markers, contacts: those nodes, too. book: where
-    the simulator writes what it sampled; instants: see `simulation.main.Simulator`; load: its load script, None for the
-    shipped one.
+    the simulator writes what it sampled; instants: see `simulation.simulator.Simulator`; load: its load script, None
+    for the shipped one.
     """
     start: dict[str, Value] = {} if autostart else {"autostart": False}
     skin: dict[str, Value] = {"config": str(config), **start}

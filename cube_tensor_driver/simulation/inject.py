@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core.errors import ConfigError
 from ..files.yaml import parse_yaml, to_yaml
 from .faults import Fault
-from .main import CONTROL
+from .simulator import CONTROL
 
 
 def inject(ports: Path | None, words: Sequence[str]) -> None:

@@ -35,8 +35,8 @@ from ..ros.messages import to_ns
 from ..ros.node import make_executor, queue
 from ..ros.start import skin_processes
 from ..simulation.faults import FRAME, PAD
-from ..simulation.main import CONTROL
 from ..simulation.reckoning import Reckoning
+from ..simulation.simulator import CONTROL
 
 HUBS, NX, NY, RATE, INSTANTS = 4, 8, 4, 500.0, 1000
 START_S, SETTLE_S, MARGIN_S, DRAIN_S = 40.0, 8.0, 2.0, 60.0
