@@ -209,6 +209,7 @@ def parser() -> argparse.ArgumentParser:
 
     sub = command("test", run.test, "build and run the test suite; arguments go to pytest")
     sub.add_argument("arguments", nargs=argparse.REMAINDER)
+    sub.prefix_chars = ""  # options are pytest's
     command("lint", run.lint, "check style and types (ruff, mypy)")
     # Run by tools/environment.py, before Python modules of the environment are needed; here for --help.
     command("exec", None, "run any command inside the built environment: ./cube exec python -c '…'")
