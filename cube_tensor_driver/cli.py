@@ -155,6 +155,8 @@ def parser() -> argparse.ArgumentParser:
             sub.add_argument("--duration", type=positive, default=10.0, metavar="S", help="seconds to measure (10)")
         if name == "skin":
             sub.add_argument("--composed", action="store_true", help="driver and reconstruction in one process")
+            sub.add_argument("--publish-period", type=not_negative, default=0.0, metavar="S",
+                             help="time that one message covers (0: a message for each scan)")  # fmt: skip
 
     sub = command("record", run.record, "record the topics of a running skin into a bag that ros2 bag reads too")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the bag, a new one")

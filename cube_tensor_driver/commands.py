@@ -125,7 +125,8 @@ def bench(options: argparse.Namespace) -> int:
     if options.what == "echo":
         return bench.bench_echo(options.cubes, options.rate, options.duration, options.json)
     if options.what == "skin":
-        return bench.bench_skin(options.cubes, options.rate, options.duration, options.composed, options.json)
+        return bench.bench_skin(options.cubes, options.rate, options.duration, options.publish_period,
+                                options.composed, options.json)  # fmt: skip
     return bench.bench_scale(options.counts, options.rate, options.duration, options.json, options.figure)
 
 

@@ -14,6 +14,11 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "rate", default_value="0.0", description="Samples per second; 0.0: as the skin file says."
         ),
+        DeclareLaunchArgument(
+            "publish_period",
+            default_value="0.0",
+            description="Time that one message covers, s; 0.0: one for each scan.",
+        ),
         switch("simulate", "Simulate the skin's hubs on pseudo-terminals instead of opening its ports."),
         DeclareLaunchArgument(
             "load", default_value="", description="Load script (YAML) of the simulated skin; empty: something wanders."

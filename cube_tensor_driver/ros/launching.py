@@ -32,17 +32,20 @@ def switch(name: str, description: str, default: str = "false") -> DeclareLaunch
 def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list[LaunchDescriptionEntity]:
     """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask for.
 
-    arguments: config and namespace; port, rate, simulate, load, composed, autostart, markers, contacts, record,
-    rviz, state_publisher if the launch file has them. ConfigError: skin file, load script or an argument is wrong.
+    arguments: config and namespace; port, rate, publish_period, simulate, load, composed, autostart, markers, contacts,
+    record, rviz, state_publisher if the launch file has them. ConfigError: skin file, load script or an argument is
+    wrong.
     """
     given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
     path = Path(given["config"]).expanduser().resolve()
     skin = read_skin(path)
     namespace = given["namespace"]
-    try:
-        rate = float(given.get("rate", 0))
-    except ValueError:
-        raise ConfigError(f"rate:={given['rate']}: must be a number of samples per second") from None
+    numbers = {}
+    for name, what in {"rate": "samples per second", "publish_period": "seconds"}.items():
+        try:
+            numbers[name] = float(given.get(name, 0))
+        except ValueError:
+            raise ConfigError(f"{name}:={given[name]}: must be a number of {what}") from None
 
     load = Path(given["load"]).expanduser().resolve() if given.get("load") else None
     if load is not None:
@@ -54,7 +57,8 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
     processes = skin_processes(
         path,
         port=given.get("port", ""),
-        rate=rate,
+        rate=numbers["rate"],
+        publish_period=numbers["publish_period"],
         composed=wanted("composed"),
         autostart=given.get("autostart") != "false",
         markers=wanted("markers") or wanted("rviz"),

@@ -28,6 +28,7 @@ def skin_processes(
     *,
     port: str = "",
     rate: float = 0.0,
+    publish_period: float = 0.0,
     composed: bool = False,
     autostart: bool = True,
     markers: bool = False,
@@ -40,13 +41,13 @@ def skin_processes(
     """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator too.
 
     port: instead of the one in the file, for a skin with one link. rate: samples per second instead of the file's, 0
-    for the file's. composed: driver and reconstruction in one process. autostart: False leaves nodes to be
-    configured and activated by lifecycle transitions. markers, contacts: those nodes, too. book: where
-    the simulator writes what it sampled; instants: see `simulation.simulator.Simulator`; load: its load script, None
-    for the shipped one.
+    for the file's. publish_period: time that one message covers, s; 0: a message for each scan. composed: driver and
+    reconstruction in one process. autostart: False leaves nodes to be configured and activated by lifecycle
+    transitions. markers, contacts: those nodes, too. book: where the simulator writes what it sampled; instants: see
+    `simulation.main.Simulator`; load: its load script, None for the shipped one.
     """
     start: dict[str, Value] = {} if autostart else {"autostart": False}
-    skin: dict[str, Value] = {"config": str(config), **start}
+    skin: dict[str, Value] = {"config": str(config), "publish_period": publish_period, **start}
     driver: dict[str, Value] = {**skin, "port": port, "rate": rate, "port_directory": str(simulated_ports or "")}
     if composed:
         processes = [Process("composed", "cube_tensor_driver.ros.composed", parameters=driver)]

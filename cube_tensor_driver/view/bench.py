@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import statistics
@@ -14,7 +15,6 @@ from typing import Any
 import numpy as np
 import psutil
 import rclpy
-from numpy.typing import NDArray
 from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 from rich.progress import Progress
@@ -25,18 +25,19 @@ from ..core.calibration import illustrative
 from ..core.errors import ConfigError, CubeError
 from ..core.oscillator import pad_frequency
 from ..core.pipeline import Pipeline
-from ..files import cdr
 from ..files.grid import grid
-from ..files.skin import Skin, read_skin
+from ..files.skin import read_skin
 from ..files.yaml import write_yaml
 from ..ros.children import Children
 from ..ros.node import make_executor, queue
 from ..ros.start import Process, skin_processes
 from .plots import draw_scale, save
+from .tally import Tally
 
 CALIBRATION, LAYOUT, PITCH, CUBES_PER_HUB, INSTANTS = "planar", "planar", 0.012, 80, 16
 ROUNDS = 400
 FIRST_S, SETTLE_S, DRAIN_S = 30.0, 1.0, 1.0
+SAMPLE_S, LONG_S, BLOCKS = 0.5, 60.0, 8
 
 
 def bench_pipeline(cubes: int, json_path: Path | None) -> int:
@@ -78,90 +79,38 @@ def _interleaved(first: Callable[[], None], second: Callable[[], None]) -> tuple
     return statistics.median(times[0]), statistics.median(times[1])
 
 
-class Tally:
-    """Counts what arrives, per hub and sequence number, without keeping the rows."""
-
-    def __init__(self, skin: Skin) -> None:
-        links = [link.name for link in skin.links]
-        link_of = np.array([links.index(cube.link or links[0]) for cube in skin.cubes])
-        self._first = np.zeros(len(skin.cubes), bool)
-        self._first[np.unique(link_of, return_index=True)[1]] = True
-        self._link_of = link_of
-        self.rows = 0
-        self._shape: tuple[bytes, cdr.Shape] | None = None
-        self._arrived: list[tuple[NDArray[Any], NDArray[Any], int]] = []
-
-    def take(self, data: bytes) -> None:
-        """A message as it comes, serialised: whoever measures should not cost what is measured."""
-        received_ns = time.time_ns()
-        if self._shape is None or not cdr.same_shape(data, *self._shape):
-            self._shape = data, cdr.stress_shape(data)
-        field = cdr.read_stress([data], self._shape[1]).field
-        cube = field["cube"][0]
-        first = self._first[cube]
-        sequence = field["sequence"][0][first]
-        self._arrived.append((self._link_of[cube[first]], sequence, received_ns))
-        self.rows += len(cube)
-
-    def result(self, book: dict[str, Any], start_ns: int, end_ns: int) -> dict[str, object]:
-        """Rows sent and received of samples taken from start_ns to end_ns (wall clock), latencies in ms."""
-        sent = received = 0
-        latency = []
-        link = np.concatenate([part[0] for part in self._arrived])
-        sequence = np.concatenate([part[1] for part in self._arrived]).astype(np.int64)
-        arrival = np.repeat([part[2] for part in self._arrived], [len(part[0]) for part in self._arrived])
-        for number, entry in enumerate(book["links"].values()):
-            members = sum(cube >= 0 for cube in entry["cubes"])
-            for run in entry["runs"]:
-                begin_ns = book["start_time_ns"] + 1000 * run["start_us"]
-                times = begin_ns + 1000 * run["period_us"] * np.arange(run["last"] - run["first"] + 1)
-                inside = (times >= start_ns) & (times < end_ns)
-                sent += members * int(inside.sum())
-                mine = (link == number) & (sequence >= run["first"]) & (sequence <= run["last"])
-                place, at = np.unique(sequence[mine] - run["first"], return_index=True)
-                kept = inside[place]
-                received += members * int(kept.sum())
-                latency.append(1e-6 * (arrival[mine][at][kept] - times[place[kept]]))
-        values = np.concatenate(latency)
-        p50, p99 = np.percentile(values, [50, 99]) if len(values) else (math.nan, math.nan)
-        return {
-            "samples_sent": sent,
-            "tensors_received": received,
-            "lost": sent - received,
-            "skipped": sum(entry["dropped"] for entry in book["links"].values()),
-            "latency_p50_ms": round(float(p50), 3),
-            "latency_p99_ms": round(float(p99), 3),
-        }
-
-
 def bench_echo(cubes: int, rate: float, duration: float, json_path: Path | None) -> int:
     """The bare floor alone: source → echo → receive."""
-    with _ros(), Progress(console=Console(stderr=True)) as progress:
+    with _ros(), _progress() as progress:
         result = _echo(cubes, rate, duration, progress)
     _report({"cubes": cubes, "rate_hz": rate, "duration_s": duration, **result}, json_path)
     return 0
 
 
-def bench_skin(cubes: int, rate: float, duration: float, composed: bool, json_path: Path | None) -> int:
+def bench_skin(
+    cubes: int, rate: float, duration: float, publish_period: float, composed: bool, json_path: Path | None
+) -> int:
     """The whole chain, the floor before and after it in the same run."""
-    with _ros(), Progress(console=Console(stderr=True)) as progress:
-        result = _skin_and_echo(cubes, rate, duration, composed, progress)
+    with _ros(), _progress() as progress:
+        result = _skin_and_echo(cubes, rate, duration, progress, publish_period, composed)
     _report(result, json_path)
     return 0
 
 
 def bench_scale(counts: list[int], rate: float, duration: float, json_path: Path | None, figure: Path) -> int:
     """CPU and latency per frame for growing skins, as table and picture."""
-    with _ros(), Progress(console=Console(stderr=True)) as progress:
-        rows = [_skin_and_echo(cubes, rate, duration, False, progress) for cubes in counts]
+    with _ros(), _progress() as progress:
+        rows = [_skin_and_echo(cubes, rate, duration, progress) for cubes in counts]
     _report({"rate_hz": rate, "duration_s": duration, "skins": rows}, json_path)
     save(draw_scale(rows), figure)
     return 0
 
 
-def _skin_and_echo(cubes: int, rate: float, duration: float, composed: bool, progress: Progress) -> dict[str, Any]:
+def _skin_and_echo(
+    cubes: int, rate: float, duration: float, progress: Progress, publish_period: float = 0.0, composed: bool = False
+) -> dict[str, Any]:
     before = _echo(cubes, rate, duration / 2, progress)
-    skin = _skin(cubes, rate, duration, composed, progress)
+    skin = _skin(cubes, rate, duration, progress, publish_period, composed)
     after = _echo(cubes, rate, duration / 2, progress)
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     total = sum(value for name, value in skin.items() if name.startswith("cpu_") and "simulator" not in name)
@@ -175,16 +124,17 @@ def _skin_and_echo(cubes: int, rate: float, duration: float, composed: bool, pro
     }
 
 
-def _skin(cubes: int, rate: float, duration: float, composed: bool, progress: Progress) -> dict[str, Any]:
+def _skin(
+    cubes: int, rate: float, duration: float, progress: Progress, publish_period: float, composed: bool
+) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
         path = folder / "skin.yaml"
         hubs = math.ceil(cubes / CUBES_PER_HUB)
         write_yaml(path, grid("skin", cubes, 1, PITCH, hubs, CALIBRATION, LAYOUT, rate, "/dev/ttyACM{}"))
         book = folder / "book.json"
-        processes = skin_processes(
-            path, composed=composed, simulated_ports=folder / "ports", book=book, instants=INSTANTS
-        )
+        processes = skin_processes(path, publish_period=publish_period, composed=composed,
+                                   simulated_ports=folder / "ports", book=book, instants=INSTANTS)  # fmt: skip
         tally = Tally(read_skin(path))
         with Children(folder) as children:
             begun = time.monotonic()
@@ -196,7 +146,7 @@ def _skin(cubes: int, rate: float, duration: float, composed: bool, progress: Pr
         return {
             **result,
             **{f"cpu_{executable}_percent": round(cpu[executable], 1) for executable in names},
-            "rss_mb": round(max(value for executable, value in memory.items() if executable != "simulator"), 1),
+            **_memory(memory),
             "first_tensor_s": round(started, 2),
         }
 
@@ -228,11 +178,15 @@ def _measure(
     duration: float,
     progress: Progress,
     what: str,
-) -> tuple[dict[str, float], dict[str, float], tuple[int, int, float]]:
+) -> tuple[dict[str, float], dict[str, list[float]], tuple[int, int, float]]:
     """Start processes, wait for the first tensors, let them settle, measure for `duration`.
 
-    Returns CPU in percent and memory in MB per process, and (start ns, end ns, monotonic time of the first tensor).
+    Returns CPU in percent and memory in MB, twice a second, per process, and (start ns, end ns, monotonic time of the
+    first tensor).
     """
+    # Nothing of ours may hold up what we measure.
+    gc.collect()
+    gc.freeze()
     for process in processes:
         children.start(process)
     node = rclpy.create_node("bench")
@@ -256,14 +210,16 @@ def _measure(
         spin(SETTLE_S)
         watched = {p.executable: psutil.Process(children.pid(p.executable)) for p in processes}
         cpu = {name: _cpu(process) for name, process in watched.items()}
+        memory: dict[str, list[float]] = {name: [] for name in watched}
         start_ns, start = time.time_ns(), time.monotonic()
         while time.monotonic() - start < duration:
-            spin(min(0.5, duration - (time.monotonic() - start)))
+            spin(min(SAMPLE_S, duration - (time.monotonic() - start)))
             progress.update(task, completed=time.monotonic() - start)
+            for name, one in watched.items():
+                memory[name].append(one.memory_info().rss / 2**20)
         children.check()
         end_ns, seconds = time.time_ns(), time.monotonic() - start
         used = {name: 100 * (_cpu(process) - cpu[name]) / seconds for name, process in watched.items()}
-        memory = {name: process.memory_info().rss / 2**20 for name, process in watched.items()}
         spin(DRAIN_S)
     finally:
         executor.remove_node(node)
@@ -272,9 +228,33 @@ def _measure(
     return used, memory, (start_ns, end_ns, first)
 
 
+def _memory(memory: dict[str, list[float]]) -> dict[str, float]:
+    """Most MB of any process; over a minute or more how fast the fastest grows after the first fifth, and the error.
+
+    A line through the means of blocks: allocators grow in steps, so neighbours in time are not independent.
+    """
+    nodes = [np.array(values) for name, values in memory.items() if name != "simulator"]
+    result = {"rss_mb": round(float(np.max(nodes)), 1)}
+    if len(nodes[0]) * SAMPLE_S >= LONG_S:
+        slopes = []
+        for values in nodes:
+            blocks = [part.mean() for part in np.array_split(values[len(values) // 5 :], BLOCKS)]
+            minutes = np.arange(BLOCKS) * 0.8 * len(values) * SAMPLE_S / 60 / BLOCKS
+            (slope, _), covariance = np.polyfit(minutes, blocks, 1, cov=True)
+            slopes.append((float(slope), float(np.sqrt(covariance[0, 0]))))
+        slope, error = max(slopes)
+        result |= {"rss_mb_per_minute": round(slope, 3), "rss_mb_per_minute_error": round(error, 3)}
+    return result
+
+
 def _cpu(process: psutil.Process) -> float:
     times = process.cpu_times()
     return float(times.user + times.system)
+
+
+def _progress() -> Progress:
+    """Drawn once a second: drawing keeps whoever measures from receiving."""
+    return Progress(console=Console(stderr=True), refresh_per_second=1)
 
 
 class _ros:

@@ -1,0 +1,56 @@
+"""The benchmark of the whole chain: its book must be right, its figures are for whoever runs it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from cube_tensor_driver.view import bench
+
+KEYS = {"cubes", "rate_hz", "duration_s", "samples_sent", "tensors_received", "lost", "skipped", "latency_p50_ms",
+        "cpu_simulator_percent", "cpu_driver_percent", "cpu_reconstruction_percent", "latency_p99_ms",
+        "echo_cpu_percent", "ratio_to_echo", "rss_mb", "first_tensor_s"}  # fmt: skip
+
+
+def test_skin_counts_what_was_sent(domain, tmp_path):
+    """In batches of two, where a message is as long as the latency of its first rows at least."""
+    # pauses and a second floor are for figures only
+    code = (
+        "import functools, sys\n"
+        "from cube_tensor_driver import cli\n"
+        "from cube_tensor_driver.view import bench\n"
+        "bench.SETTLE_S = bench.DRAIN_S = 0.2\n"
+        "bench._echo = functools.cache(bench._echo)\n"
+        "sys.exit(cli.main(sys.argv[1:]))"
+    )
+    arguments = ["bench", "skin", "--cubes", "3", "--rate", "100", "--duration", "0.6", "--publish-period", "0.02"]
+    json_path = tmp_path / "figures.json"
+    command = [sys.executable, "-c", code, *arguments, "--json", str(json_path)]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert process.returncode == 0, process.stderr
+    figures = json.loads(json_path.read_text())
+    assert figures.keys() == KEYS
+    # the measured time ends where a loop of the receiver does
+    assert 3 * 50 <= figures["samples_sent"] <= 3 * 150 and figures["samples_sent"] % 3 == 0
+    assert figures["lost"] == figures["samples_sent"] - figures["tensors_received"] == 0
+    assert figures["latency_p50_ms"] > 5.0
+
+
+def test_growth_of_memory_and_its_error():
+    """A line is found, steps on the way to nowhere are no growth, the simulator does not count."""
+    rng = np.random.default_rng(0)
+    minutes = np.arange(1200) / 120
+    line = 80 + 0.5 * minutes + rng.normal(0, 0.05, 1200)
+    found = bench._memory({"simulator": [999.0] * 1200, "driver": list(line), "reconstruction": [90.0] * 1200})
+    assert found["rss_mb"] == 90.0
+    assert abs(found["rss_mb_per_minute"] - 0.5) < 4 * found["rss_mb_per_minute_error"] < 0.1
+    steps = 80 + np.repeat(rng.normal(0, 0.3, 60), 20)
+    found = bench._memory({"driver": list(steps)})
+    assert abs(found["rss_mb_per_minute"]) < 4 * found["rss_mb_per_minute_error"]
+    assert "rss_mb_per_minute" not in bench._memory({"driver": [80.0] * 20})
