@@ -558,6 +558,30 @@ def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, cap
     assert len(caplog.records) == 1
 
 
+def test_a_thread_that_ends_unasked_says_why_and_lets_go_of_the_ports(
+    hub: PtyHub, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = threading.Event()
+    reader = Reader(
+        [LinkConfig("a", hub.port)],
+        lambda batch: None,
+        lambda link, state, error: closed.set() if state is LinkState.CLOSED else None,
+    )
+    broken = OSError("not foreseen")
+
+    def fail(data: bytes) -> list[Frame]:
+        raise broken
+
+    monkeypatch.setattr(reader.links[0].decoder, "feed", fail)
+    reader.start()
+    hub.expect(Command.HELLO)
+    assert reader.failure is None
+    hub.hello()
+    assert closed.wait(WAIT_S)
+    assert reader.failure is broken and "not foreseen" in caplog.text
+    reader.close()
+
+
 def test_close_from_a_callback(hub: PtyHub) -> None:
     closed = threading.Event()
     reader = Reader(

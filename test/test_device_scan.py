@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from cube_tensor_driver.device.protocol import Hello, Sample
 from cube_tensor_driver.device.scan import Place, Scan
+from cube_tensor_driver.device.sequence import Account
 
 
 def hello(uids, n_pads=2):
@@ -165,6 +168,20 @@ def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
     assert first.frequency[:, 0].tolist() == [1, 1, 11, 11, 2, 2, 12, 12]
     assert second.sequence.tolist() == [2, 2, 2, 2]
     assert scan.take() is None and scan.unaccounted() == 0
+
+
+def test_samples_of_one_wake_up_take_the_newest_arrival_of_their_link():
+    """An earlier one would be earlier than true for all but the first, and bend the clock's fit."""
+    driver = pytest.importorskip("cube_tensor_driver.ros.driver", reason="needs rclpy: run this with ./cube test")
+    asked = []
+    clocks = [
+        SimpleNamespace(update=lambda *given, link=link: asked.append((link, *given)) or given[0]) for link in (0, 1)
+    ]
+    scan = SimpleNamespace(add=lambda *given: None, complete=lambda turns: False)
+    node = SimpleNamespace(_accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _turns=1)
+    frames = [(link, arrival_ns, sample(n, [[1.0]])) for n, link, arrival_ns in ((0, 0, 10), (0, 1, 10), (1, 0, 20))]
+    driver.Driver._on_frames(node, frames)
+    assert [(link, len(times), arrival_ns) for link, times, arrival_ns in asked] == [(0, 2, 20), (1, 1, 10)]
 
 
 def test_pads_that_a_cube_has_not_are_nan():

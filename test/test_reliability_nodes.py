@@ -364,3 +364,17 @@ def test_what_cannot_be_opened_is_said_with_the_fix_and_shut_down_at_once(domain
         process.kill()
         os.close(near)
         os.close(far)
+
+
+def test_a_driver_that_cannot_read_any_more_ends_with_an_error(domain):
+    """Not foreseen, so that it has to be made: it must not go on as if all hubs were silent."""
+    code = (
+        "from cube_tensor_driver.device.reader import Reader\n"
+        "from cube_tensor_driver.ros.driver import main\n"
+        "Reader._tick = lambda *_: 1 / 0\n"
+        "main()"
+    )
+    command = [sys.executable, "-c", code, "--ros-args", *ros_arguments({"config": str(SINGLE)})]
+    process = subprocess.run(command, capture_output=True, text=True, env=os.environ, timeout=30, check=False)
+    assert process.returncode == 1
+    assert "cannot go on: ZeroDivisionError" in process.stderr

@@ -120,8 +120,8 @@ class ClockMap:
     def _take(self, t: float, arrival_ns: int) -> None:
         """One point, t ns of device time since the first: lower the line to it, close the bucket when
         full."""
-        point = (t, arrival_ns - self._first_ns - t)
-        above = self._above(point)
+        delay = arrival_ns - self._first_ns - t
+        above = delay - self._offset - self._drift * t
         if above < 0:
             if above < -STEP_NS:
                 self.resets += 1
@@ -131,7 +131,7 @@ class ClockMap:
             above = 0.0
         self.jitter_ns += (above - self.jitter_ns) / 64
         if self._earliest is None or above < self._above(self._earliest):
-            self._earliest = point
+            self._earliest = t, delay
         if arrival_ns >= self._bucket_end:
             self._bucket_end = arrival_ns + BUCKET_NS
             self._close_bucket(self._earliest)

@@ -31,10 +31,7 @@ from .protocol import Decoder, Hello
 from .tcp import Connecting, parse_url
 
 READ_CHUNK = 1 << 16
-TTY_READ = 4095
-"""The kernel gives at most so much of a tty in one read; less means that there was no more, without asking again."""
-READ_LIMIT = 1 << 18
-"""Bytes taken from one link per wake-up; a link that floods leaves the others their turn."""
+"""Bytes taken from one link at a time; a link that floods leaves the others their turn."""
 OUT_LIMIT = 4096
 BACKOFF_S = (0.25, 5.0)
 BACKOFF_TCP_S = 1.5
@@ -146,25 +143,20 @@ class Link:
         return True
 
     def read(self) -> bytes:
-        """All there is, up to READ_LIMIT; b"" if nothing. LinkError `lost` when the other end is gone."""
-        chunks: list[bytes] = []
-        size = 0
+        """What one call gives, up to READ_CHUNK; b"" if nothing. LinkError `lost` when the other end is gone.
+
+        A tty gives 4 kB at a time. To ask again at once would make us wait until the kernel has moved up the next;
+        while the other links are read that happens by itself.
+        """
         try:
-            while size < READ_LIMIT:
-                chunk = os.read(self._fd, READ_CHUNK)
-                if not chunk:
-                    raise OSError(errno.EIO, "end of stream")
-                chunks.append(chunk)
-                size += len(chunk)
-                if len(chunk) < TTY_READ:
-                    break
+            data = os.read(self._fd, READ_CHUNK)
         except BlockingIOError:
-            pass
+            return b""
         except OSError as error:
-            # What came before the loss is delivered first; the next call finds the loss again.
-            if not chunks:
-                raise self._lost(error) from error
-        return chunks[0] if len(chunks) == 1 else b"".join(chunks)
+            raise self._lost(error) from error
+        if not data:
+            raise self._lost(OSError(errno.EIO, "end of stream"))
+        return data
 
     def write(self, data: bytes) -> None:
         """Send without waiting; what the kernel does not take now waits for `flush`.

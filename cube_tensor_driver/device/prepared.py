@@ -26,11 +26,11 @@ class Prepared:
         whole = encode(sample)
         body = cobs.decode(whole[1:-1])[:-4]
         self._head, self._tail = bytearray(body[:_HEAD]), body[_HEAD:]
-        last = body.rindex(b"\0", _HEAD)
+        last = body.rfind(b"\0", _HEAD)
         self._middle, self._rest = cobs.encode(body[_HEAD:last]), body[last + 1 :]
-        # 254 bytes without a zero before one of those two are coded otherwise.
+        # 254 bytes without a zero before one of those two are coded otherwise, and there may be no zero at all.
         self._whole: Sample | None = None
-        if self.encode(sample.sequence, sample.device_us) != whole:
+        if last < 0 or self.encode(sample.sequence, sample.device_us) != whole:
             self._whole = sample
 
     def encode(self, sequence: int, device_us: int) -> bytes:

@@ -107,7 +107,7 @@ class Hello:
         return cls(hub_uid, firmware, n_pads, period_us, uids, flags)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # not frozen: that would take longer to make than the arrays
 class Sample:
     """One reading of cubes first_cube .. first_cube + n_cubes − 1 of a hub, all at the same instant.
 
@@ -277,6 +277,11 @@ class Decoder:
     def feed(self, data: bytes | bytearray) -> list[Frame]:
         """Frames that `data` completes, in order. Never raises, whatever the bytes are."""
         self.counters.bytes += len(data)
+        last = len(data) - 1
+        if last > MIN_RUN and not data[0] and data.find(0, 1) == last and not (self._tail or self._discarding):
+            # One frame and nothing else, as it mostly comes.
+            only = self._decode(bytes(data[1:last]))
+            return [] if only is None else [only]
         runs: list[bytes] = bytes(data).split(b"\0")
         rest = runs.pop()
         frames: list[Frame] = []

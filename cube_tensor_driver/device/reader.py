@@ -30,9 +30,13 @@ REOPEN_S = 5.0
 """A link without a single byte for so long is opened anew; hubs say HELLO every second."""
 LOOK_S = 0.25
 """How often a waiting link looks whether its port has come back."""
-GATHER = 0.2, 2e-4
+GATHER = 0.2, 1e-3
 """Hubs sample together, but their bytes come one by one. Who comes first waits so long for the others, as a share of
-the sample period and in s at most: one wake-up for all instead of one for each. Arrival may look later by that."""
+the sample period and in s at most: one message for all instead of several."""
+GATHER_STEP_S = 2e-4
+"""They are looked for at this interval, instead of a wake-up for each; arrival may look later by that."""
+NO_WAIT_S = 5e-5
+"""A wait for data shorter than this was none."""
 DRAIN_S = 0.05
 """How long closing waits for the last requests to leave the serial ports."""
 CLOSE_S = 1.5
@@ -68,6 +72,8 @@ class Reader:
     waits, changes. Both run in the reader's thread and must return soon; an exception in them is logged and
     the reader goes on. clock_ns: the clock of arrival times, read after the bytes, so that arrival is never
     earlier than true. period_us: sample period to set on every hub, None leaves the hub's own.
+
+    failure: what ended the thread though nobody asked it to end, None while all is well.
     """
 
     def __init__(
@@ -81,6 +87,7 @@ class Reader:
         """LinkError `bad_port`: a port that can never be opened."""
         self.links = [Link(config) for config in links]
         self.callback_errors = 0
+        self.failure: Exception | None = None
         self._sessions = [_Session(period_us) for _ in links]
         self._on_frames, self._on_state, self._clock_ns = on_frames, on_state, clock_ns
         self._requests: deque[tuple[int, Request]] = deque()
@@ -134,19 +141,25 @@ class Reader:
             selector.register(wake_read, selectors.EVENT_READ, None)
             tick_at = 0.0
             while not self._stopping:
-                ready = selector.select(max(0.0, tick_at - time.monotonic()))
+                now = time.monotonic()
+                ready = selector.select(max(0.0, tick_at - now))
+                begun = time.monotonic()
                 batch = self._serve(selector, ready, wake_read)
+                # Where data waited for us we are late already.
+                waited = begun - now > NO_WAIT_S
+                while batch and waited and time.monotonic() - begun < self._gathering({i for i, _, _ in batch}):
+                    time.sleep(GATHER_STEP_S)
+                    batch += self._serve(selector, selector.select(0), wake_read)
                 if batch:
-                    pause = self._gathering({i for i, _, _ in batch})
-                    if pause:
-                        time.sleep(pause)
-                        batch += self._serve(selector, selector.select(0), wake_read)
                     self._call(self._on_frames, batch)
                 now = time.monotonic()
                 if now >= tick_at:
                     tick_at = now + TICK_S
                     for i in range(len(self.links)):
                         self._tick(selector, i, now)
+        except Exception as error:  # noqa: BLE001  (a thread that ends unseen would look like silent hubs)
+            self.failure = error
+            _log.exception("the thread that reads the links has ended")
         finally:
             self._shut(selector, wake_read)
 
@@ -164,11 +177,11 @@ class Reader:
             try:
                 if events & selectors.EVENT_WRITE and link.is_open:
                     link.flush()
+                    self._watch(selector, key.data)
                 if events & selectors.EVENT_READ and link.is_open:  # else dropped since select returned
                     data = link.read()
                     if data:
                         taken.append((key.data, data))
-                self._watch(selector, key.data)
             except LinkError as error:
                 self._drop(selector, key.data, error)
         batch: list[tuple[int, int, Frame]] = []
@@ -179,13 +192,16 @@ class Reader:
                 for frame in self.links[i].decoder.feed(data):
                     if self._note(i, frame):
                         batch.append((i, arrival_ns, frame))
-                self._watch(selector, i)
+                if self.links[i].unsent:
+                    self._watch(selector, i)
             except LinkError as error:
                 self._drop(selector, i, error)
         return batch
 
     def _gathering(self, came: set[int]) -> float:
         """How long to wait for links that deliver but have not yet, s."""
+        if len(came) == len(self.links):
+            return 0.0
         late = [
             session.actual_us
             for i, (link, session) in enumerate(zip(self.links, self._sessions, strict=True))

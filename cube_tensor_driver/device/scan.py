@@ -68,8 +68,8 @@ class Scan:
         self._places = tuple(places)
         self._pads = np.array([place.n_pads for place in places])
         self._cubes: list[NDArray[np.int32]] = [np.empty(0, np.int32) for _ in range(n_links)]
-        # Per link: the skin's cubes and their pads where every cube of the hub fits; what each sample would find again.
-        self._whole: list[tuple[NDArray[np.uint16], int] | None] = [None] * n_links
+        # Per link: the skin's cubes and a sample's shape where every cube of the hub fits; what each would find again.
+        self._whole: list[tuple[NDArray[np.uint16], tuple[int, int]] | None] = [None] * n_links
         self._hellos: list[Hello | None] = [None] * n_links
         self._live = [False] * n_links
         self._here = [False] * n_links  # has said HELLO since it was last closed or silent
@@ -130,7 +130,7 @@ class Scan:
             return None
         self._cubes[link] = cubes
         fits = (cubes >= 0).all() and (self._pads[cubes] == frame.n_pads).all()
-        self._whole[link] = (cubes.astype(np.uint16), frame.n_pads) if fits else None
+        self._whole[link] = (cubes.astype(np.uint16), (len(cubes), frame.n_pads)) if fits else None
         found = {int(cube): int(frame.cube_uids[index]) for index, cube in enumerate(cubes) if cube >= 0}
         self.uids = {**self.uids, **found}
         return problems
@@ -159,11 +159,13 @@ class Scan:
         parts: list[tuple[NDArray[np.uint16], Sample, int]] = []
         longest = max(map(len, self._gathered))
         for turn in range(longest if turns is None else min(longest, turns)):
-            for link, samples in enumerate(self._gathered):
+            for link, (samples, whole) in enumerate(zip(self._gathered, self._whole, strict=True)):
                 if turn < len(samples):
-                    part = self._select(link, samples[turn][0])
-                    if part is not None:
-                        parts.append((*part, samples[turn][1]))
+                    sample, stamp_ns = samples[turn]
+                    if whole is not None and whole[1] == sample.frequency.shape and sample.first_cube == 0:
+                        parts.append((whole[0], sample, stamp_ns))
+                    elif (part := self._select(link, sample)) is not None:
+                        parts.append((*part, stamp_ns))
         for samples in self._gathered:
             del samples[:turns]
         if not parts:
@@ -189,9 +191,6 @@ class Scan:
 
     def _select(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
         """The skin's cubes of a sample, and the sample without the rows that belong to none."""
-        whole = self._whole[link]
-        if whole is not None and (len(whole[0]), whole[1]) == sample.frequency.shape and sample.first_cube == 0:
-            return whole[0], sample
         cubes = self._cubes[link][sample.first_cube : sample.first_cube + sample.n_cubes]
         known = cubes >= 0
         fits = known & (self._pads[cubes] == sample.n_pads)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import deque
 from dataclasses import asdict, dataclass
 from enum import Enum
 
@@ -47,7 +47,7 @@ class SequenceTracker:
 
     def __init__(self) -> None:
         self.counters = SequenceCounters()
-        self._seen: OrderedDict[int, int] = OrderedDict()  # unwrapped sequence -> device time, the last MEMORY
+        self._seen: deque[tuple[int, int]] = deque(maxlen=MEMORY)  # unwrapped sequence, device time
         self._first = self._next = 0  # unwrapped: they count on past 2**32
         self._newest_us = 0
 
@@ -66,7 +66,7 @@ class SequenceTracker:
             return self._deliver(number, device_us, verdict)
         if ahead < -MEMORY or ahead > MAX_GAP:
             return self._restart(sequence, device_us)
-        if self._seen.get(number) == device_us:
+        if (number, device_us) in self._seen:
             self.counters.duplicate += 1
             return Verdict.DUPLICATE
         if not self._fits(number, device_us):
@@ -90,11 +90,11 @@ class SequenceTracker:
 
     def _fits(self, number: int, device_us: int) -> bool:
         """Whether a sample from before the newest is of the same run: its time lies where its number does."""
-        if number in self._seen:
+        if any(other == number for other, _ in self._seen):
             return False
         if number < self._first:
             return 0 <= self._newest_us - device_us < RESTART_US
-        return all((us <= device_us) if other < number else (us >= device_us) for other, us in self._seen.items())
+        return all((us <= device_us) if other < number else (us >= device_us) for other, us in self._seen)
 
     def _restart(self, sequence: int, device_us: int) -> Verdict:
         self.counters.resets += 1
@@ -112,9 +112,7 @@ class SequenceTracker:
 
     def _deliver(self, number: int, device_us: int, verdict: Verdict) -> Verdict:
         self.counters.delivered += 1
-        self._seen[number] = device_us
-        if len(self._seen) > MEMORY:
-            self._seen.popitem(last=False)
+        self._seen.append((number, device_us))
         return verdict
 
 

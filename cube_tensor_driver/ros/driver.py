@@ -55,6 +55,10 @@ class Driver(CubeNode):
         self._reader: Reader | None = None
         self._diagnostics = Diagnostics(self, self._statuses)
 
+    @property
+    def failure(self) -> Exception | None:
+        return None if self._reader is None else self._reader.failure
+
     def configure(self) -> None:
         skin = read_skin(self.config())
         self._skin = skin

@@ -125,6 +125,11 @@ class CubeNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
+    @property
+    def failure(self) -> Exception | None:
+        """What makes it useless to go on: the process ends with an error."""
+        return None
+
     def configure(self) -> None:
         """Make all that does not touch the outside yet. CubeError: why it cannot be."""
 
@@ -191,6 +196,10 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
             # EventsExecutor.spin() can burn a core and does not return on a signal; spin_once in the main thread does.
             with contextlib.suppress(ExternalShutdownException):
                 executor.spin_once(timeout_sec=SPIN_S)
+            for node in nodes:
+                if node.failure is not None:
+                    node.get_logger().fatal(f"cannot go on: {node.failure!r}: please report it")
+                    stopping, code = True, 1
         for node in reversed(nodes):
             node.deactivate()
             node.cleanup()
