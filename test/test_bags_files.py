@@ -16,6 +16,7 @@ import pyarrow.parquet
 import pytest
 from bag_maker import START_NS, WRENCH, frequencies_of, header, info_of, loads, make_bag, message
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
 from cube_tensor_driver.cli import main
@@ -27,6 +28,7 @@ from cube_tensor_driver.files.bag_writer import BagWriter
 from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, Bag, typestore
 from cube_tensor_driver.files.calibration import read_calibration, write_calibration
 from cube_tensor_driver.files.cdr import stress_of_today
+from cube_tensor_driver.files.mcap import HEAD, BagReader
 from cube_tensor_driver.files.repair import repair
 from cube_tensor_driver.files.reprocess import Change, Job, Recording, reprocess
 from cube_tensor_driver.files.share import share
@@ -79,6 +81,32 @@ def test_a_written_bag_is_read_by_rosbags(tmp_path, options):
     assert times == [START_NS + 10_000_000 * k + 1000 for k in range(300)]
     if "max_seconds" in options:
         assert len(list(path.glob("*.mcap"))) == 3
+
+
+def test_messages_come_in_the_order_in_which_rosbags_reads_them(tmp_path):
+    """Also where chunks overlap in time, times are equal, or only a part is wanted."""
+    rng = np.random.default_rng(5)
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic in ("/a", "/b"):
+            writer.add_topic(topic, WRENCH)
+        for number in range(40):
+            writer.write(("/a", "/b")[number % 2], 1000 + 10 * number, bytes([number]))
+            late = rng.integers(0, 9, 20) if number % 8 == 0 else np.arange(3)
+            data = rng.integers(0, 256, (len(late), HEAD + 5), dtype=np.uint8)
+            writer.write_many("/a", 1000 + 10 * (number - late), data)
+            if number % 3 == 0:
+                writer.flush()
+
+    def messages(kind: type, topics: str, **span: int) -> list[tuple[str, int, bytes]]:
+        with kind(tmp_path / "bag") as reader:
+            wanted = [one for one in reader.connections if one.topic[1] in topics]
+            return [(one.topic, time_ns, bytes(data)) for one, time_ns, data in reader.messages(wanted, **span)]
+
+    for topics in ("a", "b", "ab"):
+        for span in ({}, {"start": 1105}, {"stop": 1290}, {"start": 1100, "stop": 1300}):
+            ours = messages(BagReader, topics, **span)
+            assert ours == messages(Reader, topics, **span) and len(ours) > 3
+            assert [time_ns for _, time_ns, _ in ours] == sorted(time_ns for _, time_ns, _ in ours)
 
 
 def test_type_hashes_are_those_of_ros():

@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import struct
-import zlib
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, NoReturn
 
+import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
-from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ..core.errors import BagError
 from .bags import DAMAGE, damage, typestore
+from .mcap import HEAD, McapOutput
 from .yaml import write_yaml
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -31,9 +31,6 @@ SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 METADATA_VERSION: Literal[9] = 9
 ERRORS = (OSError, WriterError, sqlite3.Error)
 FOREVER = QosTime(9223372036, 854775807)
-CHUNK = 1 << 18
-_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, two times
-_CRC_AT = 9 + 24  # in a chunk record: behind opcode, length, two times and the size
 
 
 def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) -> Qos:
@@ -51,34 +48,19 @@ def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) ->
     )
 
 
-class _Mcap(McapWriter):
-    """rosbags' storage, with the checksum of each chunk filled in; a message takes two writes instead of ten."""
-
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        number, chunk = connection.id, self.chunk
-        self.message_start_time = min(timestamp, self.message_start_time)
-        self.message_end_time = max(timestamp, self.message_end_time)
-        self.channel_stats[number] += 1
-        chunk.message_start_time = min(timestamp, chunk.message_start_time)
-        chunk.message_end_time = max(timestamp, chunk.message_end_time)
-        chunk.msgs[number].append((timestamp, chunk.bio.tell()))
-        chunk.bio.write(_MESSAGE.pack(5, 22 + len(data), number, 0, timestamp, timestamp))
-        chunk.bio.write(data)
-        if chunk.bio.tell() > CHUNK:
-            self.close_chunk()
-
-    def close_chunk(self) -> None:
-        checksum = zlib.crc32(self.chunk.bio.getbuffer())
-        start = self.bio.tell()
-        super().close_chunk()
-        end = self.bio.tell()
-        self.bio.seek(start + _CRC_AT)
-        self.bio.write(checksum.to_bytes(4, "little"))
-        self.bio.seek(end)
-
-
 class _Writer(Writer):
-    STORAGE_PLUGINS = MappingProxyType({StoragePlugin.MCAP: _Mcap, StoragePlugin.SQLITE3: Sqlite3Writer})
+    STORAGE_PLUGINS = MappingProxyType({StoragePlugin.MCAP: McapOutput, StoragePlugin.SQLITE3: Sqlite3Writer})
+
+    def write_many(self, connection: Connection, times_ns: NDArray[np.int64], records: NDArray[np.uint8]) -> None:
+        """`write` of messages of one length, (B, HEAD + bytes)."""
+        if not isinstance(self.storage, McapOutput):
+            for time_ns, record in zip(times_ns.tolist(), records, strict=True):
+                self.write(connection, time_ns, record[HEAD:].tobytes())
+            return
+        self.storage.write_many(connection, times_ns, records)
+        self.counts[connection.id] += len(records)
+        self.min_timestamp = min(int(times_ns.min()), self.min_timestamp)
+        self.max_timestamp = max(int(times_ns.max()), self.max_timestamp)
 
 
 class BagWriter:
@@ -121,31 +103,22 @@ class BagWriter:
 
     def write(self, topic: str, time_ns: int, data: bytes | memoryview) -> None:
         """Add a message, serialised. BagError: the disk is full or gone."""
-        if (self._max_bytes and self._part_bytes >= self._max_bytes) or (
-            self._max_ns and self._part_messages and time_ns - self._part_start_ns >= self._max_ns
-        ):
-            self._attempt(self._complete)
-            self._begin()
-        if not self._part_messages:
-            self._part_start_ns = time_ns
-        if self._writer is None:
-            raise BagError(f"{self.folder} is closed")
-        try:
-            self._writer.write(self._connections[topic], time_ns, data)
-        except ERRORS as error:
-            self._fail(error)
-        self._part_messages += 1
-        self._part_bytes += len(data)
-        self.messages += 1
-        self.bytes += len(data)
+        self._put(1, time_ns, len(data), lambda writer: writer.write(self._connections[topic], time_ns, data))
+
+    def write_many(self, topic: str, times_ns: NDArray[np.int64], records: NDArray[np.uint8]) -> None:
+        """Add B messages of one length, serialised, each behind HEAD bytes: (B, HEAD + bytes). BagError: as `write`.
+
+        They come into one storage file. The records are the bag's own from now on.
+        """
+        self._put(len(records), int(times_ns[0]), records.size - HEAD * len(records),
+                  lambda writer: writer.write_many(self._connections[topic], times_ns, records))  # fmt: skip
 
     def flush(self) -> None:
         """Hand all that was written to the system: it survives the end of this process."""
         storage = self._writer.storage if self._writer else None
-        if isinstance(storage, _Mcap):
-            if storage.chunk.msgs:
+        if isinstance(storage, McapOutput):
+            if storage.indexes:
                 self._attempt(storage.close_chunk)
-            self._attempt(storage.bio.flush)
         elif isinstance(storage, Sqlite3Writer):
             self._attempt(storage.conn.commit)
 
@@ -162,6 +135,26 @@ class BagWriter:
         self._attempt(self._writer.open)
         for topic in self._types:
             self._attempt(lambda topic=topic: self._connect(topic))  # type: ignore[misc]
+
+    def _put(self, count: int, time_ns: int, size: int, write: Callable[[_Writer], None]) -> None:
+        """Write messages into the storage file that is on, or into the next one where it is large or long enough."""
+        if (self._max_bytes and self._part_bytes >= self._max_bytes) or (
+            self._max_ns and self._part_messages and time_ns - self._part_start_ns >= self._max_ns
+        ):
+            self._attempt(self._complete)
+            self._begin()
+        if not self._part_messages:
+            self._part_start_ns = time_ns
+        if self._writer is None:
+            raise BagError(f"{self.folder} is closed")
+        try:
+            write(self._writer)
+        except ERRORS as error:
+            self._fail(error)
+        self._part_messages += count
+        self._part_bytes += size
+        self.messages += count
+        self.bytes += size
 
     def _connect(self, topic: str) -> None:
         if self._writer is None:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Connection, MessageDefinitionFormat
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.storage_mcap import zstd
 from rosbags.rosbag2.storage_sqlite3 import apsw
 from rosbags.serde import SerdeError
@@ -22,6 +23,7 @@ from ..core.calibration import Calibration
 from ..core.errors import BagError, CalibrationError, ConfigError, CubeError, MessageError
 from ..core.pipeline import Pipeline
 from . import cdr
+from .mcap import BagReader
 from .share import share
 from .yaml import parse_yaml
 
@@ -83,7 +85,7 @@ class Bag:
     def __init__(self, path: Path) -> None:
         self.path = path
         with damage(path):
-            self._reader = Reader(path)
+            self._reader = BagReader(path)
 
     def __enter__(self) -> Bag:
         with damage(self.path):
@@ -125,14 +127,20 @@ class Bag:
         self, topics: set[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Entry]:
         """Messages from start_ns until before stop_ns, of some topics or all, in the order of recording."""
+        for connection, time_ns, data in self._messages(topics, start_ns, stop_ns):
+            yield Entry(connection.topic, connection.msgtype, time_ns, data)
+
+    def _messages(
+        self, topics: set[str] | None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
         wanted = [c for c in self.connections if topics is None or c.topic in topics]
         if not wanted:
             return
         count = 0
         with damage(self.path):
-            for connection, time_ns, data in self._reader.messages(wanted, start_ns, stop_ns):
+            for message in self._reader.messages(wanted, start_ns, stop_ns):
                 count += 1
-                yield Entry(connection.topic, connection.msgtype, time_ns, data)
+                yield message
         # A name damaged in one place only makes rosbags leave messages out without a word.
         promised = sum(connection.msgcount for connection in wanted)
         if start_ns is None and stop_ns is None and count != promised:
@@ -165,34 +173,30 @@ class Bag:
                                "a newer one")  # fmt: skip
         return infos
 
-    def batches(self, topic: str) -> Iterator[tuple[cdr.Batch, list[Entry]]]:
-        """Frequencies or stress, in order, as many messages of one shape at a time as follow each other, at most BATCH.
+    def batches(self, topic: str) -> Iterator[tuple[cdr.Batch, NDArray[np.int64]]]:
+        """Frequencies or stress, in order, and when they were recorded in ns, (B,).
 
-        MessageError: a message contradicts itself.
+        As many messages of one shape at a time as follow each other, at most BATCH. BagError: one contradicts itself.
         """
         find, read = cdr.frequencies_shape, cdr.read_frequencies
         if topic in self.topics(STRESS):
             find, read = partial(cdr.stress_shape, version=self.version), partial(cdr.read_stress, version=self.version)
-        waiting: list[Entry] = []
-        shape, most = cdr.Shape(0, 0, 0), 1
-        for entry in self.entries({topic}):
-            if not waiting or len(waiting) >= most or not cdr.same_shape(entry.data, waiting[0].data, shape):
-                if waiting:
-                    yield self._batch(read, waiting, shape)
-                try:
-                    shape = find(entry.data)
-                except MessageError as error:
-                    raise BagError(f"{self.path}: {topic}: {error}") from None
-                waiting, most = [], min(BATCH, BATCH_BYTES // len(entry.data))
-            waiting.append(entry)
-        if waiting:
-            yield self._batch(read, waiting, shape)
-
-    def _batch(self, read: Any, entries: list[Entry], shape: Any) -> tuple[cdr.Batch, list[Entry]]:
+        waiting: list[bytes] = []
+        times_ns: list[int] = []
+        shape, most = cdr.Shape(0, 0, 0), 0
         try:
-            return read([entry.data for entry in entries], shape), entries
+            for _, time_ns, data in self._messages({topic}):
+                if len(waiting) >= most or not cdr.same_shape(data, waiting[0], shape):
+                    if waiting:
+                        yield read(waiting, shape), np.array(times_ns)
+                    waiting, times_ns, most = [], [], max(1, min(BATCH, BATCH_BYTES // len(data)))
+                    shape = find(data)
+                waiting.append(data)
+                times_ns.append(time_ns)
+            if waiting:
+                yield read(waiting, shape), np.array(times_ns)
         except MessageError as error:
-            raise BagError(f"{self.path}: {entries[0].topic}: {error}") from None
+            raise BagError(f"{self.path}: {topic}: {error}") from None
 
     def _own_types(self) -> Typestore:
         types: dict[str, Any] = {}

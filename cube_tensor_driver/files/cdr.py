@@ -52,6 +52,12 @@ class Batch(NamedTuple):
         times: NDArray[np.int64] = self.stamp_ns[:, None] + self.field["time_offset"].astype(np.int64)
         return times
 
+    @property
+    def newest_ns(self) -> NDArray[np.int64]:
+        """(B,) when the newest row of each message was sampled; its stamp where it has none."""
+        newest: NDArray[np.int64] = self.stamp_ns + self.field["time_offset"].max(axis=1, initial=0)
+        return newest
+
 
 class Blank:
     """A serialised message of one shape to fill in place, again and again. field: views on its bytes, by name."""
@@ -115,11 +121,12 @@ def _record(fields: tuple[tuple[str, str, int], ...], shape: Shape) -> np.dtype[
 @lru_cache(maxsize=256)
 def _counts(
     fields: tuple[tuple[str, str, int], ...], shape: Shape
-) -> tuple[np.dtype[Any], np.dtype[Any], tuple[int, ...]]:
-    """The record type of a shape, the same with nothing but its fields' counts, and what those must be."""
+) -> tuple[np.dtype[Any], list[str], NDArray[np.intp], NDArray[Any]]:
+    """The record type of a shape; of its fields with a count: their names, at which word it stands, what it must be."""
     record = _record(fields, shape)
-    widths = {f"n of {name}": shape.pads if width < 0 else width for name, _, width in fields if width}
-    return record, record[list(widths)], tuple(shape.rows * width for width in widths.values())  # type: ignore[return-value]
+    widths = {name: shape.pads if width < 0 else width for name, _, width in fields if width}
+    places = [record.fields[f"n of {name}"][1] // 4 for name in widths]  # type: ignore[index]
+    return record, list(widths), np.array(places), shape.rows * np.array(list(widths.values()), "<u4")
 
 
 def frequencies_shape(data: bytes) -> Shape:
@@ -137,12 +144,9 @@ def stress_shape(data: bytes, version: int = 2) -> Shape:
 
 def same_shape(one: bytes, other: bytes, shape: Shape) -> bool:
     """Whether a message of a type has the shape that another one has; what else its bytes say, reading checks."""
-    rows = -(-(_FIRST_COUNT + 4 + shape.frame) // 4) * 4
-    return (
-        len(one) == len(other)
-        and one[_FIRST_COUNT : _FIRST_COUNT + 4] == other[_FIRST_COUNT : _FIRST_COUNT + 4]
-        and one[rows : rows + 4] == other[rows : rows + 4]
-    )
+    # From the frame id's length to the number of rows.
+    end = -(-(_FIRST_COUNT + 4 + shape.frame) // 4) * 4 + 4
+    return len(one) == len(other) and one[_FIRST_COUNT:end] == other[_FIRST_COUNT:end]
 
 
 def read_frequencies(data: Sequence[bytes], shape: Shape) -> Batch:
@@ -155,14 +159,15 @@ def read_stress(data: Sequence[bytes], shape: Shape, version: int = 2) -> Batch:
     return _read(data, _STRESS_1 if version == 1 else _STRESS, shape)
 
 
-def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]]) -> list[bytes]:
-    """The serialised SkinStress of each SkinFrequencies of a batch.
+def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]], before: int = 0) -> NDArray[np.uint8]:
+    """The serialised SkinStress of each SkinFrequencies of a batch, each behind so many bytes: (B, before + bytes).
 
     rows: stress, gradient, residual, status, observed of all rows of the batch in order, as a pipeline gives them, and
     the pads left out of each.
     """
     record = _record(_STRESS, batch.shape._replace(pads=0))
-    out = np.zeros(len(batch.field), record)
+    made = np.zeros((len(batch.field), before + record.itemsize), np.uint8)
+    out = np.ndarray(len(made), record, made.data, before, made.strides[:1])
     for name in ("encapsulation", "sec", "nanosec", "frame_id", "cube", "sequence", "time_offset"):
         out[name] = batch.field[name]
     out["n of frame_id"] = batch.shape.frame
@@ -170,8 +175,7 @@ def stress_messages(batch: Batch, rows: Sequence[NDArray[Any]]) -> list[bytes]:
         out[name] = np.reshape(values, out[name].shape)
     for name, _, width in _STRESS:
         out[f"n of {name}"] = batch.shape.rows * width
-    whole, size = out.tobytes(), record.itemsize
-    return [whole[at : at + size] for at in range(0, len(whole), size)]
+    return made
 
 
 def stress_of_today(data: bytes) -> bytes:
@@ -205,11 +209,14 @@ def _checked(data: bytes, fields: tuple[tuple[str, str, int], ...], shape: Shape
 
 
 def _read(data: Sequence[bytes], fields: tuple[tuple[str, str, int], ...], shape: Shape) -> Batch:
-    record, counts, expected = _counts(fields, shape)
+    record, names, places, expected = _counts(fields, shape)
     size = record.itemsize
     whole = b"".join(data if len(data[0]) == size else [one[:size] for one in data])
+    counts = np.ndarray((len(data), size // 4), "<u4", whole, 0, (size, 4)).take(places, axis=1)
+    # Bytes, because one comparison of arrays costs as much as all the rest here.
+    if counts.tobytes() != expected.tobytes() * len(data):
+        message, which = np.argwhere(counts != expected)[0].tolist()
+        raise MessageError(f"a message of {shape.rows} rows has {counts[message, which]} values of {names[which]}, "
+                           f"they need {expected[which]}")  # fmt: skip
     field = np.frombuffer(whole, record)
-    for found in set(field.view(counts).tolist()) - {expected}:
-        name, n, wanted = next((k, a, b) for k, a, b in zip(counts.names or (), found, expected, strict=True) if a != b)
-        raise MessageError(f"a message of {shape.rows} rows has {n} values of {name[5:]}, they need {wanted}")
     return Batch(shape, field["sec"].astype(np.int64) * SECOND + field["nanosec"], field)

@@ -62,18 +62,28 @@ class Found:
         if end_ns < self._asked_ns - AHEAD_NS:
             self._begin()
         self._asked_ns = end_ns
-        while self._newest_ns < end_ns + AHEAD_NS and (read := next(self._unread, None)) is not None:
-            self._take(read[0])
         while self._waiting and self._waiting[0].end_ns < begin_ns - AHEAD_NS:
             self._waiting.popleft()
-        for batch in self._waiting:
+        for batch in self._near(end_ns + AHEAD_NS):
             if batch.begin_ns > end_ns or batch.end_ns < begin_ns or batch.left_out.shape[1] != cube.shape[1]:
                 continue
+            if np.array_equal(batch.stamp_ns, stamp_ns) and np.array_equal(batch.cube, cube[:, 0]):
+                return Verdict(np.ones(len(cube), bool), batch.left_out, batch.bits)
             place = np.minimum(np.searchsorted(batch.stamp_ns, stamp_ns), len(batch.stamp_ns) - 1)
             same = (batch.stamp_ns[place] == stamp_ns) & (batch.cube[place] == cube[:, 0])
             found.known[same] = True
             found.left_out[same], found.bits[same] = batch.left_out[place[same]], batch.bits[place[same]]
+            if found.known.all():
+                break
         return found
+
+    def _near(self, until_ns: int) -> Iterator[_Batch]:
+        """Stress read before, and what stands behind it, read on until then."""
+        yield from tuple(self._waiting)
+        while self._newest_ns < until_ns and (read := next(self._unread, None)) is not None:
+            if read[0].shape.rows:
+                self._take(read[0])
+                yield self._waiting[-1]
 
     def _begin(self) -> None:
         self._asked_ns = self._newest_ns = 0
@@ -81,13 +91,10 @@ class Found:
         self._unread: Iterator[Any] = self._bag.batches(self._topic) if self._there else iter(())
 
     def _take(self, batch: cdr.Batch) -> None:
-        if not batch.shape.rows:
-            return
         order = np.argsort(batch.stamp_ns, kind="stable")
-        field = batch.field if (np.diff(order) == 1).all() else batch.field[order]
-        stamp_ns = batch.stamp_ns[order]
+        stamp_ns, field = batch.stamp_ns[order], batch.field
         begin_ns, end_ns = int(stamp_ns[0]), int(stamp_ns[-1])
         self._newest_ns = max(self._newest_ns, end_ns)
-        self._waiting.append(
-            _Batch(begin_ns, end_ns, stamp_ns, field["cube"][:, 0], field["left_out"], field["status"] & BITS)
-        )
+        # Copies: the messages themselves need not be kept.
+        self._waiting.append(_Batch(begin_ns, end_ns, stamp_ns, field["cube"][order, 0], field["left_out"][order],
+                                    field["status"][order] & BITS))  # fmt: skip

@@ -27,10 +27,11 @@ from rosbags.rosbag2.storage_mcap import (
 from ..core.errors import BagError
 from .bag_writer import METADATA_VERSION, SUFFIXES, describe, describe_file, move_up, write_metadata
 from .bags import DAMAGE, damage
+from .mcap import CHUNK, INDEX, in_summary
 from .yaml import to_yaml
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, CHUNK, INDEX, DATA_END = 1, 2, 3, 4, 6, 7, 15
+HEADER, FOOTER, SCHEMA, CHANNEL, DATA_END = 1, 2, 3, 4, 15
 REST = ".rest"
 
 
@@ -163,12 +164,9 @@ class _Chunk:
             storage.channel_stats[channel] = storage.channel_stats.get(channel, 0) + count
         storage.message_start_time = min(storage.message_start_time, self.first)
         storage.message_end_time = max(storage.message_end_time, self.last)
-        summary = BytesIO()
-        summary.write(struct.pack("<QQQQI", self.first, self.last, self.start, self.length, 10 * len(self.indexes)))
-        summary.write(b"".join(struct.pack("<HQ", channel, at) for channel, (at, _) in self.indexes.items()))
-        summary.write(struct.pack("<QI", end - self.start - self.length, len(self.compression)))
-        summary.write(self.compression.encode() + struct.pack("<QQ", self.stored, self.size))
-        storage.chunks.append(summary)
+        places = {channel: at for channel, (at, _) in self.indexes.items()}
+        storage.chunks.append(in_summary(self.first, self.last, self.start, self.start + self.length, end, places,
+                                         self.compression, self.stored, self.size))  # fmt: skip
 
 
 def _record(bio: BinaryIO) -> tuple[int, int, bytes] | None:

@@ -18,14 +18,17 @@ from ..core.health import Health
 from ..core.pipeline import Pipeline, StressRows
 from . import cdr
 from .bag_writer import BagWriter, quality
-from .bags import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, Entry, damage, pipeline, typestore
+from .bags import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, damage, pipeline, typestore
 from .calibration import calibration_text
 from .found import Found
+from .mcap import HEAD
 from .skin import Skin
 from .tables import TableWriter
 
 PARTIAL = ".partial"
 """Folder beside the results for what is not complete; a restart begins those anew."""
+
+BATCHES_BYTES = 30 << 20
 
 
 @dataclass(frozen=True)
@@ -82,18 +85,20 @@ class Recording:
         # What was found bad under other rest frequencies need not be so under these.
         self.found = Found(bag, topic, change == Change())
 
-    def batches(self) -> Iterator[tuple[cdr.Batch, list[Entry], StressRows, NDArray[np.uint32]]]:
-        """Frequencies, the messages they came in, the stress of all their rows in order, the pads left out of each."""
-        for batch, entries in self.bag.batches(self.topic):
+    def batches(self) -> Iterator[tuple[cdr.Batch, NDArray[np.int64], StressRows, NDArray[np.uint32]]]:
+        """Frequencies, when they were recorded, the stress of all their rows in order, the pads left out of each."""
+        for batch, recorded_ns in self.bag.batches(self.topic):
+            field = batch.field
             # An info holds for what was sampled from its stamp on: the node stamps it just behind the last row before.
-            newest_ns = batch.times_ns.max(axis=1, initial=0)
-            which = np.maximum(np.searchsorted(self._since, newest_ns, side="right") - 1, 0)
-            known, left_out, bits = self.found.of(batch.stamp_ns, batch.field["cube"])
-            for run in np.split(np.arange(len(which)), np.flatnonzero(np.diff(2 * which + known)) + 1):
-                part = cdr.Batch(batch.shape, batch.stamp_ns[run], batch.field[run])
-                found = (left_out[run], bits[run]) if known[run[0]] else None
-                rows, without = self._process(int(which[run[0]]), part, found)
-                yield part, entries[run[0] : run[-1] + 1], rows, without
+            which = np.maximum(np.searchsorted(self._since, batch.newest_ns, side="right") - 1, 0)
+            known, left_out, bits = self.found.of(batch.stamp_ns, field["cube"])
+            changed = (field["cube"][1:] != field["cube"][:-1]).any(axis=1) | (np.diff(2 * which + known) != 0)
+            ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(field)]
+            for run in map(slice, ends[:-1], ends[1:]):
+                part = cdr.Batch(batch.shape, batch.stamp_ns[run], field[run])
+                found = (left_out[run], bits[run]) if known[run.start] else None
+                rows, without = self._process(int(which[run.start]), part, found)
+                yield part, recorded_ns[run], rows, without
 
     def number(self, newest_ns: int) -> int:
         """Which info holds for a message whose newest row was sampled then."""
@@ -106,31 +111,22 @@ class Recording:
     def _process(
         self, number: int, batch: cdr.Batch, found: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None
     ) -> tuple[StressRows, NDArray[np.uint32]]:
-        """Stress of all rows of a batch, as the reconstruction node makes it message by message; pads left out.
+        """Stress of all rows of a batch of the same cubes, as the node makes it message by message; pads left out.
 
         found: pads left out and status bits as the node found them, None to find them anew.
         """
         of, health = self._use(number)
-        field, times_ns = batch.field, batch.times_ns
-        left_out = np.empty(field["pad_fault"].shape, np.uint32)
-        edges = np.flatnonzero((field["cube"][1:] != field["cube"][:-1]).any(axis=1)) + 1
-        made = []
+        field = batch.field
+        cube, frequency, temperature = field["cube"][0], field["frequency"], field["temperature"]
         try:
-            for run in np.split(np.arange(len(field)), edges):
-                cube, part = field["cube"][run[0]], field[run[0] : run[-1] + 1]
-                if found is None:
-                    left_out[run], bits = health.update_many(
-                        cube, part["frequency"], part["pad_fault"], times_ns[run], part["temperature"]
-                    )
-                else:
-                    left_out[run], bits = found[0][run], found[1][run]
-                rows = of.process(cube, part["frequency"], left_out[run], part["temperature"])
-                rows.status[:] |= bits.ravel()
-                made.append(rows)
+            left_out, bits = found or health.update_many(
+                cube, frequency, field["pad_fault"], batch.times_ns, temperature
+            )
+            rows = of.process(cube, frequency, left_out, temperature)
         except CubeError as error:
             raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
-        whole = made[0] if len(made) == 1 else StressRows(*map(np.concatenate, zip(*made, strict=True)))
-        return whole, left_out.ravel()
+        rows.status[:] |= bits.ravel()
+        return rows, left_out.ravel()
 
     def _use(self, number: int) -> tuple[Pipeline, Health]:
         """The pipeline under an info, and the health that goes with it: a tare changes rest frequencies only."""
@@ -208,6 +204,8 @@ class Recording:
 
 def reprocess(job: Job) -> Done:
     """Do one job; its output appears when it is complete. BagError: what is wrong with bag or output."""
+    # malloc gives back what is free above twice the largest block that it ever gave back: not the batches' memory.
+    np.empty(BATCHES_BYTES, np.uint8)
     partial = job.output.parent / PARTIAL / job.output.name
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
@@ -240,10 +238,10 @@ def _to_bag(bag: Bag, topics: list[str], change: Change, output: Path) -> Done:
             writer.add_topic(f"{skin}stress", STRESS, [quality()])
             for info, data in zip(recording.infos, recording.info_messages(), strict=True):
                 writer.write(f"{skin}info", max(bag.start_ns, min(bag.end_ns, _stamp_ns(info))), data)
-            for batch, entries, stress, left_out in recording.batches():
-                for entry, data in zip(entries, cdr.stress_messages(batch, (*stress, left_out)), strict=True):
-                    writer.write(f"{skin}stress", entry.time_ns, data)
-                messages += len(entries)
+            for batch, recorded_ns, stress, left_out in recording.batches():
+                made = cdr.stress_messages(batch, (*stress, left_out), HEAD)
+                writer.write_many(f"{skin}stress", recorded_ns, made)
+                messages += len(recorded_ns)
                 rows += len(stress.status)
     return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
 
@@ -252,10 +250,10 @@ def _to_table(bag: Bag, topic: str, change: Change, output: Path) -> Done:
     messages = rows = 0
     recording = Recording(bag, topic, change)
     with TableWriter(output, [cube.name for cube in recording.infos[-1].cubes] + ["unknown"]) as table:
-        for batch, entries, stress, left_out in recording.batches():
+        for batch, recorded_ns, stress, left_out in recording.batches():
             field = batch.field
             table.write(batch.times_ns.ravel(), field["cube"].ravel(), field["sequence"].ravel(), stress, left_out)
-            messages += len(entries)
+            messages += len(recorded_ns)
             rows += len(stress.status)
     return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
 
