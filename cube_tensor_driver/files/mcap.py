@@ -150,7 +150,7 @@ class McapOutput(McapWriter):
         heads = np.zeros(count, _HEADS)
         heads["opcode"], heads["length"], heads["channel"] = MESSAGE, size - _RECORD.size, connection.id
         heads["times"] = times_ns[:, None]
-        records[:, : HEAD] = heads.view(np.uint8).reshape(count, -1)
+        records[:, :HEAD] = heads.view(np.uint8).reshape(count, -1)
         places = self._size + size * np.arange(count)
         self.indexes[connection.id].frombytes(np.stack([times_ns, places], axis=1).tobytes())
         self._parts.append(records.data.cast("B"))
