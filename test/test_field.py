@@ -157,3 +157,34 @@ def test_a_turned_skin_gives_the_turned_field():
 def test_what_no_surface_is(depth, side):
     with pytest.raises(ElasticError, match="greater than 0"):
         Surface(flat(2, 2, 0.01), depth, side)
+
+
+def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_is():
+    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
+    from cube_tensor_driver.view.carpet import Raster, is_flat
+
+    turn, place = rotation_from_rpy(0.3, -0.8, 2.0), np.array([0.2, -0.1, 0.4])
+    skin = flat(5, 3, 0.01)
+    keep = np.delete(np.arange(15), 7)  # a hole in the middle
+    skin = Places((skin.position @ turn.T + place)[keep], skin.rotation[keep] @ turn, skin.half_side[keep])
+    surface = Surface(skin, DEPTH, 2)
+    colours = np.random.default_rng(2).random((len(surface.points), 3))
+    assert is_flat(surface.points, skin.rotation[surface.cube], surface.spacing)
+    raster = Raster(surface.points, turn, surface.spacing)
+    image = raster.image(colours)
+    assert image.shape == (6, 10, 4)
+    np.testing.assert_allclose(raster.centre, place, atol=1e-12)
+    hole = np.zeros((6, 10), bool)
+    hole[2:4, 4:6] = True
+    np.testing.assert_array_equal(image[..., 3] == 0, hole)
+    for point, colour in zip(surface.points, colours, strict=True):
+        x, y, _ = (point - place) @ turn / surface.spacing
+        np.testing.assert_array_equal(image[round(2.5 - y), round(4.5 + x), :3], (255 * colour).astype(np.uint8))
+
+    bent = skin.rotation.copy()
+    bent[3] = rotation_from_rpy(0.1, 0, 0) @ bent[3]
+    assert not is_flat(surface.points, bent[surface.cube], surface.spacing)
+    far = surface.points + np.where(surface.cube == 3, 1.0, 0.0)[:, None] * turn[:, 0]
+    assert not is_flat(far, skin.rotation[surface.cube], surface.spacing)
+    raised = surface.points + np.where(surface.cube == 3, 0.003, 0.0)[:, None] * turn[:, 2]
+    assert not is_flat(raised, skin.rotation[surface.cube], surface.spacing)

@@ -15,6 +15,7 @@ from ..core import scene
 from ..core.scene import QUANTITIES, Newest, Places
 from ..elastic.surface import Contact, Surface
 from . import markup
+from .carpet import Carpet, light
 from .history import History
 from .markup import Facts
 
@@ -25,6 +26,10 @@ LEAST_PA = 300.0
 STEP_S = 0.1
 MOST_POINTS = 5000
 """Of the field's carpet."""
+LEAST_ARROW = SPAN / 16
+"""Arrows are drawn as if the pitch were at least this: of a thousand cubes the direction of a touch is still seen."""
+DIM = 0.5
+"""The carpet's colours beside the cubes', which stand out by it."""
 PLOTS = (
     ("normal stress / kPa", 1e-3, ("xx", "yy", "zz")),
     ("shear / kPa", 1e-3, ("zx", "yz", "xy")),
@@ -37,8 +42,6 @@ DASHES = ((), (6, 3), (2, 3))
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 CUBE_FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
                        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
-TILE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
-TILE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 AMBIENT, DIRECT = 2.0, 1.4
 WHITE, GOLD, PULL, PUSH = (235, 235, 235), (255, 170, 60), (255, 90, 70), (90, 150, 255)
 
@@ -76,6 +79,7 @@ class Page:
         self.selected = int(((places.position - centre) ** 2).sum(axis=1).argmin())
         self._places = Places((places.position - centre) * self._unit, places.rotation, places.half_side * self._unit)
         self._pitch = places.pitch * self._unit
+        self._arrow = max(self._pitch, LEAST_ARROW)
         self._top = self._longest = self._steepest = 0.0
         self._load: Contact | None = None
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large",
@@ -121,15 +125,12 @@ class Page:
         points = (self._surface.points - self._centre) * self._unit
         cube = self._surface.cube
         points = points - places.rotation[cube, :, 2] * places.half_side[cube, None]
-        self._carpet = to.add_batched_meshes_simple(
-            "/field", TILE * self._surface.spacing * self._unit, TILE_FACES, turns[cube], points,
-            batched_colors=np.full((len(points), 3), 60, np.uint8), side="double", lod="off", cast_shadow=False,
-            receive_shadow=False)  # fmt: skip
-        self._carpet.on_click(self._pick)
+        self._carpet = Carpet(to, points, places.rotation[cube], self._surface.spacing * self._unit)
+        self._carpet.node.on_click(self._pick)
         thick = {
-            "shaft_radius": 0.025 * self._pitch,
-            "head_radius": 0.075 * self._pitch,
-            "head_length": 0.2 * self._pitch,
+            "shaft_radius": 0.025 * self._arrow,
+            "head_radius": 0.075 * self._arrow,
+            "head_length": 0.2 * self._arrow,
         }
         none = np.zeros((0, 2, 3))
         self._traction = to.add_arrows("/traction", none, WHITE, **thick)
@@ -169,7 +170,7 @@ class Page:
 
         @layers.on_click
         def _(_: object) -> None:
-            nodes = {"field": self._carpet, "traction": self._traction, "gradient": self._gradient}
+            nodes = {"field": self._carpet.node, "traction": self._traction, "gradient": self._gradient}
             node = {**nodes, "principal": self._crosses}[layers.value]
             node.visible = not node.visible
 
@@ -216,16 +217,16 @@ class Page:
         self._longest = scene.automatic(shear, values[:, 2:5], self._longest)
         self._steepest = scene.automatic(gradient, gradient.of(values, newest.residual), self._steepest)
         with self._server.atomic():
-            self._cubes.batched_colors = _light(scene.colours(quantity, shown, self._top))
-            if self._carpet.visible:
+            self._cubes.batched_colors = light(scene.colours(quantity, shown, self._top))
+            if self._carpet.node.visible:
                 carpet = scene.colours(quantity, self._field(values, shown), self._top)
-                self._carpet.batched_colors = _light(0.75 * carpet)
+                self._carpet.paint(DIM * carpet)
             if self._traction.visible:
-                arrows = scene.traction_arrows(places, values, 1.8 * self._pitch / self._longest)
-                self._traction.points = _seen(arrows, 0.15 * self._pitch)
+                arrows = scene.traction_arrows(places, values, 1.8 * self._arrow / self._longest)
+                self._traction.points = _seen(arrows, 0.15 * self._arrow)
             if self._gradient.visible:
-                arrows = scene.gradient_arrows(places, values, 1.2 * self._pitch / self._steepest)
-                self._gradient.points = _seen(arrows, 0.15 * self._pitch)
+                arrows = scene.gradient_arrows(places, values, 1.2 * self._arrow / self._steepest)
+                self._gradient.points = _seen(arrows, 0.15 * self._arrow)
             if self._crosses.visible:
                 lines, pulls = scene.principal_crosses(places, values, self._pitch / self._longest)
                 self._crosses.points = lines.reshape(-1, 2, 3).astype(np.float32)
@@ -275,7 +276,7 @@ class Page:
         if contact is None:
             self._contact.visible = False
             return
-        place = (contact.position - self._centre + 1.1 * self._surface.pitch * contact.normal) * self._unit
+        place = (contact.position - self._centre) * self._unit + 2.0 * self._arrow * contact.normal
         self._contact.text = markup.newtons(contact)
         self._contact.position = place
         self._contact.visible = True
@@ -283,11 +284,6 @@ class Page:
 
 def _bytes(colours: np.ndarray) -> np.ndarray:
     return (255 * colours).astype(np.uint8)
-
-
-def _light(colours: np.ndarray) -> np.ndarray:
-    """Colours of batched meshes: the client takes them as amounts of light, not as sRGB."""
-    return _bytes(np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4))
 
 
 def _nice(low: float, high: float) -> tuple[float, float]:
