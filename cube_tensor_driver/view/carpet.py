@@ -1,7 +1,8 @@
-"""The field on a skin's surface in the 3-D view: one image where all of it is plane, elsewhere a tile for each point."""
+"""The field on a skin's surface in the 3-D view: one image where all of it is plane, elsewhere a tile per point."""
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,9 @@ import viser
 from scipy.spatial import cKDTree
 
 from ..core import scene
+
+# Viser looks for OpenCV anew for each image, which costs more than the image where there is none.
+sys.modules.setdefault("cv2", None)  # type: ignore[arg-type]
 
 EMPTY = 4
 """Most pixels per point: an image of cubes far apart would be mostly of nothing."""

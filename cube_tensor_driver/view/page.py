@@ -233,7 +233,8 @@ class Page:
                 colours = np.where(pulls.reshape(-1, 1, 1), PULL, PUSH).repeat(2, axis=1)
                 self._crosses.colors = colours.astype(np.uint8)
             bad = np.flatnonzero(health)
-            self._faults.points = scene.fault_crosses(places, health)[bad].reshape(-1, 2, 3).astype(np.float32)
+            crossed = Places(*(column[bad] for column in places))
+            self._faults.points = scene.fault_crosses(crossed, health[bad]).reshape(-1, 2, 3).astype(np.float32)
             self._faults.colors = _bytes(scene.MARK[health[bad]]).repeat(2, axis=0)[:, None].repeat(2, axis=1)
             up = places.rotation[self.selected, :, 2] * places.half_side[self.selected] * 1.1
             self._ring.position = places.position[self.selected] + up
