@@ -144,6 +144,8 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
     assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
     assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
+    # RViz sets a second line 1 cm lower and has no letter for −
+    assert "\n" not in markers["legend"].text and "−" not in markers["legend"].text
 
     figure = draw_markers(pictures[-1])
     figure.canvas.draw()

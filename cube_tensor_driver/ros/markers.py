@@ -19,9 +19,8 @@ from ..core.errors import ConfigError
 from .follow import FollowerNode
 from .node import run
 
-LINE_BYTES = 79
-LEGEND_BYTES = 2 * LINE_BYTES + 1
-"""Two lines, filled up on both sides: viewers centre them."""
+LEGEND_BYTES = 128
+"""One line, filled up on both sides: viewers centre it. RViz sets a second one 1 cm lower, whatever the text's size."""
 LIFETIME_S = 2
 """Viewers drop the picture so long after the node is gone: no old load stands there as if it were true."""
 BAR = 32
@@ -90,16 +89,17 @@ class Markers(FollowerNode):
             canvas["crosses"].colours[:, :3] = np.repeat(np.where(pulls.reshape(-1, 1), PULL, PUSH), 2, axis=0)
         bar = np.linspace(-self._top if self._quantity.signed else 0.0, self._top, BAR)
         canvas["legend bar"].colours[:, :3] = scene.colours(self._quantity, bar, self._top)
-        canvas.write(*self._legend(health))
+        canvas.write(self._legend(health))
         return bytes(canvas.message)
 
-    def _legend(self, health: np.ndarray) -> tuple[str, str]:
+    def _legend(self, health: np.ndarray) -> str:
         quantity = self._quantity
         top = self._top / quantity.size
         counts = [f"{np.count_nonzero(health == k)} {word}" for k, word in enumerate(scene.HEALTH)]
         states = ", ".join(text for k, text in enumerate(counts) if k == scene.FINE or np.any(health == k))
         low = -top if quantity.signed else 0
-        return f"{quantity.label}: {low:.3g} to {top:.3g} {quantity.unit}", states
+        label = quantity.label.replace("−", "-")  # which RViz's font has not
+        return f"{label}: {low:.3g} to {top:.3g} {quantity.unit}; {states}"
 
 
 class Canvas:
@@ -117,7 +117,8 @@ class Canvas:
             marker = self._add(f"cubes {k}", Marker.CUBE_LIST, len(members), True)
             ((w, x, y, z),) = scene.turns(turn.reshape(1, 3, 3)).tolist()
             marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
-            side = 2.0 * float(places.half_side[members].max())
+            # A little larger than the robot model's, so that faces in one plane do not flicker.
+            side = 2.04 * float(places.half_side[members].max())
             marker.scale = Vector3(x=side, y=side, z=side)
         for name, count, many, colour in (("traction", 6, False, TRACTION), ("gradient", 6, False, GRADIENT),
                                           ("faults", 4, True, WHITE), ("crosses", 6, True, WHITE)):  # fmt: skip
@@ -129,7 +130,7 @@ class Canvas:
         bar = self._add("legend bar", Marker.CUBE_LIST, BAR, True)
         bar.scale = Vector3(x=width / BAR, y=0.3 * pitch, z=0.05 * pitch)
         text = self._add("legend", Marker.TEXT_VIEW_FACING, 0, False, WHITE)
-        text.scale.z = 0.07 * width
+        text.scale.z = 0.05 * width
         text.text = "\x01" * LEGEND_BYTES
         middle = 0.5 * (low[0] + high[0])
         text.pose.position = Point(x=middle, y=low[1] - 2.5 * pitch, z=low[2])
@@ -152,9 +153,8 @@ class Canvas:
         for k, members in enumerate(self._groups):
             self[f"cubes {k}"].colours[:, :3] = colours[members]
 
-    def write(self, *legend: str) -> None:
-        lines = [line.encode()[:LINE_BYTES].center(LINE_BYTES) for line in legend]
-        self._legend[:] = np.frombuffer(b"\n".join(lines), np.uint8)
+    def write(self, legend: str) -> None:
+        self._legend[:] = np.frombuffer(legend.encode()[:LEGEND_BYTES].center(LEGEND_BYTES), np.uint8)
 
     def _add(self, name: str, kind: int, n: int, many: bool, colour: tuple[float, float, float] = WHITE) -> Marker:
         """A marker whose points, and colours if `many`, are its number until `_serialise` finds them by it."""

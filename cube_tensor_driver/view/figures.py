@@ -49,7 +49,7 @@ def draw_field(pitch: float = 0.010, width: float = 0.012) -> Figure:
                  xlim=(-22, 22), ylim=(-22, 22))  # fmt: skip
         axis.grid(False)
     axes[0].set_ylabel("y / mm")
-    axes[0].legend(fontsize=7, loc="lower left")
+    axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
     figure.colorbar(image, ax=axes, label="pressure in the cubes' plane / kPa")
     return figure
 

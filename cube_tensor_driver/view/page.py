@@ -37,6 +37,8 @@ PLOTS = (
     ("residual / σ", 1.0, ("residual",)),
 )
 TIME = uplot.Scale(time=False, auto=False, range=(-10.0, 0.0))
+RENEW = 20
+"""After how many `write` all charts are made anew."""
 STROKES = ("#4dabf7", "#ffa94d", "#69db7c")
 DASHES = ((), (6, 3), (2, 3))
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -185,7 +187,7 @@ class Page:
         with gui.add_folder("last 10 s"):
             empty = np.array([0.0])
             self._plots = []
-            self._spans = [(0.0, 1.0) for _ in PLOTS]
+            self._spans, self._written = [(0.0, 1.0) for _ in PLOTS], 0
             scales = {"x": TIME, "y": uplot.Scale(auto=False, range=(0.0, 1.0))}
             for title, _factor, columns in PLOTS:
                 lines = [uplot.Series(label=markup.label(name), stroke=stroke, width=1.5, dash=dash)
@@ -262,12 +264,15 @@ class Page:
         self._show_contact(self._load)
         self._numbers.content = markup.numbers(newest, k, health[k], rate[k])
         times, lines = history.of(k)
+        self._written += 1
         for number, (plot, (_, factor, columns)) in enumerate(zip(self._plots, PLOTS, strict=True)):
             shown = [lines[:, History.COLUMNS.index(name)] * factor for name in columns]
             plot.data = (times, *shown)
             finite = np.concatenate(shown)
             finite = finite[np.isfinite(finite)]
-            span = _nice(finite.min(initial=0.0), finite.max(initial=0.0))
+            low, high = _nice(finite.min(initial=0.0), finite.max(initial=0.0))
+            # A chart that the page makes before it knows its width has no time axis until its scales change.
+            span = low, high + 1e-9 * (high - low) * (self._written // RENEW % 2)
             # uPlot cannot scale by itself where there is NaN.
             if self._spans[number] != span:
                 self._spans[number], plot.scales = span, {"x": TIME, "y": uplot.Scale(auto=False, range=span)}
@@ -277,7 +282,7 @@ class Page:
         if contact is None:
             self._contact.visible = False
             return
-        place = (contact.position - self._centre) * self._unit + 2.0 * self._arrow * contact.normal
+        place = (contact.position - self._centre) * self._unit + 1.1 * self._arrow * contact.normal
         self._contact.text = markup.newtons(contact)
         self._contact.position = place
         self._contact.visible = True

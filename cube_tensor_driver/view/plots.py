@@ -131,7 +131,7 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
         key = f"cpu_{name}_percent" if name != "echo" else "echo_cpu_percent"
         used = [1e4 * row[key] / row["rate_hz"] for row in rows]
         left.plot(cubes, used, style, color="0.55" if name == "echo" else "black", mfc="white", ms=5, label=name)
-    left.set(xscale="log", yscale="log", xlabel="cubes", ylabel="CPU per frame / µs")
+    left.set(xscale="log", xlabel="cubes", ylabel="CPU per frame / µs", ylim=(0, None))
     left.legend()
     for name, style in (("p50", "o-"), ("p99", "s--")):
         right.plot(
