@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,7 @@ class Layout:
     def n_pads(self) -> int:
         return len(self.positions)
 
-    @property
+    @cached_property
     def pads(self) -> tuple[str, ...]:
         """Stable names: face, then side of the face, such as "+z-x"; a second pad there is "+z-x#2"."""
         plain = [

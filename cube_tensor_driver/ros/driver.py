@@ -87,6 +87,7 @@ class Driver(CubeNode):
         self._frequencies = self.create_lifecycle_publisher(SkinFrequencies, "frequencies", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._uids: dict[int, int] = {}
+        self._pipeline = Pipeline([cube.calibration for cube in skin.cubes])
         self._publish_info()
 
     def activate(self) -> None:
@@ -195,9 +196,8 @@ class Driver(CubeNode):
             self.get_logger().info(f"link {name}: {state.value}")
 
     def _publish_info(self) -> None:
-        pipeline = Pipeline([cube.calibration for cube in self._skin.cubes])
         now_ns = self.get_clock().now().nanoseconds
-        self._info.publish(info_message(self._skin, pipeline, now_ns, self._uids, "driver"))
+        self._info.publish(info_message(self._skin, self._pipeline, now_ns, self._uids, "driver"))
 
     def _statuses(self) -> list[DiagnosticStatus]:
         """For diagnostics, of the whole and of each link; what happened since the last time is in them."""

@@ -30,6 +30,8 @@ UNKNOWN_RATE = 1000.0
 BLANKS_KEPT = 8
 """Shapes of messages whose bytes are kept to be filled again."""
 SPIN_S = 0.2
+SWITCH_S = 1e-4
+"""A reader gives up Python's lock at each read; while the main thread computes it would wait 5 ms each time."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -178,6 +180,7 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
+    sys.setswitchinterval(SWITCH_S)
     code = 0
     # rclpy's own handlers would end the context under a thread that publishes.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)

@@ -36,7 +36,7 @@ from .tally import Tally
 
 CALIBRATION, LAYOUT, PITCH, CUBES_PER_HUB, INSTANTS = "planar", "planar", 0.012, 80, 16
 ROUNDS = 400
-FIRST_S, SETTLE_S, DRAIN_S = 30.0, 1.0, 1.0
+FIRST_S, SETTLE_S, DRAIN_S, ECHO_S = 30.0, 1.0, 1.0, 15.0
 SAMPLE_S, LONG_S, BLOCKS = 0.5, 60.0, 8
 
 
@@ -109,9 +109,9 @@ def bench_scale(counts: list[int], rate: float, duration: float, json_path: Path
 def _skin_and_echo(
     cubes: int, rate: float, duration: float, progress: Progress, publish_period: float = 0.0, composed: bool = False
 ) -> dict[str, Any]:
-    before = _echo(cubes, rate, duration / 2, progress)
+    before = _echo(cubes, rate, min(duration / 2, ECHO_S), progress)
     skin = _skin(cubes, rate, duration, progress, publish_period, composed)
-    after = _echo(cubes, rate, duration / 2, progress)
+    after = _echo(cubes, rate, min(duration / 2, ECHO_S), progress)
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     total = sum(value for name, value in skin.items() if name.startswith("cpu_") and "simulator" not in name)
     return {
