@@ -20,7 +20,10 @@ from .recorder import DEPTH, message_class
 CLOCK_S = 0.01
 """Of real time, at least so often the clock is sent; and before every message."""
 DISCOVERY_S, NOBODY_S, LOOK_S = 1.0, 3.0, 0.1
-"""Before the first message: no further subscriber has found the publishers for so long, or none at all."""
+"""Before the first message: no further subscriber has found the publishers for so long; or none of frequencies at all.
+
+Each topic is discovered in its own time: that somebody hears of `info` says nothing of `frequencies` yet.
+"""
 SHOWN_NS = 100_000_000
 """So much of the bag is published after a jump, though the player is paused: enough for every link to deliver."""
 MADE = (f"{PACKAGE}/msg/SkinStress", f"{PACKAGE}/msg/StressTensorStamped", "geometry_msgs/msg/WrenchStamped")
@@ -96,12 +99,7 @@ class Player:
         BagError: damaged, or start is not in the bag.
         """
         begin_ns: int | None = self._at(start)
-        publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
-        found, since = 0, time.monotonic()
-        while time.monotonic() - since < (DISCOVERY_S if found else NOBODY_S) and not self.stop.wait(LOOK_S):
-            now = sum(publisher.get_subscription_count() for publisher in publishers)
-            if now != found:
-                found, since = now, time.monotonic()
+        self._await_subscribers()
         next_ns = begin_ns
         while next_ns is not None and not self.stop.is_set():
             self._once(next_ns)
@@ -113,6 +111,18 @@ class Player:
                 if self._jump_ns is not None:
                     next_ns, self._jump_ns = self._jump_ns, None
                     self._shown_ns = next_ns + SHOWN_NS
+
+    def _await_subscribers(self) -> None:
+        """Until those who listen have found the publishers."""
+        publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
+        raw = [publisher for topic, publisher in self._publishers.items() if topic.endswith("frequencies")]
+        found, since, enough = 0, time.monotonic(), NOBODY_S
+        while time.monotonic() - since < enough and not self.stop.wait(LOOK_S):
+            now = sum(publisher.get_subscription_count() for publisher in publishers)
+            if now != found:
+                found, since = now, time.monotonic()
+                heard = all(publisher.get_subscription_count() for publisher in raw or publishers)
+                enough = DISCOVERY_S if heard else NOBODY_S
 
     def _at(self, position: float) -> int:
         if not 0 <= position <= self.length:
