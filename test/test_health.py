@@ -240,3 +240,22 @@ def test_bits_are_those_of_the_message():
     assert (message.PAD_FAULT, message.RESIDUAL) == (PAD_FAULT, RESIDUAL)
     for name in ("OPEN", "SHORT", "RANGE", "STUCK", "NOISY", "REPORTED", "DRIFT"):
         assert getattr(message, f"PAD_{name}") == getattr(status, name)
+
+
+def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
+    """The one is bad, the other is not; and neither is said twice."""
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from cube_tensor_driver.files.share import share
+    from cube_tensor_driver.files.skin import read_skin
+    from cube_tensor_driver.ros.cube_health import CubeHealth
+
+    skin = Skin(16)
+    words = CubeHealth(read_skin(share() / "config" / "skin_demo.yaml"), skin.pipeline, skin.health)
+    said = []
+    for harm in (lambda frequency, row: None, set_pad(np.nan), set_pad(np.nan), *[lambda frequency, row: None] * 3):
+        skin.play(2 * WINDOW_S, harm)
+        said.append(words.statuses({})[1])
+    pad = CALIBRATION.layout.pads[5]
+    assert said[1] == [(f"cube c02: pad {pad} short", True)]
+    assert [line for lines in said[2:] for line in lines] == [("cube c02: fine", False)]
+    assert not said[0]

@@ -25,8 +25,8 @@ class CubeHealth:
         self._came = np.zeros(len(skin.cubes), bool)
         self._words: dict[int, str] = {}
 
-    def statuses(self, uids: Mapping[int, int]) -> tuple[list[DiagnosticStatus], list[str]]:
-        """Statuses of cubes that are not fine or were not the last time; a line for the log of each that changed."""
+    def statuses(self, uids: Mapping[int, int]) -> tuple[list[DiagnosticStatus], list[tuple[str, bool]]]:
+        """Statuses of cubes that are not fine or were not the last time; of what changed a line, and if it is bad."""
         bits, strained, rows = self._health.collect()
         self._came |= rows > 0
         levels = np.zeros(len(rows), int)
@@ -44,7 +44,7 @@ class CubeHealth:
             level = int(levels[cube]) if cube in words else 0
             name = self._skin.cubes[cube].name
             if text != self._words.get(cube, "fine"):
-                lines.append(f"cube {name}: {text}")
+                lines.append((f"cube {name}: {text}", level > 0))
             uid = self._skin.cubes[cube].uid or uids.get(cube, 0)
             values = {"rows since the last": int(rows[cube])}
             statuses.append(make_status(f"cube {name}", f"{uid:#x}" if uid else "", bytes([level]), text, values))

@@ -173,8 +173,11 @@ class Reconstruction(CubeNode):
         with self._lock:
             statuses, lines = self._words.statuses(self._taring.uids)
             summary = self._words.summary()
-        for line in lines:
-            self.get_logger().warning(line)
+        for line, bad in lines:
+            if bad:
+                self.get_logger().warning(line)
+            else:
+                self.get_logger().info(line)
         rate, self._rows_before = self._rows - self._rows_before, self._rows
         values = {
             "rows": self._rows,
