@@ -20,12 +20,12 @@ from .tensor import principal_stresses, quaternion_from_rotation
 # viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both read in grey.
 SEQUENTIAL = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 DIVERGING = "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f"
-GREY, RED, ORANGE = (0.55, 0.55, 0.55), (0.85, 0.1, 0.1), (0.95, 0.55, 0.0)
+GREY, RED, ORANGE, WHITE = (0.55, 0.55, 0.55), (0.85, 0.1, 0.1), (0.95, 0.55, 0.0), (0.95, 0.95, 0.95)
 
 FINE, DOUBTFUL, FAULTY, STALE = range(4)
 HEALTH = ("ok", "doubtful", "no tensor", "stale")
 """Words of `Newest.health`. Doubtful: some status bit is set; no tensor: INVALID; stale: nothing came lately."""
-MARK = np.array([GREY, ORANGE, RED, GREY])
+MARK = np.array([GREY, ORANGE, RED, WHITE])
 """Colour of the cross over a cube by its health; a fine cube has none."""
 FALL = 0.98
 """What an automatic range keeps of its top from one picture to the next."""

@@ -45,7 +45,7 @@ CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], 
 CUBE_FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
                        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
 AMBIENT, DIRECT = 2.0, 1.4
-WHITE, GOLD, PULL, PUSH = (235, 235, 235), (255, 170, 60), (255, 90, 70), (90, 150, 255)
+WHITE, GOLD, PULL, PUSH = light(np.array([(0.92, 0.92, 0.92), (1.0, 0.6, 0.15), (1.0, 0.35, 0.27), (0.35, 0.59, 1.0)]))
 
 
 @dataclass
@@ -237,7 +237,7 @@ class Page:
             bad = np.flatnonzero(health)
             crossed = Places(*(column[bad] for column in places))
             self._faults.points = scene.fault_crosses(crossed, health[bad]).reshape(-1, 2, 3).astype(np.float32)
-            self._faults.colors = _bytes(scene.MARK[health[bad]]).repeat(2, axis=0)[:, None].repeat(2, axis=1)
+            self._faults.colors = light(scene.MARK[health[bad]]).repeat(2, axis=0)[:, None].repeat(2, axis=1)
             up = places.rotation[self.selected, :, 2] * places.half_side[self.selected] * 1.1
             self._ring.position = places.position[self.selected] + up
             self._ring.wxyz = self._turns[self.selected]
@@ -286,10 +286,6 @@ class Page:
         self._contact.text = markup.newtons(contact)
         self._contact.position = place
         self._contact.visible = True
-
-
-def _bytes(colours: np.ndarray) -> np.ndarray:
-    return (255 * colours).astype(np.uint8)
 
 
 def _nice(low: float, high: float) -> tuple[float, float]:
