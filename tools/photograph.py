@@ -27,7 +27,7 @@ HELD = """return new Promise(drawn => {
 CLICK = "for (const b of document.querySelectorAll('button')) if (b.innerText.trim() == 'pause') b.click()"
 CLEAR = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 LOADED = "return Number((/([0-9.]+) N, shear/.exec(document.body.innerText) || [0, 0])[1])"
-LEAST_N, WAIT_S, TRIES = 2.2, 60.0, 8
+LEAST_N, WAIT_S = 2.2, 60.0
 """The load comes and goes: the picture waits until it presses."""
 
 
@@ -55,15 +55,9 @@ def photograph(url: str, path: str) -> None:
         with contextlib.suppress(TimeoutException):
             WebDriverWait(browser, PLOTS_S).until(lambda _: False)
         browser.execute_script(CLEAR)
-        for _ in range(TRIES):
-            wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
-            browser.execute_script(CLICK)
-            wait.until(lambda _: browser.execute_script(HELD))
-            # What is drawn slowly may be held after the load has gone.
-            if browser.execute_script(LOADED) > LEAST_N:
-                break
-            browser.execute_script(CLICK)
-            wait.until(lambda _: not browser.execute_script(HELD))
+        wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
+        browser.execute_script(CLICK)
+        wait.until(lambda _: browser.execute_script(HELD))
         browser.save_screenshot(path)
 
 
