@@ -30,7 +30,7 @@ UNKNOWN_RATE = 1000.0
 BLANKS_KEPT = 8
 """Shapes of messages whose bytes are kept to be filled again."""
 SPIN_S = 0.2
-SWITCH_S = 1e-4
+SWITCH_S = 1e-3
 """A reader gives up Python's lock at each read; while the main thread computes it would wait 5 ms each time."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
