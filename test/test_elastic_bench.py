@@ -8,8 +8,10 @@ from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.elastic import bench as benches
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import paper
-from cube_tensor_driver.elastic.bench import Bench, dent, plates
+from cube_tensor_driver.elastic.bench import Bench
 from cube_tensor_driver.elastic.body import Body
+from cube_tensor_driver.elastic.material import Material
+from cube_tensor_driver.elastic.paper import dent, plates
 from cube_tensor_driver.elastic.rod import Contact, Rod
 from cube_tensor_driver.elastic.study import study
 
@@ -24,6 +26,17 @@ def uniaxial(stretch, young, poisson):
         x = (low + high) / 2
         low, high = (low, x) if mu * (x - 1 / x) + lam * np.log(x * stretch) / x > 0 else (x, high)
     return (mu * (stretch - 1 / stretch) + lam * np.log(x * stretch) / stretch) / x
+
+
+@pytest.mark.parametrize("finite", [False, True])
+def test_stress_and_moduli_are_derivatives_of_the_energy(finite):
+    material = Material(np.array([0.7, 2.0]), np.array([0.3, 1.0]), finite)
+    random, h = np.random.default_rng(3), 1e-6
+    f, way = np.eye(2) + 0.2 * random.normal(size=(2, 2, 2)), random.normal(size=(2, 2, 2))
+    slope = (material.energy(f + h * way) - material.energy(f - h * way)) / (2 * h)
+    assert np.einsum("eij,eij->e", material.stress(f), way) == pytest.approx(slope, rel=1e-7)
+    bend = (material.stress(f + h * way) - material.stress(f - h * way)) / (2 * h)
+    assert np.einsum("eijkl,ekl->eij", material.moduli(f), way) == pytest.approx(bend, rel=1e-6)
 
 
 @pytest.mark.parametrize("finite", [False, True])
@@ -48,10 +61,20 @@ def test_finite_strain_is_linear_for_small_loads():
 
 def test_shear_leaves_the_linear_normal_sum_alone_and_not_the_finite_one():
     steps = [plates(BODY, 1e-3), plates(BODY, 1e-3, 3e-3)]
-    before, after = Bench(BODY).run(steps).pads[:, :4]
+    before, after = Bench(BODY, fine=0).run(steps).pads[:, :4]
     assert after.sum() == pytest.approx(before.sum(), rel=1e-9)
-    before, after = Bench(BODY, finite=True).run(steps).pads[:, :4]
+    before, after = Bench(BODY, finite=True, fine=0).run(steps).pads[:, :4]
     assert abs(after.sum() / before.sum() - 1) > 1e-3
+
+
+def test_pads_do_not_depend_on_the_mesh_at_the_cube():
+    """P_shear of plates that press and shear, with the triangles at the cube cut in four twice and thrice.
+
+    0.13 % is found, 2 % where they are not cut.
+    """
+    step = [plates(BODY, 3e-3, 3e-3)]
+    default, finer = (Bench(BODY, fine=fine).run(step).pads[0, :4] @ [-1, 1, 1, -1] for fine in (2, 3))
+    assert default == pytest.approx(finer, rel=0.003)
 
 
 def test_plates_that_grip_shear_the_body_as_it_stands():
@@ -87,7 +110,8 @@ def test_a_round_rod_presses_as_hertz_says():
     radius = 50e-3
     bench = Bench(body, cube=False, size=1.0)
     rod = Rod(1e-3, 0.0, 2 * radius, radius)
-    u = bench._newton(np.zeros(bench.basis.N), *held(bench, dent(body, rod)), rod)
+    nothing = np.zeros(bench.basis.N)
+    u = bench._newton(nothing, bench._task(dent(body, rod), nothing))
     vertical = np.concatenate([bench.basis.nodal_dofs[1], bench.basis.facet_dofs[1]])
     force = 5e-3 * Contact(bench._top, rod, 5e-3, body.young, False).force(u)[vertical]
     square = force @ (5e-3 * bench.basis.doflocs[0, vertical]) ** 2 / force.sum()
@@ -95,18 +119,9 @@ def test_a_round_rod_presses_as_hertz_says():
     assert force.sum() == pytest.approx(np.pi * body.young / (1 - body.poisson**2) * square / radius, rel=0.01)
 
 
-def held(bench, step):
-    """Which dofs a step prescribes, and to what, in d0."""
-    d0, x = bench.body.side / 2, bench.basis.doflocs
-    component = np.zeros(bench.basis.N, dtype=int)
-    component[bench.basis.get_dofs(elements=True).all("u^2")] = 1
-    prescribed = step.prescribed(d0 * x)[component, np.arange(bench.basis.N)] / d0
-    return ~np.isnan(prescribed), prescribed
-
-
 @pytest.mark.parametrize("finite", [False, True])
 def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(finite):
-    bench = Bench(BODY, finite=finite, size=1.0)
+    bench = Bench(BODY, finite=finite, size=1.0, fine=0)
     contact = Contact(bench._top, Rod(0.5e-3, 1e-3), 2e-3, BODY.young, finite)
     random = np.random.default_rng(8)
     u, way = 0.05 * random.normal(size=(2, bench.basis.N))
@@ -117,18 +132,34 @@ def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(finite):
     assert np.abs(contact.tangent(u) @ way - bend).max() < 1e-5 * np.abs(bend).max()
 
 
-def test_a_deep_rod_folds_no_element():
-    """2 mm into the 3.5 mm above the cube: P_shear grows ever faster, without a kink, and is that of a finer mesh.
+@pytest.mark.parametrize("bonded", [True, False])
+def test_a_deep_rod_folds_no_element(bonded):
+    """2 mm into the 3.5 mm above the cube: P_shear grows (bonded: ever faster) and is that of a finer mesh.
 
-    0.1 % is found between the meshes.
+    0.2 % is found between the meshes; a sliding bottom that is held at one point is wrong by 5 % at 1.5 mm.
     """
-    steps = [dent(BODY, Rod(depth, 1e-3)) for depth in (0.5e-3, 1e-3, 1.5e-3, 2e-3)]
+    steps = [dent(BODY, Rod(depth, 1e-3), bonded) for depth in (0.5e-3, 1e-3, 1.5e-3, 2e-3)]
     coarse, fine = (
-        Bench(BODY, finite=True, size=size).run(some).pads[:, :4] @ [-1, 1, 1, -1]
+        Bench(BODY, finite=True, size=size, fine=0).run(some).pads[:, :4] @ [-1, 1, 1, -1]
         for size, some in ((2.0, steps), (1.0, steps[:3]))
     )
     assert coarse[:3] == pytest.approx(fine, rel=0.005)
-    assert np.all(np.diff(coarse, 2) < 0)
+    assert np.all(np.diff(coarse, 2 if bonded else 1) < 0)
+
+
+@pytest.mark.parametrize("finite", [False, True])
+def test_a_sliding_bottom_stays_on_average(finite):
+    """And what keeps it there is spread evenly: in proportion to the mean's weights, on the bottom alone."""
+    bench, nothing = Bench(BODY, finite=finite, size=1.0, fine=0), np.zeros(0)
+    rod = Rod(0.5e-3, 1e-3)
+    u = bench._newton(np.zeros(bench.basis.N), bench._task(dent(BODY, rod, bonded=False), nothing))
+    assert abs(bench._mean @ u) < 1e-9 * np.abs(bench._mean).max() * np.abs(u).max()
+    left, _ = bench._balance(u, Contact(bench._top, rod, 2e-3, BODY.young, finite))
+    sideways = left[bench._component == 0]
+    weights = bench._mean[bench._component == 0]
+    even = weights * (weights @ sideways) / (weights @ weights)
+    assert np.abs(sideways - even).max() < 1e-6 * np.abs(left).max()
+    assert (np.abs(even).max() > 1e-4 * np.abs(left).max()) == finite  # linear: the rod has no force along x
 
 
 def test_prototype_signs():

@@ -13,6 +13,7 @@ from skfem.helpers import dot
 from cube_tensor_driver.core.errors import ElasticError, LayoutError, SymmetryError
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
+from cube_tensor_driver.core.response import project
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import fem, mesh
 from cube_tensor_driver.elastic.body import Body, strip_layout
@@ -182,11 +183,25 @@ def test_slab_deviates_from_the_papers_structure(slab):
 
 @pytest.mark.parametrize("result", ["slab", "square"])
 def test_coefficients_converge_with_the_mesh(result, request):
-    """The middle mesh is within 1 % of the finest in every coefficient, f (near zero) included."""
+    """The middle mesh is within 0.5 % of the finest in every coefficient; f, near zero, within 1e-4."""
     rows = request.getfixturevalue(result).convergence
-    assert rows[1]["coefficients"] == pytest.approx(rows[2]["coefficients"], rel=1e-2)
+    assert rows[1]["coefficients"] == pytest.approx(rows[2]["coefficients"], rel=5e-3, abs=1e-4)
     assert rows[0]["change"] < 1e-3 and rows[1]["change"] < 1e-3
     assert rows[2]["change"] is None
+
+
+def test_the_default_is_right():
+    """Every coefficient of the default body and pads, against triangles cut in four once more.
+
+    0.5 % is asked and 0.022 % found. The finer mesh stops its rings at 0.01, which moves the means over strips, that
+    end before the corner, by less than 0.005 %.
+    """
+    body, layout = Body(), LAYOUTS["planar"]
+    row = compute_response(body, layout, meshes=3).convergence[-1]
+    finer = Solid(mesh.section((15.0, 2.75), (0.3, 0.7), 3, smallest=0.01), lame(1.0, 0.48), lame(200e9 / 0.3e6, 0.3))
+    truth = project(fem.find_structure(layout, "full"), fem.linear_response(finer, layout, lambda _: None))[0]
+    assert 1.5 * row["unknowns"] < finer.basis.N
+    assert row["coefficients"] == pytest.approx(truth, rel=5e-4)
 
 
 def test_elastic_steel_is_as_good_as_rigid(slab):
@@ -298,6 +313,17 @@ def test_too_little_memory(monkeypatch):
     monkeypatch.setattr(bodies, "available_memory", lambda: 1e8)
     with pytest.raises(ElasticError, match=r"GB of memory and 0\.1 GB are available"):
         compute_response(Body(), LAYOUTS["cube"], "slab")
+
+
+def test_memory_that_runs_out_is_said(monkeypatch):
+    """A limit on this process alone, of which nobody told us."""
+
+    def work(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(fem, "make_solid", work)
+    with pytest.raises(ElasticError, match=r"ran out on mesh 1, of .* ask for fewer meshes"):
+        compute_response(Body(), HALVES)
 
 
 def test_a_layout_without_the_symmetry():

@@ -97,8 +97,14 @@ def compute_response(
     rows: list[dict[str, Any]] = []
     for grid in grids:
         began = time.perf_counter()
-        solid = make_solid(body, layout, grid)
-        matrix = linear_response(solid, layout, report)
+        try:
+            solid = make_solid(body, layout, grid)
+            matrix = linear_response(solid, layout, report)
+        except MemoryError:  # a limit that check_memory does not know
+            raise ElasticError(
+                f"the memory ran out on mesh {len(matrices) + 1}, of {grid.nvertices} corners; "
+                "ask for fewer meshes or wider pads"
+            ) from None
         if rows:
             rows[-1]["change"] = float(np.abs(matrix - matrices[-1]).max() / np.abs(matrix).max())
         matrices.append(matrix)

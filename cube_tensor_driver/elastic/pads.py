@@ -36,6 +36,21 @@ def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: 
     return signed(stop) - signed(start)
 
 
+def face_integral(nodes: Array, forces: Array, order: int, start: float, stop: float) -> float:
+    """Integral of the traction from start to stop from nodal forces (n,) along a whole face, split by parity.
+
+    nodes: (n,) positions from corner to corner, -1 to 1, symmetric about the middle
+    """
+    half = len(nodes) // 2
+    right, left = forces[half:], forces[half::-1]
+    even, odd = (right + left) / 2, (right - left) / 2
+    even[0] /= 2  # the middle node belongs to both halves
+    return sum(
+        float(interval_weights(nodes[half:], order, parity, start, stop) @ part)
+        for parity, part in ((1, even), (-1, odd))
+    )
+
+
 def _from_middle(nodes: Array, order: int, parity: int, stop: float) -> Array:
     """Weights of the integral from 0 to stop: solve (int phi_i t_j)^T w = int_0^stop t_j."""
     n = len(nodes)

@@ -7,7 +7,7 @@ no pad is crushed at 27 % compression.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..core.estimator import make_estimator
 from ..core.layout import LAYOUTS
 from ..core.modes import PLANE
 from ..core.oscillator import pad_frequency
-from .bench import Bench, Run, dent, plates
+from .bench import Bench, Run, Step
 from .body import Body
 from .fem import Response, compute_response
 from .rod import Rod
@@ -54,17 +54,16 @@ def experiments(
     press = shear = np.linspace(0.5e-3, 3e-3, 6)
     deep = np.linspace(0.25e-3, 3e-3, 12)
     rods = [Rod(depth, body.side / 4) for depth in deep]
+    both = np.concatenate([press, 3e-3 + shear])
     runs = [
-        ("a, top plate pressed, bonded", press, [plates(body, p) for p in press]),
-        ("a, top plate pressed, sliding", press, [plates(body, p, bonded=False) for p in press]),
         (
             "b, pressed 3 mm then sheared, bonded",
-            np.concatenate([press, 3e-3 + shear]),
+            both,
             [plates(body, p) for p in press] + [plates(body, 3e-3, s) for s in shear],
         ),
         (
             "b, pressed 3 mm by sliding plates that then grip, sheared",
-            np.concatenate([press, 3e-3 + shear]),
+            both,
             [plates(body, p, bonded=False) for p in press] + [plates(body, 3e-3, s, gripped=True) for s in shear],
         ),
         ("c, 5 mm rod above C2, bonded bottom", deep, [dent(body, rod) for rod in rods]),
@@ -78,7 +77,13 @@ def experiments(
         found.append(_experiment(name, displacement, steps, body, finite, calibration))
     if progress is not None:
         progress(len(runs), len(runs), "done")
-    return found
+    # (a) is how (b) begins
+    names = ("a, top plate pressed, bonded", "a, top plate pressed, sliding")
+    return [_beginning(one, name, len(press)) for one, name in zip(found[:2], names, strict=True)] + found
+
+
+def _beginning(experiment: Experiment, name: str, steps: int) -> Experiment:
+    return Experiment(name, *(getattr(experiment, field.name)[:steps] for field in fields(Experiment)[1:]))
 
 
 def _experiment(
@@ -103,6 +108,38 @@ def prototype(frequency: Array) -> Array:
     """P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4): the paper's eqs. 8 to 10 as printed."""
     change = frequency - FOAM["rest_frequency"]
     return np.stack([-change.sum(axis=1), change @ _SHEAR, change @ _GRAD], axis=1)
+
+
+def plates(body: Body, pressed: float, sheared: float = 0.0, bonded: bool = True, gripped: bool = False) -> Step:
+    """The top plate pressed down and the bottom plate moved along x, in m; sliding plates leave x free.
+
+    gripped: plates that slid before hold the body from now on, as it stands between them.
+    """
+
+    def prescribed(x: Array) -> Array:
+        moved = _on_plate(body, x, bonded, sheared)
+        top = x[1] > body.height / 2 - 1e-9
+        moved[1, top] = -pressed
+        if bonded:
+            moved[0, top] = 0.0
+        return moved
+
+    return Step(prescribed, gripped=gripped, sliding=not bonded)
+
+
+def dent(body: Body, rod: Rod, bonded: bool = True) -> Step:
+    """A rod pressed into the top, the bottom bonded to its plate or sliding on it."""
+    return Step(lambda x: _on_plate(body, x, bonded, 0.0), rod, sliding=not bonded)
+
+
+def _on_plate(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
+    """What the bottom plate prescribes."""
+    moved = np.full(x.shape, np.nan)
+    bottom = x[1] < -body.height / 2 + 1e-9
+    moved[1, bottom] = 0.0
+    if bonded:
+        moved[0, bottom] = sheared
+    return moved
 
 
 def rod_sweep(
