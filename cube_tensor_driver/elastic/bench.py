@@ -1,38 +1,33 @@
 """A virtual bench: plates and rods that move the surface of the elastomer, and what the pads feel.
 
 Section of the body with the cube, or without it for the true field, of a linear or a neo-Hookean material
-(material.py). Newton's method on int P : grad w dV = 0 with prescribed displacements and contact with a rod, in steps
-of the load. No step of it may turn an element inside out, and each must lower the energy or the forces out of balance.
-Sources: J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), 9.6; J. Nocedal,
-S. J. Wright, Numerical Optimization (2006), 3.1.
+(material.py). Forces int P : grad w dV balance (newton.py) under prescribed displacements and contact with a rod, in
+steps of the load, none of which may turn an element inside out.
+Source: J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), 9.6.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 import skfem
 from numpy.typing import NDArray
-from scipy.sparse.linalg import SuperLU, splu
 
 from ..core.errors import ElasticError
 from ..core.layout import LAYOUTS, Layout
 from .body import Body
 from .material import Material, determinant
 from .mesh import mirrored, section
+from .newton import factors, find_balance
 from .pads import face_integral
 from .rod import Contact, Rod
 from .solid import lame
 
 Array = NDArray[np.float64]
 
-_TOLERANCE = 1e-9  # of Newton's correction over the largest displacement
-_ITERATIONS = 30
-_LONGEST = 0.3  # correction of any node at once, d0
-_SHORTENINGS = 7
 _HALVINGS = 5
 _STIFF = 1e4  # cube over body: rigid to 1e-4, without spoiling Newton's numbers
 
@@ -77,10 +72,6 @@ class _Task:
     prescribed: Array
     rod: Rod | None
     row: Array | None
-
-    @property
-    def free(self) -> NDArray[np.int64]:
-        return np.flatnonzero(np.isnan(self.prescribed))
 
 
 class Bench:
@@ -142,8 +133,7 @@ class Bench:
         rows, rod = [], None
         for number, step in enumerate(steps, 1):
             task = self._task(step, loose)
-            with np.errstate(all="ignore"):  # a failed try passes through inverted elements
-                found = self._newton(2 * u - before, task)  # as the last step went
+            found = self._newton(2 * u - before, task)  # as the last step went
             if found is None:
                 found = self._advance(u, rod, task, number)
             u, before, rod = found, u, step.rod
@@ -162,7 +152,7 @@ class Bench:
         pinned = [*self.basis.nodal_dofs[:, middle], self.basis.nodal_dofs[1, side]]
         free = np.setdiff1d(np.arange(self.basis.N), pinned)
         u = np.zeros(self.basis.N)
-        u[free] = _factors(self._tangent(self._deformation(u))[free][:, free]).solve(force[free])
+        u[free] = factors(self._tangent(self._deformation(u))[free][:, free]).solve(force[free])
         zz = self._material.stress(self._deformation(u))[..., 1, 1].mean(axis=1)
         return self.body.side / 2 * u[self.basis.nodal_dofs], zz
 
@@ -179,8 +169,7 @@ class Bench:
 
     def _advance(self, u: Array, before: Rod | None, task: _Task, number: int, halvings: int = 0) -> Array:
         """Newton's method for one step of the load, after the rod `before`, in halves where it fails."""
-        with np.errstate(all="ignore"):  # a failed try passes through inverted elements
-            found = self._newton(u, task)
+        found = self._newton(u, task)
         if found is not None:
             return found
         if halvings == _HALVINGS:
@@ -190,44 +179,16 @@ class Bench:
         return self._advance(self._advance(u, before, half, number, halvings + 1), rod, task, number, halvings + 1)
 
     def _newton(self, u: Array, task: _Task) -> Array | None:
-        """Displacements (dofs,) that balance, from the guess u; None where it does not get there."""
-        jump = np.where(np.isnan(task.prescribed), 0.0, task.prescribed - u)
+        """Displacements (dofs,) that balance, from the guess u; None where Newton's method does not get there."""
         contact = Contact(self._top, task.rod, self.body.side / 2, self.body.young, self.finite) if task.rod else None
-        state = self._balance(u, contact)
-        for _ in range(_ITERATIONS):
-            if state is None:
-                return None
-            tangent, tried = self._tangent(self._deformation(u)), None
-            for curved in (True, False) if contact else (True,):
-                matrix = tangent + contact.tangent(u, curved) if contact else tangent
-                change = _correction(matrix, state[0], u, jump, task)
-                if (not self.finite and not contact) or np.abs(change).max() < _TOLERANCE * np.abs(u).max():
-                    return np.asarray(u + change)
-                if jump.any():  # the prescribed displacements are taken over whole
-                    tried = u + change, self._balance(u + change, contact)
-                else:
-                    tried = self._search(u, change, state, task, contact)
-                if tried is not None:
-                    break
-            if tried is None:
-                return None
-            (u, state), jump = tried, np.zeros_like(u)
-        return None
 
-    def _search(
-        self, u: Array, change: Array, state: tuple[Array, float], task: _Task, contact: Contact | None
-    ) -> tuple[Array, tuple[Array, float]] | None:
-        """As much of a change of u as lowers the energy (by Armijo's rule) or the forces out of balance."""
-        force, energy = state
-        slope, size = float(force @ change), min(1.0, _LONGEST / np.abs(change).max())
-        for _ in range(_SHORTENINGS):
-            there = self._balance(u + size * change, contact)
-            if there is not None and (
-                _left(there[0], task) < _left(force, task) or (slope < 0 and there[1] <= energy + 1e-4 * size * slope)
-            ):
-                return u + size * change, there
-            size /= 2
-        return None
+        def tangents(u: Array) -> Iterator[sp.csr_matrix]:
+            tangent = self._tangent(self._deformation(u))
+            yield from (tangent + contact.tangent(u, curved) for curved in (True, False)) if contact else (tangent,)
+
+        linear = not self.finite and contact is None
+        with np.errstate(all="ignore"):  # a failed try passes through inverted elements
+            return find_balance(u, task.prescribed, task.row, lambda u: self._balance(u, contact), tangents, linear)
 
     def _balance(self, u: Array, contact: Contact | None) -> tuple[Array, float] | None:
         """Nodal forces out of balance (dofs,) and energy; None when an element is inside out."""
@@ -306,31 +267,3 @@ def _refined(mesh: skfem.MeshTri, where: Callable[[Array, Array], NDArray[np.boo
 @skfem.LinearForm
 def _along_x(w, _):
     return w[0]
-
-
-def _factors(matrix: sp.spmatrix) -> SuperLU:
-    # next to symmetric: half the time of free pivoting
-    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True})
-
-
-def _correction(matrix: sp.csr_matrix, force: Array, u: Array, jump: Array, task: _Task) -> Array:
-    """Newton's change of u (dofs,): -force / matrix where u is free, `jump` elsewhere; row @ (u + change) = 0."""
-    free, change = task.free, jump.copy()
-    right = -(force + matrix @ jump)[free]
-    matrix = matrix[free][:, free]
-    if task.row is None:
-        change[free] = _factors(matrix).solve(right)
-        return change
-    row = sp.csr_matrix(task.row[free])
-    right = np.append(right, -task.row @ u)
-    change[free] = _factors(sp.bmat([[matrix, row.T], [row, None]])).solve(right)[:-1]
-    return change
-
-
-def _left(force: Array, task: _Task) -> float:
-    """How much of nodal forces is out of balance: what neither plates nor the row hold."""
-    left = force[task.free]
-    if task.row is not None:
-        row = task.row[task.free]
-        left = left - row * (row @ left) / (row @ row)
-    return float(np.linalg.norm(left))
