@@ -52,9 +52,9 @@ def repair(folder: Path, keep_rest: bool = True) -> Repaired:
         raise BagError(f"{folder}: no folder; name the folder of a bag")
     cut = damaged = 0
     with damage(folder):
-        for part in [
-            path for path in folder.iterdir() if path.is_dir() and path.name.startswith(folder.resolve().name)
-        ]:
+        # While it is written a file stands in a folder of its own name, whatever the bag's folder is called by now.
+        written = [path for suffix in SUFFIXES.values() for path in folder.glob(f"*/*{suffix}")]
+        for part in {path.parent for path in written if path.parent.name == path.stem}:
             move_up(part)
         for path in folder.glob("*.mcap"):
             one_cut, one_damaged = _seal(path, keep_rest)
