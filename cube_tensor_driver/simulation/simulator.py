@@ -146,6 +146,8 @@ class Simulator:
                             behind |= bench.hub.started and bench.hub.next_us <= now
                 for bench in self.benches:
                     bench.line.flush(now)
+                    if bench.hub.started and not bench.prepared:
+                        self._field_at(bench.hub.next_us)  # before it is due: a hub does not compute its load
                 self._injector.step(now)
                 if now >= second_us:
                     second_us += 1_000_000
