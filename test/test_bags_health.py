@@ -23,6 +23,8 @@ def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
         frequency[50:90, 2, 1], frequency[200, 4, 3], frequency[300:, 1, 0] = np.nan, 1e9, 98_000.0
         pad_fault[120, 3] = 4
     stamp_ns = np.repeat(10_000_000 * np.arange(count)[:, None], n, axis=1)
+    stamp_ns[70:] += 30_000_000  # rows are missing
+    stamp_ns[150:] += np.cumsum(rng.integers(0, 2, count - 150) * 10_000_000)[:, None]
     stamp_ns[250:] -= 2_000_000_000  # played again from further back
     cube = np.arange(n, dtype=np.uint16)
     temperature = np.full((count, n), np.nan, np.float32)

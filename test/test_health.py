@@ -59,6 +59,42 @@ def test_nothing_healthy_is_called_ill(moving, noise):
     assert not skin.health.collect()[0].any()
 
 
+class Press:
+    """Cubes of which one pad is pressed harder than the others, and rows are missing, of each cube on its own."""
+
+    def __init__(self, cubes: int, missing: float) -> None:
+        self._random = np.random.default_rng(3)
+        self.health = Health(Pipeline([CALIBRATION] * cubes, np.float32))
+        self._cubes, self._missing = cubes, missing
+
+    def play(self, seconds: float, noise: np.ndarray) -> np.ndarray:
+        """noise: (cubes, 8) of the frequency. Returns the bits found."""
+        stress = np.where(np.arange(8) == np.arange(self._cubes)[:, None] % 8, -10e3, -1e3)
+        for row in range(round(seconds * 1e9 / PERIOD_NS)):
+            cube = np.flatnonzero(self._random.random(self._cubes) >= self._missing).astype(np.uint16)
+            v = stress[cube] * np.sin(2 * np.pi * 0.5 * row * 1e-9 * PERIOD_NS)
+            f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+            f = (f * (1 + noise[cube] * self._random.standard_normal(f.shape))).astype(np.float32)
+            jitter = self._random.integers(0, PERIOD_NS // 10, len(cube))
+            self.health.update(cube, f, np.zeros(len(cube), np.uint32), row * PERIOD_NS + jitter)
+        return self.health.collect()[0]
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.1, 0.4])
+def test_missing_rows_of_a_moving_load_are_no_noise(missing):
+    assert not Press(64, missing).play(5, np.full((64, 8), NOISE)).any()
+
+
+@pytest.mark.parametrize("missing", [0.1, 0.4])
+def test_noise_is_found_among_missing_rows(missing):
+    noise = np.full((16, 8), NOISE)
+    noise[3, 6] = 3e-4
+    found = Press(16, missing).play(5, noise)
+    assert found[3, 6] == NOISY
+    found[3, 6] = 0
+    assert not found.any()
+
+
 def set_pad(value):
     def harm(frequency, row):
         frequency[2, 5] = value

@@ -172,7 +172,7 @@ class Health:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rows of one turn."""
         self._go_on(stamp_ns)
-        self._statistics.add(column.cubes, frequency)
+        self._statistics.add(column.cubes, frequency, stamp_ns)
         self.rows[column.cubes] += 1
         if temperature is not None:
             self.temperature[column.cubes] = temperature
@@ -203,7 +203,7 @@ class Health:
         turn = np.arange(len(cube)) - np.searchsorted(ordered, ordered)
         for k in range(int(turn.max()) + 1):
             chosen = order[turn == k]
-            self._statistics.add(cube[chosen], frequency[chosen])
+            self._statistics.add(cube[chosen], frequency[chosen], stamp_ns[chosen])
             self.rows[cube[chosen]] += 1
         if temperature is not None:
             self.temperature[cube] = temperature
@@ -233,7 +233,7 @@ class Health:
             while end < len(frequency) and quiet[end] and low <= stamp_ns[end] < high:
                 end += 1
             if end > k:
-                self._statistics.add_many(column.cubes, frequency[k:end])
+                self._statistics.add_many(column.cubes, frequency[k:end], stamp_ns[k:end])
                 self.rows[column.cubes] += end - k
                 if temperature is not None:
                     self.temperature[column.cubes] = temperature[end - 1]

@@ -1,18 +1,21 @@
 """Windows: statistics of pads over half a second, what they say of the pads, and what tare averages.
 
-    noise of a pad    sqrt(mean((f[n] - 2 f[n-1] + f[n-2])²) / 6), each term bounded so that one jump is no noise; a
-                      load that moves slowly leaves no second difference
+    noise of a pad    sqrt(mean(w (f[n] - f[n-1] - r (f[n-1] - f[n-2]))²) / 6), r = (t[n] - t[n-1]) / (t[n-1] - t[n-2]),
+                      w = 6 / (1 + (1 + r)² + r²), each term bounded so that one jump is no noise; a load that moves
+                      slowly leaves nothing, also where rows are missing; r = 1 where it is within EVEN
 
 All arrays are (cubes, pads); nothing loops over cubes.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from .status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, SHORT, STUCK
+
+_Times = TypeVar("_Times", int, np.ndarray)
 
 MIN_COUNT = 20
 """Rows in a window below which its statistics say nothing."""
@@ -20,6 +23,8 @@ NOISY_ENTER, NOISY_LEAVE = 10.0, 5.0
 """Times the calibration's noise and times the cube's other pads, to become noisy and to stay so."""
 JUMP = 60.0
 """Times the usual noise, to which a second difference is bounded: two of them in 20 rows stay below NOISY_ENTER."""
+EVEN = 1.5
+"""Times each other, up to which two intervals count as equal: stamps jitter, but a missing row makes it 2."""
 STUCK_MOVING = 5.0
 """Times its noise that the cube's pads must have moved, before one that did not move at all is called stuck."""
 STILL = 8.0
@@ -38,6 +43,14 @@ class Window(NamedTuple):
     noise: np.ndarray
 
 
+class _Pace(NamedTuple):
+    """When the newest rows of these cubes came, all at once, and how long after the rows before."""
+
+    cubes: slice | np.ndarray
+    time_ns: int
+    interval_ns: int
+
+
 class Statistics:
     """Of the window that is not over yet.
 
@@ -53,6 +66,9 @@ class Statistics:
         self._base[:] = np.nan_to_num(rest)
         self.bound[:] = bound
         self.count = np.zeros(len(rest), int)
+        # When the newest row of each cube came, and how long after the one before: 0 is unknown.
+        self._time_ns, self._interval_ns = np.zeros((2, len(rest)), np.int64)
+        self._together: _Pace | None = None
         self.clear()
 
     def clear(self) -> None:
@@ -60,13 +76,20 @@ class Statistics:
         self._bend[:] = self._sum[:] = self.count[:] = 0
         self._lowest[:] = self._highest[:] = np.nan
 
-    def add(self, cubes: slice | np.ndarray, frequency: np.ndarray) -> None:
-        """Rows (N, P) of different cubes."""
+    def add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray) -> None:
+        """Rows (N, P) of different cubes, taken at one time or (N,) times."""
         part = self._all[:, cubes]
         last, step, bend, total, lowest, highest, base, bound = part
+        uneven = self._pace(cubes, stamp_ns)
         new = frequency - last
-        work = new - step
-        work *= work
+        if uneven is None:
+            work = new - step
+            work *= work
+        else:
+            ratio, weight = uneven
+            work = new - ratio * step
+            work *= work
+            work *= weight
         bend += np.minimum(work, bound, out=work)
         step[:] = new
         np.fmin(lowest, frequency, out=lowest)
@@ -77,8 +100,19 @@ class Statistics:
             self._all[:, cubes] = part
         self.count[cubes] += 1
 
-    def add_many(self, cubes: slice | np.ndarray, frequency: np.ndarray) -> None:
-        """`add` of (B, N, P), one after the other, to the same bits: sums go batch by batch."""
+    def add_many(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
+        """`add` of (B, N, P) taken at (B,) times, one after the other, to the same bits: sums go batch by batch."""
+        k = 0
+        while k < len(frequency):
+            even = self._count_even(cubes, stamp_ns[k:])
+            if even:
+                self._add_even(cubes, frequency[k : k + even])
+            else:
+                self.add(cubes, frequency[k], int(stamp_ns[k]))
+            k += even or 1
+
+    def _add_even(self, cubes: slice | np.ndarray, frequency: np.ndarray) -> None:
+        """(B, N, P) that came at even intervals."""
         part = self._all[:, cubes]
         last, step, bend, total, lowest, highest, base, bound = part
         new = np.diff(np.concatenate([last[None], frequency]), axis=0)
@@ -94,6 +128,40 @@ class Statistics:
         if not isinstance(cubes, slice):
             self._all[:, cubes] = part
         self.count[cubes] += len(frequency)
+
+    def _pace(self, cubes: slice | np.ndarray, stamp_ns: int | np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """r and w of the rows, (N, 1) each; None where all are even, which for the same cubes as before is known
+        without looking at each. Where an interval is unknown or not positive, w = 0."""
+        one = self._together
+        if one is not None and one.cubes is cubes and isinstance(stamp_ns, int):
+            interval_ns = stamp_ns - one.time_ns
+            if _even(interval_ns, one.interval_ns):
+                self._together = _Pace(cubes, stamp_ns, interval_ns)
+                return None
+        if one is not None:
+            self._time_ns[one.cubes], self._interval_ns[one.cubes] = one.time_ns, one.interval_ns
+            self._together = None
+        before = self._interval_ns[cubes].copy()
+        interval = stamp_ns - self._time_ns[cubes]
+        self._time_ns[cubes], self._interval_ns[cubes] = stamp_ns, interval
+        if isinstance(stamp_ns, int) and (interval == interval[0]).all():
+            self._together = _Pace(cubes, stamp_ns, int(interval[0]))
+        known = (interval > 0) & (before > 0)
+        ratio = np.where(known & ~_even(interval, before), interval / np.where(known, before, 1), 1.0)
+        weight = known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
+        return ratio.astype(np.float32)[:, None], weight.astype(np.float32)[:, None]
+
+    def _count_even(self, cubes: slice | np.ndarray, stamp_ns: np.ndarray) -> int:
+        """How many of the first rows of (B,) times are even; goes on to the last of them."""
+        one = self._together
+        if one is None or one.cubes is not cubes:
+            return 0
+        interval = np.diff(stamp_ns, prepend=one.time_ns)
+        even = _even(interval, np.concatenate([[one.interval_ns], interval[:-1]]))
+        count = len(even) if even.all() else int(np.argmin(even))
+        if count:
+            self._together = _Pace(cubes, int(stamp_ns[count - 1]), int(interval[count - 1]))
+        return count
 
     def window(self) -> Window:
         """The statistics so far."""
@@ -150,6 +218,11 @@ class Judge:
     def _bound(noise: np.ndarray) -> np.ndarray:
         bound: np.ndarray = ((JUMP * noise) ** 2).astype(np.float32)
         return bound
+
+
+def _even(interval: _Times, before: _Times) -> _Times:
+    """Whether two intervals count as equal; never where one is not positive."""
+    return (interval < EVEN * before) & (before < EVEN * interval)
 
 
 def _median(values: np.ndarray) -> np.ndarray:
