@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,8 @@ END_S = 1.2
 
 
 LOOK_S = 0.05
+LEASH = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
+"""Runs a command so that the kernel ends it when the thread that started it is gone, even by SIGKILL; of util-linux."""
 
 
 class ChildError(CubeError):
@@ -40,7 +43,7 @@ class Children:
 
     def start(self, process: Process) -> None:
         """Start one. It has a session of its own: Ctrl-C reaches it through us, in order."""
-        command = [sys.executable, "-m", process.module, *process.arguments]
+        command = [*LEASH, sys.executable, "-m", process.module, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]
         with (self._logs / f"{process.executable}.log").open("wb") as log:

@@ -24,6 +24,7 @@ from cube_tensor_driver.msg import ReplayState
 from cube_tensor_driver.srv import SteerReplay, Tare
 
 from ..core.errors import ConfigError
+from ..ros.children import LEASH
 from ..ros.follow import STALE_S, Follower
 from ..ros.node import make_executor
 from .history import History
@@ -189,7 +190,7 @@ class Browser:
             self._end_recording()
             return
         name = time.strftime("skin_%Y%m%d_%H%M%S")
-        command = [sys.executable, "-m", "cube_tensor_driver.cli", "record", "-o", name]
+        command = [*LEASH, sys.executable, "-m", "cube_tensor_driver.cli", "record", "-o", name]
         self._recorder = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                                           start_new_session=True)  # fmt: skip
         self._facts.recording, self._facts.action = True, f"recording to {name}"
