@@ -170,7 +170,7 @@ def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_i
     surface = Surface(skin, DEPTH, 2)
     colours = np.random.default_rng(2).random((len(surface.points), 3))
     assert is_flat(surface.points, skin.rotation[surface.cube], surface.spacing)
-    raster = Raster(surface.points, turn, surface.spacing)
+    raster = Raster(surface.points, turn, surface.spacing, surface.spacing, None)
     image = raster.image(colours)
     assert image.shape == (6, 10, 4)
     np.testing.assert_allclose(raster.centre, place, atol=1e-12)
@@ -180,6 +180,28 @@ def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_i
     for point, colour in zip(surface.points, colours, strict=True):
         x, y, _ = (point - place) @ turn / surface.spacing
         np.testing.assert_array_equal(image[round(2.5 - y), round(4.5 + x), :3], (255 * colour).astype(np.uint8))
+
+    # with the cubes in it, each as a square of its own turn
+    turned = skin._replace(rotation=skin.rotation @ rotation_from_rpy(0, 0, np.pi / 4))
+    raster = Raster(surface.points, turn, surface.spacing, surface.spacing / 8, turned)
+    image = raster.image(np.concatenate([colours, 1 - colours[: len(keep)]]))
+    rows, columns = image.shape[:2]
+    painted = np.zeros((rows, columns), bool)
+    for cube, place_of_cube in enumerate(skin.position):
+        x, y, _ = (place_of_cube - place) @ turn / (surface.spacing / 8)
+        across = np.arange(columns) - (columns - 1) / 2 - x
+        up = (rows - 1) / 2 - np.arange(rows) - y
+        # |x| + |y| < half the diagonal of a square that is turned by 45 degrees
+        inside = np.abs(across) + np.abs(up)[:, None] < np.sqrt(2) * skin.half_side[cube] / (surface.spacing / 8)
+        assert inside.sum() > 10
+        painted |= inside
+        expected = (255 * (1 - colours[cube])).astype(np.uint8)
+        assert (image[inside][:, :3] == expected).all() and (image[inside][:, 3] == 255).all()
+    nothing = raster.owner == len(colours) + len(keep)
+    assert nothing[24, 40] and not nothing[~np.kron(hole, np.ones((8, 8), bool))].any()
+    assert (raster.owner[~painted & (image[..., 3] > 0)] < len(colours)).all()
+    hidden = raster.image(np.concatenate([np.full_like(colours, np.nan), colours[: len(keep)]]))
+    np.testing.assert_array_equal(hidden[..., 3] > 0, painted)
 
     bent = skin.rotation.copy()
     bent[3] = rotation_from_rpy(0.1, 0, 0) @ bent[3]

@@ -32,8 +32,8 @@ LEAST_N, WAIT_S = 2.2, 60.0
 
 
 @contextmanager
-def chromium(url: str) -> Iterator[webdriver.Chrome]:
-    """A headless browser that shows the page."""
+def chromium(url: str, script: str = "") -> Iterator[webdriver.Chrome]:
+    """A headless browser that shows the page; script: runs before the page's own."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or shutil.which("google-chrome") or ""
     for flag in FLAGS:
@@ -41,6 +41,7 @@ def chromium(url: str) -> Iterator[webdriver.Chrome]:
     browser = webdriver.Chrome(options, Service(shutil.which("chromedriver")))
     try:
         browser.set_script_timeout(60)
+        browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
         browser.get(url)
         yield browser
     finally:
