@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from selenium import webdriver
-from selenium.common.exceptions import TimeoutException
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.wait import WebDriverWait
 
 FLAGS = ("--headless", "--no-sandbox", "--disable-background-networking", "--enable-unsafe-swiftshader",
          "--use-gl=angle", "--use-angle=swiftshader", "--window-size=1400,950")  # fmt: skip
-PLOTS_S = 10.0
-"""What the plots show."""
 READY = "return /of \\d+ cubes/.test(document.body.innerText) && document.body.innerText.includes('live')"
 HELD = """return new Promise(drawn => {
   if (!document.body.innerText.includes('paused')) return drawn(false)
@@ -27,8 +23,8 @@ HELD = """return new Promise(drawn => {
 CLICK = "for (const b of document.querySelectorAll('button')) if (b.innerText.trim() == 'pause') b.click()"
 CLEAR = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 LOADED = "return Number((/([0-9.]+) N, shear/.exec(document.body.innerText) || [0, 0])[1])"
-LEAST_N, WAIT_S = 2.2, 60.0
-"""The load comes and goes: the picture waits until it presses."""
+LEAST_N, WAIT_S, COMINGS = 2.2, 60.0, 3
+"""The load comes and goes: the picture is of its third coming, when the plots are full, while it presses."""
 
 
 @contextmanager
@@ -52,14 +48,24 @@ def photograph(url: str, path: str) -> None:
     with chromium(url) as browser:
         wait = WebDriverWait(browser, WAIT_S, poll_frequency=0.02)
         wait.until(lambda _: browser.execute_script(READY))
-        # Nothing to wait for but time itself: the plots fill from right to left.
-        with contextlib.suppress(TimeoutException):
-            WebDriverWait(browser, PLOTS_S).until(lambda _: False)
         browser.execute_script(CLEAR)
-        wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
-        browser.execute_script(CLICK)
-        wait.until(lambda _: browser.execute_script(HELD))
+        for _ in range(COMINGS - 1):
+            wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
+            wait.until(lambda _: browser.execute_script(LOADED) < LEAST_N / 2)
+        wait.until(lambda _: pressed(browser, wait))
         browser.save_screenshot(path)
+
+
+def pressed(browser: webdriver.Chrome, wait: WebDriverWait[webdriver.Chrome]) -> bool:
+    """Wait for the load and hold the page; whether it was still pressing by then. If not the page runs again."""
+    wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
+    browser.execute_script(CLICK)
+    wait.until(lambda _: browser.execute_script(HELD))
+    if browser.execute_script(LOADED) > LEAST_N:
+        return True
+    browser.execute_script(CLICK)
+    wait.until(lambda _: browser.execute_script(READY))
+    return False
 
 
 if __name__ == "__main__":
