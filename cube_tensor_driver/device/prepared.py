@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import replace
 
 from cobs import cobs  # type: ignore[import-untyped]
 
@@ -36,7 +35,8 @@ class Prepared:
     def encode(self, sequence: int, device_us: int) -> bytes:
         """The same bytes as `protocol.encode` of the sample with these numbers."""
         if self._whole is not None:
-            return encode(replace(self._whole, sequence=sequence, device_us=device_us))
+            self._whole.sequence, self._whole.device_us = sequence, device_us
+            return encode(self._whole)
         for (field, place), value in ((_SEQUENCE, sequence), (_DEVICE_US, device_us)):
             field.pack_into(self._head, place, value)
         crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(4, "little")

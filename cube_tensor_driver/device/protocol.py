@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from enum import IntEnum
 from typing import Any
@@ -43,11 +43,13 @@ _STATS = struct.Struct("<QIIH")
 _REQUEST = struct.Struct("<BI")
 _ACK = struct.Struct("<BBI")
 _U16, _U32, _U64, _I16 = (np.dtype(code) for code in ("<u2", "<u4", "<u8", "<i2"))
+_Arrays = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.int16]]
 _OVERHEAD = _HEADER.size + 4
+_FREQUENCY = _HEADER.size + _SAMPLE.size
 MIN_RUN = _OVERHEAD + _REQUEST.size + 1
 """Shortest run that can be a frame, of any version: to try shorter ones would let noise slow the decoder down."""
 SHORT_RUN, CROWD = 32, 32
-"""More runs in a feed than CROWD that are shorter than any SAMPLE are noise: see `Decoder._without_torn`."""
+"""More runs in a feed than CROWD that are shorter than any SAMPLE are noise: see `Decoder._thinned`."""
 # CRC-32 over data followed by its own CRC is this constant: no slice, no second look at the frame's end.
 _CRC_RESIDUE = 0x2144DF1C
 
@@ -107,36 +109,66 @@ class Hello:
         return cls(hub_uid, firmware, n_pads, period_us, uids, flags)
 
 
-@dataclass(slots=True, eq=False)  # not frozen: that would take longer to make than the arrays
 class Sample:
     """One reading of cubes first_cube .. first_cube + n_cubes − 1 of a hub, all at the same instant.
 
     sequence: u32, given when the sample is taken, so that a sample dropped in the hub leaves a gap; wraps.
-    first_cube: index on the hub, u16. device_us: hub clock, µs, u64.
+    first_cube: index on the hub, u16. device_us: hub clock, µs, u64. shape: (n_cubes, n_pads).
     frequency: (n_cubes, n_pads) uint32, mHz, 0 not measured.
     pad_fault: (n_cubes,) uint32, bit p set = pad p reported faulty by the hub.
     temperature: (n_cubes,) int16, 0.01 °C, −32768 unknown.
     """
 
-    sequence: int
-    first_cube: int
-    device_us: int
-    frequency: NDArray[np.uint32]
-    pad_fault: NDArray[np.uint32]
-    temperature: NDArray[np.int16]
+    __slots__ = ("_arrays", "_raw", "device_us", "first_cube", "sequence", "shape")
+
+    def __init__(
+        self,
+        sequence: int,
+        first_cube: int,
+        device_us: int,
+        frequency: NDArray[np.uint32],
+        pad_fault: NDArray[np.uint32],
+        temperature: NDArray[np.int16],
+    ) -> None:
+        self.sequence, self.first_cube, self.device_us = sequence, first_cube, device_us
+        self.shape = frequency.shape
+        self._arrays: _Arrays | None = (frequency, pad_fault, temperature)
+        self._raw = b""
+
+    def __repr__(self) -> str:
+        numbers = f"{self.sequence}, {self.first_cube}, {self.device_us}"
+        return f"Sample({numbers}, {self.frequency!r}, {self.pad_fault!r}, {self.temperature!r})"
 
     @property
     def n_cubes(self) -> int:
-        return len(self.frequency)
+        return self.shape[0]
 
     @property
     def n_pads(self) -> int:
-        return int(self.frequency.shape[1])
+        return self.shape[1]
+
+    @property
+    def frequency(self) -> NDArray[np.uint32]:
+        return self._made()[0]
+
+    @property
+    def pad_fault(self) -> NDArray[np.uint32]:
+        return self._made()[1]
+
+    @property
+    def temperature(self) -> NDArray[np.int16]:
+        return self._made()[2]
+
+    def _made(self) -> _Arrays:
+        # Of decoded samples `join` mostly makes the arrays of several at once.
+        if self._arrays is None:
+            self._arrays = join([self])
+        return self._arrays
 
     def _pack(self) -> bytes:
-        if self.frequency.ndim != 2:
-            raise ProtocolError(f"frequency has {self.frequency.ndim} dimensions, must have 2: (n_cubes, n_pads)")
-        n_cubes, n_pads = self.frequency.shape
+        if len(self.shape) != 2:
+            raise ProtocolError(f"frequency has {len(self.shape)} dimensions, must have 2: (n_cubes, n_pads)")
+        n_cubes, n_pads = self.shape
         frequency = _array("frequency", self.frequency, _U32, (n_cubes, n_pads))
         pad_fault = _array("pad_fault", self.pad_fault, _U32, (n_cubes,))
         temperature = _array("temperature", self.temperature, _I16, (n_cubes,))
@@ -147,18 +179,35 @@ class Sample:
     def _unpack(cls, raw: bytes, size: int) -> Sample | None:
         if size < _SAMPLE.size:
             return None
-        sequence, first_cube, n_cubes, device_us, n_pads = _SAMPLE.unpack_from(raw, 4)
+        sample = cls.__new__(cls)
+        sample.sequence, sample.first_cube, n_cubes, sample.device_us, n_pads = _SAMPLE.unpack_from(raw, 4)
         if size != _SAMPLE.size + n_cubes * (4 * n_pads + 6):
             return None
-        at_fault = 4 + _SAMPLE.size + 4 * n_cubes * n_pads
-        return cls(
-            sequence,
-            first_cube,
-            device_us,
-            np.ndarray((n_cubes, n_pads), _U32, raw, 4 + _SAMPLE.size),
-            np.ndarray((n_cubes,), _U32, raw, at_fault),
-            np.ndarray((n_cubes,), _I16, raw, at_fault + 4 * n_cubes),
-        )
+        sample.shape = n_cubes, n_pads
+        sample._raw, sample._arrays = raw, None
+        return sample
+
+
+def join(samples: Sequence[Sample]) -> _Arrays:
+    """frequency (N, P), pad_fault (N,) and temperature (N,) of all cubes of samples with P pads, one after the other.
+
+    Decoded bytes become arrays once for all of them. Read-only where all were decoded.
+    """
+    width = samples[0].n_pads
+    parts: list[bytes] = []
+    for sample in samples:
+        raw, n_cubes = sample._raw, sample.shape[0]
+        if not raw:
+            frequency, pad_fault, temperature = zip(*(sample._made() for sample in samples), strict=True)
+            return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
+        at_fault = _FREQUENCY + 4 * n_cubes * width
+        at_temperature = at_fault + 4 * n_cubes
+        parts += raw[_FREQUENCY:at_fault], raw[at_fault:at_temperature], raw[at_temperature:-4]
+    return (
+        np.frombuffer(b"".join(parts[::3]), _U32).reshape(sum(sample.n_cubes for sample in samples), width),
+        np.frombuffer(b"".join(parts[1::3]), _U32),
+        np.frombuffer(b"".join(parts[2::3]), _I16),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +331,8 @@ class Decoder:
             # One frame and nothing else, as it mostly comes.
             only = self._decode(bytes(data[1:last]))
             return [] if only is None else [only]
-        runs: list[bytes] = bytes(data).split(b"\0")
+        data = bytes(data)
+        runs = (self._thinned(data) if data.count(0) > CROWD else data).split(b"\0")
         rest = runs.pop()
         frames: list[Frame] = []
         if runs:
@@ -290,13 +340,13 @@ class Decoder:
                 runs[0] = b"" if self._discarding else bytes(self._tail + runs[0])
                 self._tail.clear()
                 self._discarding = False
-            # Noise can be all short runs: they are counted without a step in Python each.
-            long = [run for run in runs if len(run) >= MIN_RUN]
-            self.counters.length += len(runs) - runs.count(b"") - len(long)
-            for run in long if len(long) <= CROWD else self._without_torn(long):
-                frame = self._decode(run)
-                if frame is not None:
-                    frames.append(frame)
+            for run in runs:
+                if len(run) >= MIN_RUN:
+                    frame = self._decode(run)
+                    if frame is not None:
+                        frames.append(frame)
+                elif run:
+                    self.counters.length += 1
         if not self._discarding:
             self._tail += rest
             if len(self._tail) > MAX_RUN:
@@ -311,24 +361,36 @@ class Decoder:
         self._tail.clear()
         self._discarding = False
 
-    def _without_torn(self, runs: list[bytes]) -> list[bytes]:
-        """Of a crowd of short runs those that are COBS; the others are counted as framing, all in one go.
+    def _thinned(self, data: bytes) -> bytes:
+        """Data without the short runs that can be no frame, where they are a crowd: counted without a step each.
 
-        The cobs package tells by raising, which takes longer than decoding a good frame of the same size.
+        To decode each would take longer than good frames of the same size. A short frame with a sound checksum but type
+        or version 0, which no version has, counts as crc here.
         """
-        short = [run for run in runs if len(run) < SHORT_RUN]
-        if len(short) <= CROWD:
-            return runs
-        # Each code word says where the next one is; a run is COBS where that leads to its end, a zero, which stays.
-        code = np.frombuffer(b"\0".join(short) + b"\0", np.uint8)
-        ends = np.flatnonzero(code == 0)
-        at = np.minimum(np.arange(len(code) + 1) + np.append(code, 0), len(code))
-        for _ in range(SHORT_RUN.bit_length()):
-            at = at[at]
-        good = at[np.append(0, ends[:-1] + 1)] == ends
-        self.counters.framing += len(short) - int(np.count_nonzero(good))
-        verdicts = iter(good.tolist())
-        return [run for run in runs if len(run) >= SHORT_RUN or next(verdicts)]
+        code = np.frombuffer(data + b"\0", np.uint8)  # one more, where what leads beyond the data ends
+        zeros = np.flatnonzero(code[:-1] == 0)
+        length = np.diff(zeros) - 1
+        tiny = np.count_nonzero(length < MIN_RUN) - np.count_nonzero(length == 0)
+        kept = length >= MIN_RUN
+        short = np.flatnonzero(kept & (length < SHORT_RUN))
+        if len(short) > CROWD:
+            # Each code word says where the next one is; a run is COBS where that leads to its end, a zero, which stays.
+            at = np.minimum(np.arange(len(code)) + code, len(code) - 1)
+            for _ in range((SHORT_RUN - 1).bit_length()):
+                at = at[at]
+            first, end, size = zeros[short] + 1, zeros[short + 1], length[short]
+            sound = at[first] == end
+            # The header's fourth byte, the high one of its length, is the only one of four that is 0.
+            hopeful = sound & (code[first] == 4) & (code[first + 3] == size - 1 - _OVERHEAD)
+            kept[short] = hopeful
+            self.counters.framing += len(short) - int(np.count_nonzero(sound))
+            self.counters.crc += int(np.count_nonzero(sound)) - int(np.count_nonzero(hopeful))
+        elif tiny <= CROWD:
+            return data
+        self.counters.length += tiny
+        chosen = np.flatnonzero(kept)
+        runs = [data[i:j] for i, j in zip((zeros[chosen] + 1).tolist(), zeros[chosen + 1].tolist(), strict=True)]
+        return b"\0".join([data[: zeros[0]], *runs, data[zeros[-1] + 1 :]])
 
     def _decode(self, run: bytes) -> Frame | None:
         counters = self.counters

@@ -185,6 +185,8 @@ class Reader:
             except LinkError as error:
                 self._drop(selector, key.data, error)
         batch: list[tuple[int, int, Frame]] = []
+        if not taken:
+            return batch
         arrival_ns, now = self._clock_ns(), time.monotonic()
         for i, data in taken:
             self._sessions[i].last_byte = now

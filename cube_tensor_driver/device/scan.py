@@ -14,8 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Hello, Sample
+from .protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Hello, Sample, join
 
+# °C of each of the 65536 bit patterns of a temperature.
+_CELSIUS = np.arange(1 << 16, dtype=np.uint16).view(np.int16) * np.float32(0.01)
+_CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
 NAMED = 8
 """Cubes that a message names; of more it says how many."""
 
@@ -162,7 +165,7 @@ class Scan:
             for link, (samples, whole) in enumerate(zip(self._gathered, self._whole, strict=True)):
                 if turn < len(samples):
                     sample, stamp_ns = samples[turn]
-                    if whole is not None and whole[1] == sample.frequency.shape and sample.first_cube == 0:
+                    if whole is not None and whole[1] == sample.shape and sample.first_cube == 0:
                         parts.append((whole[0], sample, stamp_ns))
                     elif (part := self._select(link, sample)) is not None:
                         parts.append((*part, stamp_ns))
@@ -170,18 +173,14 @@ class Scan:
             del samples[:turns]
         if not parts:
             return None
-        cubes, taken, stamps = zip(*parts, strict=True)
-        counts = [len(cube) for cube in cubes]
-        rows = room(sum(counts), self.n_pads)
+        rows = room(sum(len(cube) for cube, _, _ in parts), self.n_pads)
         self.rows += len(rows.cube)
-        np.concatenate(cubes, out=rows.cube)
-        rows.sequence[:] = np.repeat(np.array([sample.sequence for sample in taken], np.uint32), counts)
-        rows.stamp_ns[:] = np.repeat(np.array(stamps, np.int64), counts)
-        self._hertz([sample.frequency for sample in taken], rows.frequency)
-        temperature = np.concatenate([sample.temperature for sample in taken])
-        np.multiply(temperature, np.float32(0.01), out=rows.temperature)
-        rows.temperature[temperature == TEMPERATURE_UNKNOWN] = np.nan
-        np.concatenate([sample.pad_fault for sample in taken], out=rows.pad_fault)
+        start = 0
+        for _, alike in groupby(parts, lambda part: part[1].n_pads):
+            cubes, taken, stamps = zip(*alike, strict=True)
+            end = start + sum(map(len, cubes))
+            _fill(Rows._make(field[start:end] for field in rows), cubes, taken, stamps)
+            start = end
         return rows
 
     def unaccounted(self) -> int:
@@ -209,18 +208,21 @@ class Scan:
         kept = Sample(sample.sequence, sample.first_cube, sample.device_us, frequency, pad_fault, temperature)
         return cubes[rows].astype(np.uint16), kept
 
-    def _hertz(self, parts: list[NDArray[np.uint32]], hertz: NDArray[np.float32]) -> None:
-        """Fill hertz (N, n_pads) with frequencies in mHz; pads that a cube has not are NaN."""
-        start = 0
-        for width, alike in groupby(parts, lambda part: part.shape[1]):
-            millihertz = np.concatenate(list(alike))
-            rows = hertz[start : start + len(millihertz)]
-            start += len(millihertz)
-            # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.
-            np.multiply(millihertz, 1e-3, out=rows[:, :width], casting="same_kind")
-            rows[:, width:] = np.nan
-            if millihertz.size and millihertz.min() == NOT_MEASURED:
-                rows[:, :width][millihertz == NOT_MEASURED] = np.nan
+
+def _fill(rows: Rows, cubes: Sequence[NDArray[np.uint16]], samples: Sequence[Sample], stamps_ns: Sequence[int]) -> None:
+    """Rows of samples with the same number of pads, one after the other; pads that a cube has not are NaN."""
+    frequency, pad_fault, temperature = join(samples)
+    width, counts = frequency.shape[1], [len(cube) for cube in cubes]
+    np.concatenate(cubes, out=rows.cube)
+    rows.sequence[:] = np.array([sample.sequence for sample in samples], np.uint32).repeat(counts)
+    rows.stamp_ns[:] = np.array(stamps_ns, np.int64).repeat(counts)
+    rows.pad_fault[:] = pad_fault
+    _CELSIUS.take(temperature.view(np.uint16), out=rows.temperature, mode="clip")
+    # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.
+    np.multiply(frequency, 1e-3, out=rows.frequency[:, :width], casting="same_kind")
+    rows.frequency[:, width:] = np.nan
+    if frequency.size and frequency.min() == NOT_MEASURED:
+        rows.frequency[:, :width][frequency == NOT_MEASURED] = np.nan
 
 
 def _named(what: str, names: Sequence[str], text: str) -> str:

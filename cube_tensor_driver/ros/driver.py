@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock import ROSClock
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
@@ -92,10 +94,8 @@ class Driver(CubeNode):
 
     def activate(self) -> None:
         period_us = None if self._rate is None else round(1e6 / self._rate)
-        clock = self.get_clock()
-        self._reader = Reader(
-            self._links, self._on_frames, self._on_state, lambda: int(clock.now().nanoseconds), period_us
-        )
+        self._look_at_clock()
+        self._reader = Reader(self._links, self._on_frames, self._on_state, self._now_ns, period_us)
         self._reader.start()
 
     def changed(self, name: str) -> None:
@@ -129,6 +129,14 @@ class Driver(CubeNode):
             )
             for link in skin.links
         ]
+
+    def _look_at_clock(self) -> None:
+        clock = self.get_clock()
+        self._simulated_time = isinstance(clock, ROSClock) and clock.ros_time_is_active
+
+    def _now_ns(self) -> int:
+        """The node's clock. Without simulated time that is the system's, asked for itself in a tenth of the time."""
+        return int(self.get_clock().now().nanoseconds) if self._simulated_time else time.time_ns()
 
     def _on_frames(self, frames: list[tuple[int, int, Frame]]) -> None:
         """Reader's thread, once per wake-up."""
@@ -203,6 +211,7 @@ class Driver(CubeNode):
         """For diagnostics, of the whole and of each link; what happened since the last time is in them."""
         if not self.configured:
             return []
+        self._look_at_clock()
         if self._scan.uids != self._uids:
             self._uids = dict(self._scan.uids)
             self._publish_info()
