@@ -17,7 +17,7 @@ sys.modules.setdefault("cv2", None)  # type: ignore[arg-type]
 
 EMPTY = 4
 """Most pixels per point: an image of cubes far apart would be mostly of nothing."""
-MOST_PIXELS = 50_000
+MOST_PIXELS = 25_000
 """Of an image: encoding it is half of what a picture of a large skin costs the view."""
 DARK = np.uint8(60)
 
