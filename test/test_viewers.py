@@ -1,4 +1,5 @@
-"""The set-ups for RViz and Foxglove, whose programs are not here: every name in them is one that their sources read.
+"""The live table; and the set-ups for RViz and Foxglove, whose programs are not here: every name in them is one that
+their sources read.
 
 Names from ros2/rviz, branch jazzy (14.1): plugins_description.xml, panel_factory.cpp and the constructors of displays
 and properties; from Lichtblick (Foxglove Studio's open sources), March 2025: the panels' index and config types.
@@ -6,8 +7,10 @@ and properties; from Lichtblick (Foxglove Studio's open sources), March 2025: th
 
 from __future__ import annotations
 
+import io
 import json
 
+import numpy as np
 import pytest
 
 from conftest import ROOT
@@ -122,3 +125,29 @@ def test_what_foxglove_plots_are_fields_of_our_messages():
         for field in fields:
             value = getattr(value, field)
         assert isinstance(value, float)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_live_table_of_planar_cubes_is_whole_in(width):
+    console = pytest.importorskip("rich.console", reason="needs rich: run this with ./cube test")
+    from cube_tensor_driver.core.pipeline import StressRows
+    from cube_tensor_driver.files.share import share
+    from cube_tensor_driver.files.skin import read_skin
+    from cube_tensor_driver.view.table import LiveTable
+
+    skin = read_skin(share() / "config" / "skin_demo.yaml")
+    n = len(skin.cubes)
+    stress, gradient = np.full((n, 6), np.nan, np.float32), np.full((n, 9), np.nan, np.float32)
+    stress[:, [0, 2, 4]], gradient[:, [6, 8]] = -123e3, -12e6
+    none = np.zeros(n, np.uint16)
+    table = LiveTable(skin, show=False)
+    table.update(np.arange(n), StressRows(stress, gradient, np.ones(n, np.float32), none, none))
+    shown = console.Console(width=width, record=True, file=io.StringIO())
+    shown.print(table.draw(n, width))
+    text = shown.export_text()
+    assert "…" not in text
+    for word in ("pressure", "∂zz/∂z", "residual", "Hz", "state"):
+        assert word in text
+    rows = [line for line in text.splitlines() if any(cube.name in line for cube in skin.cubes)]
+    assert len(rows) == n and all(row.count("-123.00") == 3 and row.count("-12.00") == 2 for row in rows)
+    assert all("1.00" in row and "ok" in row for row in rows)

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.live import Live
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -23,6 +25,8 @@ SHOWN = ("xx", "zz", "zx", "yz", "zz_x", "zz_y", "zz_z")
 """Components with a column of their own where a cube observes them: normal stress, shear on the skin's surface, how the
 pressure varies."""
 BAR = 12
+WIDEST = 1000
+"""Of a terminal, in columns."""
 
 
 class LiveTable:
@@ -74,10 +78,10 @@ class LiveTable:
             self._rate_count, self._rate_at = self._count.copy(), now
         if self._live and now - self._drawn_at >= REFRESH_S:
             self._drawn_at = now
-            self._live.update(self.draw(max(4, self._console.height - 8)), refresh=True)
+            self._live.update(self.draw(max(4, self._console.height - 8), self._console.width), refresh=True)
 
-    def draw(self, most: int) -> Table:
-        """The table, with the `most` cubes that carry the greatest normal stress if there are more."""
+    def draw(self, most: int, width: int) -> Table:
+        """The table for a terminal of `width`, with the `most` cubes under the greatest normal stress if there are more."""
         title = f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed"
         table = Table(title=title + self.note)
         table.add_column("cube")
@@ -107,6 +111,9 @@ class LiveTable:
             rate = "·" if np.isnan(self._rate[number]) else f"{self._rate[number]:.0f}"
             residual = "·" if np.isnan(self._residual[number]) else f"{self._residual[number]:.2f}"
             table.add_row(self._skin.cubes[number].name, Text(bar, "blue"), *values, residual, rate, state)
+        if Measurement.get(self._console, self._console.options.update(max_width=WIDEST), table).maximum > width:
+            # Without lines a planar skin fits into 80 columns.
+            table.box, table.padding, table.show_edge = SIMPLE_HEAD, 0, False
         return table
 
 
