@@ -20,7 +20,7 @@ from conftest import ROOT, end
 
 PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 ELSEWHERE = {
-    "./cube demo": "test_end_to_end.py::test_interrupted_demo_leaves_no_process",
+    "./cube demo": "test_end_to_end.py::test_ended_demo_leaves_no_process",
     "./cube record -o run1": "test_bags_ros.py::test_recorded_is_published_and_reprocessed_is_live",
     "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml":
         "test_bags_files.py::test_fit_from_a_bag",
@@ -41,7 +41,7 @@ ELSEWHERE = {
 """What runs for minutes, needs what a page of its own does not have, or is this suite: where it is run instead."""
 ENDLESS = {
     "./cube demo --view": "shows it",
-    "./cube demo --config skin.yaml --load load.yaml": "│ c0",
+    "./cube demo --config skin.yaml --load load.yaml": "c0 ",
     "./cube view": "http://",
 }
 """Commands that Ctrl-C ends, and what they say once they run."""

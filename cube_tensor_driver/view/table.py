@@ -81,7 +81,7 @@ class LiveTable:
             self._live.update(self.draw(max(4, self._console.height - 8), self._console.width), refresh=True)
 
     def draw(self, most: int, width: int) -> Table:
-        """The table for a terminal of `width`, with the `most` cubes under the greatest normal stress if there are more."""
+        """The table for a terminal of `width`, of the `most` cubes under the greatest normal stress."""
         title = f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed"
         table = Table(title=title + self.note)
         table.add_column("cube")
