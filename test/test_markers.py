@@ -156,3 +156,26 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     contact = contacts[-1]
     assert contact.header.frame_id == "skin_base" and len(contact.position) == 1
     assert contact.normal_force[0] > 0 and contact.force[0].z < 0 < contact.force[0].x
+
+
+def test_rods_lie_around_their_lines_with_the_radii_asked_for():
+    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
+    from cube_tensor_driver.view.stage import SIDES, rods
+
+    lines = np.random.default_rng(3).normal(size=(7, 2, 3))
+    lines[0, 1] = lines[0, 0] + [0, 0, 2.0]  # along an axis
+    vertices, faces = rods(lines, 0.2, 0.05)
+    rings = vertices.reshape(7, 2, SIDES, 3)
+    np.testing.assert_allclose(rings.mean(axis=2), lines, atol=1e-12)
+    way = lines[:, 1] - lines[:, 0]
+    from_axis = rings - lines[:, :, None]
+    np.testing.assert_allclose(np.einsum("nask,nk->nas", from_axis, way), 0, atol=1e-12)
+    radii = np.linalg.norm(from_axis, axis=3)
+    np.testing.assert_allclose(radii, np.broadcast_to([[[0.2], [0.05]]], radii.shape))
+    # every face lies on one rod and touches both of its ends; every vertex has three
+    assert (faces // (2 * SIDES) == np.repeat(np.arange(7), 2 * SIDES)[:, None]).all()
+    assert {len(set(end)) for end in (faces // SIDES % 2).tolist()} == {2}
+    assert (np.bincount(faces.ravel()) == 3).all()
+    # nothing to draw is a shape that is not seen
+    vertices, faces = rods(np.zeros((0, 2, 3)), 0.2)
+    assert np.ptp(vertices, axis=0).max() == 0 and faces.max() < len(vertices)
