@@ -179,3 +179,20 @@ def test_rods_lie_around_their_lines_with_the_radii_asked_for():
     # nothing to draw is a shape that is not seen
     vertices, faces = rods(np.zeros((0, 2, 3)), 0.2)
     assert np.ptp(vertices, axis=0).max() == 0 and faces.max() < len(vertices)
+
+
+def test_a_click_finds_the_cube_in_front():
+    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
+    from cube_tensor_driver.view.stage import hit
+
+    around = 2 * np.pi * np.arange(24) / 24
+    ring = np.stack([0 * around, np.cos(around), np.sin(around)], axis=1)
+    pitch = 2 * np.sin(np.pi / 24)
+    for cube in range(24):
+        aside = 0.1 * pitch * np.array([1.0, 0, 0])
+        assert hit(ring, pitch, 5 * ring[cube] + aside, -2 * ring[cube]) == cube
+    assert hit(ring, pitch, np.array([1.01 * pitch, 5, 0]), np.array([0, -1.0, 0])) is None
+    flat = np.stack([*(a.ravel() for a in np.meshgrid(np.arange(6.0), np.arange(5.0))), np.zeros(30)], axis=1)
+    eye = np.array([2.5, -8, 6.0])  # as the page looks at a skin
+    for cube in range(30):
+        assert hit(flat, 1.0, eye, flat[cube] + [0.2, -0.2, 0] - eye) == cube

@@ -85,19 +85,14 @@ class Stage:
 
         @to.on_click()
         def _(event: viser.SceneClickEvent) -> None:
-            cube = self._hit(np.array(event.ray_origin), np.array(event.ray_direction))
+            ray = np.array(event.ray_origin), np.array(event.ray_direction)
+            cube = hit(self._places.position, self._pitch, *ray)
             if cube is not None:
                 pick(cube)
 
     def _mesh(self, name: str, colour: Any) -> viser.MeshHandle:
         look: dict[str, Any] = {"color": tuple(colour), "flat_shading": True, "side": "double", **PLAIN}
         return self._scene.add_mesh_simple(f"/{name}", *NOTHING, **look)
-
-    def _hit(self, start: np.ndarray, ray: np.ndarray) -> int | None:
-        """The cube that a ray passes, None: it passes beside the skin."""
-        apart = np.linalg.norm(np.cross(self._places.position - start, ray / np.linalg.norm(ray)), axis=1)
-        cube = int(apart.argmin())
-        return cube if apart[cube] < self._pitch else None
 
     def draw(self, quantity: Quantity, top: float, newest: Newest, health: np.ndarray) -> None:
         """Colours, arrows, crosses, carpet; top: of the colours' range, SI, 0 follows what is there."""
@@ -162,6 +157,17 @@ class Stage:
         shafts, heads = np.stack([tail, neck], axis=1), np.stack([neck, tip], axis=1)
         (shaft, shaft_faces), (head, head_faces) = rods(shafts, 0.025 * size), rods(heads, 0.075 * size, 0.0)
         _shape(node, (np.concatenate([shaft, head]), np.concatenate([shaft_faces, head_faces + len(shaft)])))
+
+
+def hit(position: np.ndarray, pitch: float, start: np.ndarray, ray: np.ndarray) -> int | None:
+    """Which of the cubes at (N, 3) a ray meets, not one behind it on the far side of a skin; None: it passes beside."""
+    ray = ray / np.linalg.norm(ray)
+    depth = (position - start) @ ray
+    apart = np.linalg.norm(position - start - depth[:, None] * ray, axis=1)
+    near = apart < pitch
+    if not near.any():
+        return None
+    return int(np.where(near & (depth < depth[near].min() + 2 * pitch), apart, np.inf).argmin())
 
 
 Mesh = tuple[np.ndarray, np.ndarray]
