@@ -58,7 +58,8 @@ class Raster:
 
 
 class Carpet:
-    """Points (M, 3) with the frames (M, 3, 3) that they lie in, `spacing` apart, and cubes that lie there or None."""
+    """Points (M, 3) at the cubes' lower faces, `spacing` apart, with the frames (M, 3, 3) that they lie in; cubes: to
+    show there, None: none."""
 
     def __init__(self, to: viser.SceneApi, points: np.ndarray, rotation: np.ndarray, spacing: float,
                  cubes: Places | None) -> None:  # fmt: skip
@@ -68,10 +69,12 @@ class Carpet:
             self._raster = Raster(points, rotation[0], spacing, spacing / fine, cubes)
             rows, columns = self._raster.owner.shape
             x, y, z = rotation[0].T
+            # Cubes that are painted lie where their upper faces would be.
+            place = self._raster.centre + (0 if cubes is None else 2 * float(np.median(cubes.half_side))) * z
             # Viser's images lie in x and −y.
             (turn,) = scene.turns(np.stack([x, -y, -z], axis=1)[None])
             self._image = to.add_image("/field", np.zeros((rows, columns, 4), np.uint8), columns * spacing / fine,
-                                       rows * spacing / fine, format="png", wxyz=turn, position=self._raster.centre,
+                                       rows * spacing / fine, format="png", wxyz=turn, position=place,
                                        cast_shadow=False, receive_shadow=False)  # fmt: skip
         else:
             # Squares that touch at their corners, too, however they are turned.
