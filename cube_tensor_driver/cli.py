@@ -108,7 +108,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
 
     sub = command("fem", run.fem, "compute a cube's response matrix by finite elements; lengths in mm")
-    sub.argument_default = argparse.SUPPRESS  # what is not given is left to view.elastic.Options
+    sub.argument_default = argparse.SUPPRESS  # what is not given is left to view.fem.Options
     sub.add_argument("--3d", dest="space", action="store_true", help="in space: 24 pads; minutes, and up to 6 GB")
     sub.add_argument("--layout", metavar="NAME", help="quad, planar, cube, or a YAML file (planar; cube with --3d)")
     sub.add_argument("--symmetry", metavar="G", help="full, slab, mirrors or none (the first that the layout has)")

@@ -99,20 +99,20 @@ def fit(options: argparse.Namespace) -> int:
 
 
 def fem(options: argparse.Namespace) -> int:
-    from .view.elastic import Options, run_fem
+    from .view.fem import Options, run_fem
 
     given = {name: value for name, value in vars(options).items() if name not in ("command", "run")}
     return run_fem(Options(**given | {"neglect": tuple(given.get("neglect", ()))}))
 
 
 def study(options: argparse.Namespace) -> int:
-    from .view.elastic import run_study
+    from .view.study import run_study
 
     return run_study(options.json, options.figure)
 
 
 def paper(options: argparse.Namespace) -> int:
-    from .view.elastic import run_paper
+    from .view.study import run_paper
 
     return run_paper(options.out)
 

@@ -21,7 +21,8 @@ from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import figures, paper
 from cube_tensor_driver.elastic.study import Study
 from cube_tensor_driver.files.calibration import read_calibration
-from cube_tensor_driver.view import elastic
+from cube_tensor_driver.view import fem
+from cube_tensor_driver.view import study as view_study
 
 SMALL = ("--width", "20", "--height", "12", "--meshes", "2")
 
@@ -106,7 +107,7 @@ def computed(monkeypatch):
         calls.append(arguments)
         raise ElasticError("enough")
 
-    monkeypatch.setattr(elastic, "compute_response", compute)
+    monkeypatch.setattr(fem, "compute_response", compute)
     return calls
 
 
@@ -247,7 +248,7 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
         dict.fromkeys(LAYOUTS),
         error,
     )
-    monkeypatch.setattr(elastic, "study", lambda progress: found)
+    monkeypatch.setattr(view_study, "study", lambda progress: found)
     assert cli.main(["study", "--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")]) == 0
     result = json.loads((tmp_path / "s.json").read_text())
     assert np.array(result["error"]["cube"]).shape == (2, 2, 15) and result["error"]["quad"][0][0][1] is None
@@ -259,7 +260,7 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
 def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     one = lambda **_: [_experiment()]  # noqa: E731
     monkeypatch.setattr(figures, "experiments", one)
-    monkeypatch.setattr(figures, "rod_sweep", lambda: paper.rod_sweep(places=(0.0, 2e-3)))
+    monkeypatch.setattr(figures, "rod_sweep", lambda **_: paper.rod_sweep(places=(0.0, 2e-3)))
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())
     assert made == [

@@ -11,6 +11,7 @@ matplotlib.use("Agg")  # files only, no window
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 from matplotlib.tri import Triangulation
 
@@ -121,9 +122,13 @@ def plot_loads(body: Body, layout: Layout, path: Path) -> None:
         d0 = 1e3 * body.side / 2
         for place, normal in zip(layout.positions[:, [0, 2]], layout.normals[:, [0, 2]], strict=True):
             ends = place + np.outer((-0.5, 0.5), layout.pad_size * (1 - np.abs(normal)))
-            axis.plot(*(d0 * ends.T), color="gold", linewidth=3, solid_capstyle="butt")
+            axis.plot(*(d0 * ends.T), color="black", linewidth=7, solid_capstyle="butt")
+            axis.plot(*(d0 * ends.T), color="white", linewidth=3.5, linestyle=(0, (0.5, 0.5)), dash_capstyle="butt")
     axes.flat[-1].axis("off")
-    figure.supxlabel("x, mm (yellow: pads)")
+    axes.flat[-1].legend(
+        handles=[Patch(facecolor="white", edgecolor="black", hatch="||||", label="pad")], loc="center", handlelength=4
+    )
+    figure.supxlabel("x, mm")
     figure.savefig(path, dpi=120)
     plt.close(figure)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import json
 import math
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from ..core.symmetry import find_structure
 from ..files.calibration import find_calibration, read_calibration, write_calibration
 from ..files.loads import read_loads, unloaded
 from .layout import named_layout, shipped_calibration
+from .output import write_json
 from .plots import draw_fit, save
 
 
@@ -129,7 +129,4 @@ def _write_json(path: Path, result: Fit) -> None:
         "undetermined": list(result.undetermined),
         "advice": list(result.advice),
     }
-    try:
-        path.write_text(json.dumps(data, indent=2) + "\n")
-    except OSError as error:
-        raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None
+    write_json(path, data)

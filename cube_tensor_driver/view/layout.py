@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core.calibration import Calibration
-from ..core.errors import ConfigError, SymmetryError
+from ..core.errors import SymmetryError
 from ..core.estimator import summary
 from ..core.layout import LAYOUTS, Layout, find_layout
 from ..core.response import response
@@ -19,6 +18,7 @@ from ..core.symmetry import GENERATORS, find_structure
 from ..files.calibration import find_calibration, read_calibration
 from ..files.share import share
 from ..files.yaml import read_yaml
+from .output import write_json
 from .plots import draw_layout, save
 
 
@@ -61,10 +61,7 @@ def run_layout(
         source = f"calibration {calibration.id} ({calibration.source or 'no source given'})"
     _show(layout, symmetry, counts, result, source)
     if json_path is not None:
-        try:
-            json_path.write_text(json.dumps(result, indent=2) + "\n")
-        except OSError as error:
-            raise ConfigError(f"--json {json_path}: {error.strerror}; name a file that can be written") from None
+        write_json(json_path, result)
     if figure is not None:
         save(draw_layout(layout), figure)
     return 0

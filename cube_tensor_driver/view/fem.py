@@ -1,31 +1,25 @@
-"""./cube fem, ./cube study and ./cube paper: the elastomer computed, as tables, files and pictures."""
+"""./cube fem: a response matrix computed, as tables, files and pictures."""
 
 from __future__ import annotations
 
-import json
-import os
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from ..core.errors import ConfigError, ElasticError, LayoutError
+from ..core.errors import ElasticError, LayoutError
 from ..core.layout import Layout
 from ..core.symmetry import default_modes, find_structure
 from ..elastic.body import Body, strip_layout
 from ..elastic.fem import Response, calibration_from_fem, compute_response
-from ..elastic.figures import make_paper, plot_convergence, plot_loads, plot_response, plot_study
-from ..elastic.study import Study, study
+from ..elastic.figures import plot_convergence, plot_loads, plot_response
 from ..files.calibration import write_calibration
 from .layout import coefficient_counts, named_layout
+from .output import check_outputs, make_folder, progress_bar, write_json
 
 _COLUMNS = 7  # modes in one table, so that it fits a terminal
 _ROWS = 40  # coefficients shown; more are in the JSON file
@@ -63,7 +57,7 @@ def run_fem(options: Options) -> int:
     default_modes(layout).index(options.neglect)
     body = _body(options, layout)
     check_outputs({"--json": options.json, "-o": options.output})
-    _make_folder(options.figures)
+    make_folder(options.figures)
     console = Console()
     console.print(
         f"{_describe(body, layout)}; {layout.n_pads} pads, symmetry {symmetry}", highlight=False, soft_wrap=True
@@ -72,7 +66,7 @@ def run_fem(options: Options) -> int:
         result = compute_response(body, layout, symmetry, options.meshes, report)
     _show(console, result)
     if options.json is not None:
-        _write_json(options.json, result.to_dict())
+        write_json(options.json, result.to_dict())
     if options.figures is not None:
         plot_convergence(result, options.figures / "convergence.png")
         plot_response(result, options.figures / "response.png")
@@ -82,57 +76,6 @@ def run_fem(options: Options) -> int:
     if options.output is not None:
         _write_calibration(console, options, result)
     return 0
-
-
-def run_study(json_path: Path | None, figure: Path) -> int:
-    """Sweep indenters over cubes, show from which width on each layout is right, draw the errors."""
-    check_outputs({"--json": json_path, "--figure": figure})
-    with progress_bar() as report:
-        result = study(progress=report)
-    _show_study(result)
-    plot_study(result, figure)
-    if json_path is not None:
-        _write_json(json_path, result.to_dict())
-    return 0
-
-
-def run_paper(out: Path) -> int:
-    """All pictures and numbers of docs/paper.md into a folder."""
-    _make_folder(out)
-    with progress_bar() as report:
-        made, numbers = make_paper(out, report)
-    made.append(out / "paper.json")
-    _write_json(made[-1], numbers)
-    Console().print(f"wrote {', '.join(path.name for path in made)} into {out}", highlight=False, soft_wrap=True)
-    return 0
-
-
-@contextmanager
-def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr, where that is a terminal; yields report(done, total, what)."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(
-        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("meshing", total=None)
-        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
-
-
-def check_outputs(paths: dict[str, Path | None]) -> None:
-    """ConfigError, before any work: a file to be written has no folder, or one that cannot be written."""
-    for option, path in paths.items():
-        if path is not None and (path.is_dir() or not os.access(path.resolve().parent, os.W_OK)):
-            raise ConfigError(f"{option} {path}: cannot be written; name a file in a folder that exists and is yours")
-
-
-def _make_folder(path: Path | None) -> None:
-    try:
-        if path is not None:
-            path.mkdir(parents=True, exist_ok=True)
-            check_outputs({"folder": path / "a file"})
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name a folder that can be made and written") from None
 
 
 def _layout(options: Options) -> Layout:
@@ -270,33 +213,3 @@ def _write_calibration(console: Console, options: Options, result: Response) -> 
     if whole:
         what += f", with the whole matrix: symmetry {result.symmetry} does not explain it"
     console.print(f"wrote {options.output}: {what}", highlight=False, soft_wrap=True)
-
-
-def _write_json(path: Path, value: Any) -> None:
-    try:
-        partial = path.with_name(path.name + ".part")  # whole or not at all
-        partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None
-
-
-def _show_study(result: Study) -> None:
-    rows = result.trusted()
-    console = Console()
-    console.print(f"narrowest indenter, mm, from which on the error stays below 20 % of the component's range; "
-                  f"cube's centre {1e3 * result.depth:g} mm deep", highlight=False, soft_wrap=True)  # fmt: skip
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column()
-    heads = [(name, float(side)) for name in result.error for side in result.sides]
-    for name, side in heads:
-        table.add_column(f"{name}\n{1e3 * side:g} mm", justify="right")
-    found = {(name, side, component): width for name, side, component, width in rows}
-    for component in dict.fromkeys(row[2] for row in rows):
-        cells = []
-        for name, side in heads:
-            width = found.get((name, side, component), np.nan)
-            cells.append("never" if width is None else "·" if np.isnan(width) else f"{1e3 * width:g}")
-        table.add_row(component, *cells)
-    console.print(table)
-    console.print("· not observed by the layout")
