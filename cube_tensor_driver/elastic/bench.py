@@ -29,6 +29,7 @@ from .solid import lame
 Array = NDArray[np.float64]
 
 _HALVINGS = 5
+_CUTS = 2  # of the triangles that touch the cube: P_shear is a small difference of pad stresses, 2 % off with none
 _STIFF = 1e4  # cube over body: rigid to 1e-4, without spoiling Newton's numbers
 
 
@@ -78,8 +79,6 @@ class Bench:
     """The body on the bench. cube=False replaces the cube by elastomer; finite=True is the neo-Hookean body.
 
     size: the longest side of an element away from the cube, in d0; below the top it is half of that
-    fine: how often the triangles that touch the cube are cut in four. P_shear is a small difference of pad stresses: in
-    the linear model it is wrong by 2 % where they are not cut, by 0.5 % where they are cut twice, in twice the time.
     """
 
     def __init__(
@@ -89,7 +88,6 @@ class Bench:
         finite: bool = False,
         layout: Layout | None = None,
         size: float = 0.5,
-        fine: int = 0,
     ) -> None:
         self.body, self.cube, self.finite = body, cube, finite
         self.layout = layout or LAYOUTS["planar"]
@@ -100,7 +98,7 @@ class Bench:
         high = body.height / 2 / d0
         quarter = section([body.width / 2 / d0, high], stops, 1, smallest=0.3, largest=size)
         quarter = _refined(quarter, lambda x, z: (z > high - 0.9) & (x < 6))  # where rods press
-        for _ in range(fine if cube else 0):
+        for _ in range(_CUTS if cube else 0):
             quarter = _refined(quarter, lambda x, z: np.abs(np.maximum(x, z) - 1.15) < 0.15)
         self.mesh = mirrored(quarter)
         self._inside = np.all(np.abs(self.mesh.p[:, self.mesh.t].mean(axis=1)) < 1.0, axis=0)
@@ -123,8 +121,8 @@ class Bench:
         )
         self._mean = _along_x.assemble(bottom) * body.young  # in the size of the stiffness
 
-    def run(self, steps: Sequence[Step]) -> Run:
-        """Solve the steps, each starting from the last solution.
+    def run(self, steps: Sequence[Step], report: Callable[[], None] = lambda: None) -> Run:
+        """Solve the steps, each starting from the last solution; report() is called after each.
 
         Raises ElasticError when a step is too large for Newton's method.
         """
@@ -139,6 +137,7 @@ class Bench:
             u, before, rod = found, u, step.rod
             loose = loose if step.gripped else u
             rows.append((self._pads(u), self._state(u), self._turn(u), d0 * u[self.basis.nodal_dofs]))
+            report()
         return Run(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def loaded(self, stress: Array, gradient: Array) -> tuple[Array, Array]:

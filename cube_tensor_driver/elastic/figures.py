@@ -225,11 +225,11 @@ def make_paper(out: Path, progress: Progress | None = None) -> tuple[list[Path],
         progress(0, 1, "figure 4")
     plot_figure_4(made[0])
     numbers: dict[str, object] = {}
-    for half, kind in enumerate(("linear", "finite")):
+    for kind in ("linear", "finite"):
 
-        def report(done: int, total: int, what: str, half: int = half, kind: str = kind) -> None:
+        def report(done: int, total: int, what: str, kind: str = kind) -> None:
             if progress is not None:
-                progress(half * total + done, 2 * total, f"{kind}: {what}")
+                progress(done, total, f"{kind}: {what}")
 
         for number, result in enumerate(experiments(finite=kind == "finite", progress=report), 1):
             made.append(out / f"experiment_{number}_{kind}.png")
@@ -241,7 +241,7 @@ def make_paper(out: Path, progress: Progress | None = None) -> tuple[list[Path],
                 "recovered": result.recovered.tolist(),
                 "truth": result.truth.tolist(),
             }
-    table = rod_sweep()
+    table = rod_sweep(progress=progress)
     made.append(out / "rod_positions.png")
     plot_rod_sweep(table, made[-1])
     numbers["rod positions"] = table

@@ -6,9 +6,9 @@ no pad is crushed at 27 % compression.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from ..core.estimator import make_estimator
 from ..core.layout import LAYOUTS
 from ..core.modes import PLANE
 from ..core.oscillator import pad_frequency
-from .bench import Bench, Run, Step
+from .bench import Bench, Step
 from .body import Body
 from .fem import Response, compute_response
 from .rod import Rod
@@ -51,9 +51,8 @@ def experiments(
 ) -> list[Experiment]:
     """The three experiments, plates bonded and (where they do not shear) sliding."""
     body = body or Body()
-    press = shear = np.linspace(0.5e-3, 3e-3, 6)
-    deep = np.linspace(0.25e-3, 3e-3, 12)
-    rods = [Rod(depth, body.side / 4) for depth in deep]
+    press = shear = np.linspace(0.25e-3, 3e-3, 12)
+    rods = [Rod(depth, body.side / 4) for depth in press]
     both = np.concatenate([press, 3e-3 + shear])
     runs = [
         (
@@ -66,17 +65,18 @@ def experiments(
             both,
             [plates(body, p, bonded=False) for p in press] + [plates(body, 3e-3, s, gripped=True) for s in shear],
         ),
-        ("c, 5 mm rod above C2, bonded bottom", deep, [dent(body, rod) for rod in rods]),
-        ("c, 5 mm rod above C2, sliding bottom", deep, [dent(body, rod, bonded=False) for rod in rods]),
+        ("c, 5 mm rod above C2, bonded bottom", press, [dent(body, rod) for rod in rods]),
+        ("c, 5 mm rod above C2, sliding bottom", press, [dent(body, rod, bonded=False) for rod in rods]),
     ]
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
-    found = []
-    for number, (name, displacement, steps) in enumerate(runs):
-        if progress is not None:
-            progress(number, len(runs), name)
-        found.append(_experiment(name, displacement, steps, body, finite, calibration))
-    if progress is not None:
-        progress(len(runs), len(runs), "done")
+    found, done, total = [], itertools.count(1), 2 * sum(len(steps) for *_, steps in runs)
+    for name, displacement, steps in runs:
+
+        def report(name: str = name) -> None:
+            if progress is not None:
+                progress(next(done), total, name)
+
+        found.append(_experiment(name, displacement, steps, body, finite, calibration, report))
     # (a) is how (b) begins
     names = ("a, top plate pressed, bonded", "a, top plate pressed, sliding")
     return [_beginning(one, name, len(press)) for one, name in zip(found[:2], names, strict=True)] + found
@@ -87,10 +87,16 @@ def _beginning(experiment: Experiment, name: str, steps: int) -> Experiment:
 
 
 def _experiment(
-    name: str, displacement: Array, steps: Sequence[Any], body: Body, finite: bool, calibration: Response
+    name: str,
+    displacement: Array,
+    steps: Sequence[Step],
+    body: Body,
+    finite: bool,
+    calibration: Response,
+    report: Callable[[], None],
 ) -> Experiment:
-    with_cube = Bench(body, finite=finite).run(steps)
-    without: Run = Bench(body, cube=False, finite=finite).run(steps)
+    with_cube = Bench(body, finite=finite).run(steps, report)
+    without = Bench(body, cube=False, finite=finite).run(steps, report)
     frequency = pad_frequency(with_cube.pads[:, :4], FOAM["rest_frequency"], FOAM["beta"], FOAM["modulus"])
     recover = make_estimator(calibration.matrix, np.ones(8), PLANE, targets=np.eye(7)).matrix
     return Experiment(
@@ -143,7 +149,10 @@ def _on_plate(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
 
 
 def rod_sweep(
-    body: Body | None = None, places: Sequence[float] = tuple(np.arange(9) * 1e-3), pressed: float = 1e-3
+    body: Body | None = None,
+    places: Sequence[float] = tuple(np.arange(9) * 1e-3),
+    pressed: float = 1e-3,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> dict[str, list[float]]:
     """How much of the prototype's shear signal under a rod is shear; linear body on a bonded plate, per rod position.
 
@@ -154,7 +163,9 @@ def rod_sweep(
     with_cube, without = Bench(body), Bench(body, cube=False)
     row = compute_response(body, LAYOUTS["planar"], "slab", meshes=1).matrix[:4, PLANE.names.index("zx")]
     table: dict[str, list[float]] = {"place": [], "signal": [], "shear": [], "crosstalk": [], "true_zx": []}
-    for place in places:
+    for number, place in enumerate(places):
+        if progress is not None:
+            progress(number, len(places), f"rod at {1e3 * place:g} mm")
         step = dent(body, Rod(pressed, place))
         pads = with_cube.run([step]).pads[0, :4]
         zx = without.run([step]).state[0, 1]
