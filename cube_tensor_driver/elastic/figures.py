@@ -142,7 +142,7 @@ def plot_figure_4(path: Path) -> None:
     for axis, (name, (moved, stress)) in zip(axes, found.items(), strict=True):
         scale = _draw_field(axis, bench, moved, stress, 6)
         axis.set(title=titles[name])
-    axes[-1].set_xlabel(f"x, mm (displacements enlarged {scale:.3g} times)")
+    axes[-1].set_xlabel(f"x, mm (displacements drawn times {scale:.2g})")
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
