@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cube_tensor_driver.core.errors import CubeError
-from cube_tensor_driver.device.protocol import MAX_RUN, Decoder, Sample, encode
+from cube_tensor_driver.device.protocol import MAX_RUN, Ack, Decoder, Request, Sample, Stats, encode
 from cube_tensor_driver.files.calibration import read_calibration
 from cube_tensor_driver.files.share import share
 from cube_tensor_driver.files.skin import read_skin
@@ -81,6 +81,32 @@ def test_ten_million_bytes_of_noise(name: str) -> None:
     # The best of several, one after the other: other processes only ever add.
     ratios = [(feed(Decoder(), part) / len(part)) / (feed(Decoder(), good) / len(good)) for _ in range(5)]
     assert min(ratios) < 3.0
+
+
+FRAMES = [encode(frame) for frame in (Request(1), Request(4, 10_000), Ack(4, 0, 10_000), Stats(5, 4, 3, 2))]
+PIECES = st.one_of(
+    st.sampled_from(FRAMES),
+    st.sampled_from(FRAMES).map(lambda frame: encode(Stats(1, 2, 3), version=2) + frame),
+    st.tuples(st.sampled_from(FRAMES), st.integers(1, 30), st.integers(0, 255)).map(
+        lambda harm: harm[0][: harm[1]] + bytes([harm[2]]) + harm[0][harm[1] + 1 :]
+    ),
+    st.lists(st.integers(1, 40), max_size=34).map(lambda run: bytes(run) + b"\0"),
+    st.binary(max_size=40),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(pieces=st.lists(PIECES, min_size=20, max_size=60), cut=st.integers(0, 500))
+def test_a_crowd_of_short_runs_is_what_they_are_one_by_one(pieces: list[bytes], cut: int) -> None:
+    """Frames and counters, however noise and frames mix, and wherever the bytes are cut."""
+    data = b"".join(pieces) + b"\0"
+    together, alone = Decoder(), Decoder()
+    found = together.feed(data[:cut]) + together.feed(data[cut:])
+    expected = [frame for run in data.split(b"\0") for frame in alone.feed(run + b"\0")]
+    assert repr(found) == repr(expected)
+    counts, others = together.counters.as_dict(), alone.counters.as_dict()
+    del counts["bytes"], others["bytes"]
+    assert counts == others
 
 
 @settings(max_examples=60, deadline=None)
