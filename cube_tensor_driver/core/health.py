@@ -36,7 +36,7 @@ RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
 class _Column(NamedTuple):
     """What depends on the cube column of a message alone."""
 
-    whole: np.ndarray  # (N,)
+    whole: bytes  # as it came
     turns: int  # how many times the same rising cubes stand in it, 0: not so
     cube: np.ndarray  # (n,) of one turn
     cubes: slice | np.ndarray  # the same, as a slice where they are neighbours: numpy does not copy those
@@ -246,7 +246,7 @@ class Health:
         """Of a message whose frequencies have this shape."""
         key = column_key(cube)
         column = self._columns.get(key)
-        if column is None or not (column.whole == cube).all() or shape != (len(cube), self._shape[1]):
+        if column is None or column.whole != cube.tobytes() or shape != (len(cube), self._shape[1]):
             if shape != (len(cube), self._shape[1]) or (len(cube) and int(cube.max()) >= self._shape[0]):
                 raise LayoutError(
                     f"frequencies of shape {shape} for cubes up to {max(cube, default=0)}; this skin has "
@@ -259,7 +259,7 @@ class Health:
             together = count and int(one[-1]) - int(one[0]) + 1 == len(one)
             cubes = slice(int(one[0]), int(one[-1]) + 1) if together else one
             column = self._columns[key] = _Column(
-                cube.copy(), count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
+                cube.tobytes(), count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
                 np.zeros(len(one), np.uint16),
             )  # fmt: skip
         return column

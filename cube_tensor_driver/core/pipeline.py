@@ -64,7 +64,7 @@ class _Block(NamedTuple):
 class _Column(NamedTuple):
     """What depends on the cube column alone, kept from call to call because a hub's cubes do not change."""
 
-    cube: np.ndarray
+    cube: bytes  # of the column: they are compared in a fifth of the time that numbers are
     turns: int  # how many times the same cubes stand in it
     strange: np.ndarray  # (N,) bool: the index is none of our cubes
     kind: np.ndarray  # (N,) which calibration
@@ -175,7 +175,8 @@ class Pipeline:
                 observed.reshape(len(v), -1)[:, column.strange] = 0
             rest = out[:, :, N:]
             residual = np.abs(rest[:, :, 0]) if self._depth == 1 else np.sqrt(np.einsum("bnd,bnd->bn", rest, rest))
-            status = ((residual > limit) * np.uint16(RESIDUAL)).ravel()
+            over = (residual > limit).ravel()
+            status = over * np.uint16(RESIDUAL) if np.count_nonzero(over) else np.zeros(len(over), np.uint16)
         if mask is not None:
             status[mask.ravel() != 0] |= PAD_FAULT
             status[observed == 0] |= INVALID
@@ -286,7 +287,7 @@ class Pipeline:
     def _column(self, cube: np.ndarray) -> _Column:
         key = column_key(cube)
         kept = self._kept.get(key)
-        if kept is not None and (kept.cube == cube).all():
+        if kept is not None and kept.cube == cube.tobytes():
             return kept
         if len(self._kept) >= COLUMNS_KEPT:
             self._kept.clear()
@@ -297,7 +298,7 @@ class Pipeline:
         # A strange row never counts as good, so it always takes the slow way, where it is made NaN.
         pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
         column = self._kept[key] = _Column(
-            cube.copy(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), pads,
+            cube.tobytes(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), pads,
             self._blocks(kind), self._limits[kind], self._observed[kind],
         )  # fmt: skip
         return column
