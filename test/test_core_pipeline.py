@@ -337,7 +337,7 @@ def cost_of(count: int, dtype) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_speed_against_bare_numpy(dtype):
-    """In a process of its own: what other tests left behind, memory in pieces and threads of DDS, counts for neither."""
+    """In a process of its own: what other tests left behind, memory in pieces and threads, counts for neither side."""
     costs = f"[cost_of(n, np.{dtype}).tolist() for n in (1260, 1024, 64)]"
     script = f"from test_core_pipeline import *; print({costs})"
     done = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, text=True,
