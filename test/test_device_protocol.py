@@ -25,6 +25,7 @@ from cube_tensor_driver.device.protocol import (
     Sample,
     Stats,
     encode,
+    join,
 )
 
 DOC = (Path(__file__).parent.parent / "docs" / "protocol.md").read_text(encoding="utf-8")
@@ -351,3 +352,17 @@ def test_crc_residue() -> None:
     """The decoder's one-pass check is the definition of the CRC, not a property of our encoder."""
     for data in (b"", b"123456789", bytes(range(256))):
         assert zlib.crc32(data + crc_of(data).to_bytes(4, "little")) == 0x2144DF1C
+
+
+def test_arrays_of_several_frames_are_those_of_each_in_order() -> None:
+    random = np.random.default_rng(5)
+    samples = [
+        Sample(
+            number, 0, 0, random.integers(1, 2**32, (n, 3)).astype("<u4"), random.integers(0, 2**32, n).astype("<u4"),
+            random.integers(-(2**15), 2**15, n).astype("<i2"),
+        )
+        for number, n in enumerate((2, 5, 1))
+    ]  # fmt: skip
+    decoded = [Decoder().feed(encode(sample))[0] for sample in samples]
+    for found, name in zip(join(decoded), ("frequency", "pad_fault", "temperature"), strict=True):
+        np.testing.assert_array_equal(found, np.concatenate([getattr(sample, name) for sample in samples]))

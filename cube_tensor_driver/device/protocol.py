@@ -7,8 +7,8 @@ one annotated hex dump per frame type: docs/protocol.md. The driver and the simu
 Contracts
     `encode` takes a frame and returns bytes, or raises `ProtocolError`.
     `Decoder.feed` takes any bytes and never raises: every non-empty run of bytes closed by a zero becomes
-    exactly one frame or is counted in exactly one counter of `Counters`. Arrays of decoded frames are
-    read-only views on the decoded bytes. Arrays to encode must have the dtype named in the frame's docstring;
+    exactly one frame or is counted in exactly one counter of `Counters`. Arrays of decoded frames are read-only,
+    made when first asked for. Arrays to encode must have the dtype named in the frame's docstring;
     nothing is converted behind the caller's back.
 """
 
