@@ -25,6 +25,7 @@ from .status import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE
 N = len(COMPONENTS)
 MASKS_KEPT = 1024  # estimators of pad masks remembered at a time
 BETA_FLOOR = 1e-12  # so that every pad has a highest frequency; changes the law by 1e-12 of a strain
+FLOOR_MARGIN = 1e-6  # some roundings of float32
 COLUMNS_KEPT = 64  # cube columns remembered at a time: one per hub
 FEW_KINDS = 8  # up to so many calibrations: a product for each; more: one einsum for all of as many pads
 
@@ -70,6 +71,7 @@ class _Column(NamedTuple):
     kind: np.ndarray  # (N,) which calibration
     rest: np.ndarray  # (N, P)
     top: np.ndarray  # (N, P) highest frequency of the law
+    floor: float  # v that f = 0 gives, of the row where it is highest
     pads: int  # how many pads there are in all rows
     blocks: list[_Block]
     limit: np.ndarray  # (N,)
@@ -158,7 +160,7 @@ class Pipeline:
         B batches of the same cubes at once: frequency (B, N, P) and so on give B * N rows, to the same bits.
         Raises LayoutError for arrays of the wrong shape; all that a row can hold ends in its status.
         """
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore", divide="raise"):
             column, v, mask, cold = self._law(cube, frequency, pad_fault, temperature)
             out = self._products(column, v)
             limit: np.ndarray = column.limit
@@ -229,7 +231,7 @@ class Pipeline:
 
     def _pads(self, cube, frequency, pad_fault, temperature):
         """The column, pad stresses (N, P) in Pa, and masks (N,) of bad pads."""
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore", divide="raise"):
             column, v, mask, _ = self._law(cube, frequency, pad_fault, temperature, keep=True)
         none = np.zeros(len(v[0]), dtype=np.int64)
         return column, v[0] * self._stiffness[column.kind], none if mask is None else mask[0]
@@ -270,12 +272,17 @@ class Pipeline:
         # the law of oscillator.py in three passes: v = E (1 + beta) / beta (f - f0) / (top - f)
         v = f - rest
         below = top - f
-        v /= below
-        # NaN, Inf and frequencies beyond the law's range all fail one of the two comparisons
         reported = pad_fault is not None and np.count_nonzero(pad_fault) > 0
+        try:
+            v /= below
+            # Falls with f down to 0 and is below -1 beyond top, so one comparison finds all that the law has not.
+            within = n > 0 and f.size == count * column.pads and v.min() > column.floor
+        except FloatingPointError:  # f is top
+            within = False
         v = v.reshape(count, n, self.n_pads)
-        if f.size == count * column.pads and n and not reported and f.min() > 0 and below.min() > 0:
+        if within and not reported:
             return column, v, None, cold
+        # NaN, Inf and frequencies beyond the law's range all fail one of the two comparisons
         good = ((f > 0) & (below > 0)).reshape(v.shape)
         if np.count_nonzero(good) == count * column.pads and not reported:
             return column, v, None, cold
@@ -298,8 +305,8 @@ class Pipeline:
         # A strange row never counts as good, so it always takes the slow way, where it is made NaN.
         pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
         column = self._kept[key] = _Column(
-            cube.tobytes(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), pads,
-            self._blocks(kind), self._limits[kind], self._observed[kind],
+            cube.tobytes(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype),
+            float(np.nanmax(-rest / top, initial=-1.0)) * (1 - FLOOR_MARGIN), pads, self._blocks(kind), self._limits[kind], self._observed[kind],
         )  # fmt: skip
         return column
 
