@@ -304,9 +304,10 @@ class Pipeline:
         top = highest_frequency(rest, self._beta[kind])
         # A strange row never counts as good, so it always takes the slow way, where it is made NaN.
         pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
+        floor = float(np.nanmax(-rest / top, initial=-1.0)) * (1 - FLOOR_MARGIN)
         column = self._kept[key] = _Column(
-            cube.tobytes(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype),
-            float(np.nanmax(-rest / top, initial=-1.0)) * (1 - FLOOR_MARGIN), pads, self._blocks(kind), self._limits[kind], self._observed[kind],
+            cube.tobytes(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), floor, pads,
+            self._blocks(kind), self._limits[kind], self._observed[kind],
         )  # fmt: skip
         return column
 
