@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,21 @@ def test_a_written_bag_is_read_by_rosbags(tmp_path, options):
     assert times == [START_NS + 10_000_000 * k + 1000 for k in range(300)]
     if "max_seconds" in options:
         assert len(list(path.glob("*.mcap"))) == 3
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_threads_take_turns(tmp_path, storage):
+    """As in a recording: topics come from one thread, messages from another; with a second storage file."""
+    written = [(("/a", "/b")[number % 2], 1000 + number) for number in range(6)]
+    with BagWriter(tmp_path / "bag", storage, max_bytes=8) as writer, ThreadPoolExecutor(1) as thread:
+        writer.add_topic("/a", WRENCH)
+        for topic, time_ns in written:
+            if time_ns == 1001:
+                writer.add_topic("/b", WRENCH)
+            thread.submit(writer.write, topic, time_ns, bytes(4)).result()
+            thread.submit(writer.flush).result()
+    with Reader(tmp_path / "bag") as reader:
+        assert [(connection.topic, time_ns) for connection, time_ns, _ in reader.messages()] == written
 
 
 def test_messages_come_in_the_order_in_which_rosbags_reads_them(tmp_path):

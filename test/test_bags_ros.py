@@ -90,9 +90,10 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     running.wait(lambda: running.heard[-1].left_out[-6:].count(1 << 6))
     heard = running.listen(SkinFrequencies, "frequencies", 1000)
     running.wait(lambda: heard)
-    recorder = cube("record", "-o", path)
+    recorder, other = cube("record", "-o", path), cube("record", "-o", tmp_path / "other", "--storage", "sqlite3")
     running.wait(lambda: grown(path, 800_000))
     output = end(recorder)
+    assert "/frequencies" in end(other) and other.returncode == 0
     assert recorder.returncode == 0 and "/frequencies" in output, output
     with Bag(path) as bag:
         assert {info.sender for info in bag.infos("/info")} == {"driver", "reconstruction"}
@@ -103,6 +104,7 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     stamps = [to_ns(message.header.stamp) for message in heard]
     first, last = stamps.index(recorded[0]), stamps.index(recorded[-1])
     assert recorded == stamps[first : last + 1] and len(recorded) > 50
+    assert len(set(recorded) & set(frequency_stamps(tmp_path / "other"))) > 50
     reprocess(Job(path, tmp_path / "out", "bag", Change()))
     live, again = stress(path), stress(tmp_path / "out")
     common = live.keys() & again.keys()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2.enums import CompressionMode
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -48,8 +49,18 @@ def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) ->
     )
 
 
+class _Sqlite3Output(Sqlite3Writer):
+    """As rosbags writes it, but for whichever thread has its turn, as files are."""
+
+    def __init__(self, path: Path, compression: CompressionMode) -> None:
+        super().__init__(path, compression)
+        self.conn.close()
+        self.conn = sqlite3.connect(self.path, check_same_thread=False)
+        self.cursor = self.conn.cursor()
+
+
 class _Writer(Writer):
-    STORAGE_PLUGINS = MappingProxyType({StoragePlugin.MCAP: McapOutput, StoragePlugin.SQLITE3: Sqlite3Writer})
+    STORAGE_PLUGINS = MappingProxyType({StoragePlugin.MCAP: McapOutput, StoragePlugin.SQLITE3: _Sqlite3Output})
 
     def write_many(self, connection: Connection, times_ns: NDArray[np.int64], records: NDArray[np.uint8]) -> None:
         """`write` of messages of one length, (B, HEAD + bytes)."""
@@ -64,7 +75,7 @@ class _Writer(Writer):
 
 
 class BagWriter:
-    """A new bag; a context that completes it. Not for several threads.
+    """A new bag; a context that completes it. For one thread at a time.
 
     storage: mcap or sqlite3. max_bytes, max_seconds: of one storage file, 0 without limit. messages, bytes: written.
     BagError: the folder is there already, cannot be written, or the disk is full; `repair` then saves what was written.
