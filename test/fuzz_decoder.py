@@ -16,7 +16,8 @@ import atheris
 with atheris.instrument_imports(include=["cube_tensor_driver.device"]):
     from cobs import cobs
 
-    from cube_tensor_driver.device.protocol import Decoder, Sample, Stats, encode
+    from cube_tensor_driver.device.decoder import Decoder
+    from cube_tensor_driver.device.protocol import Sample, Stats, encode
     from cube_tensor_driver.device.sequence import Account
 
 

@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cube_tensor_driver.core.errors import CubeError, ProtocolError
+from cube_tensor_driver.device.decoder import MAX_RUN, Decoder
 from cube_tensor_driver.device.protocol import (
-    MAX_RUN,
     Ack,
     Command,
-    Decoder,
     Frame,
     Hello,
     Request,

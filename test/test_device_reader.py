@@ -23,11 +23,11 @@ from cobs import cobs  # type: ignore[import-untyped]
 from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device import reader as reader_module
 from cube_tensor_driver.device import tcp
+from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.link import LinkConfig, LinkState
 from cube_tensor_driver.device.protocol import (
     Ack,
     Command,
-    Decoder,
     Frame,
     Hello,
     Request,

@@ -28,7 +28,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from conftest import ROOT
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.device.protocol import Decoder, Hello, Request, Sample, encode
+from cube_tensor_driver.device.decoder import Decoder
+from cube_tensor_driver.device.protocol import Hello, Request, Sample, encode
 from cube_tensor_driver.files.share import share
 from cube_tensor_driver.files.skin import read_skin
 from cube_tensor_driver.files.yaml import parse_yaml

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.device.protocol import Decoder, Hello, Sample, Stats
+from cube_tensor_driver.device.decoder import Decoder
+from cube_tensor_driver.device.protocol import Hello, Sample, Stats
 from cube_tensor_driver.device.sequence import Account, Verdict
 from cube_tensor_driver.files.skin import read_skin
 from cube_tensor_driver.files.yaml import parse_yaml, write_yaml

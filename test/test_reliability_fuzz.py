@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cube_tensor_driver.core.errors import CubeError
-from cube_tensor_driver.device.protocol import MAX_RUN, Ack, Decoder, Request, Sample, Stats, encode
+from cube_tensor_driver.device.decoder import MAX_RUN, Decoder
+from cube_tensor_driver.device.protocol import Ack, Request, Sample, Stats, encode
 from cube_tensor_driver.files.calibration import read_calibration
 from cube_tensor_driver.files.share import share
 from cube_tensor_driver.files.skin import read_skin

@@ -27,7 +27,8 @@ from pathlib import Path
 import serial
 
 from ..core.errors import LinkError
-from .protocol import Decoder, Hello
+from .decoder import Decoder
+from .protocol import Hello
 from .tcp import Connecting, parse_url
 
 READ_CHUNK = 1 << 16

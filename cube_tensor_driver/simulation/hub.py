@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device.decoder import Decoder
 from ..device.prepared import Prepared
 from ..device.protocol import (
     TEMPERATURE_UNKNOWN,
     VERSION,
     Ack,
     Command,
-    Decoder,
     Hello,
     Request,
     Result,
