@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .column import Columns, turns
 from .errors import LayoutError
 from .oscillator import pad_frequency, stress_slope
-from .pipeline import COLUMNS_KEPT, Pipeline, column_key, turns
+from .pipeline import Pipeline
 from .status import LEFT_OUT, OPEN, RANGE, REPORTED, RESIDUAL, SHORT
 from .window import Judge, Statistics, Window
 
@@ -36,7 +37,6 @@ RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
 class _Column(NamedTuple):
     """What depends on the cube column of a message alone."""
 
-    whole: bytes  # as it came
     turns: int  # how many times the same rising cubes stand in it, 0: not so
     cube: np.ndarray  # (n,) of one turn
     cubes: slice | np.ndarray  # the same, as a slice where they are neighbours: numpy does not copy those
@@ -74,7 +74,7 @@ class Health:
         self.closed = 0
         self.newest_ns = 0
         self.temperature = np.full(self._shape[0], np.nan)
-        self._columns: dict[tuple, _Column] = {}
+        self._columns = Columns(self._make_column)
         self._judge = Judge(self._exists)
         self.refresh()
         self._statistics = Statistics(self._rest, self._judge.bound)
@@ -244,25 +244,25 @@ class Health:
 
     def _column(self, cube: np.ndarray, shape: tuple[int, ...]) -> _Column:
         """Of a message whose frequencies have this shape."""
-        key = column_key(cube)
-        column = self._columns.get(key)
-        if column is None or column.whole != cube.tobytes() or shape != (len(cube), self._shape[1]):
-            if shape != (len(cube), self._shape[1]) or (len(cube) and int(cube.max()) >= self._shape[0]):
-                raise LayoutError(
-                    f"frequencies of shape {shape} for cubes up to {max(cube, default=0)}; this skin has "
-                    f"{self._shape[0]} cubes of {self._shape[1]} pads: use the skin file of the driver"
-                )
-            if len(self._columns) >= COLUMNS_KEPT:
-                self._columns.clear()
-            count = turns(cube)
-            one = cube[: len(cube) // count].copy() if count else cube[:0]
-            together = count and int(one[-1]) - int(one[0]) + 1 == len(one)
-            cubes = slice(int(one[0]), int(one[-1]) + 1) if together else one
-            column = self._columns[key] = _Column(
-                cube.tobytes(), count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
-                np.zeros(len(one), np.uint16),
-            )  # fmt: skip
-        return column
+        if shape != (len(cube), self._shape[1]):
+            raise self._strange(cube, shape)
+        return self._columns.of(cube)
+
+    def _make_column(self, cube: np.ndarray) -> _Column:
+        if len(cube) and int(cube.max()) >= self._shape[0]:
+            raise self._strange(cube, (len(cube), self._shape[1]))
+        count = turns(cube)
+        one = cube[: len(cube) // count].copy() if count else cube[:0]
+        together = count and int(one[-1]) - int(one[0]) + 1 == len(one)
+        cubes = slice(int(one[0]), int(one[-1]) + 1) if together else one
+        return _Column(count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
+                       np.zeros(len(one), np.uint16))  # fmt: skip
+
+    def _strange(self, cube: np.ndarray, shape: tuple[int, ...]) -> LayoutError:
+        return LayoutError(
+            f"frequencies of shape {shape} for cubes up to {max(cube, default=0)}; this skin has {self._shape[0]} "
+            f"cubes of {self._shape[1]} pads: use the skin file of the driver"
+        )
 
     def _go_on(self, stamp_ns: int) -> None:
         """Time goes on; the window ends where it is over. What fell back in time begins a new one."""

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .calibration import Calibration
+from .column import Columns, turns
 from .errors import CalibrationError, CubeError, LayoutError
 from .estimator import FALSE_ALARM, Estimator, chi2_limit, make_estimator
 from .modes import COMPONENTS, STRESS
@@ -26,7 +27,6 @@ N = len(COMPONENTS)
 MASKS_KEPT = 1024  # estimators of pad masks remembered at a time
 BETA_FLOOR = 1e-12  # so that every pad has a highest frequency; changes the law by 1e-12 of a strain
 FLOOR_MARGIN = 1e-6  # some roundings of float32
-COLUMNS_KEPT = 64  # cube columns remembered at a time: one per hub
 FEW_KINDS = 8  # up to so many calibrations: a product for each; more: one einsum for all of as many pads
 
 
@@ -63,9 +63,8 @@ class _Block(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """What depends on the cube column alone, kept from call to call because a hub's cubes do not change."""
+    """What depends on the cube column alone."""
 
-    cube: bytes  # of the column: they are compared in a fifth of the time that numbers are
     turns: int  # how many times the same cubes stand in it
     strange: np.ndarray  # (N,) bool: the index is none of our cubes
     kind: np.ndarray  # (N,) which calibration
@@ -76,20 +75,6 @@ class _Column(NamedTuple):
     blocks: list[_Block]
     limit: np.ndarray  # (N,)
     observed: np.ndarray
-
-
-def column_key(cube: np.ndarray) -> tuple:
-    """What a kept column is found by; it may be another one with the same ends, which a comparison tells."""
-    return (len(cube), cube[0], cube[-1]) if len(cube) else (0,)
-
-
-def turns(cube: np.ndarray) -> int:
-    """How many times the same rising cubes stand one after the other in a column (N,); 0: it is none such."""
-    falls = np.flatnonzero(cube[1:] <= cube[:-1])
-    n = int(falls[0]) + 1 if len(falls) else len(cube)
-    if not n or len(cube) % n or (cube.reshape(-1, n) != cube[:n]).any():
-        return 0
-    return len(cube) // n
 
 
 class Pipeline:
@@ -120,7 +105,7 @@ class Pipeline:
         self._seen = np.flatnonzero(~np.isnan(self._matrices).all(axis=(0, 2)))
         self._limits = np.array([t.limit for t in full], dtype=self.dtype)
         self._observed = np.array([t.observed for t in full], dtype=np.uint16)
-        self._kept: dict[tuple, _Column] = {}
+        self._columns = Columns(self._make_column)
         self.rest_frequency = self._per_pad([c.rest_frequency for c in self.calibrations], np.nan)
 
     def _per_pad(self, values: Sequence[np.ndarray], missing: float) -> np.ndarray:
@@ -140,7 +125,7 @@ class Pipeline:
         if not np.all(rest[exists] > 0) or not np.all(np.isfinite(rest[exists])):
             raise CubeError(f"rest_frequency holds {rest[exists].min():g} Hz; every pad's must be finite and above 0")
         self._rest = np.where(exists, rest, np.nan)
-        self._kept.clear()
+        self._columns.clear()
 
     def temperature_factor(self, cube: np.ndarray, temperature: np.ndarray) -> np.ndarray:
         """(N, P) f0(T) / f0 of rows; 1 without a model or a temperature. Tare divides by it."""
@@ -255,9 +240,9 @@ class Pipeline:
                 f"pipeline: cube has shape {cube.shape} and frequency {f.shape}; "
                 f"this skin needs (N,) and (N, {self.n_pads})"
             )
-        column = self._column(cube)
+        column = self._columns.of(cube)
         if column.turns > 1 and not keep:
-            column = self._column(cube[: len(cube) // column.turns])
+            column = self._columns.of(cube[: len(cube) // column.turns])
         n = len(column.kind)
         count = f.size // (n * self.n_pads) if n else 1
         f = f.reshape((n, self.n_pads) if count == 1 else (count, n, self.n_pads))  # numpy is faster with two axes
@@ -291,13 +276,7 @@ class Pipeline:
         v[~good] = 0
         return column, v, _mask(self._exists[column.kind] & ~good), cold
 
-    def _column(self, cube: np.ndarray) -> _Column:
-        key = column_key(cube)
-        kept = self._kept.get(key)
-        if kept is not None and kept.cube == cube.tobytes():
-            return kept
-        if len(self._kept) >= COLUMNS_KEPT:
-            self._kept.clear()
+    def _make_column(self, cube: np.ndarray) -> _Column:
         strange = (cube < 0) | (cube >= len(self.calibrations))
         index = np.where(strange, 0, cube).astype(int)
         kind, rest = self._kind[index], self._rest[index]
@@ -305,11 +284,10 @@ class Pipeline:
         # A strange row never counts as good, so it always takes the slow way, where it is made NaN.
         pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
         floor = float(np.nanmax(-rest / top, initial=-1.0)) * (1 - FLOOR_MARGIN)
-        column = self._kept[key] = _Column(
-            cube.tobytes(), turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), floor, pads,
+        return _Column(
+            turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), floor, pads,
             self._blocks(kind), self._limits[kind], self._observed[kind],
         )  # fmt: skip
-        return column
 
     def _blocks(self, kind: np.ndarray) -> list[_Block]:
         few = len(self._kinds) <= FEW_KINDS
