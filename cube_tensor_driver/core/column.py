@@ -1,4 +1,4 @@
-"""The cube column of a message: which cube each row is of. What is made of it stays, for a hub's cubes do not change."""
+"""The cube column of a message: which cube each row is of. A hub's cubes stay the same, and so what is made of them."""
 
 from __future__ import annotations
 
