@@ -20,16 +20,9 @@ from .calibration import Calibration
 from .errors import FitError
 from .modes import Modes
 from .oscillator import pad_stress
+from .robust import STAGES, STEPS, hidden_directions, least_squares, robust_covariance, scatter, touched, weights_of
 from .symmetry import Structure
 
-HUBER, TUKEY = 1.345, 4.685  # 95 % efficient on normal noise
-STEPS = 100  # Gauss-Newton steps of one stage at most
-STILL = {
-    "plain": 1e-10,
-    "huber": 1e-3,
-    "tukey": 1e-9,
-}  # relative change that ends a stage; Huber's only leads on
-DIRECTION_TOLERANCE = 1e-6  # a direction of coefficients and gains below this part of the strongest is not determined
 FOLDS = 10  # of the cross-validation
 
 
@@ -134,12 +127,12 @@ def fit(
     design = model.design(x)
     theta, weights, scale = model.solve(design, y)
     jacobian = model.jacobian(theta, design)
-    hidden = _hidden(jacobian)
-    open_ = _open(hidden, len(model.free))
+    hidden = hidden_directions(jacobian)
+    open_ = touched(hidden, len(model.free))
     names = [structure.names[k] for k in model.free]
     if len(names) and open_.all():
         raise FitError("these loads determine no coefficient: " + "; ".join(_advise(model, theta, x, hidden, open_)))
-    covariance = _covariance(jacobian, model.residuals(theta, design, y) / scale, scale)
+    covariance = robust_covariance(jacobian, model.residuals(theta, design, y) / scale, scale)
     covariance[: len(names)][open_] = covariance[:, : len(names)][:, open_] = np.nan
     k = np.full((structure.n_coefficients,) * 2, 0.0)
     k[np.ix_(model.free, model.free)] = covariance[: len(names), : len(names)]
@@ -208,17 +201,17 @@ class _Model:
         """theta, the weights (N, P) of the readings, and the scatter in units of the noise."""
         theta = np.zeros(len(self.free) + self.gains.shape[1])
         weights, scale = np.ones(y.size), 1.0
-        for stage in ("plain", "huber", "tukey"):
+        for stage, small in STAGES.items():
             for _ in range(STEPS):
                 r = self.residuals(theta, design, y)
                 if stage == "huber":  # the scale of the last stage stays, so that it settles
-                    scale = _scale(r)
+                    scale = scatter(r)
                 if stage != "plain":
-                    weights = _weights(stage, r / scale)
+                    weights = weights_of(stage, r / scale)
                 root = np.sqrt(weights)
-                step = _least_squares(root[:, None] * self.jacobian(theta, design), root * r)
+                step = least_squares(root[:, None] * self.jacobian(theta, design), root * r)
                 theta = theta + step
-                if np.linalg.norm(step) <= STILL[stage] * (1 + np.linalg.norm(theta)):
+                if np.linalg.norm(step) <= small * (1 + np.linalg.norm(theta)):
                     break
         return theta, weights.reshape(y.shape), scale
 
@@ -250,52 +243,6 @@ def _check(structure, loads, measured, noise, fixed):
     return x, y, np.broadcast_to(noise, (n_pads,))
 
 
-def _scale(r: np.ndarray) -> float:
-    """Normal-consistent median of |r|, never 0 so that perfect data have a scale too."""
-    return max(1.4826 * float(np.median(np.abs(r))), 1e-12)
-
-
-def _weights(stage: str, r: np.ndarray) -> np.ndarray:
-    if stage == "huber":
-        return np.minimum(1, HUBER / np.maximum(np.abs(r), 1e-300))
-    return np.where(np.abs(r) < TUKEY, (1 - (r / TUKEY) ** 2) ** 2, 0)
-
-
-def _least_squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest solution, columns scaled to unit length; directions that a does not determine stay put."""
-    size = np.linalg.norm(a, axis=0)
-    size[size == 0] = 1
-    return np.linalg.lstsq(a / size, b, rcond=DIRECTION_TOLERANCE)[0] / size
-
-
-def _hidden(jacobian: np.ndarray) -> np.ndarray:
-    """(parameters, H) directions that change no reading."""
-    size = np.linalg.norm(jacobian, axis=0)
-    size[size == 0] = 1
-    _, s, vt = np.linalg.svd(jacobian / size, full_matrices=True)
-    return vt[int(np.sum(s > DIRECTION_TOLERANCE * s[0])) :].T if s[0] > 0 else vt.T
-
-
-def _open(hidden: np.ndarray, count: int) -> np.ndarray:
-    return np.linalg.norm(hidden[:count], axis=1) > DIRECTION_TOLERANCE
-
-
-def _covariance(jacobian: np.ndarray, r: np.ndarray, scale: float) -> np.ndarray:
-    """Huber's: scale^2 <psi^2> / <psi'>^2 (J'J)^-1, with the loss of degrees of freedom."""
-    u = np.where(np.abs(r) < TUKEY, (r / TUKEY) ** 2, 1)
-    psi2, slope = np.mean((r * (1 - u) ** 2) ** 2), np.mean((1 - u) * (1 - 5 * u))
-    rank = jacobian.shape[1] - _hidden(jacobian).shape[1]
-    factor = psi2 / slope**2 * len(r) / max(len(r) - rank, 1)
-    size = np.linalg.norm(jacobian, axis=0)
-    size[size == 0] = 1
-    return (
-        scale**2
-        * factor
-        * np.linalg.pinv((jacobian / size).T @ (jacobian / size), rcond=DIRECTION_TOLERANCE**2)
-        / np.outer(size, size)
-    )
-
-
 def _held_out(model: _Model, design: np.ndarray, y: np.ndarray, kept: np.ndarray) -> float:
     if len(y) < 2 or not np.any(y[kept]):
         return float("nan")
@@ -315,10 +262,10 @@ def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray,
     loads, size = x, np.sqrt(np.mean(x[x != 0] ** 2))
     while open_.any():
         trials = [np.vstack([loads, size * np.eye(x.shape[1])[m]]) for m in range(x.shape[1])]
-        hiddens = [_hidden(model.jacobian(theta, model.design(trial))) for trial in trials]
-        counts = [(_open(h, len(open_)).sum(), h.shape[1]) for h in hiddens]
+        hiddens = [hidden_directions(model.jacobian(theta, model.design(trial))) for trial in trials]
+        counts = [(touched(h, len(open_)).sum(), h.shape[1]) for h in hiddens]
         best = min(range(len(counts)), key=counts.__getitem__)
-        still = _open(hiddens[best], len(open_))
+        still = touched(hiddens[best], len(open_))
         names = [model.structure.names[k] for k, o in zip(model.free, open_, strict=True) if o]
         if hiddens[best].shape[1] >= hidden.shape[1]:
             advice.append(f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry")
