@@ -74,7 +74,7 @@ class Health:
         self.closed = 0
         self.newest_ns = 0
         self.temperature = np.full(self._shape[0], np.nan)
-        self._columns = Columns(self._make_column)
+        self._columns = Columns(self._make_column, self._shape[0])
         self._judge = Judge(self._exists)
         self.refresh()
         self._statistics = Statistics(self._rest, self._judge.bound)

@@ -105,7 +105,7 @@ class Pipeline:
         self._seen = np.flatnonzero(~np.isnan(self._matrices).all(axis=(0, 2)))
         self._limits = np.array([t.limit for t in full], dtype=self.dtype)
         self._observed = np.array([t.observed for t in full], dtype=np.uint16)
-        self._columns = Columns(self._make_column)
+        self._columns = Columns(self._make_column, len(self.calibrations))
         self.rest_frequency = self._per_pad([c.rest_frequency for c in self.calibrations], np.nan)
 
     def _per_pad(self, values: Sequence[np.ndarray], missing: float) -> np.ndarray:

@@ -27,7 +27,7 @@ QUEUE_BYTES = 64_000_000
 """What a queue may hold of the largest skins, so that no process grows beyond 200 MB: there the pause is shorter."""
 ROW_BYTES = 78
 UNKNOWN_RATE = 1000.0
-BLANKS_KEPT = 8
+BLANKS_KEPT = 4
 """Shapes of messages whose bytes are kept to be filled again."""
 SPIN_S = 0.2
 SWITCH_S = 1e-3
