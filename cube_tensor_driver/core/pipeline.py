@@ -65,7 +65,6 @@ class _Block(NamedTuple):
 class _Column(NamedTuple):
     """What depends on the cube column alone."""
 
-    turns: int  # how many times the same cubes stand in it
     strange: np.ndarray  # (N,) bool: the index is none of our cubes
     kind: np.ndarray  # (N,) which calibration
     rest: np.ndarray  # (N, P)
@@ -195,8 +194,8 @@ class Pipeline:
         temperature: np.ndarray | None = None,
     ) -> np.ndarray:
         """(N, P) pad stresses in Pa as the law gives them, before gains; NaN for bad and missing pads."""
-        column, pads, mask = self._pads(cube, frequency, pad_fault, temperature)
-        bad = ~self._exists[column.kind] | column.strange[:, None] | _bits(mask, self.n_pads)
+        kind, strange, pads, mask = self._pads(cube, frequency, pad_fault, temperature)
+        bad = ~self._exists[kind] | strange[:, None] | _bits(mask, self.n_pads)
         return np.where(bad, np.nan, pads)
 
     def suspects(
@@ -207,19 +206,20 @@ class Pipeline:
         temperature: np.ndarray | None = None,
     ) -> np.ndarray:
         """(N, P) bool, pads of which one alone explains a bad residual; see Estimator.suspects."""
-        column, pads, mask = self._pads(cube, frequency, pad_fault, temperature)
+        kinds, strange, pads, mask = self._pads(cube, frequency, pad_fault, temperature)
         result = np.zeros(pads.shape, dtype=bool)
-        for kind, bits, chosen in _distinct(column.kind, mask, everything=True):
+        for kind, bits, chosen in _distinct(kinds, mask, everything=True):
             n = self._kinds[kind].layout.n_pads
             result[chosen, :n] = self._estimator(kind, bits).suspects(pads[chosen, :n])
-        return result & ~column.strange[:, None]
+        return result & ~strange[:, None]
 
     def _pads(self, cube, frequency, pad_fault, temperature):
-        """The column, pad stresses (N, P) in Pa, and masks (N,) of bad pads."""
+        """Of each row: kind (N,), whether its cube is none of ours (N,), pad stresses (N, P) in Pa, bad pads (N,)."""
         with np.errstate(all="ignore", divide="raise"):
-            column, v, mask, _ = self._law(cube, frequency, pad_fault, temperature, keep=True)
-        none = np.zeros(len(v[0]), dtype=np.int64)
-        return column, v[0] * self._stiffness[column.kind], none if mask is None else mask[0]
+            column, v, mask, _ = self._law(cube, frequency, pad_fault, temperature)
+        kind, strange = np.tile(column.kind, len(v)), np.tile(column.strange, len(v))
+        none = np.zeros(len(kind), dtype=np.int64)
+        return kind, strange, v.reshape(-1, self.n_pads) * self._stiffness[kind], none if mask is None else mask.ravel()
 
     def covariance(self, cube: int, pad_fault: int = 0) -> np.ndarray:
         """(15, 15) of one cube's components from its pads' noise, in Pa and Pa/m; NaN where unobserved."""
@@ -228,11 +228,11 @@ class Pipeline:
         mask = int(pad_fault) & int(_mask(self._exists[kind]))
         return self._estimator(kind, mask).covariance * np.outer(scale, scale)
 
-    def _law(self, cube, frequency, pad_fault, temperature, keep=False):
+    def _law(self, cube, frequency, pad_fault, temperature):
         """The column, v / stiffness (B, N, P), and, or None, masks (B, N) of bad pads and rows without temperature.
 
         Bad pads are 0; pads that a cube has not are NaN, or 0 where any pad is bad. A column of several turns becomes
-        as many batches, unless it is to be kept as it is.
+        as many batches.
         """
         f, cube = np.asarray(frequency, dtype=self.dtype), np.asarray(cube)
         if cube.ndim != 1 or f.shape[-2:] != (len(cube), self.n_pads):
@@ -241,8 +241,6 @@ class Pipeline:
                 f"this skin needs (N,) and (N, {self.n_pads})"
             )
         column = self._columns.of(cube)
-        if column.turns > 1 and not keep:
-            column = self._columns.of(cube[: len(cube) // column.turns])
         n = len(column.kind)
         count = f.size // (n * self.n_pads) if n else 1
         f = f.reshape((n, self.n_pads) if count == 1 else (count, n, self.n_pads))  # numpy is faster with two axes
@@ -277,6 +275,10 @@ class Pipeline:
         return column, v, _mask(self._exists[column.kind] & ~good), cold
 
     def _make_column(self, cube: np.ndarray) -> _Column:
+        """Of several turns it is that of one."""
+        count = turns(cube)
+        if count > 1:
+            return self._columns.of(cube[: len(cube) // count])
         strange = (cube < 0) | (cube >= len(self.calibrations))
         index = np.where(strange, 0, cube).astype(int)
         kind, rest = self._kind[index], self._rest[index]
@@ -285,7 +287,7 @@ class Pipeline:
         pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
         floor = float(np.nanmax(-rest / top, initial=-1.0)) * (1 - FLOOR_MARGIN)
         return _Column(
-            turns(cube), strange, kind, rest.astype(self.dtype), top.astype(self.dtype), floor, pads,
+            strange, kind, rest.astype(self.dtype), top.astype(self.dtype), floor, pads,
             self._blocks(kind), self._limits[kind], self._observed[kind],
         )  # fmt: skip
 
