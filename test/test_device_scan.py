@@ -69,6 +69,41 @@ def test_a_scan_waits_for_live_links_but_not_twice():
     assert scan.complete()
 
 
+def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
+    scan = two_links()
+
+    def give(link, turn):
+        scan.add(link, sample(turn, [[1.0, 1.0]] * 2), 1000 * (turn + 1) + link)
+
+    def taken():
+        rows = scan.take() if scan.complete() else None
+        return None if rows is None else rows.sequence.tolist()
+
+    for link, turn, expected in (
+        (0, 0, [0, 0]), (1, 0, [0, 0]),  # each begins for itself
+        (0, 1, None), (1, 1, [1, 1, 1, 1]), (1, 2, None), (0, 2, [2, 2, 2, 2]),
+    ):  # fmt: skip
+        give(link, turn)
+        assert taken() == expected, (link, turn)
+    scan = two_links()
+    for link in (0, 1):
+        give(link, 0)
+    assert taken() == [0] * 4
+    give(0, 1), give(0, 2), give(1, 1)
+    assert taken() == [1] * 4, "the second was late once: what the first has given more waits"
+    assert taken() is None
+    give(1, 2)
+    assert taken() == [2] * 4 and scan.unaccounted() == 0
+    give(0, 3), give(0, 4)
+    assert taken() == [3, 3, 4, 4], "nothing from the second: nobody waits for it any longer"
+    give(1, 3)
+    assert taken() == [3, 3], "what is late to a scan waits for nobody"
+    give(0, 5), give(1, 4), give(1, 5)
+    assert [taken(), taken(), taken()] == [[5, 5, 4, 4], [5, 5], None]
+    give(0, 6), give(1, 6)
+    assert taken() == [6] * 4 and scan.unaccounted() == 0
+
+
 def test_not_measured_is_nan_and_millihertz_survive():
     scan = Scan(1, [Place("a", 0, 0, None, 2)])
     scan.hello(0, hello([1]))
@@ -177,8 +212,8 @@ def test_samples_of_one_wake_up_take_the_newest_arrival_of_their_link():
     clocks = [
         SimpleNamespace(update=lambda *given, link=link: asked.append((link, *given)) or given[0]) for link in (0, 1)
     ]
-    scan = SimpleNamespace(add=lambda *given: None, complete=lambda turns: False)
-    node = SimpleNamespace(_accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _turns=1)
+    scan = SimpleNamespace(add=lambda *given: None)
+    node = SimpleNamespace(_accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _publish=lambda: False)
     frames = [(link, arrival_ns, sample(n, [[1.0]])) for n, link, arrival_ns in ((0, 0, 10), (0, 1, 10), (1, 0, 20))]
     driver.Driver._on_frames(node, frames)
     assert [(link, len(times), arrival_ns) for link, times, arrival_ns in asked] == [(0, 2, 20), (1, 1, 10)]

@@ -78,6 +78,7 @@ class Scan:
         self._here = [False] * n_links  # has said HELLO since it was last closed or silent
         self._waits = [False] * n_links  # has a cube that another link has too, and may have it alone later
         self._gathered: list[list[tuple[Sample, int]]] = [[] for _ in range(n_links)]
+        self._taken_ns = [0] * n_links  # when the newest sample that was taken was made
 
     def hello(self, link: int, frame: Hello) -> list[str] | None:
         """Learn which cubes a link carries. Returns what does not fit the skin, in words; None if nothing changed."""
@@ -150,18 +151,32 @@ class Scan:
         self._gathered[link].append((sample, stamp_ns))
 
     def complete(self, turns: int = 1) -> bool:
-        """Whether every live link has given `turns` samples, or one has given one more."""
+        """Whether every live link has given `turns` samples, or one has given one more, or one comes late to a scan.
+
+        It does where all who have given nothing since have given one nearer to it than to its own last: to wait for
+        their next would keep it a sample behind from then on.
+        """
         counts = [len(samples) for samples in self._gathered]
-        return max(counts) > turns or all(n >= turns or not live for n, live in zip(counts, self._live, strict=True))
+        if max(counts) > turns:
+            return True
+        missing = [link for link, n in enumerate(counts) if n < turns and self._live[link]]
+        if not missing or turns > 1:
+            return not missing
+        middles = [(samples[0][1] + self._taken_ns[link]) / 2 for link, samples in enumerate(self._gathered) if samples]
+        return bool(middles) and all(self._taken_ns[link] > min(middles) for link in missing)
 
     def take(self, room: Callable[[int, int], Rows] = room_for, turns: int | None = None) -> Rows | None:
         """The rows gathered since the last time, of at most so many samples of each link; None if there are none.
 
+        What some live links have given one more of waits for the others: a link that was late once would else stay a
+        sample behind. All is taken where a live link has given nothing.
         room: makes arrays for so many rows of so many pads to fill, the message's own where there is one.
         """
         parts: list[tuple[NDArray[np.uint16], Sample, int]] = []
-        longest = max(map(len, self._gathered))
-        for turn in range(longest if turns is None else min(longest, turns)):
+        counts = [len(samples) for samples in self._gathered]
+        common = min((n for n, live in zip(counts, self._live, strict=True) if live), default=0) or max(counts)
+        turns = common if turns is None else min(common, turns)
+        for turn in range(turns):
             for link, (samples, whole) in enumerate(zip(self._gathered, self._whole, strict=True)):
                 if turn < len(samples):
                     sample, stamp_ns = samples[turn]
@@ -169,8 +184,10 @@ class Scan:
                         parts.append((whole[0], sample, stamp_ns))
                     elif (part := self._select(link, sample)) is not None:
                         parts.append((*part, stamp_ns))
-        for samples in self._gathered:
-            del samples[:turns]
+        for link, samples in enumerate(self._gathered):
+            if samples:
+                self._taken_ns[link] = samples[:turns][-1][1]
+                del samples[:turns]
         if not parts:
             return None
         rows = room(sum(len(cube) for cube, _, _ in parts), self.n_pads)
