@@ -112,7 +112,7 @@ def study(options: argparse.Namespace) -> int:
 
 
 def paper(options: argparse.Namespace) -> int:
-    from .view.study import run_paper
+    from .view.paper import run_paper
 
     return run_paper(options.out)
 

@@ -18,10 +18,11 @@ from cube_tensor_driver import cli
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.elastic import body as bodies
-from cube_tensor_driver.elastic import figures, paper
+from cube_tensor_driver.elastic import paper
 from cube_tensor_driver.elastic.study import Study
 from cube_tensor_driver.files.calibration import read_calibration
 from cube_tensor_driver.view import fem
+from cube_tensor_driver.view import paper as view_paper
 from cube_tensor_driver.view import study as view_study
 
 SMALL = ("--width", "20", "--height", "12", "--meshes", "2")
@@ -147,9 +148,9 @@ def test_pads(computed, flags, size, centre):
     [
         ("--poisson 0.5", ["poisson is 0.5", "[0, 0.5)"]),
         ("--side 11", ["side is 11 mm", "height is 11 mm"]),
-        ("--pad 1.2 --pad-centre 0.5", ["+z-x and +z+x overlap", "narrower"]),
-        ("--pad 2.5", ["2.5 mm wide", "the face ends at 1", "--pad-centre"]),
-        ("--pad 0.001", ["mesh resolves 0.001", "wider"]),
+        ("--pad 1.2 --pad-centre 0.5", ["+z-x and +z+x overlap: 1.2 mm wide, 1 mm apart", "narrower"]),
+        ("--pad 2.5", ["2.5 mm wide", "reach to 2.25 mm", "faces end at 2 mm", "--pad-centre"]),
+        ("--pad 0.001", ["mesh resolves 0.002 mm", "wider"]),
         ("--pad wide", ["'wide'", "half, or a width in mm"]),
         ("--pad half --pad-centre 0.5", ["leave out --pad-centre"]),
         ("--3d --pad half", ["overlap"]),
@@ -158,9 +159,13 @@ def test_pads(computed, flags, size, centre):
         ("--layout round", ["unknown layout 'round'"]),
         ("--layout quad --symmetry full", ["lacks this symmetry"]),
         ("--neglect round", ["unknown mode 'round'", "zz_x"]),
-        ("-o none/cube.yaml", ["none/cube.yaml", "a folder that exists"]),
-        ("--json .", ["--json .", "cannot be written"]),
-        ("--figures README.md", ["README.md", "name a folder"]),
+        ("-o none/cube.yaml", ["-o none/cube.yaml", "a folder that can be written"]),
+        ("-o /proc/cube.yaml", ["-o /proc/cube.yaml", "a folder that can be written"]),
+        ("--json .", ["--json .", "is no file"]),
+        ("--json /dev/null", ["--json /dev/null", "is no file"]),
+        ("--json x -o x", ["--json and -o", "name two files"]),
+        ("--figures /proc/x", ["--figures /proc/x", "name a folder"]),
+        ("--figures README.md", ["--figures README.md", "name a folder"]),
     ],
 )
 def test_a_mistake_is_one_line_before_any_work(monkeypatch, capsys, flags, words):
@@ -259,8 +264,8 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
 
 def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     one = lambda **_: [_experiment()]  # noqa: E731
-    monkeypatch.setattr(figures, "experiments", one)
-    monkeypatch.setattr(figures, "rod_sweep", lambda **_: paper.rod_sweep(places=(0.0, 2e-3)))
+    monkeypatch.setattr(view_paper, "experiments", one)
+    monkeypatch.setattr(view_paper, "rod_sweep", lambda **_: paper.rod_sweep(places=(0.0, 2e-3)))
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())
     assert made == [

@@ -131,9 +131,7 @@ class Bench:
         rows, rod = [], None
         for number, step in enumerate(steps, 1):
             task = self._task(step, loose)
-            found = self._newton(2 * u - before, task)  # as the last step went
-            if found is None:
-                found = self._advance(u, rod, task, number)
+            found = self._advance(u, 2 * u - before, rod, task, number)  # as the last step went
             u, before, rod = found, u, step.rod
             loose = loose if step.gripped else u
             rows.append((self._pads(u), self._state(u), self._turn(u), d0 * u[self.basis.nodal_dofs]))
@@ -166,16 +164,21 @@ class Bench:
             prescribed = prescribed + np.where(self._component == 0, loose, 0.0)
         return _Task(prescribed, step.rod, self._mean if step.sliding else None)
 
-    def _advance(self, u: Array, before: Rod | None, task: _Task, number: int, halvings: int = 0) -> Array:
-        """Newton's method for one step of the load, after the rod `before`, in halves where it fails."""
-        found = self._newton(u, task)
+    def _advance(
+        self, u: Array, guess: Array, before: Rod | None, task: _Task, number: int, halvings: int = 0
+    ) -> Array:
+        """Newton's method for one step of the load from u, after the rod `before`, in halves where it fails."""
+        found = self._newton(guess, task)
+        if found is None:
+            found = self._newton(u, task)
         if found is not None:
             return found
         if halvings == _HALVINGS:
             raise ElasticError(f"step {number} of the load is too large even in {2**_HALVINGS} parts; press less")
         rod = task.rod and replace(task.rod, pressed=(task.rod.pressed + (before.pressed if before else 0.0)) / 2)
         half = replace(task, prescribed=(u + task.prescribed) / 2, rod=rod)
-        return self._advance(self._advance(u, before, half, number, halvings + 1), rod, task, number, halvings + 1)
+        middle = self._advance(u, (u + guess) / 2, before, half, number, halvings + 1)
+        return self._advance(middle, 2 * middle - u, rod, task, number, halvings + 1)
 
     def _newton(self, u: Array, task: _Task) -> Array | None:
         """Displacements (dofs,) that balance, from the guess u; None where Newton's method does not get there."""

@@ -14,6 +14,7 @@ from ..core.layout import Layout
 from .mesh import block, section
 
 _SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.2, 2.0), (0.25, 0.15, 1.5))  # brick on a face, at an edge, growth
+_FINEST = 1e-3  # distance of two pad edges, d0
 _BYTES = {2: 3e5, 3: 8e5}  # of memory per corner of an element at the peak, measured
 
 
@@ -74,14 +75,15 @@ def field_axes(layout: Layout) -> tuple[int, ...]:
     return (0, 2) if layout.planar else (0, 1, 2)
 
 
-def check_pads(layout: Layout) -> None:
+def check_pads(body: Body, layout: Layout) -> None:
     """Pads of one face must not share area: square ones overlap when both distances are below their side."""
+    mm = 1e3 * body.side / 2
     for i, j in itertools.combinations(range(layout.n_pads), 2):
         gap = np.abs(layout.positions[i] - layout.positions[j]).max()
         if np.array_equal(layout.normals[i], layout.normals[j]) and gap < layout.pad_size * (1 - 1e-9):
             raise ElasticError(
-                f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {layout.pad_size:g} d0 wide, {gap:g} "
-                "d0 apart; make them narrower or move them apart"
+                f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {mm * layout.pad_size:g} mm wide, "
+                f"{mm * gap:g} mm apart; make them narrower or move them apart"
             )
 
 
@@ -98,9 +100,10 @@ def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
     ]
     stops = np.unique(np.round(edges, 9))
     steps = np.diff(np.unique([0.0, *stops[stops < 1], 1.0]))
-    if steps.min() < 1e-3:
+    if steps.min() < _FINEST:
+        mm = 1e3 * body.side / 2
         raise ElasticError(
-            f"pad edges are {steps.min():.2g} d0 apart and the mesh resolves 0.001; "
+            f"pad edges are {mm * steps.min():.2g} mm apart and the mesh resolves {mm * _FINEST:g} mm; "
             "make the pads wider, or move their edges together or apart"
         )
     return section(half, stops, level) if layout.planar else block(half, stops, *_SPACE_MESHES[level])

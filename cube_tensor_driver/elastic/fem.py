@@ -25,7 +25,7 @@ from .body import Body, check_memory, check_pads, field_axes, make_mesh
 from .solid import Parity, Solid, lame
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int, str], None]
+Progress = Callable[[float, float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def compute_response(
     structure = find_structure(layout, symmetry)
     if not 1 <= meshes <= 3:
         raise ElasticError(f"{meshes} meshes are asked for; 1, 2 or 3 are possible")
-    check_pads(layout)
+    check_pads(body, layout)
     grids = [make_mesh(body, layout, level) for level in range(meshes)]
     check_memory(grids[-1])
     matrices: list[Array] = []

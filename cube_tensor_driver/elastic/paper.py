@@ -19,7 +19,7 @@ from ..core.modes import PLANE
 from ..core.oscillator import pad_frequency
 from .bench import Bench, Step
 from .body import Body
-from .fem import Response, compute_response
+from .fem import Progress, Response, compute_response
 from .rod import Rod
 
 Array = NDArray[np.float64]
@@ -46,9 +46,7 @@ class Experiment:
     truth: Array
 
 
-def experiments(
-    body: Body | None = None, finite: bool = False, progress: Callable[[int, int, str], None] | None = None
-) -> list[Experiment]:
+def experiments(body: Body | None = None, finite: bool = False, progress: Progress | None = None) -> list[Experiment]:
     """The three experiments, plates bonded and (where they do not shear) sliding."""
     body = body or Body()
     press = shear = np.linspace(0.25e-3, 3e-3, 12)
@@ -152,7 +150,7 @@ def rod_sweep(
     body: Body | None = None,
     places: Sequence[float] = tuple(np.arange(9) * 1e-3),
     pressed: float = 1e-3,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, list[float]]:
     """How much of the prototype's shear signal under a rod is shear; linear body on a bonded plate, per rod position.
 

@@ -10,7 +10,7 @@ part of the model. Each layout is calibrated with the linear modes on the same b
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ from ..core.layout import LAYOUTS
 from ..core.modes import COMPONENTS, PLANE, SPACE, Modes, to_matrix
 from . import contact
 from .body import Body, make_mesh
-from .fem import linear_response, make_solid, pad_stresses
+from .fem import Progress, linear_response, make_solid, pad_stresses
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def study(
     offsets: Sequence[float] = tuple(np.linspace(-12e-3, 12e-3, 9)),
     depth: float = 5.5e-3,
     poisson: float = 0.48,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Study:
     """Slide a round indenter of each width (its diameter) over a cube of each side, along x at y = 1 mm.
 
@@ -113,6 +113,7 @@ def study(
 
     matrix = linear_response(solid, layout, report)
     pads = pad_stresses(solid, layout, lambda parity: solid.outer_forces(parity, field), report)
+    report("done")
     shape = (len(sides), len(widths), len(offsets), len(COMPONENTS))
     truth = np.concatenate([_components(*load, depth, poisson) for load in loads]).reshape(shape)
     recovered = {name: (pads[: LAYOUTS[name].n_pads].T @ _recovery(matrix, name).T).reshape(shape) for name in LAYOUTS}

@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from ..core.errors import ConfigError
+from .whole import whole
 
 MAX_BYTES = 64 << 20
 """No skin or calibration comes near; a wrong path to a bag or a disk image does."""
@@ -70,13 +71,9 @@ def to_yaml(value: Any) -> str:
 def write_yaml(path: Path, value: Any, header: str = "") -> None:
     """Write plain values as YAML, whole or not at all; `header` becomes comment lines at the top.
 
-    ConfigError: the folder cannot be written.
+    ConfigError: it cannot be written.
     """
     lines = "".join(f"# {line}".rstrip() + "\n" for line in header.splitlines())
     text = lines + to_yaml(value)
-    partial = path.with_name(path.name + ".part")
-    try:
+    with whole(path) as partial:
         partial.write_text(text)
-        partial.replace(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name a file in a folder that can be written") from None

@@ -16,10 +16,11 @@ from ..core.layout import Layout
 from ..core.symmetry import default_modes, find_structure
 from ..elastic.body import Body, strip_layout
 from ..elastic.fem import Response, calibration_from_fem, compute_response
-from ..elastic.figures import plot_convergence, plot_loads, plot_response
 from ..files.calibration import write_calibration
+from .elastic_plots import draw_convergence, draw_loads, draw_response
 from .layout import coefficient_counts, named_layout
 from .output import check_outputs, make_folder, progress_bar, write_json
+from .plots import save
 
 _COLUMNS = 7  # modes in one table, so that it fits a terminal
 _ROWS = 40  # coefficients shown; more are in the JSON file
@@ -57,7 +58,7 @@ def run_fem(options: Options) -> int:
     default_modes(layout).index(options.neglect)
     body = _body(options, layout)
     check_outputs({"--json": options.json, "-o": options.output})
-    make_folder(options.figures)
+    make_folder("--figures", options.figures)
     console = Console()
     console.print(
         f"{_describe(body, layout)}; {layout.n_pads} pads, symmetry {symmetry}", highlight=False, soft_wrap=True
@@ -68,10 +69,10 @@ def run_fem(options: Options) -> int:
     if options.json is not None:
         write_json(options.json, result.to_dict())
     if options.figures is not None:
-        plot_convergence(result, options.figures / "convergence.png")
-        plot_response(result, options.figures / "response.png")
+        save(draw_convergence(result), options.figures / "convergence.png")
+        save(draw_response(result), options.figures / "response.png")
         if layout.planar:
-            plot_loads(body, layout, options.figures / "loads.png")
+            save(draw_loads(body, layout), options.figures / "loads.png")
         console.print(f"pictures in {options.figures}", highlight=False)
     if options.output is not None:
         _write_calibration(console, options, result)
@@ -96,8 +97,10 @@ def _layout(options: Options) -> Layout:
     try:
         return strip_layout(layout, width, centre)
     except LayoutError as error:
-        where = f"pads {width * d0:g} mm wide, {centre * d0:g} mm from the middle of faces {options.side:g} mm wide"
-        raise ElasticError(f"{where}: {error}; change --pad or --pad-centre") from None
+        where = f"pads {width * d0:g} mm wide, {centre * d0:g} mm from the middle of their faces"
+        reach = (centre + width / 2) * d0
+        why = f"they reach to {reach:g} mm and the faces end at {d0:g} mm" if reach > d0 else str(error)
+        raise ElasticError(f"{where}: {why}; change --pad or --pad-centre") from None
 
 
 def _millimetres(text: str) -> float:

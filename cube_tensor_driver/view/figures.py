@@ -43,7 +43,7 @@ def draw_field(pitch: float = 0.010, width: float = 0.012) -> Figure:
         image = axis.pcolormesh(x, y, kilo, vmin=0, vmax=top, shading="nearest", rasterized=True)
         axis.contour(x, y, kilo, levels=np.arange(2, top, 4), colors="white", linewidths=0.5)
         axis.plot(*(1e3 * skin.position[:, :2].T), "s", ms=4, mfc="none", mec="0.8", label="cube")
-        axis.plot(*(1e3 * centre), "r+", ms=9, label="load")
+        axis.plot(*(1e3 * centre), "P", ms=7, mfc="red", mec="white", mew=0.8, label="load")
         rms = np.sqrt(((pressure - maps["truth"]) ** 2).mean() / (maps["truth"] ** 2).mean())
         axis.set(title=name if name == "truth" else f"{name}: {100 * rms:.0f} %", xlabel="x / mm", aspect="equal",
                  xlim=(-22, 22), ylim=(-22, 22))  # fmt: skip

@@ -3,52 +3,57 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 from ..core.errors import ConfigError
+from ..files.whole import check_writable, whole
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr, where that is a terminal; yields report(done, total, what)."""
+def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
+    """A bar of one line on stderr, where that is a terminal; yields report(done, total, what)."""
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(
-        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
+    what = TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1))
+    columns = (what, BarColumn(bar_width=20), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, expand=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("meshing", total=None)
         yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
+        bar.update(task, completed=bar.tasks[0].total)
 
 
 def check_outputs(paths: dict[str, Path | None]) -> None:
-    """ConfigError, before any work: a file to be written has no folder, or one that cannot be written."""
-    for option, path in paths.items():
-        if path is not None and (path.is_dir() or not os.access(path.resolve().parent, os.W_OK)):
-            raise ConfigError(f"{option} {path}: cannot be written; name a file in a folder that exists and is yours")
+    """ConfigError, before any work: a file that cannot be written, or one for two outputs."""
+    given = {option: path for option, path in paths.items() if path is not None}
+    for option, path in given.items():
+        for other in given:
+            if other != option and given[other].resolve() == path.resolve():
+                raise ConfigError(f"{option} and {other} both name {path}; name two files")
+        try:
+            check_writable(path)
+        except ConfigError as error:
+            raise ConfigError(f"{option} {error}") from None
 
 
-def make_folder(path: Path | None) -> None:
+def make_folder(option: str, path: Path | None) -> None:
     """ConfigError, before any work: the folder cannot be made or written. None: none is asked for."""
+    if path is None:
+        return
     try:
-        if path is not None:
-            path.mkdir(parents=True, exist_ok=True)
-            check_outputs({"folder": path / "a file"})
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name a folder that can be made and written") from None
+        path.mkdir(parents=True, exist_ok=True)
+        check_writable(path / "a file")
+    except (OSError, ConfigError) as error:
+        what = error.strerror if isinstance(error, OSError) else "no file can be made in it"
+        raise ConfigError(f"{option} {path}: {what}; name a folder that can be made and written") from None
 
 
 def write_json(path: Path, value: Any) -> None:
     """A file that is whole or not there at all. ConfigError: it cannot be written."""
-    try:
-        partial = path.with_name(path.name + ".part")  # whole or not at all
+    with whole(path) as partial:
         partial.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ..core.errors import ConfigError
 from ..core.fit import Fit
 from ..core.layout import Layout
+from ..files.whole import whole
 from ..simulation.judge import Forces
 
 plt.rcParams |= {
@@ -31,15 +33,20 @@ MARKERS = "osD^v<>pP*hX"
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure; the suffix says the format. ConfigError: cannot be written, or no such format."""
+    """Write a figure, whole or not at all; the suffix says the format. ConfigError: cannot be, or no such format."""
     try:
-        figure.savefig(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name a picture file in a folder that can be written") from None
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        check_picture(path)
+        with whole(path) as partial:
+            figure.savefig(partial, format=path.suffix[1:] or "png")
     finally:
         plt.close(figure)
+
+
+def check_picture(path: Path) -> None:
+    """ConfigError: the suffix is no format of a picture."""
+    formats = FigureCanvasAgg.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in formats:
+        raise ConfigError(f"{path}: {path.suffix!r} is no format of a picture; take one of {', '.join(formats)}")
 
 
 def draw_layout(layout: Layout) -> Figure:
@@ -105,8 +112,9 @@ def draw_forces(forces: Forces, cubes: NDArray[np.float64]) -> Figure:
     seconds = forces.seconds - forces.seconds.min()
     for name, unit, truth, found in (("force", 1.0, forces.force, forces.found_force),
                                      ("centre", 1e3, forces.centre, forces.found_centre)):  # fmt: skip
-        for axis, (letter, mark, color) in enumerate(zip("xyz", "osD", ("C0", "C2", "black"), strict=True)):
-            axes[name].plot(seconds, unit * truth[:, axis], color=color, lw=1)
+        for axis, (letter, mark, color, dash) in enumerate(zip("xyz", "osD", ("C0", "C1", "black"), ("--", ":", "-"),
+                                                               strict=True)):  # fmt: skip
+            axes[name].plot(seconds, unit * truth[:, axis], color=color, lw=1, ls=dash)
             axes[name].plot(seconds, unit * found[:, axis], mark, color=color, mfc="none", ms=3, label=letter)
     handles, labels = axes["force"].get_legend_handles_labels()
     axes["force"].legend(handles, labels, title="lines: script, marks: measured", ncols=3, loc="lower left",

@@ -1,4 +1,4 @@
-"""./cube study and ./cube paper: experiments on a virtual bench, as tables, files and pictures."""
+"""./cube study: where each layout can be trusted, as a table, a file and a picture."""
 
 from __future__ import annotations
 
@@ -9,31 +9,22 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from ..elastic.figures import make_paper, plot_study
 from ..elastic.study import Study, study
-from .output import check_outputs, make_folder, progress_bar, write_json
+from .elastic_plots import draw_trust
+from .output import check_outputs, progress_bar, write_json
+from .plots import check_picture, save
 
 
 def run_study(json_path: Path | None, figure: Path) -> int:
     """Sweep indenters over cubes, show from which width on each layout is right, draw the errors."""
     check_outputs({"--json": json_path, "--figure": figure})
+    check_picture(figure)
     with progress_bar() as report:
         result = study(progress=report)
     _show_study(result)
-    plot_study(result, figure)
+    save(draw_trust(result), figure)
     if json_path is not None:
         write_json(json_path, result.to_dict())
-    return 0
-
-
-def run_paper(out: Path) -> int:
-    """All pictures and numbers of docs/paper.md into a folder."""
-    make_folder(out)
-    with progress_bar() as report:
-        made, numbers = make_paper(out, report)
-    made.append(out / "paper.json")
-    write_json(made[-1], numbers)
-    Console().print(f"wrote {', '.join(path.name for path in made)} into {out}", highlight=False, soft_wrap=True)
     return 0
 
 

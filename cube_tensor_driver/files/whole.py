@@ -1,0 +1,42 @@
+"""Files that are whole or not there at all: written beside their place, then moved onto it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ..core.errors import ConfigError
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """What to write in place of `path`, whose place it takes at the end; after an error neither is left behind.
+
+    ConfigError: cannot be written, or `path` is a folder or a device.
+    """
+    with _beside(path) as partial:
+        yield partial
+        partial.replace(path)
+
+
+def check_writable(path: Path) -> None:
+    """ConfigError, before any work: `whole` could not write this. Permissions say little to root or in /proc."""
+    with _beside(path) as partial:
+        partial.touch()
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A name beside `path`, where nothing is left in the end; its errors as ConfigError."""
+    partial = path.parent / f"{path.name}.part"
+    try:
+        if path.exists() and not path.is_file():
+            raise OSError(0, "is no file")
+        yield partial
+    except OSError as error:
+        what = error.strerror or str(error)
+        raise ConfigError(f"{path}: {what}; name a file in a folder that can be written") from None
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
