@@ -111,8 +111,8 @@ def test_too_large_a_load_is_refused(coarse, monkeypatch):
 def test_a_round_rod_presses_as_hertz_says():
     """Two-dimensional contact on a half plane: P = pi E* a^2 / 4R, and the mean square of x over p is a^2 / 4.
 
-    K. L. Johnson, Contact Mechanics (1985), 4.2. The half plane is 200 x 100 mm, 35 times a; 0.2 % is
-    found, and a contact that sets in over 0.05 mm instead of 0.005 mm is wrong by 20 %.
+    K. L. Johnson, Contact Mechanics (1985), 4.2. The half plane is 200 x 100 mm, 35 times a; 1.1 % is found for a
+    contact that sets in over 0.005 mm, 0.2 % and 0.1 % for a half and a quarter of that, 20 % for 0.05 mm.
     """
     body = Body(200e-3, 1.0, 100e-3, 10e-3)
     radius = 50e-3
@@ -124,7 +124,7 @@ def test_a_round_rod_presses_as_hertz_says():
     force = 5e-3 * Contact(bench._top, rod, 5e-3, body.young, False).force(u)[vertical]
     square = force @ (5e-3 * bench.basis.doflocs[0, vertical]) ** 2 / force.sum()
     assert 4e-3 < 2 * np.sqrt(square) < 7e-3
-    assert force.sum() == pytest.approx(np.pi * body.young / (1 - body.poisson**2) * square / radius, rel=0.01)
+    assert force.sum() == pytest.approx(np.pi * body.young / (1 - body.poisson**2) * square / radius, rel=0.015)
 
 
 @pytest.mark.parametrize("finite", [False, True])
@@ -142,24 +142,26 @@ def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(coarse, finite
 
 @pytest.mark.parametrize("bonded", [True, False])
 def test_a_deep_rod_folds_no_element(coarse, bonded):
-    """2 mm into the 3.5 mm above the cube: P_shear grows (bonded: ever faster) and is that of a finer mesh.
+    """Into the 3.5 mm above the cube: P_shear grows (bonded: ever faster), is that of a finer mesh, and is found
+    again at 2 mm after 2.6 mm: no node has stayed on the rod's edge.
 
     0.2 % is found between the meshes; a sliding bottom that is held at one point is wrong by 5 % at 1.5 mm.
     """
-    steps = [dent(BODY, Rod(depth, 1e-3), bonded) for depth in (0.5e-3, 1e-3, 1.5e-3, 2e-3)]
+    steps = [dent(BODY, Rod(depth, 1e-3), bonded) for depth in (0.5e-3, 1e-3, 1.5e-3, 2e-3, 2.6e-3, 2e-3)]
     coarse, fine = (
         Bench(BODY, finite=True, size=size).run(some).pads[:, :4] @ [-1, 1, 1, -1]
         for size, some in ((2.0, steps), (1.0, steps[:3]))
     )
     assert coarse[:3] == pytest.approx(fine, rel=0.005)
-    assert np.all(np.diff(coarse, 2 if bonded else 1) < 0)
+    assert np.all(np.diff(coarse[:4], 2 if bonded else 1) < 0)
+    assert coarse[5] == pytest.approx(coarse[3], rel=1e-6)
 
 
 @pytest.mark.parametrize("finite", [False, True])
 def test_a_sliding_bottom_stays_on_average(coarse, finite):
     """And what keeps it there is spread evenly: in proportion to the mean's weights, on the bottom alone."""
     bench, nothing = Bench(BODY, finite=finite, size=1.0), np.zeros(0)
-    rod = Rod(0.5e-3, 1e-3)
+    rod = Rod(0.3e-3, 1e-3)
     u = bench._newton(np.zeros(bench.basis.N), bench._task(dent(BODY, rod, bonded=False), nothing))
     assert abs(bench._mean @ u) < 1e-9 * np.abs(bench._mean).max() * np.abs(u).max()
     left, _ = bench._balance(u, Contact(bench._top, rod, 2e-3, BODY.young, finite))

@@ -16,6 +16,7 @@ from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import fem, mesh
+from cube_tensor_driver.elastic.bench import Bench
 from cube_tensor_driver.elastic.body import Body, strip_layout
 from cube_tensor_driver.elastic.fem import calibration_from_fem, compute_response
 from cube_tensor_driver.elastic.pads import interval_weights
@@ -313,6 +314,17 @@ def test_too_little_memory(monkeypatch):
     monkeypatch.setattr(bodies, "available_memory", lambda: 1e8)
     with pytest.raises(ElasticError, match=r"GB of memory and 0\.1 GB are available"):
         compute_response(Body(), LAYOUTS["cube"], "slab")
+
+
+def test_a_limit_on_this_process_counts(monkeypatch):
+    """SuperLU may look for memory for ever where a limit is near: `ulimit -v` is asked before."""
+    taken = bodies.resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[0])
+    monkeypatch.setattr(bodies.resource, "getrlimit", lambda _: (taken + 1e8, -1))
+    assert bodies.available_memory() == pytest.approx(1e8, abs=2e7)
+    with pytest.raises(ElasticError, match=r"GB of memory and 0\.\d+ GB are available"):
+        compute_response(Body(), HALVES, meshes=1)
+    with pytest.raises(ElasticError, match="are available"):
+        Bench(Body())
 
 
 def test_memory_that_runs_out_is_said(monkeypatch):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ElasticError
 from ..core.layout import LAYOUTS, Layout
-from .body import Body
+from .body import Body, check_memory
 from .material import Material, determinant
 from .mesh import mirrored, section
 from .newton import factors, find_balance
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 _HALVINGS = 5
 _CUTS = 2  # of the triangles that touch the cube: P_shear is a small difference of pad stresses, 2 % off with none
+_BYTES = 6e4  # of memory per corner of a triangle at the peak, measured
 _STIFF = 1e4  # cube over body: rigid to 1e-4, without spoiling Newton's numbers
 
 
@@ -97,10 +98,12 @@ class Bench:
         stops = np.unique(np.round([across - half, across + half], 9))
         high = body.height / 2 / d0
         quarter = section([body.width / 2 / d0, high], stops, 1, smallest=0.3, largest=size)
-        quarter = _refined(quarter, lambda x, z: (z > high - 0.9) & (x < 6))  # where rods press
+        quarter = _refined(quarter, lambda x, z: (z > high - 0.9) & (x < 6.0))  # where rods press
+        quarter = _refined(quarter, lambda x, z: (z > high - 0.25) & (x < 2.4))  # and stretch the surface most
         for _ in range(_CUTS if cube else 0):
             quarter = _refined(quarter, lambda x, z: np.abs(np.maximum(x, z) - 1.15) < 0.15)
         self.mesh = mirrored(quarter)
+        check_memory(self.mesh, _BYTES)
         self._inside = np.all(np.abs(self.mesh.p[:, self.mesh.t].mean(axis=1)) < 1.0, axis=0)
         self.basis = skfem.Basis(self.mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=4)
         if finite and body.plane != "strain":
@@ -167,10 +170,8 @@ class Bench:
     def _advance(
         self, u: Array, guess: Array, before: Rod | None, task: _Task, number: int, halvings: int = 0
     ) -> Array:
-        """Newton's method for one step of the load from u, after the rod `before`, in halves where it fails."""
+        """Newton's method from a guess for one step of the load after u and the rod `before`; halves where it fails."""
         found = self._newton(guess, task)
-        if found is None:
-            found = self._newton(u, task)
         if found is not None:
             return found
         if halvings == _HALVINGS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import resource
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from ..core.errors import ElasticError
 from ..core.layout import Layout
 from .mesh import block, section
 
-_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.2, 2.0), (0.25, 0.15, 1.5))  # brick on a face, at an edge, growth
+_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.2, 2.0), (0.25, 0.1, 1.5))  # brick on a face, at an edge, growth
 _FINEST = 1e-3  # distance of two pad edges, d0
+_FIRST_BYTES = 3e8  # of memory, whatever the mesh: SuperLU hangs where less of it can be had, measured
 _BYTES = {2: 3e5, 3: 8e5}  # of memory per corner of an element at the peak, measured
 
 
@@ -109,18 +111,28 @@ def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
     return section(half, stops, level) if layout.planar else block(half, stops, *_SPACE_MESHES[level])
 
 
-def check_memory(grid: skfem.Mesh) -> None:
-    need, have = grid.nvertices * _BYTES[int(grid.dim())], available_memory()
+def check_memory(grid: skfem.Mesh, per_corner: float | None = None) -> None:
+    """ElasticError, before any work: too little memory. per_corner: bytes, by default of the response's solver.
+
+    SuperLU must not run into a limit: it may look for memory for ever.
+    """
+    need, have = _FIRST_BYTES + grid.nvertices * (per_corner or _BYTES[int(grid.dim())]), available_memory()
     if have is not None and need > have:
         raise ElasticError(
-            f"this needs about {need / 1e9:.1f} GB of memory and {have / 1e9:.1f} GB are available; "
-            "ask for fewer meshes or wider pads"
+            f"this needs about {need / 1e9:.2g} GB of memory and {max(have, 0.0) / 1e9:.2g} GB are available; "
+            "ask for fewer meshes or wider pads, or give it more"
         )
 
 
 def available_memory() -> float | None:
+    """Bytes that this process may still take: of the machine, and of its own limit. None: nothing is known."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+        free = next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return free
+        taken = resource.getpagesize() * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        return min(free, float(limit - taken))
     except (OSError, StopIteration):
         return None  # not Linux: nothing is known, so nothing is refused

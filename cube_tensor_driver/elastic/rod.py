@@ -24,13 +24,16 @@ _ROUND = 0.001  # length over which the contact sets in, d0
 class Rod:
     """A rod whose flat part ends `round` before its edges, in parabolas of that radius at their apex; in m.
 
+    Sides of elements must be short beside that radius, as far as they are stretched: where they are not, a node
+    stays on the rod's edge as the surface slides round it, and how far it slides depends on the steps of the load.
+
     place: of its middle along x; pressed: how deep its lowest point is below the undeformed top
     """
 
     pressed: float
     place: float
     width: float = 5e-3
-    round: float = 0.5e-3
+    round: float = 1e-3
 
     def lower_side(self, x: Array, top: float, unit: float) -> tuple[Array, Array, Array]:
         """h, dh/dx and d2h/dx2 at x; x, top and h in units of `unit` m."""

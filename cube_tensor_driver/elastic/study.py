@@ -22,7 +22,7 @@ from ..core.estimator import make_estimator
 from ..core.layout import LAYOUTS
 from ..core.modes import COMPONENTS, PLANE, SPACE, Modes, to_matrix
 from . import contact
-from .body import Body, make_mesh
+from .body import Body, check_memory, make_mesh
 from .fem import Progress, linear_response, make_solid, pad_stresses
 
 Array = NDArray[np.float64]
@@ -97,7 +97,9 @@ def study(
     loads = list(itertools.product(sides, widths, offsets))
     body = Body(_BOX, _BOX, _BOX, side=1.0, poisson=poisson, cube_young=np.inf)  # lengths in units of the side
     layout = LAYOUTS["cube"]
-    solid = make_solid(body, layout, make_mesh(body, layout, 0))
+    grid = make_mesh(body, layout, 0)
+    check_memory(grid)
+    solid = make_solid(body, layout, grid)
     cache: dict[bytes, Array] = {}
     done = itertools.count()
 
