@@ -143,7 +143,7 @@ def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(coarse, finite
 @pytest.mark.parametrize("bonded", [True, False])
 def test_a_deep_rod_folds_no_element(coarse, bonded):
     """Into the 3.5 mm above the cube: P_shear grows (bonded: ever faster), is that of a finer mesh, and is found
-    again at 2 mm after 2.6 mm: no node has stayed on the rod's edge.
+    again at 2 mm after 2.6 mm: nothing rubs, and no node stays on the rod's edge.
 
     0.2 % is found between the meshes; a sliding bottom that is held at one point is wrong by 5 % at 1.5 mm.
     """

@@ -283,3 +283,52 @@ def _experiment() -> paper.Experiment:
 def test_every_picture_of_the_paper_is_there_and_shown():
     shown = set(re.findall(r"\(paper/([a-z0-9_]+\.png)\)", (ROOT / "docs" / "paper.md").read_text()))
     assert shown and shown == {path.name for path in (ROOT / "docs" / "paper").glob("*.png")}
+
+
+def test_the_figures_of_the_papers_page_are_those_of_its_json():
+    """paper.json is what ./cube paper wrote beside the pictures; each figure of the claims' table is made of it."""
+    text = (ROOT / "docs" / "paper.md").read_text().replace("−", "-")
+    found = json.loads((ROOT / "docs" / "paper" / "paper.json").read_text())
+    experiment = {
+        "a": "a, top plate pressed, bonded",
+        "a, sliding": "a, top plate pressed, sliding",
+        "b": "b, pressed 3 mm then sheared, bonded",
+        "b, gripped": "b, pressed 3 mm by sliding plates that then grip, sheared",
+        "c": "c, 5 mm rod above C2, bonded bottom",
+        "c, sliding": "c, 5 mm rod above C2, sliding bottom",
+    }
+
+    def last(name: str, kind: str, what: str, column: int, row: int = -1) -> float:
+        return found[f"{experiment[name]}, {kind}"][what][row][column] / 1e3
+
+    def four(name: str, digits: int, column: int) -> list[str]:
+        """Linear and finite of one experiment at its end, then of its sliding or gripped one, kHz."""
+        other = {"a": "a, sliding", "b": "b, gripped", "c": "c, sliding"}[name]
+        kinds = [(one, kind) for one in (name, other) for kind in ("linear", "finite")]
+        return [f"{last(*one, 'prototype', column):.{digits}f}" for one in kinds]
+
+    said = [
+        "{} kHz linear, {} kHz finite; sliding: {} and {} kHz".format(*four("a", 1, 0)),
+        "{} kHz linear, {} kHz finite; gripped after sliding {} and {} kHz".format(*four("b", 2, 1)),
+        "{} kHz linear, {} kHz finite; sliding bottom: {} and {} kHz".format(*four("c", 2, 2)),
+        "{} kHz linear, {} kHz finite; sliding bottom: {} and {} kHz".format(*four("c", 2, 1)),
+    ]
+    for name in ("b", "b, gripped"):
+        before, after = (last(name, "finite", "prototype", 0, row) for row in (11, 23))
+        said.append(f"{before:.2f} → {after:.2f} kHz, {100 * (after / before - 1):.1f} %")
+    for name, mode in (("a", 0), ("a, sliding", 0), ("b", 1), ("c", 0), ("c", 3)):
+        digits = 1 if mode else 0
+        said.append(" for ".join(f"{last(name, 'linear', what, mode):.{digits}f}" for what in ("recovered", "truth")))
+    pads = 1e-3 * np.array(found[f"{experiment['c']}, finite"]["pads"])[:, :4]
+    both = pads @ np.array([[-1, 1, 1, -1], [1, -1, 1, -1]]).T
+    said.append(" | ".join(f"{shear:.2f}, {grad:.2f}" for shear, grad in both[[3, 5, 7, 9, 11]]))
+    rods = found["rod positions"]
+    for place, *parts in zip(*(rods[key] for key in ("place", "signal", "shear", "crosstalk")), strict=True):
+        if place:
+            numbers = [f"{part / 1e3 + 0.0:.1f}".replace("-0.0", "0.0") for part in parts]
+            said.append(f"| {1e3 * place:g} | {' | '.join(numbers)} | {100 * parts[1] / parts[0]:.0f} % |")
+    slab = read_calibration(ROOT / "config" / "calibration" / "planar_slab.yaml").response[:4]
+    said += [", ".join(f"{value:.3f}" for value in slab[:, column]) for column in (1, 3)]  # zx and zz_x
+    assert len(said) == 22
+    for words in said:
+        assert words in text, words
