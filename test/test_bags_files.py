@@ -84,6 +84,26 @@ def test_a_written_bag_is_read_by_rosbags(tmp_path, options):
         assert len(list(path.glob("*.mcap"))) == 3
 
 
+@pytest.mark.parametrize("options", [{}, {"storage": "sqlite3"}, {"max_bytes": 400_000}])
+def test_a_written_bag_is_read_by_rosbag2(tmp_path, options):
+    """Byte for byte, in our order; types, hashes, definitions and latched info too."""
+    rosbag2 = pytest.importorskip("rosbag2_py", reason="needs rosbag2, which the wheels lack")
+    path = make_bag(tmp_path / "bag", SKIN, **options)
+    reader = rosbag2.SequentialReader()
+    uri, storage = str(path), options.get("storage", "mcap")
+    reader.open(rosbag2.StorageOptions(uri=uri, storage_id=storage), rosbag2.ConverterOptions("", ""))
+    messages = []
+    while reader.has_next():
+        messages.append(reader.read_next())
+    metadata = rosbag2.Info().read_metadata(uri, storage)
+    topics = {one.name: (one.type, one.type_description_hash) for one in reader.get_all_topics_and_types()}
+    assert {one.topic_type for one in reader.get_all_message_definitions()} >= {FREQUENCIES, STRESS, INFO}
+    with Bag(path) as bag:
+        assert messages == [(entry.topic, entry.data, entry.time_ns) for entry in bag.entries()]
+        assert topics == {one.topic: (one.msgtype, typestore().hash_rihs01(one.msgtype)) for one in bag.connections}
+        assert (metadata.starting_time.nanoseconds, metadata.message_count) == (bag.start_ns, len(messages))
+
+
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_threads_take_turns(tmp_path, storage):
     """As in a recording: topics come from one thread, messages from another; with a second storage file."""
@@ -480,6 +500,10 @@ def test_plot_and_info(bag, tmp_path, capsys):
     assert "skin skin: 16 cubes" in text and read_skin(SKIN).cubes[0].calibration.id in text
     row = next(line for line in text.splitlines() if " c07 " in line)
     assert [cell.strip() for cell in row.split("│")[3:6]] == ["300", "100.0", "0"]
+    with BagWriter(tmp_path / "empty"):
+        pass
+    assert main(["bag", "info", str(tmp_path / "empty")]) == 0
+    assert capsys.readouterr().out.startswith(f"{tmp_path / 'empty'}: no messages\n")
 
 
 def test_disk_full_leaves_what_was_written(bag, tmp_path):

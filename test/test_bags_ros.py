@@ -31,15 +31,21 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.ros.children import Children
 from cube_tensor_driver.ros.messages import read_stress, to_ns
 from cube_tensor_driver.ros.node import queue
-from cube_tensor_driver.ros.start import Process, skin_processes
+from cube_tensor_driver.ros.start import Process, record_command, skin_processes
 from cube_tensor_driver.simulation.inject import inject
 
 SKIN = share() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MADE_ANEW = ("--exclude-topics", "/stress")
 
 
 def cube(*arguments: object) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", *map(str, arguments)], cwd=ROOT,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
+
+
+def ros2_bag(*arguments: object) -> subprocess.Popen:
+    return subprocess.Popen(["ros2", "bag", *map(str, arguments), "--disable-keyboard-controls"],
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
 
 
@@ -113,6 +119,31 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     assert all(again[k]["left_out"][again[k]["cube"] == 10].all() for k in common)
 
 
+def test_ros2_bag_records_what_is_published(running, tmp_path):
+    """As record:=true has it recorded: info from before the recording and every scan, reprocessed to the bit."""
+    pytest.importorskip("ros2bag", reason="needs ros2 bag, which the wheels lack")
+    _, _, verb, *options = record_command("skin")
+    path = tmp_path / options[options.index("-o") + 1]
+    options[options.index("-o") + 1] = str(path)
+    heard = running.listen(SkinFrequencies, "frequencies", 1000)
+    running.wait(lambda: heard)
+    recorder = ros2_bag(verb, *options)
+    running.wait(lambda: len(running.node.get_subscriptions_info_by_topic("/frequencies")) == 3)
+    begun = len(heard)
+    running.wait(lambda: len(heard) > begun + 100)
+    end(recorder)
+    recorded = frequency_stamps(path)
+    stamps = [to_ns(message.header.stamp) for message in heard]
+    assert recorded == stamps[stamps.index(recorded[0]) : stamps.index(recorded[-1]) + 1] and len(recorded) > 50
+    with Bag(path) as bag:
+        assert {info.sender for info in bag.infos("/info")} == {"driver", "reconstruction"}
+    reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    live, again = stress(path), stress(tmp_path / "out")
+    common = live.keys() & again.keys()
+    assert len(common) > 50
+    assert differing_bits({k: live[k] for k in common}, {k: again[k] for k in common}) == 0
+
+
 def test_killed_recordings_lose_less_than_a_second(running, tmp_path):
     heard = running.listen(SkinFrequencies, "frequencies", 1000)
     running.wait(lambda: heard)
@@ -154,12 +185,14 @@ def stuck(k: int) -> np.ndarray:
     return np.where(np.arange(16) == 5, 1 << 3, 0) * (k < 60)
 
 
-@pytest.mark.parametrize("config", ["skin", "bag"])
-def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config):
+@pytest.mark.parametrize(("config", "command"), [("skin", "replay"), ("bag", "replay"), ("bag", "ros2 bag play")])
+def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, command):
     """To the bit, stamps included, also the second time round after the jump back.
 
     With the bag as configuration also where the skin was tared in the middle, and a pad known to be bad.
     """
+    if command != "replay":
+        pytest.importorskip("ros2bag", reason="needs ros2 bag, which the wheels lack")
     made = {"left_out": stuck, "tare": (90, 1.001)} if config == "bag" else {}
     path = make_bag(tmp_path / "bag", SKIN, 150, **made)
     batches = ros.listen(SkinStress, "stress", queue(None))
@@ -168,7 +201,8 @@ def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config):
     with Children(tmp_path) as children:
         reconstruction(children, path if config == "bag" else SKIN)
         ros.wait(lambda: len(infos) == 1)
-        player = cube("replay", path, "--clock", "--loop", "--rate", "2")
+        options = (path, "--clock", "--loop", "--rate", "2")
+        player = cube("replay", *options) if command == "replay" else ros2_bag("play", *options, *MADE_ANEW)
 
         def twice_round() -> bool:
             """Two beginnings and a jump back seen; how much of the first round is heard is up to discovery."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,7 +13,8 @@ import pytest
 
 from conftest import ROOT
 from cube_tensor_driver.files.share import share
-from cube_tensor_driver.ros.start import skin_processes
+from cube_tensor_driver.files.yaml import read_yaml
+from cube_tensor_driver.ros.start import record_command, skin_processes
 
 SKIN = share() / "config" / "skin_demo.yaml"
 
@@ -35,6 +37,21 @@ def test_every_executable_of_the_list_is_a_script_and_a_module():
         script = ROOT / "scripts" / process.executable
         assert os.access(script, os.X_OK) and f"from {process.module} import main" in script.read_text()
         assert f"scripts/{process.executable}" in cmake
+
+
+def test_each_recording_has_a_folder_of_its_own():
+    """ros2 bag refuses one that is there; info is asked for also from before the recording, in words ros2 bag knows."""
+    command = record_command("skin", "left/arm")
+    assert re.fullmatch(r"left_arm_skin_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", command[command.index("-o") + 1])
+    assert command[-3:] == ["/left/arm/frequencies", "/left/arm/stress", "/left/arm/info"]
+    profiles = read_yaml(Path(command[command.index("--qos-profile-overrides-path") + 1]))
+    assert [profiles[topic]["durability"] for topic in command[-3:]] == ["volatile", "volatile", "transient_local"]
+    assert record_command("skin")[-1] == "/info" and record_command("skin")[6].startswith("skin_")
+    policies = pytest.importorskip("rclpy.qos", reason="needs rclpy")
+    for profile in profiles.values():
+        for name in ("history", "reliability", "durability"):
+            policy = getattr(policies, f"{name.title()}Policy")
+            assert policy.get_from_short_key(profile[name]) != policy.UNKNOWN
 
 
 @pytest.mark.parametrize("name", ["skin.launch.py", "cube.launch.py"])

@@ -17,11 +17,7 @@ from ..files.script import read_script
 from ..files.share import share
 from ..files.skin import Skin, read_skin
 from ..files.urdf import skin_urdf
-from ..files.yaml import read_yaml, write_yaml
-from .start import Process, skin_processes
-
-TOPICS = ("frequencies", "stress", "info")
-"""What a recording needs: `frequencies` and `info` make everything again, `stress` is what was seen."""
+from .start import Process, record_command, skin_processes
 
 
 def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
@@ -71,7 +67,8 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
     if wanted("state_publisher") or wanted("rviz"):
         actions.append(_state_publisher(skin, namespace))
     if wanted("record"):
-        actions.append(_record(skin, namespace))
+        record = ExecuteProcess(cmd=record_command(skin.name, namespace), output="screen")
+        actions.append(_installed("ros2bag", record))
     if wanted("rviz"):
         actions.append(_rviz(namespace))
     return actions
@@ -115,16 +112,3 @@ def _state_publisher(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
 def _rviz(namespace: str) -> LaunchDescriptionEntity:
     arguments = ["-d", str(share() / "rviz" / "skin.rviz")]
     return _installed("rviz2", Node(package="rviz2", executable="rviz2", namespace=namespace, arguments=arguments))
-
-
-def _record(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
-    prefix = f"/{namespace.strip('/')}/" if namespace else "/"
-    command = ["ros2", "bag", "record", "--storage", "mcap", "-o", f"{skin.name}_bag"]
-    overrides = share() / "config" / "record_qos.yaml"
-    if namespace:
-        # The file names topics without a namespace.
-        profiles = {prefix.rstrip("/") + topic: profile for topic, profile in read_yaml(overrides).items()}
-        overrides = Path(tempfile.mkdtemp(prefix="cube_record_")) / overrides.name
-        write_yaml(overrides, profiles)
-    command += ["--qos-profile-overrides-path", str(overrides), *(prefix + topic for topic in TOPICS)]
-    return _installed("ros2bag", ExecuteProcess(cmd=command, output="screen"))

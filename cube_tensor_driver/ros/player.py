@@ -58,9 +58,8 @@ class Player:
             if topic not in self._publishers and topic != "/clock" and (stress or not made):
                 self._add(topic, connection)
         if not self._publishers:
-            raise BagError(
-                f"{bag.path}: nothing to publish but what a reconstruction makes; --stress publishes that too"
-            )
+            there = "but what a reconstruction makes; --stress publishes that too" if bag.connections else "in it"
+            raise BagError(f"{bag.path}: nothing to publish {there}")
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._clock = node.create_publisher(Clock, "/clock", best_effort) if clock else None
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 
+from ..files.share import share
+from ..files.yaml import read_yaml, write_yaml
+
 Value = str | float | bool
+RECORDED = ("frequencies", "stress", "info")
+"""What a recording needs: `frequencies` and `info` make everything again, `stress` is what was seen."""
 
 
 @dataclass(frozen=True)
@@ -71,3 +78,18 @@ def skin_processes(
             0, Process("simulator", "cube_tensor_driver.simulation.main", False, arguments=tuple(arguments))
         )
     return processes
+
+
+def record_command(skin: str, namespace: str = "") -> list[str]:
+    """ros2 bag record of a running skin, into a new folder where it is started: [namespace_]skin_date-time."""
+    parts = [part for part in namespace.split("/") if part]
+    prefix = "".join(f"/{part}" for part in parts)
+    folder = "_".join([*parts, skin, f"{datetime.now():%Y_%m_%d-%H_%M_%S}"])
+    overrides = share() / "config" / "record_qos.yaml"
+    if prefix:
+        # The file names topics without a namespace.
+        profiles = {prefix + topic: profile for topic, profile in read_yaml(overrides).items()}
+        overrides = Path(tempfile.mkdtemp(prefix="cube_record_")) / overrides.name
+        write_yaml(overrides, profiles)
+    return ["ros2", "bag", "record", "--storage", "mcap", "-o", folder, "--qos-profile-overrides-path", str(overrides),
+            "--topics", *(f"{prefix}/{topic}" for topic in RECORDED)]  # fmt: skip

@@ -22,9 +22,11 @@ def run_info(path: Path) -> int:
     """Print topics, skins, cubes, calibrations, rates, gaps and the last counters. BagError: cannot be read."""
     console = Console(highlight=False)
     with Bag(path) as bag:
-        seconds = (bag.end_ns - bag.start_ns) * 1e-9
+        # A bag without messages has no time either.
+        empty = not any(one.msgcount for one in bag.connections)
+        seconds = 0.0 if empty else (bag.end_ns - bag.start_ns) * 1e-9
         start = np.datetime64(bag.start_ns, "ns").astype("datetime64[ms]")
-        console.print(f"{path}: {seconds:.3f} s from {start} UTC")
+        console.print(f"{path}: no messages" if empty else f"{path}: {seconds:.3f} s from {start} UTC")
         table = Table("topic", "type")
         for name in ("messages", "Hz"):
             table.add_column(name, justify="right")
