@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ from cube_tensor_driver.simulation.inject import inject
 SKIN = share() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MADE_ANEW = ("--exclude-topics", "/stress")
+needs_ros2_bag = pytest.mark.skipif(find_spec("ros2bag") is None, reason="needs ros2 bag, which the wheels lack")
 
 
 def cube(*arguments: object) -> subprocess.Popen:
@@ -119,9 +121,9 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     assert all(again[k]["left_out"][again[k]["cube"] == 10].all() for k in common)
 
 
+@needs_ros2_bag
 def test_ros2_bag_records_what_is_published(running, tmp_path):
     """As record:=true has it recorded: info from before the recording and every scan, reprocessed to the bit."""
-    pytest.importorskip("ros2bag", reason="needs ros2 bag, which the wheels lack")
     _, _, verb, *options = record_command("skin")
     path = tmp_path / options[options.index("-o") + 1]
     options[options.index("-o") + 1] = str(path)
@@ -185,14 +187,15 @@ def stuck(k: int) -> np.ndarray:
     return np.where(np.arange(16) == 5, 1 << 3, 0) * (k < 60)
 
 
-@pytest.mark.parametrize(("config", "command"), [("skin", "replay"), ("bag", "replay"), ("bag", "ros2 bag play")])
+@pytest.mark.parametrize(
+    ("config", "command"),
+    [("skin", "replay"), ("bag", "replay"), pytest.param("bag", "ros2 bag play", marks=needs_ros2_bag)],
+)
 def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, command):
     """To the bit, stamps included, also the second time round after the jump back.
 
     With the bag as configuration also where the skin was tared in the middle, and a pad known to be bad.
     """
-    if command != "replay":
-        pytest.importorskip("ros2bag", reason="needs ros2 bag, which the wheels lack")
     made = {"left_out": stuck, "tare": (90, 1.001)} if config == "bag" else {}
     path = make_bag(tmp_path / "bag", SKIN, 150, **made)
     batches = ros.listen(SkinStress, "stress", queue(None))
