@@ -8,6 +8,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -263,15 +264,29 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
 
 
 def test_paper_makes_its_pictures(monkeypatch, tmp_path):
-    one = lambda **_: [_experiment()]  # noqa: E731
+    told = []
+
+    def one(finite, progress):
+        progress(1, 2, "half of it")
+        progress(2, 2, "all of it")
+        return [_experiment()]
+
+    @contextmanager
+    def bar():
+        yield lambda done, total, what: told.append(done / total)
+
+    monkeypatch.setattr(view_paper, "progress_bar", bar)
     monkeypatch.setattr(view_paper, "experiments", one)
-    monkeypatch.setattr(view_paper, "rod_sweep", lambda **_: paper.rod_sweep(places=(0.0, 2e-3)))
+    monkeypatch.setattr(
+        view_paper, "rod_sweep", lambda progress: paper.rod_sweep(places=(0.0, 2e-3), progress=progress)
+    )
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())
     assert made == [
         "experiment_1_finite.png", "experiment_1_linear.png", "figure_4.png", "paper.json", "rod_positions.png",
     ]  # fmt: skip
     assert json.loads((tmp_path / "p" / "paper.json").read_text())["rod positions"]["place"] == [0.0, 2e-3]
+    assert told == sorted(told) and told[0] == 0 and 0.9 < told[-1] <= 1  # one bar
 
 
 def _experiment() -> paper.Experiment:

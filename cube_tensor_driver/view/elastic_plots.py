@@ -33,7 +33,7 @@ _SIGNED = "cividis"  # its lightness grows all the way, unlike that of red to bl
 
 def _style(k: int) -> dict[str, Any]:
     """Colour, marker and dashes of the k-th curve of a panel."""
-    return {"color": _COLOURS[k % 8], "marker": _MARKERS[k % 8], "linestyle": _DASHES[k % 4],
+    return {"color": _COLOURS[k % 8], "marker": _MARKERS[k % 8], "linestyle": _DASHES[(k + k // 8) % 4],
             "markersize": 4, "markerfacecolor": "none", "linewidth": 1.2}  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def draw_convergence(result: Response) -> Figure:
     shown = sorted(last, key=lambda name: -abs(last[name]))[:12]
     for k, name in enumerate(shown):
         away = [100 * abs(row["coefficients"][name] - last[name]) / largest for row in rows[:-1]]
-        axis.loglog(unknowns, away, label=name, **_style(k) | {"linestyle": _DASHES[k // 8]})
+        axis.loglog(unknowns, away, label=name, **_style(k))
     axis.set(xlabel="unknowns", ylabel=f"distance from {rows[-1]['unknowns']} unknowns, % of the largest")
     if unknowns:
         axis.set_xticks(unknowns, [str(n) for n in unknowns], minor=False)
