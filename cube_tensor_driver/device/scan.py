@@ -157,13 +157,14 @@ class Scan:
         their next would keep it a sample behind from then on.
         """
         counts = [len(samples) for samples in self._gathered]
-        if max(counts) > turns:
-            return True
+        most = max(counts)
+        if most == 0 or most > turns:
+            return most > 0
         missing = [link for link, n in enumerate(counts) if n < turns and self._live[link]]
         if not missing or turns > 1:
             return not missing
         middles = [(samples[0][1] + self._taken_ns[link]) / 2 for link, samples in enumerate(self._gathered) if samples]
-        return bool(middles) and all(self._taken_ns[link] > min(middles) for link in missing)
+        return min(self._taken_ns[link] for link in missing) > min(middles)
 
     def take(self, room: Callable[[int, int], Rows] = room_for, turns: int | None = None) -> Rows | None:
         """The rows gathered since the last time, of at most so many samples of each link; None if there are none.
