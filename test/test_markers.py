@@ -11,7 +11,7 @@ from cube_tensor_driver.core import scene
 from cube_tensor_driver.core.pipeline import StressRows
 from cube_tensor_driver.core.scene import QUANTITIES, Newest, Places
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT
-from cube_tensor_driver.core.tensor import rotation_from_rpy
+from cube_tensor_driver.core.tensor import rotation_from_quaternion, rotation_from_rpy
 
 
 def places(n: int = 3, turn: np.ndarray | None = None) -> Places:
@@ -133,7 +133,14 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     assert all(marker.header.frame_id == "skin_base" and marker.action == Marker.ADD for marker in markers.values())
     cubes = markers["cubes 0"]
     assert cubes.type == Marker.CUBE_LIST and len(cubes.points) == len(cubes.colors) == n
-    np.testing.assert_allclose([[p.x, p.y, p.z] for p in cubes.points], [cube.xyz for cube in skin.cubes], atol=1e-12)
+    # RViz 2 shades a box's −z face least among those that one sees from above: the boxes stand on their heads.
+    q = cubes.pose.orientation
+    turn = rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
+    np.testing.assert_allclose(turn, np.diag([-1, 1, -1]), atol=1e-12)
+    points = np.array([[p.x, p.y, p.z] for p in cubes.points]) @ turn.T
+    np.testing.assert_allclose(points, [cube.xyz for cube in skin.cubes], atol=1e-12)
+    bar = np.array([[p.x, p.y, p.z] for p in markers["legend bar"].points]) * np.diag(turn)
+    assert markers["legend bar"].pose.orientation == q and (np.diff(bar[:, 0]) > 0).all() and not bar[:, 2].any()
     colours = np.array([[c.r, c.g, c.b, c.a] for c in cubes.colors])
     np.testing.assert_allclose(colours[pressed], [0xFD / 255, 0xE7 / 255, 0x25 / 255, 1], atol=1e-6)
     np.testing.assert_allclose(colours[silent, :3], scene.GREY, atol=1e-6)

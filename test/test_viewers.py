@@ -86,6 +86,10 @@ def test_rviz_shows_our_topics_as_they_are_offered():
     wrench = displays["Wrench"]
     assert wrench["Topic"]["Value"] == "cubes/c05/wrench" and wrench["Topic"]["Reliability Policy"] == "Best Effort"
     assert wrench["Accept NaN Values"] is False
+    # RViz draws no arrow that is shorter than its width: 10 kPa on a cube 4 mm wide must be one, 40 kPa no mast.
+    force = np.array([10e3, 40e3]) * 0.004**2
+    short, long = force * wrench["Force Arrow Scale"]
+    assert wrench["Enabled"] and wrench["Arrow Width"] < short and long < 0.06
     assert rviz["Visualization Manager"]["Global Options"]["Fixed Frame"] == "skin_base"
 
 

@@ -24,6 +24,8 @@ LEGEND_BYTES = 128
 LIFETIME_S = 2
 """Viewers drop the picture so long after the node is gone: no old load stands there as if it were true."""
 BAR = 32
+UPSIDE_DOWN = np.array([-1.0, 1.0, -1.0])
+"""Half a turn about y: the same box. RViz 2 draws a box's −z face at 0.9 of its colour, the +z face at 0.5."""
 WHITE, TRACTION, GRADIENT, PULL, PUSH = (
     (0.9, 0.9, 0.9),
     (0.95, 0.95, 0.95),
@@ -111,11 +113,11 @@ class Canvas:
         self._frame = frame
         n = len(places.position)
         # CUBE_LIST has one orientation for all its points: one marker for each orientation in the skin.
-        turns, group = np.unique(places.rotation.round(6).reshape(n, 9), axis=0, return_inverse=True)
+        unique, group = np.unique(places.rotation.round(6).reshape(n, 9), axis=0, return_inverse=True)
+        turns = unique.reshape(-1, 3, 3) * UPSIDE_DOWN
         self._groups = [np.flatnonzero(group.ravel() == k) for k in range(len(turns))]
-        for k, (turn, members) in enumerate(zip(turns, self._groups, strict=True)):
+        for k, ((w, x, y, z), members) in enumerate(zip(scene.turns(turns).tolist(), self._groups, strict=True)):
             marker = self._add(f"cubes {k}", Marker.CUBE_LIST, len(members), True)
-            ((w, x, y, z),) = scene.turns(turn.reshape(1, 3, 3)).tolist()
             marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
             # A little larger than the robot model's, so that faces in one plane do not flicker.
             side = 2.04 * float(places.half_side[members].max())
@@ -128,6 +130,7 @@ class Canvas:
         low, high = places.position.min(axis=0), places.position.max(axis=0)
         width = max(high[0] - low[0], 4 * pitch)
         bar = self._add("legend bar", Marker.CUBE_LIST, BAR, True)
+        bar.pose.orientation = Quaternion(y=1.0, w=0.0)
         bar.scale = Vector3(x=width / BAR, y=0.3 * pitch, z=0.05 * pitch)
         text = self._add("legend", Marker.TEXT_VIEW_FACING, 0, False, WHITE)
         text.scale.z = 0.05 * width
@@ -137,11 +140,10 @@ class Canvas:
         self._serialise()
         for k, (turn, members) in enumerate(zip(turns, self._groups, strict=True)):
             # points of a marker are in its pose, which is turned
-            self[f"cubes {k}"].points[:] = places.position[members] @ turn.reshape(3, 3)
-        self["legend bar"].points[:] = np.stack(
-            [middle + width * (np.linspace(0, 1, BAR) - 0.5), np.full(BAR, low[1] - 1.2 * pitch), np.full(BAR, low[2])],
-            1,
-        )
+            self[f"cubes {k}"].points[:] = places.position[members] @ turn
+        across = middle + width * (np.linspace(0, 1, BAR) - 0.5)
+        beside = np.broadcast_to([low[1] - 1.2 * pitch, low[2]], (BAR, 2))
+        self["legend bar"].points[:] = np.column_stack([across, beside]) * UPSIDE_DOWN
 
     def __getitem__(self, name: str) -> Drawn:
         return self._drawn[name]

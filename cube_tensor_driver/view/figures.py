@@ -20,8 +20,8 @@ from ..elastic.surface import Surface
 RVIZ_GREY = (40 / 255, 42 / 255, 46 / 255)
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 FACES = np.array([[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
-LIGHT = np.array([0.7, 0.9, 0.75, 0.65, 0.55, 1.0])
-"""Of the faces −x, +x, −y, +y, −z, +z."""
+LIGHT = np.array([0.9, 0.7, 0.75, 0.65, 1.0, 0.55])
+"""Of the faces −x, +x, −y, +y, −z, +z of boxes that stand on their heads, as the markers node draws them."""
 
 
 def draw_field(pitch: float = 0.010, width: float = 0.012) -> Figure:
