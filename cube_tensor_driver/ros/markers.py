@@ -20,7 +20,12 @@ from .follow import FollowerNode
 from .node import run
 
 LEGEND_BYTES = 128
-"""One line, filled up on both sides: viewers centre it. RViz sets a second one 1 cm lower, whatever the text's size."""
+"""One line, filled up on both sides: viewers centre it. RViz sets a second one 1 cm lower, whatever the text's size.
+
+A dot at either end: RViz 2 first takes a blank for over a metre, finds a text that begins with blanks out of sight and
+never draws it."""
+PLAIN = str.maketrans("−σ∂", "-sd")
+"""RViz 2 reads a text byte by byte: each byte of another letter is a gap."""
 LIFETIME_S = 2
 """Viewers drop the picture so long after the node is gone: no old load stands there as if it were true."""
 BAR = 32
@@ -100,8 +105,8 @@ class Markers(FollowerNode):
         counts = [f"{np.count_nonzero(health == k)} {word}" for k, word in enumerate(scene.HEALTH)]
         states = ", ".join(text for k, text in enumerate(counts) if k == scene.FINE or np.any(health == k))
         low = -top if quantity.signed else 0
-        label = quantity.label.replace("−", "-")  # which RViz's font has not
-        return f"{label}: {low:.3g} to {top:.3g} {quantity.unit}; {states}"
+        label, unit = quantity.label.translate(PLAIN), quantity.unit.replace("σ", "sigma")
+        return f"{label}: {low:.3g} to {top:.3g} {unit}; {states}"
 
 
 class Canvas:
@@ -134,6 +139,7 @@ class Canvas:
         bar.scale = Vector3(x=width / BAR, y=0.3 * pitch, z=0.05 * pitch)
         text = self._add("legend", Marker.TEXT_VIEW_FACING, 0, False, WHITE)
         text.scale.z = 0.05 * width
+        text.scale.x = 0.5 * text.scale.z  # of a blank in RViz 2, drawn half as wide; else over a metre
         text.text = "\x01" * LEGEND_BYTES
         middle = 0.5 * (low[0] + high[0])
         text.pose.position = Point(x=middle, y=low[1] - 2.5 * pitch, z=low[2])
@@ -156,7 +162,8 @@ class Canvas:
             self[f"cubes {k}"].colours[:, :3] = colours[members]
 
     def write(self, legend: str) -> None:
-        self._legend[:] = np.frombuffer(legend.encode()[:LEGEND_BYTES].center(LEGEND_BYTES), np.uint8)
+        room = LEGEND_BYTES - 2
+        self._legend[:] = np.frombuffer(b"." + legend.encode()[:room].center(room) + b".", np.uint8)
 
     def _add(self, name: str, kind: int, n: int, many: bool, colour: tuple[float, float, float] = WHITE) -> Marker:
         """A marker whose points, and colours if `many`, are its number until `_serialise` finds them by it."""

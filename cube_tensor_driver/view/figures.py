@@ -129,7 +129,8 @@ def draw_markers(message: MarkerArray) -> Figure:
             axes.add_collection3d(Line3DCollection(lines, colors=colours[::2], linewidths=1.6, zorder=10 + order))
         elif marker.type == Marker.TEXT_VIEW_FACING:
             at = marker.pose.position
-            axes.text(at.x, at.y, at.z, marker.text, color="white", ha="center", va="center", fontsize=9, zorder=30)
+            text = marker.text.strip(" .")
+            axes.text(at.x, at.y, at.z, text, color="white", ha="center", va="center", fontsize=9, zorder=30)
         else:
             raise ValueError(f"marker {marker.ns} has type {marker.type}")
     every = np.concatenate([_points(marker) for marker in message.markers])
