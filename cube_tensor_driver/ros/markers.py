@@ -142,7 +142,7 @@ class Canvas:
         text.scale.x = 0.5 * text.scale.z  # of a blank in RViz 2, drawn half as wide; else over a metre
         text.text = "\x01" * LEGEND_BYTES
         middle = 0.5 * (low[0] + high[0])
-        text.pose.position = Point(x=middle, y=low[1] - 2.5 * pitch, z=low[2])
+        text.pose.position = Point(x=middle, y=low[1] - 2.2 * pitch - 0.07 * width, z=low[2])
         self._serialise()
         for k, (turn, members) in enumerate(zip(turns, self._groups, strict=True)):
             # points of a marker are in its pose, which is turned
