@@ -18,6 +18,8 @@ from ..core.errors import MessageError
 from ..core.modes import COMPONENTS, STRESS
 
 SECOND = 1_000_000_000
+SHAPES_KEPT = 32
+"""Record types remembered at a time."""
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 _START = len(LITTLE_ENDIAN)
 _FIRST_COUNT = _START + 8  # after sec and nanosec: length of the frame id
@@ -95,7 +97,7 @@ def blank_stress(frame_id: bytes, rows: int) -> Blank:
     return Blank(_STRESS, Shape(len(frame_id), rows, 0), frame_id)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=SHAPES_KEPT)
 def _record(fields: tuple[tuple[str, str, int], ...], shape: Shape) -> np.dtype[Any]:
     """The record type of a shape. Counts of sequences are fields named `n of` them."""
     names, formats, offsets = ["encapsulation", "sec", "nanosec", "n of frame_id", "frame_id"], [], []
@@ -118,7 +120,7 @@ def _record(fields: tuple[tuple[str, str, int], ...], shape: Shape) -> np.dtype[
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": place})
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=SHAPES_KEPT)
 def _counts(
     fields: tuple[tuple[str, str, int], ...], shape: Shape
 ) -> tuple[np.dtype[Any], list[str], NDArray[np.intp], NDArray[Any]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -50,11 +49,16 @@ class Diagnostics(Updater):  # type: ignore[misc]
 
 def make_status(name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]) -> DiagnosticStatus:
     """A status of a part of the node."""
-    pairs = [_pair(key, str(value)) for key, value in values.items()]
+    pairs = [_pair(name, key, str(value)) for key, value in values.items()]
     return DiagnosticStatus(name=name, hardware_id=hardware_id, level=level, message=text, values=pairs)
 
 
-@lru_cache(maxsize=4096)
-def _pair(key: str, value: str) -> KeyValue:
-    """Most counters stay as they are, and rclpy takes 2 us to make one."""
-    return KeyValue(key=key, value=value)
+_newest: dict[tuple[str, str], KeyValue] = {}
+
+
+def _pair(name: str, key: str, value: str) -> KeyValue:
+    """Most values stay as they are from one second to the next, and rclpy takes 2 us to make a pair."""
+    pair = _newest.get((name, key))
+    if pair is None or pair.value != value:
+        pair = _newest[name, key] = KeyValue(key=key, value=value)
+    return pair
