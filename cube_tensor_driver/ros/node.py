@@ -32,6 +32,8 @@ BLANKS_KEPT = 4
 SPIN_S = 0.2
 SWITCH_S = 1e-3
 """A reader gives up Python's lock at each read; while the main thread computes it would wait 5 ms each time."""
+COLLECT = 20_000, 20, 20
+"""When Python looks for garbage: what a scan makes goes without that, but at 700 objects it looked every scan or two."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -195,6 +197,7 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
         # What is there by now stays: no collection has to look at it, which would take 20 ms.
         gc.collect()
         gc.freeze()
+        gc.set_threshold(*COLLECT)
         while not stopping:
             # EventsExecutor.spin() can burn a core and does not return on a signal; spin_once in the main thread does.
             with contextlib.suppress(ExternalShutdownException):
