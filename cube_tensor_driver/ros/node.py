@@ -33,7 +33,7 @@ SPIN_S = 0.2
 SWITCH_S = 1e-3
 """A reader gives up Python's lock at each read; while the main thread computes it would wait 5 ms each time."""
 COLLECT = 20_000, 20, 20
-"""When Python looks for garbage: what a scan makes goes without that, but at 700 objects it looked every scan or two."""
+"""When Python looks for garbage. A scan leaves none, but at 700 objects it looked every scan or two."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
