@@ -163,6 +163,7 @@ class CubeNode(LifecycleNode):
     def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
         self.cleanup()
         self.configured = False
+        gc.collect()  # what was configured leaves garbage, unlike a scan
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
