@@ -104,6 +104,15 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
     assert taken() == [6] * 4 and scan.unaccounted() == 0
 
 
+def test_a_sample_in_two_frames_goes_on_at_once():
+    """Its second part does not wait for the next scan, whichever hub is the earlier one."""
+    scan = two_links()
+    for link, stamp_ns in ((0, 1010), (0, 1010), (1, 1000)):
+        scan.add(link, sample(0, [[1.0, 1.0]]), stamp_ns)
+    taken = [len(scan.take().cube) for _ in range(2) if scan.complete()]
+    assert taken == [2, 1] and not scan.complete() and scan.unaccounted() == 0
+
+
 def test_not_measured_is_nan_and_millihertz_survive():
     scan = Scan(1, [Place("a", 0, 0, None, 2)])
     scan.hello(0, hello([1]))
@@ -212,8 +221,8 @@ def test_samples_of_one_wake_up_take_the_newest_arrival_of_their_link():
     clocks = [
         SimpleNamespace(update=lambda *given, link=link: asked.append((link, *given)) or given[0]) for link in (0, 1)
     ]
-    scan = SimpleNamespace(add=lambda *given: None)
-    node = SimpleNamespace(_accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _publish=lambda: False)
+    scan = SimpleNamespace(add=lambda *given: None, unaccounted=lambda: 0)
+    node = SimpleNamespace(_accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _publish=lambda: None)
     frames = [(link, arrival_ns, sample(n, [[1.0]])) for n, link, arrival_ns in ((0, 0, 10), (0, 1, 10), (1, 0, 20))]
     driver.Driver._on_frames(node, frames)
     assert [(link, len(times), arrival_ns) for link, times, arrival_ns in asked] == [(0, 2, 20), (1, 1, 10)]

@@ -163,8 +163,12 @@ class Scan:
         missing = [link for link, n in enumerate(counts) if n < turns and self._live[link]]
         if not missing or turns > 1:
             return not missing
-        middles = [(samples[0][1] + self._taken_ns[link]) / 2 for link, samples in enumerate(self._gathered) if samples]
-        return min(self._taken_ns[link] for link in missing) > min(middles)
+        pending = [
+            (samples[0][1], taken) for samples, taken in zip(self._gathered, self._taken_ns, strict=True) if samples
+        ]
+        # A further part of the sample that was taken is late, too.
+        middle = min((made + taken) / 2 if made > taken else 0.0 for made, taken in pending)
+        return min(self._taken_ns[link] for link in missing) > middle
 
     def take(self, room: Callable[[int, int], Rows] = room_for, turns: int | None = None) -> Rows | None:
         """The rows gathered since the last time, of at most so many samples of each link; None if there are none.

@@ -158,12 +158,13 @@ class Driver(CubeNode):
             stamps = self._clocks[link].update([sample.device_us for sample in several], arrived[link])
             for sample, stamp_ns in zip(several, stamps, strict=True):
                 self._scan.add(link, sample, stamp_ns)
-        if samples and self._publish():
+        if samples:
+            self._publish()
             self._unaccounted_rows = self._scan.unaccounted()
 
-    def _publish(self) -> bool:
-        """What is complete; whether there was any."""
-        before, most = self._published, max(MAX_SCANS, self._turns + 1)
+    def _publish(self) -> None:
+        """What is complete."""
+        most = max(MAX_SCANS, self._turns + 1)
         while self._scan.complete(self._turns) and (rows := self._scan.take(self._room, most)) is not None:
             first_ns = int(rows.stamp_ns.min())
             if self._take is None or self._frequencies.get_subscription_count():
@@ -172,7 +173,6 @@ class Driver(CubeNode):
             if self._take is not None:
                 self._take(rows, first_ns, self._frame_id)
             self._published += len(rows.cube)
-        return self._published > before
 
     def _room(self, rows: int, n_pads: int) -> Rows:
         """The fields of a message: what the scan writes there is not copied any more."""
