@@ -222,8 +222,15 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     # Not before the arguments are read: --help works without the environment.
     from .core.errors import CubeError
+    from .files.whole import check_outputs
 
+    figure = getattr(options, "figure", None)
     try:
+        check_outputs({"--json": getattr(options, "json", None), "--figure": figure})
+        if figure is not None:
+            from .view.plots import check_picture
+
+            check_picture(figure)
         return int(options.run(options))
     except CubeError as error:
         print(f"cube: {error}", file=sys.stderr)

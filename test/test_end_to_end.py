@@ -95,7 +95,7 @@ def test_ended_demo_leaves_no_process(domain, number):
     [
         (["--config", "none.yaml"], ["none.yaml", "No such file"]),
         (["--cubes", "0"], ["--cubes is 0", "1 to 4096"]),
-        (["--headless", "--duration", "0.2", "--json", "/nowhere/x.json"], ["/nowhere/x.json", "can be written"]),
+        (["--headless", "--json", "/nowhere/x.json"], ["/nowhere/x.json", "can be written"]),
     ],
 )
 def test_demo_says_what_is_wrong_in_one_line(domain, arguments, words):

@@ -21,7 +21,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -91,12 +91,7 @@ class Stage:
         self.wait(lambda: self.number >= end)
 
     def call(self, kind, service, request):
-        client = self.ros.node.create_client(kind, service)
-        self.wait(client.service_is_ready)
-        future = client.call_async(request)
-        self.wait(future.done)
-        self.ros.node.destroy_client(client)
-        return future.result()
+        return self.ros.call(kind, service, request, self.wait)
 
     def tare(self, *cubes):
         return self.call(Tare, "/reconstruction/tare", Tare.Request(cubes=list(cubes)))
@@ -268,6 +263,7 @@ def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
             children.start(process)
         client = ros.node.create_client(ChangeState, f"/{executable}/change_state")
         ros.wait(client.service_is_ready)
+        ros.call(GetState, f"/{executable}/get_state", GetState.Request())  # they have met
         process = psutil.Process(children.pid(executable))
 
         def run(cycles):
@@ -298,11 +294,11 @@ def test_lifecycle_in_the_middle_of_a_reconnect(ros, tmp_path, deaf):
 
         def change(number):
             begun = time.monotonic()
-            assert ros.call(
-                ChangeState, "/driver/change_state", ChangeState.Request(transition=kind(id=number))
-            ).success
+            request = ChangeState.Request(transition=kind(id=number))
+            assert ros.call(ChangeState, "/driver/change_state", request).success
             return time.monotonic() - begun
 
+        ros.call(GetState, "/driver/get_state", GetState.Request())  # they have met
         change(kind.TRANSITION_CONFIGURE)
         idle = process.num_threads()
         for end in (kind.TRANSITION_CLEANUP, kind.TRANSITION_INACTIVE_SHUTDOWN):

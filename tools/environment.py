@@ -162,10 +162,11 @@ def make_venv() -> None:
         seen = 0
 
         def progress(line: str) -> None:
-            nonlocal seen
+            nonlocal seen, total
             seen += line.startswith("Collecting ")
-            if sys.stderr.isatty():
-                text = "installing" if line.startswith("Installing") else f"{seen} of about {total} wheels"
+            total -= line.startswith("Ignoring ")
+            if sys.stderr.isatty() and line.startswith(("Collecting ", "Installing ")):
+                text = f"{seen} of {total} wheels" if line.startswith("Collecting ") else "installing them"
                 print(f"\r\033[K      {text}", end="", file=sys.stderr, flush=True)
 
         pip = [str(VENV / "bin/python"), "-m", "pip", "install", "--no-deps", "--require-hashes", "--no-input",

@@ -26,6 +26,19 @@ def check_writable(path: Path) -> None:
         partial.touch()
 
 
+def check_outputs(paths: dict[str, Path | None]) -> None:
+    """ConfigError, before any work: a file that cannot be written, or one for two outputs."""
+    given = {option: path for option, path in paths.items() if path is not None}
+    for option, path in given.items():
+        for other in given:
+            if other != option and given[other].resolve() == path.resolve():
+                raise ConfigError(f"{option} and {other} both name {path}; name two files")
+        try:
+            check_writable(path)
+        except ConfigError as error:
+            raise ConfigError(f"{option} {error}") from None
+
+
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
     """A name beside `path`, where nothing is left in the end; its errors as ConfigError."""

@@ -22,7 +22,7 @@ from rich.progress import Progress
 from cube_tensor_driver.msg import SkinStress
 
 from ..core.calibration import illustrative
-from ..core.errors import ConfigError, CubeError
+from ..core.errors import CubeError
 from ..core.oscillator import pad_frequency
 from ..core.pipeline import Pipeline
 from ..files.grid import grid
@@ -31,6 +31,7 @@ from ..files.yaml import write_yaml
 from ..ros.children import Children
 from ..ros.node import make_executor, queue
 from ..ros.start import Process, skin_processes
+from .output import write_json
 from .plots import draw_scale, save
 from .tally import Tally
 
@@ -268,10 +269,6 @@ class _ros:
 
 
 def _report(result: dict[str, Any], path: Path | None) -> None:
-    text = json.dumps(result, indent=2)
-    print(text)
+    print(json.dumps(result, indent=2))
     if path is not None:
-        try:
-            path.write_text(text + "\n")
-        except OSError as error:
-            raise ConfigError(f"--json {path}: {error.strerror}; name a file that can be written") from None
+        write_json(path, result)

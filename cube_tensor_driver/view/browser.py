@@ -67,6 +67,7 @@ class Browser:
         self._replay_at = -np.inf
         self._jump: float | None = None
         self._steered: Any = None
+        self._jumped = 0.0
         self._wishes: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._answers: list[tuple[str, Any, float]] = []
         self._recorder: subprocess.Popen[bytes] | None = None
@@ -158,12 +159,13 @@ class Browser:
 
     def _make_jump(self) -> None:
         """The last place that the slider was drawn to, once the place before it has been reached."""
-        if self._steered is not None and self._steered.done():
+        now = time.monotonic()
+        if self._steered is not None and (self._steered.done() or now > self._jumped + WAIT_S):
             self._steered = None
         if self._jump is None or self._steered is not None or self._replay is None:
             return
         request = SteerReplay.Request(position=min(self._jump, self._replay.length), paused=self._replay.paused)
-        self._jump, self._steered = None, self._steer.call_async(request)
+        self._jump, self._steered, self._jumped = None, self._steer.call_async(request), now
         self._replay.position = request.position
         self._history.clear()
 

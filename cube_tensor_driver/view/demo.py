@@ -33,6 +33,7 @@ from ..ros.node import make_executor, queue
 from ..ros.start import Process, skin_processes
 from ..simulation.judge import Judge
 from ..simulation.load import Load, default_script
+from .output import write_json
 from .plots import draw_forces, save
 from .table import LiveTable
 
@@ -233,13 +234,7 @@ def _cpu(process: psutil.Process) -> float:
 
 
 def _report(result: dict[str, object], options: Options) -> None:
-    text = json.dumps(result, indent=2)
     if options.json is None:
-        print(text)
-        return
-    try:
-        options.json.write_text(text + "\n")
-    except OSError as error:
-        raise ConfigError(
-            f"--json {options.json}: {error.strerror}; name a file in a folder that can be written"
-        ) from None
+        print(json.dumps(result, indent=2))
+    else:
+        write_json(options.json, result)

@@ -17,9 +17,10 @@ from ..core.symmetry import default_modes, find_structure
 from ..elastic.body import Body, strip_layout
 from ..elastic.fem import Response, calibration_from_fem, compute_response
 from ..files.calibration import write_calibration
+from ..files.whole import check_outputs
 from .elastic_plots import draw_convergence, draw_loads, draw_response
 from .layout import coefficient_counts, named_layout
-from .output import check_outputs, make_folder, progress_bar, write_json
+from .output import make_folder, progress_bar, write_json
 from .plots import save
 
 _COLUMNS = 7  # modes in one table, so that it fits a terminal

@@ -16,6 +16,7 @@ from ..core.fit import Fit, fit, measured_stress
 from ..core.symmetry import find_structure
 from ..files.calibration import find_calibration, read_calibration, write_calibration
 from ..files.loads import read_loads, unloaded
+from ..files.whole import check_outputs
 from .layout import named_layout, shipped_calibration
 from .output import write_json
 from .plots import draw_fit, save
@@ -43,6 +44,7 @@ class Options:
 
 def run_fit(options: Options) -> int:
     """Fit, report, write. CubeError: what is wrong; nothing is written then."""
+    check_outputs({"--json": options.json, "--figure": options.figure, "-o": options.output})
     layout = named_layout(options.layout)
     recorded = None
     if options.reference is not None:

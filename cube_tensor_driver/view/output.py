@@ -28,19 +28,6 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
         bar.update(task, completed=bar.tasks[0].total)
 
 
-def check_outputs(paths: dict[str, Path | None]) -> None:
-    """ConfigError, before any work: a file that cannot be written, or one for two outputs."""
-    given = {option: path for option, path in paths.items() if path is not None}
-    for option, path in given.items():
-        for other in given:
-            if other != option and given[other].resolve() == path.resolve():
-                raise ConfigError(f"{option} and {other} both name {path}; name two files")
-        try:
-            check_writable(path)
-        except ConfigError as error:
-            raise ConfigError(f"{option} {error}") from None
-
-
 def make_folder(option: str, path: Path | None) -> None:
     """ConfigError, before any work: the folder cannot be made or written. None: none is asked for."""
     if path is None:

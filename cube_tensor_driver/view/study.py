@@ -11,14 +11,12 @@ from rich.table import Table
 
 from ..elastic.study import Study, study
 from .elastic_plots import draw_trust
-from .output import check_outputs, progress_bar, write_json
-from .plots import check_picture, save
+from .output import progress_bar, write_json
+from .plots import save
 
 
 def run_study(json_path: Path | None, figure: Path) -> int:
     """Sweep indenters over cubes, show from which width on each layout is right, draw the errors."""
-    check_outputs({"--json": json_path, "--figure": figure})
-    check_picture(figure)
     with progress_bar() as report:
         result = study(progress=report)
     _show_study(result)

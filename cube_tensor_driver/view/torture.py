@@ -37,6 +37,7 @@ from ..ros.start import skin_processes
 from ..simulation.faults import FRAME, PAD
 from ..simulation.reckoning import Reckoning
 from ..simulation.simulator import CONTROL
+from .output import write_json
 
 HUBS, NX, NY, RATE, INSTANTS = 4, 8, 4, 500.0, 1000
 START_S, SETTLE_S, MARGIN_S, DRAIN_S = 40.0, 8.0, 2.0, 60.0
@@ -112,10 +113,9 @@ def run_torture(options: Options) -> int:
             result = _run(options, Path(name), interrupted)
     finally:
         rclpy.try_shutdown()
-    text = json.dumps(result, indent=2)
-    print(text)
+    print(json.dumps(result, indent=2))
     if options.json is not None:
-        options.json.write_text(text + "\n")
+        write_json(options.json, result)
     broken = failures(result)
     if broken:
         print(f"not as it must be: {', '.join(broken)}")
@@ -165,18 +165,23 @@ def _run(options: Options, folder: Path, interrupted: threading.Event) -> dict[s
         change = node.create_client(ChangeState, "driver/change_state")
         spin(START_S, change.service_is_ready)
 
-        def transit(number: int) -> None:
-            future = change.call_async(ChangeState.Request(transition=Transition(id=number)))
-            spin(START_S, future.done)
-            if not (future.done() and future.result().success):
-                raise CubeError(f"the driver did not change its state:\n{children.log('driver')[-1500:]}")
+        def transit(number: int) -> bool:
+            # An answer is lost if the driver has not met our client yet: asked again.
+            for _ in range(4):
+                future = change.call_async(ChangeState.Request(transition=Transition(id=number)))
+                spin(START_S / 4, future.done)
+                if future.done():
+                    return bool(future.result().success)
+            return False
 
+        # Whether it did shows at the next: asked twice it says no to the second.
         transit(Transition.TRANSITION_CONFIGURE)
         # Both ends of every topic must know each other before the first sample: the judge sees them all.
         spin(START_S, lambda: node.count_publishers("stress") > 0 and node.count_subscribers("frequencies") > 1
              and node.count_publishers("frequencies") > 0 and (ports / CONTROL).exists())  # fmt: skip
         spin(1.0)
-        transit(Transition.TRANSITION_ACTIVATE)
+        if not transit(Transition.TRANSITION_ACTIVATE):
+            raise CubeError(f"the driver did not become active:\n{children.log('driver')[-1500:]}")
         spin(START_S, lambda: reckoning.tensors > 2 * RATE * len(skin.cubes))
         processes = {name: psutil.Process(children.pid(name)) for name in NODES}
         threads = {name: process.num_threads() for name, process in processes.items()}
