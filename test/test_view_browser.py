@@ -43,7 +43,7 @@ from cube_tensor_driver.srv import SteerReplay
 
 CHROMIUM, DRIVER = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
 FLAGS = ("--headless", "--no-sandbox", "--disable-background-networking", "--enable-unsafe-swiftshader",
-         "--use-gl=angle", "--use-angle=swiftshader", "--window-size=1200,900")  # fmt: skip
+         "--use-gl=angle", "--use-angle=swiftshader", "--window-size=900,600")  # fmt: skip
 CONFIG = share() / "config" / "skin_demo.yaml"
 SKIN = read_skin(CONFIG)
 N = len(SKIN.cubes)
