@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .health import RESIDUAL_ENTER, RESIDUAL_LEAVE, WINDOW_S
 from .modes import COMPONENTS, STRESS
 from .pipeline import StressRows
-from .status import INVALID
+from .status import INVALID, RESIDUAL
 from .tensor import principal_stresses, quaternion_from_rotation
 
 # viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both read in grey.
@@ -24,7 +25,8 @@ GREY, RED, ORANGE, WHITE = (0.55, 0.55, 0.55), (0.85, 0.1, 0.1), (0.95, 0.55, 0.
 
 FINE, DOUBTFUL, FAULTY, STALE = range(4)
 HEALTH = ("ok", "doubtful", "no tensor", "stale")
-"""Words of `Newest.health`. Doubtful: some status bit is set; no tensor: INVALID; stale: nothing came lately."""
+"""Words of `Newest.health`. Doubtful: a status bit is set, RESIDUAL in many rows; no tensor: INVALID; stale: nothing
+came lately."""
 MARK = np.array([GREY, ORANGE, RED, WHITE])
 """Colour of the cross over a cube by its health; a fine cube has none."""
 FALL = 0.98
@@ -56,7 +58,11 @@ def turns(rotation: np.ndarray) -> np.ndarray:
 
 
 class Newest:
-    """The newest row of each of n cubes and when it came. Time is what the caller counts, in s."""
+    """The newest row of each of n cubes and when it came. Time is what the caller counts, in s.
+
+    strained: (n,) bool, many rows with a residual above its limit, as `Health` has it; noise alone is above it in one
+    row of a thousand, on a large skin in every picture.
+    """
 
     def __init__(self, n: int) -> None:
         self.values = np.full((n, len(COMPONENTS)), np.nan)
@@ -64,6 +70,9 @@ class Newest:
         self.status = np.zeros(n, np.uint16)
         self.arrived = np.full(n, -np.inf)
         self.count = np.zeros(n, np.int64)
+        self.strained = np.zeros(n, bool)
+        self._window = -np.inf, np.zeros(n, np.int64)  # when it began, and `count` then
+        self._over = np.zeros(n, np.int64)  # rows of the window with RESIDUAL
 
     def update(self, cube: np.ndarray, rows: StressRows, now: float) -> None:
         """Take rows; of several rows of a cube the last stays, rows of cubes that we do not have are left out."""
@@ -72,11 +81,15 @@ class Newest:
             cube, rows = cube[ours], StressRows(*(column[ours] for column in rows))
         self.values[cube, : len(STRESS)], self.values[cube, len(STRESS) :] = rows.stress, rows.gradient
         self.residual[cube], self.status[cube], self.arrived[cube] = rows.residual, rows.status, now
+        self._close_window(now)
         np.add.at(self.count, cube, 1)
+        over = rows.status & RESIDUAL != 0
+        if over.any():
+            np.add.at(self._over, cube[over], 1)
 
     def health(self, now: float, stale: float) -> np.ndarray:
         """(N,) FINE, DOUBTFUL, FAULTY or STALE; stale after so many s without a row."""
-        health = np.where(self.status != 0, DOUBTFUL, FINE)
+        health = np.where(self.strained | (self.status & ~np.uint16(RESIDUAL) != 0), DOUBTFUL, FINE)
         health[self.status & INVALID != 0] = FAULTY
         health[now - self.arrived > stale] = STALE
         return health
@@ -84,6 +97,17 @@ class Newest:
     def believed(self, health: np.ndarray) -> np.ndarray:
         """(N, 15) the values, NaN where the health is FAULTY or STALE."""
         return np.where((health < FAULTY)[:, None], self.values, np.nan)
+
+    def _close_window(self, now: float) -> None:
+        """Where it is over, or time fell back."""
+        begun, count = self._window
+        if 0 <= now - begun < WINDOW_S:
+            return
+        came = self.count - count
+        share = self._over / np.maximum(came, 1)
+        limit = np.where(self.strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
+        self.strained = np.where(came > 0, share > limit, self.strained)
+        self._window, self._over[:] = (now, self.count.copy()), 0
 
 
 @dataclass(frozen=True)
