@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from . import commands as run
 
@@ -243,7 +246,17 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
 
 
+def interrupt_again(lost: Any) -> None:
+    """sys.unraisablehook: Ctrl-C that falls into a destructor or the end of an import would be lost; it comes again."""
+    if lost.exc_type is KeyboardInterrupt:
+        # At once it would be lost in here.
+        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
 if __name__ == "__main__":
+    sys.unraisablehook = interrupt_again
     # Ended from outside as by Ctrl-C: processes that a command started are ended too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(main())

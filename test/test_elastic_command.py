@@ -199,6 +199,27 @@ def test_control_c_ends_it_quietly(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_control_c_in_a_destructor_is_not_lost():
+    code = """
+import signal, sys, threading
+from cube_tensor_driver.cli import interrupt_again
+
+class Trap:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+sys.unraisablehook = interrupt_again
+try:
+    Trap()
+    threading.Event().wait(10.0)
+    print("lost")
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout == "interrupted\n" and not done.stderr
+
+
 def test_an_interrupted_run_leaves_no_file(tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
