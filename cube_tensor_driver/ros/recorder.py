@@ -19,7 +19,7 @@ from ..files.bag_writer import BagWriter, quality
 DEPTH = 2000
 WRITE_S = 0.05
 """How often the writing thread looks what there is: seldom, so that it does not contend for the interpreter."""
-FLUSH_S = 0.4
+FLUSH_S = 0.25
 """How often all that was written is handed to the system: what a kill -9 can cost, twice over."""
 WAITING_BYTES = 256 << 20
 """Of messages that the disk has not taken yet; what comes on top is dropped and counted."""
