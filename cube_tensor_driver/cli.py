@@ -259,4 +259,8 @@ if __name__ == "__main__":
     sys.unraisablehook = interrupt_again
     # Ended from outside as by Ctrl-C: processes that a command started are ended too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.exit(main())
+    try:
+        code = main()
+    except KeyboardInterrupt:  # while the arguments were read
+        code = 130
+    sys.exit(code)
