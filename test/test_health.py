@@ -59,6 +59,20 @@ def test_nothing_healthy_is_called_ill(moving, noise):
     assert not skin.health.collect()[0].any()
 
 
+@pytest.mark.parametrize("frequency", [1.0, 3.0, 6.0])
+def test_a_load_that_moves_fast_is_no_noise(frequency):
+    """Though one pad of each cube feels 30 times as much of it as the others, and all more than their noise."""
+    health = Health(Pipeline([CALIBRATION] * 8, np.float32))
+    cube, random = np.arange(8, dtype=np.uint16), np.random.default_rng(5)
+    stress = np.where(np.eye(8) > 0, -20e3, -20e3 / 30)
+    for row in range(300):
+        v = stress * np.sin(2e-9 * np.pi * frequency * row * PERIOD_NS)
+        f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+        f = (f * (1 + NOISE * random.standard_normal(f.shape))).astype(np.float32)
+        health.update(cube, f, np.zeros(8, np.uint32), np.full(8, row * PERIOD_NS))
+    assert not health.collect()[0].any()
+
+
 class Press:
     """Cubes of which one pad is pressed harder than the others, and rows are missing, of each cube on its own."""
 

@@ -3,6 +3,7 @@
     noise of a pad    sqrt(mean(w (f[n] - f[n-1] - r (f[n-1] - f[n-2]))²) / 6), r = (t[n] - t[n-1]) / (t[n-1] - t[n-2]),
                       w = 6 / (1 + (1 + r)² + r²), each term bounded so that one jump is no noise; a load that moves
                       slowly leaves nothing, also where rows are missing; r = 1 where it is within EVEN
+    roughness         sum w (…)² / sum (f[n] - f[n-1])²: 3 for noise, (2 pi F T)² for a load that moves with F Hz
 
 All arrays are (cubes, pads); nothing loops over cubes.
 """
@@ -21,6 +22,8 @@ MIN_COUNT = 20
 """Rows in a window below which its statistics say nothing."""
 NOISY_ENTER, NOISY_LEAVE = 10.0, 5.0
 """Times the calibration's noise and times the cube's other pads, to become noisy and to stay so."""
+ROUGH = 0.3
+"""Roughness below which it is a load that moves, and no pad becomes noisy: below 9 Hz at 100 rows a second."""
 JUMP = 60.0
 """Times the usual noise, to which a second difference is bounded: two of them in 20 rows stay below NOISY_ENTER."""
 EVEN = 1.5
@@ -34,13 +37,15 @@ DRIFT_LIMIT = 2e-4
 
 
 class Window(NamedTuple):
-    """What is kept of a window: rows (cubes,) that came, and (cubes, P) in Hz, NaN where nothing was measured."""
+    """What is kept of a window: rows (cubes,) that came; (cubes, P) in Hz, NaN where nothing was measured; rough:
+    (cubes, P) bool, rougher than a load that moves."""
 
     rows: np.ndarray
     mean: np.ndarray
     lowest: np.ndarray
     highest: np.ndarray
     noise: np.ndarray
+    rough: np.ndarray
 
 
 class _Pace(NamedTuple):
@@ -60,9 +65,10 @@ class Statistics:
 
     def __init__(self, rest: np.ndarray, bound: np.ndarray) -> None:
         """rest: (cubes, P) Hz, NaN where there is no pad; float32 sums are of what is above it."""
-        self._all = np.full((8, *rest.shape), np.nan, np.float32)
-        # step: the newest first difference; bend: sum of squared second differences.
-        self.last, self._step, self._bend, self._sum, self._lowest, self._highest, self._base, self.bound = self._all
+        self._all = np.full((9, *rest.shape), np.nan, np.float32)
+        # step: the newest first difference; way, bend: sums of squared first and second differences.
+        (self.last, self._step, self._way, self._bend, self._sum, self._lowest, self._highest, self._base,
+         self.bound) = self._all  # fmt: skip
         self._base[:] = np.nan_to_num(rest)
         self.bound[:] = bound
         self.count = np.zeros(len(rest), int)
@@ -73,13 +79,13 @@ class Statistics:
 
     def clear(self) -> None:
         """Begin a window; differences go on."""
-        self._bend[:] = self._sum[:] = self.count[:] = 0
+        self._way[:] = self._bend[:] = self._sum[:] = self.count[:] = 0
         self._lowest[:] = self._highest[:] = np.nan
 
     def add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray) -> None:
         """Rows (N, P) of different cubes, taken at one time or (N,) times."""
         part = self._all[:, cubes]
-        last, step, bend, total, lowest, highest, base, bound = part
+        last, step, way, bend, total, lowest, highest, base, bound = part
         uneven = self._pace(cubes, stamp_ns)
         new = frequency - last
         if uneven is None:
@@ -91,6 +97,7 @@ class Statistics:
             work *= work
             work *= weight
         bend += np.minimum(work, bound, out=work)
+        way += np.multiply(new, new, out=work)
         step[:] = new
         np.fmin(lowest, frequency, out=lowest)
         np.fmax(highest, frequency, out=highest)
@@ -114,12 +121,14 @@ class Statistics:
     def _add_even(self, cubes: slice | np.ndarray, frequency: np.ndarray) -> None:
         """(B, N, P) that came at even intervals."""
         part = self._all[:, cubes]
-        last, step, bend, total, lowest, highest, base, bound = part
+        last, step, way, bend, total, lowest, highest, base, bound = part
         new = np.diff(np.concatenate([last[None], frequency]), axis=0)
         work = np.diff(np.concatenate([step[None], new]), axis=0)
         work *= work
         np.minimum(work, bound, out=work)
         bend[:] = np.add.reduce(np.concatenate([bend[None], work]), axis=0)
+        np.multiply(new, new, out=work)
+        way[:] = np.add.reduce(np.concatenate([way[None], work]), axis=0)
         np.subtract(frequency, base, out=work)
         total[:] = np.add.reduce(np.concatenate([total[None], work]), axis=0)
         np.fmin(lowest, np.fmin.reduce(frequency, axis=0), out=lowest)
@@ -169,7 +178,8 @@ class Statistics:
         with np.errstate(invalid="ignore"):
             mean = np.where(self.count[:, None] > 0, self._base + self._sum / count, np.nan)
         noise = np.sqrt(self._bend / count / 6)
-        return Window(self.count.copy(), mean, self._lowest.copy(), self._highest.copy(), noise)
+        return Window(self.count.copy(), mean, self._lowest.copy(), self._highest.copy(), noise,
+                      self._bend > ROUGH * self._way)  # fmt: skip
 
 
 class Judge:
@@ -195,7 +205,8 @@ class Judge:
         with np.errstate(invalid="ignore"):
             times = np.where(state & NOISY, NOISY_LEAVE, NOISY_ENTER)
             usual = np.fmax(self.noise, _median(noise))
-            found[noise > times * usual] |= NOISY
+            # One that is noisy already stays so while a load moves it.
+            found[(noise > times * usual) & (window.rough | (state & NOISY > 0))] |= NOISY
             self.bound = self._bound(usual)
             moving = _median(span / self.noise) > STUCK_MOVING
             # What comes and goes shows a single value now and then, which is not stuck.
