@@ -11,6 +11,10 @@ from cube_tensor_driver.core.health import WINDOW_S, Health
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, PAD_FAULT, RANGE, REPORTED, RESIDUAL, SHORT, STUCK
+from cube_tensor_driver.files.share import share
+from cube_tensor_driver.files.skin import read_skin
+from cube_tensor_driver.simulation.cubes import SimulatedCubes
+from cube_tensor_driver.simulation.load import Load, default_script
 
 PERIOD_NS = 10_000_000  # 100 Hz
 CALIBRATION = illustrative("planar")
@@ -70,6 +74,22 @@ def test_a_load_that_moves_fast_is_no_noise(frequency):
         f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
         f = (f * (1 + NOISE * random.standard_normal(f.shape))).astype(np.float32)
         health.update(cube, f, np.zeros(8, np.uint32), np.full(8, row * PERIOD_NS))
+    assert not health.collect()[0].any()
+
+
+def test_a_load_that_moves_while_hubs_stall_is_no_noise():
+    """Up to 60 ms of rows at 500 Hz, then up to 0.2 s of none, as on a machine with too much to do; the load of the demo
+    at four times its speed."""
+    skin = read_skin(share() / "config" / "skin_demo.yaml")
+    load, cubes = Load(skin, default_script()), SimulatedCubes([cube.calibration for cube in skin.cubes])
+    table = [cubes.frequency(*load.at(k * load.period / 1000), 0.0) * 1e-3 for k in range(1000)]
+    health = Health(Pipeline([cube.calibration for cube in skin.cubes], np.float32))
+    cube, random, row = np.arange(16, dtype=np.uint16), np.random.default_rng(1), 0
+    while row < 60_000:
+        for row in range(row, row + int(random.integers(1, 30))):
+            stamp = np.full(16, 2_000_000 * row)
+            health.update(cube, table[row % 1000].astype(np.float32), np.zeros(16, np.uint32), stamp)
+        row += int(random.integers(1, 100))
     assert not health.collect()[0].any()
 
 

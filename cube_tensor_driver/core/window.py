@@ -2,7 +2,8 @@
 
     noise of a pad    sqrt(mean(w (f[n] - f[n-1] - r (f[n-1] - f[n-2]))²) / 6), r = (t[n] - t[n-1]) / (t[n-1] - t[n-2]),
                       w = 6 / (1 + (1 + r)² + r²), each term bounded so that one jump is no noise; a load that moves
-                      slowly leaves nothing, also where rows are missing; r = 1 where it is within EVEN
+                      slowly leaves nothing, also where rows are missing; r = 1 where it is within EVEN;
+                      w = 0 across a gap
     roughness         sum w (…)² / sum (f[n] - f[n-1])²: 3 for noise, (2 pi F T)² for a load that moves with F Hz
 
 All arrays are (cubes, pads); nothing loops over cubes.
@@ -26,6 +27,8 @@ ROUGH = 0.3
 """Roughness below which it is a load that moves, and no pad becomes noisy: below 9 Hz at 100 rows a second."""
 JUMP = 60.0
 """Times the usual noise, to which a second difference is bounded: two of them in 20 rows stay below NOISY_ENTER."""
+GAP_NS = 50_000_000
+"""What a load did across a longer gap is not known; MIN_COUNT rows in half a second come twice as often."""
 EVEN = 1.5
 """Times each other, up to which two intervals count as equal: stamps jitter, but a missing row makes it 2."""
 STUCK_MOVING = 5.0
@@ -140,7 +143,7 @@ class Statistics:
 
     def _pace(self, cubes: slice | np.ndarray, stamp_ns: int | np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """r and w of the rows, (N, 1) each; None where all are even, which for the same cubes as before is known
-        without looking at each. Where an interval is unknown or not positive, w = 0."""
+        without looking at each. Where an interval is unknown, not positive or a gap, w = 0."""
         one = self._together
         if one is not None and one.cubes is cubes and isinstance(stamp_ns, int):
             interval_ns = stamp_ns - one.time_ns
@@ -155,7 +158,7 @@ class Statistics:
         self._time_ns[cubes], self._interval_ns[cubes] = stamp_ns, interval
         if isinstance(stamp_ns, int) and (interval == interval[0]).all():
             self._together = _Pace(cubes, stamp_ns, int(interval[0]))
-        known = (interval > 0) & (before > 0)
+        known = (interval > 0) & (before > 0) & (np.maximum(interval, before) < GAP_NS)
         ratio = np.where(known & ~_even(interval, before), interval / np.where(known, before, 1), 1.0)
         weight = known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
         return ratio.astype(np.float32)[:, None], weight.astype(np.float32)[:, None]

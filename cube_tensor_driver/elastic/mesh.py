@@ -42,8 +42,9 @@ def section(
     ring, corner = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
     points = np.concatenate([base.p.T, ring])
     triangles = np.concatenate([base.t.T[away], corner + base.p.shape[1]])
-    unique, inverse = np.unique(points[triangles.ravel()], axis=0, return_inverse=True)
-    mesh = skfem.MeshTri(unique.T.copy(), inverse.reshape(-1, 3).T.copy())
+    # As complex numbers: comparing rows (axis=0) swallows Ctrl-C.
+    unique, inverse = np.unique(points[triangles.ravel()] @ [1, 1j], return_inverse=True)
+    mesh = skfem.MeshTri(np.array([unique.real, unique.imag]), inverse.reshape(-1, 3).T.copy())
     return mesh.refined(level - 1) if level > 1 else mesh
 
 

@@ -211,6 +211,8 @@ def _run(options: Options, folder: Path, interrupted: threading.Event) -> dict[s
         logs = {name: children.log(name) for name in NODES}
         children.end(["simulator"])
         result = reckoning.close(json.loads(book.read_text()), end_ns, counted, watch.counters["rows published"])
+        strange = {f"cube {skin.cubes[cube].name}: " for cube, _ in result["unexplained"]}
+        said = [line for line in logs["reconstruction"].splitlines() if any(name in line for name in strange)]
     return {
         "duration_s": options.duration,
         "seed": options.seed,
@@ -219,6 +221,7 @@ def _run(options: Options, folder: Path, interrupted: threading.Event) -> dict[s
         "counters": watch.counters,
         "threads_leaked": leaked,
         "rss_growth_mb": round(growth, 2),
+        "said_of_unexplained": said,
         "crashes": sum(log.count("Traceback") for log in logs.values()),
     }
 
