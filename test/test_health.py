@@ -78,18 +78,19 @@ def test_a_load_that_moves_fast_is_no_noise(frequency):
 
 
 def test_a_load_that_moves_while_hubs_stall_is_no_noise():
-    """Up to 60 ms of rows at 500 Hz, then up to 0.2 s of none, as on a machine with too much to do; the load of the demo
-    at four times its speed."""
+    """Up to 60 ms of rows at 500 Hz, then up to 0.2 s of none, as on a machine with too much to do; the demo's load at
+    four times its speed."""
     skin = read_skin(share() / "config" / "skin_demo.yaml")
     load, cubes = Load(skin, default_script()), SimulatedCubes([cube.calibration for cube in skin.cubes])
     table = [cubes.frequency(*load.at(k * load.period / 1000), 0.0) * 1e-3 for k in range(1000)]
     health = Health(Pipeline([cube.calibration for cube in skin.cubes], np.float32))
-    cube, random, row = np.arange(16, dtype=np.uint16), np.random.default_rng(1), 0
-    while row < 60_000:
-        for row in range(row, row + int(random.integers(1, 30))):
+    cube, random, begin = np.arange(16, dtype=np.uint16), np.random.default_rng(1), 0
+    while begin < 60_000:
+        end = begin + int(random.integers(1, 30))
+        for row in range(begin, end):
             stamp = np.full(16, 2_000_000 * row)
             health.update(cube, table[row % 1000].astype(np.float32), np.zeros(16, np.uint32), stamp)
-        row += int(random.integers(1, 100))
+        begin = end + int(random.integers(0, 99))
     assert not health.collect()[0].any()
 
 
