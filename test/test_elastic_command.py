@@ -182,6 +182,32 @@ def test_a_mistake_is_one_line_before_any_work(monkeypatch, capsys, flags, words
         assert word in message
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("bench pipeline --json /proc/x", ["--json /proc/x", "can be written"]),
+        ("bench scale --figure .", ["--figure .", "is no file"]),
+        ("bench scale --figure x.abc", ["x.abc", "no format of a picture"]),
+        ("demo --json x --figure x", ["--json and --figure", "name two files"]),
+        ("torture --json none/x.json", ["--json none/x.json", "can be written"]),
+        ("layout cube --json .", ["--json .", "is no file"]),
+        ("study --figure x.abc", ["x.abc", "no format of a picture"]),
+    ],
+)
+def test_every_output_is_asked_about_before_any_work(monkeypatch, capsys, tmp_path, arguments, words):
+    def work(*_):
+        raise RuntimeError("it began to work")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(f"cube_tensor_driver.commands.{arguments.split()[0]}", work)
+    assert cli.main(arguments.split()) == 1
+    message = capsys.readouterr().err
+    assert message.startswith("cube: ") and message.count("\n") == 1
+    for word in words:
+        assert word in message
+    assert not list(tmp_path.iterdir())
+
+
 def test_too_little_memory_is_said_before_any_work(monkeypatch, capsys):
     monkeypatch.setattr(bodies, "available_memory", lambda: 1e8)
     monkeypatch.setattr("cube_tensor_driver.elastic.fem.make_solid", None)

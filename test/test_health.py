@@ -7,10 +7,11 @@ import pytest
 
 from cube_tensor_driver.core import status
 from cube_tensor_driver.core.calibration import illustrative
-from cube_tensor_driver.core.health import WINDOW_S, Health
+from cube_tensor_driver.core.health import Health
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, PAD_FAULT, RANGE, REPORTED, RESIDUAL, SHORT, STUCK
+from cube_tensor_driver.core.window import WINDOW_S
 from cube_tensor_driver.files.share import share
 from cube_tensor_driver.files.skin import read_skin
 from cube_tensor_driver.simulation.cubes import SimulatedCubes

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import ConfigError, TareError
-from cube_tensor_driver.core.health import HOLD, WINDOW_S, Health
+from cube_tensor_driver.core.health import HOLD, Health
 from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.tare import DriftTracker, measure_rest
+from cube_tensor_driver.core.window import WINDOW_S
 from cube_tensor_driver.files.tare import read_tare, remove_tare, tare_path, write_tare
 
 CALIBRATION = illustrative("planar")

@@ -19,9 +19,8 @@ from .errors import LayoutError
 from .oscillator import pad_frequency, stress_slope
 from .pipeline import Pipeline
 from .status import LEFT_OUT, OPEN, RANGE, REPORTED, RESIDUAL, SHORT
-from .window import Judge, Statistics, Window
+from .window import WINDOW_S, Judge, Statistics, Window, still_strained
 
-WINDOW_S = 0.5
 BACK_NS = round(2e9 * WINDOW_S)
 """Times that lie further back than this before the window's end are another time: a recording played again."""
 HOLD = 3
@@ -30,8 +29,6 @@ HISTORY = 20
 STRAIN_RANGE = (-0.8, 1.0)
 """Squeezed to a fifth or stretched to twice: elastomer tears before."""
 STRAIN_OPEN = 3.0
-RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
-"""Shares of a window's rows with a residual above its limit."""
 
 
 class _Column(NamedTuple):
@@ -327,9 +324,7 @@ class Health:
         came = window.rows > 0
         found = self._judge.judge(window, self.state)
         self._statistics.bound[:] = self._judge.bound
-        share = self._bad_residual / np.maximum(window.rows, 1)
-        limit = np.where(self.strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
-        self.strained = np.where(came, share > limit, self.strained)
+        self.strained = still_strained(self.strained, self._bad_residual, window.rows)
         self._strained_seen |= self.strained
         self._recent[0] |= found
         self._publish()

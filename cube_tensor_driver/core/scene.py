@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .health import RESIDUAL_ENTER, RESIDUAL_LEAVE, WINDOW_S
 from .modes import COMPONENTS, STRESS
 from .pipeline import StressRows
 from .status import INVALID, RESIDUAL
 from .tensor import principal_stresses, quaternion_from_rotation
+from .window import WINDOW_S, still_strained
 
 # viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both read in grey.
 SEQUENTIAL = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
@@ -103,10 +103,7 @@ class Newest:
         begun, count = self._window
         if 0 <= now - begun < WINDOW_S:
             return
-        came = self.count - count
-        share = self._over / np.maximum(came, 1)
-        limit = np.where(self.strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
-        self.strained = np.where(came > 0, share > limit, self.strained)
+        self.strained = still_strained(self.strained, self._over, self.count - count)
         self._window, self._over[:] = (now, self.count.copy()), 0
 
 

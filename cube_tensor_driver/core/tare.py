@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from .errors import TareError
-from .health import HISTORY, WINDOW_S, Health
+from .health import HISTORY, Health
 from .pipeline import Pipeline
 from .status import LEFT_OUT
-from .window import MIN_COUNT
+from .window import MIN_COUNT, WINDOW_S
 
 MOVED = 12.0
 """Times the calibration's noise, peak to peak, above which a pad moved: noise alone spans 9 in 10000 rows."""

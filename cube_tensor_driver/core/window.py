@@ -19,6 +19,7 @@ from .status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, SHORT, STUCK
 
 _Times = TypeVar("_Times", int, np.ndarray)
 
+WINDOW_S = 0.5
 MIN_COUNT = 20
 """Rows in a window below which its statistics say nothing."""
 NOISY_ENTER, NOISY_LEAVE = 10.0, 5.0
@@ -35,6 +36,8 @@ STUCK_MOVING = 5.0
 """Times its noise that the cube's pads must have moved, before one that did not move at all is called stuck."""
 STILL = 8.0
 """Times its noise, peak to peak, within which a pad stands still: noise alone spans 6 in 1000 rows."""
+RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
+"""Shares of a window's rows with a residual above its limit, for a cube to become strained and to stay so."""
 DRIFT_LIMIT = 2e-4
 """Of the rest frequency: how far one pad wanders while all stand still, before it is called drifting."""
 
@@ -232,6 +235,13 @@ class Judge:
     def _bound(noise: np.ndarray) -> np.ndarray:
         bound: np.ndarray = ((JUMP * noise) ** 2).astype(np.float32)
         return bound
+
+
+def still_strained(strained: np.ndarray, over: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(cubes,) bool after a window: strained (cubes,) bool before it; over (cubes,) of its rows (cubes,) had a residual
+    above its limit, as noise alone does to one in a thousand. Cubes without rows stay as they were."""
+    limit = np.where(strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
+    return np.where(rows > 0, over > limit * rows, strained)
 
 
 def _even(interval: _Times, before: _Times) -> _Times:
