@@ -144,6 +144,19 @@ def test_pads(computed, flags, size, centre):
     assert layout.pad_size == pytest.approx(size) and layout.positions[1] == pytest.approx([centre, 0, 1])
 
 
+def work(*_):
+    raise RuntimeError("it began to work")
+
+
+def refused(capsys, arguments, words):
+    """In one line that has these words."""
+    assert cli.main(arguments.split()) == 1
+    message = capsys.readouterr().err
+    assert message.startswith("cube: ") and message.count("\n") == 1
+    for word in words:
+        assert word in message
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
@@ -170,16 +183,9 @@ def test_pads(computed, flags, size, centre):
     ],
 )
 def test_a_mistake_is_one_line_before_any_work(monkeypatch, capsys, flags, words):
-    def work(*_):
-        raise RuntimeError("it began to work")
-
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("cube_tensor_driver.elastic.fem.make_solid", work)
-    assert cli.main(["fem", *flags.split()]) == 1
-    message = capsys.readouterr().err
-    assert message.startswith("cube: ") and message.count("\n") == 1
-    for word in words:
-        assert word in message
+    refused(capsys, f"fem {flags}", words)
 
 
 @pytest.mark.parametrize(
@@ -195,16 +201,9 @@ def test_a_mistake_is_one_line_before_any_work(monkeypatch, capsys, flags, words
     ],
 )
 def test_every_output_is_asked_about_before_any_work(monkeypatch, capsys, tmp_path, arguments, words):
-    def work(*_):
-        raise RuntimeError("it began to work")
-
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(f"cube_tensor_driver.commands.{arguments.split()[0]}", work)
-    assert cli.main(arguments.split()) == 1
-    message = capsys.readouterr().err
-    assert message.startswith("cube: ") and message.count("\n") == 1
-    for word in words:
-        assert word in message
+    refused(capsys, arguments, words)
     assert not list(tmp_path.iterdir())
 
 
