@@ -56,6 +56,18 @@ class Skin:
         return mask
 
 
+def test_last_is_the_newest_row():
+    """Also while rows wait to be added."""
+    skin = Skin()
+    for n in range(1, 20):
+        frequency = np.full((6, 8), 100e3 + n, np.float32)
+        skin.health.update(skin.cube, frequency, np.zeros(6, np.uint32), np.full(6, n * PERIOD_NS))
+        frequency += 1  # the caller's own, to fill again
+        if n % 3 == 0:
+            assert (skin.health.last == 100e3 + n).all()
+            assert (skin.health.window().rows == n).all()
+
+
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize("noise", [0.0, NOISE, 2 * NOISE])
 def test_nothing_healthy_is_called_ill(moving, noise):

@@ -38,6 +38,9 @@ STILL = 8.0
 """Times its noise, peak to peak, within which a pad stands still: noise alone spans 6 in 1000 rows."""
 RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
 """Shares of a window's rows with a residual above its limit, for a cube to become strained and to stay so."""
+WAITING = 8
+"""Scans whose rows wait until they are added one after the other: what the sums are is fetched from memory once for all
+of them, which takes several times as long as to add."""
 DRIFT_LIMIT = 2e-4
 """Of the rest frequency: how far one pad wanders while all stand still, before it is called drifting."""
 
@@ -63,33 +66,50 @@ class _Pace(NamedTuple):
 
 
 class Statistics:
-    """Of the window that is not over yet.
-
-    last: (cubes, P) Hz float32, newest frequencies; count: (cubes,) rows in the window; bound: (cubes, P) Hz², to which
-    a squared second difference is cut.
-    """
+    """Of the window that is not over yet. bound: (cubes, P) Hz², to which a squared second difference is cut."""
 
     def __init__(self, rest: np.ndarray, bound: np.ndarray) -> None:
         """rest: (cubes, P) Hz, NaN where there is no pad; float32 sums are of what is above it."""
         self._all = np.full((9, *rest.shape), np.nan, np.float32)
         # step: the newest first difference; way, bend: sums of squared first and second differences.
-        (self.last, self._step, self._way, self._bend, self._sum, self._lowest, self._highest, self._base,
+        (self._last, self._step, self._way, self._bend, self._sum, self._lowest, self._highest, self._base,
          self.bound) = self._all  # fmt: skip
         self._base[:] = np.nan_to_num(rest)
         self.bound[:] = bound
-        self.count = np.zeros(len(rest), int)
+        self._count = np.zeros(len(rest), int)
         # When the newest row of each cube came, and how long after the one before: 0 is unknown.
         self._time_ns, self._interval_ns = np.zeros((2, len(rest)), np.int64)
         self._together: _Pace | None = None
+        self._waiting: list[tuple[slice | np.ndarray, np.ndarray, int | np.ndarray]] = []
+        self._kept = np.empty((WAITING, *rest.shape), np.float32)
         self.clear()
+
+    @property
+    def last(self) -> np.ndarray:
+        """(cubes, P) Hz float32, newest frequencies."""
+        self._settle()
+        return self._last
 
     def clear(self) -> None:
         """Begin a window; differences go on."""
-        self._way[:] = self._bend[:] = self._sum[:] = self.count[:] = 0
+        self._settle()
+        self._way[:] = self._bend[:] = self._sum[:] = self._count[:] = 0
         self._lowest[:] = self._highest[:] = np.nan
 
     def add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray) -> None:
         """Rows (N, P) of different cubes, taken at one time or (N,) times."""
+        kept = self._kept[len(self._waiting), : len(frequency)]
+        kept[:] = frequency
+        self._waiting.append((cubes, kept, stamp_ns))
+        if len(self._waiting) == WAITING:
+            self._settle()
+
+    def _settle(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for one in waiting:
+            self._add(*one)
+
+    def _add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray) -> None:
         part = self._all[:, cubes]
         last, step, way, bend, total, lowest, highest, base, bound = part
         uneven = self._pace(cubes, stamp_ns)
@@ -111,17 +131,18 @@ class Statistics:
         last[:] = frequency
         if not isinstance(cubes, slice):
             self._all[:, cubes] = part
-        self.count[cubes] += 1
+        self._count[cubes] += 1
 
     def add_many(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
         """`add` of (B, N, P) taken at (B,) times, one after the other, to the same bits: sums go batch by batch."""
+        self._settle()
         k = 0
         while k < len(frequency):
             even = self._count_even(cubes, stamp_ns[k:])
             if even:
                 self._add_even(cubes, frequency[k : k + even])
             else:
-                self.add(cubes, frequency[k], int(stamp_ns[k]))
+                self._add(cubes, frequency[k], int(stamp_ns[k]))
             k += even or 1
 
     def _add_even(self, cubes: slice | np.ndarray, frequency: np.ndarray) -> None:
@@ -142,7 +163,7 @@ class Statistics:
         step[:], last[:] = new[-1], frequency[-1]
         if not isinstance(cubes, slice):
             self._all[:, cubes] = part
-        self.count[cubes] += len(frequency)
+        self._count[cubes] += len(frequency)
 
     def _pace(self, cubes: slice | np.ndarray, stamp_ns: int | np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """r and w of the rows, (N, 1) each; None where all are even, which for the same cubes as before is known
@@ -180,11 +201,12 @@ class Statistics:
 
     def window(self) -> Window:
         """The statistics so far."""
-        count = np.maximum(self.count, 1)[:, None]
+        self._settle()
+        count = np.maximum(self._count, 1)[:, None]
         with np.errstate(invalid="ignore"):
-            mean = np.where(self.count[:, None] > 0, self._base + self._sum / count, np.nan)
+            mean = np.where(self._count[:, None] > 0, self._base + self._sum / count, np.nan)
         noise = np.sqrt(self._bend / count / 6)
-        return Window(self.count.copy(), mean, self._lowest.copy(), self._highest.copy(), noise,
+        return Window(self._count.copy(), mean, self._lowest.copy(), self._highest.copy(), noise,
                       self._bend > ROUGH * self._way)  # fmt: skip
 
 
