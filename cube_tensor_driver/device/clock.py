@@ -10,6 +10,7 @@ always there cannot be told from the offset: stamps are late by it.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
@@ -45,7 +46,8 @@ class ClockMap:
     # The line: (arrival − device), both since the first, = offset + drift · device, all in ns.
     _offset: float
     _points: deque[tuple[float, float]]
-    _earliest: tuple[float, float] | None  # of the bucket being filled
+    _earliest: tuple[float, float]  # of the bucket being filled
+    _least: float  # how far that is above the line; inf: the bucket is empty
     _bucket_end: int
     _high: int  # buckets in a row that lie wholly above the line by more than STEP_NS
 
@@ -115,7 +117,7 @@ class ClockMap:
         self._newest = _NEVER
         self._offset = 0.0
         self._points = deque(maxlen=WINDOW)
-        self._earliest = None
+        self._least = math.inf
 
     def _take(self, t: float, arrival_ns: int) -> None:
         """One point, t ns of device time since the first: lower the line to it, close the bucket when
@@ -126,16 +128,15 @@ class ClockMap:
             if above < -STEP_NS:
                 self.resets += 1
                 self._points.clear()
-                self._earliest = None
             self._offset += above
-            above = 0.0
+            above, self._least = 0.0, math.inf
         self.jitter_ns += (above - self.jitter_ns) / 64
-        if self._earliest is None or above < self._above(self._earliest):
-            self._earliest = t, delay
+        if above < self._least:
+            self._least, self._earliest = above, (t, delay)
         if arrival_ns >= self._bucket_end:
             self._bucket_end = arrival_ns + BUCKET_NS
             self._close_bucket(self._earliest)
-            self._earliest = None
+            self._least = math.inf
 
     def _close_bucket(self, earliest: tuple[float, float]) -> None:
         self._high = self._high + 1 if self._above(earliest) > STEP_NS else 0
