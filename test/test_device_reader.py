@@ -7,6 +7,7 @@ import logging
 import os
 import queue
 import select
+import selectors
 import socket
 import threading
 import time
@@ -35,7 +36,7 @@ from cube_tensor_driver.device.protocol import (
     Stats,
     encode,
 )
-from cube_tensor_driver.device.reader import Reader
+from cube_tensor_driver.device.reader import GATHER, Batch, Reader
 
 WAIT_S = 5.0  # ends a failing test; nothing is measured with it
 BACK_S = 2.0  # limit of the issue: a link is back so soon after its port
@@ -117,14 +118,14 @@ class Watch:
     """A reader, and what it called back, to be waited for."""
 
     def __init__(self, *configs: LinkConfig, **options: object) -> None:
-        self.batches: list[list[tuple[int, int, Frame]]] = []
+        self.batches: list[list[tuple[int, int, Frame]]] = []  # a frame each, as they came
         self.frames: queue.Queue[tuple[int, int, Frame]] = queue.Queue()
         self.states: queue.Queue[tuple[int, LinkState, LinkError | None, float]] = queue.Queue()
         self.reader = Reader(configs, self._on_frames, self._on_state, **options)  # type: ignore[arg-type]
 
-    def _on_frames(self, batch: list[tuple[int, int, Frame]]) -> None:
-        self.batches.append(batch)
-        for item in batch:
+    def _on_frames(self, batch: Batch) -> None:
+        self.batches.append([(link, arrival_ns, frame) for link, arrival_ns, frames in batch for frame in frames])
+        for item in self.batches[-1]:
             self.frames.put(item)
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
@@ -205,6 +206,35 @@ def test_one_callback_for_all_that_is_there(start: Start, hub: PtyHub) -> None:
     assert [watch.frame(Sample).sequence for _ in range(10)] == list(range(10))
     # The kernel may hand over one write in two pieces, not in ten.
     assert sum(any(isinstance(frame, Sample) for _, _, frame in batch) for batch in watch.batches) <= 3
+
+
+def test_who_comes_first_waits_for_those_that_deliver() -> None:
+    reader = Reader([LinkConfig(name, "/dev/none") for name in "abc"], print, print, period_us=10_000)
+    for link, session in zip(reader.links, reader._sessions, strict=True):
+        link.state, session.greeted = LinkState.OPEN, True
+    whole, part = b"\0\x01\0", b"\0\x01"
+    assert reader._gathering([(0, 0, whole), (1, 0, part)]) == GATHER[1]  # a fifth of 10 ms would be longer
+    reader._sessions[1].actual_us = 2_000
+    assert reader._gathering([(0, 0, whole)]) == pytest.approx(GATHER[0] * 2e-3)
+    assert reader._gathering([(0, 0, part)]) == 0  # nothing to hold back
+    assert reader._gathering([(i, 0, whole) for i in range(3)]) == 0
+    reader._sessions[2].started = reader._sessions[1].greeted = False
+    assert reader._gathering([(0, 0, whole), (0, 0, whole)]) == 0
+
+
+def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
+    """Two looks of one wake-up may both find the port gone; frames of before the loss are delivered all the same."""
+    reader = Reader([LinkConfig("a", hub.port)], lambda batch: None, lambda *state: None)
+    (link,), (session,) = reader.links, reader._sessions
+    link.open()
+    session.greeted = True
+    selector = selectors.DefaultSelector()
+    selector.register(link, selectors.EVENT_READ, 0)
+    lost, data = LinkError("gone", "lost"), encode(make_sample(1))
+    batch = reader._decode(selector, [(0, 5, data), (0, 6, lost), (0, 7, lost), (0, 8, data)])
+    assert [(at, [frame.sequence for frame in frames]) for _, at, frames in batch] == [(5, [1])]
+    assert link.lost == 1 and link.state is LinkState.WAITING
+    selector.close()
 
 
 def test_started_before_the_port_exists(start: Start, tmp_path: Path) -> None:
@@ -540,8 +570,8 @@ def test_close_in_the_middle_of_a_reconnect(start: Start, port: str, deaf: str) 
 def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, caplog) -> None:
     seen: queue.Queue[int] = queue.Queue()
 
-    def on_frames(batch: list[tuple[int, int, Frame]]) -> None:
-        for _, _, frame in batch:
+    def on_frames(batch: Batch) -> None:
+        for frame in (frame for _, _, frames in batch for frame in frames):
             if isinstance(frame, Sample):
                 seen.put(frame.sequence)
                 raise RuntimeError("bug of the caller")

@@ -328,6 +328,28 @@ def test_beyond_the_law_is_a_fault_and_no_number(ros, hub, tmp_path):
         assert np.abs(seen).max(initial=0) < 1e-3
 
 
+def test_one_process_sends_frequencies_to_who_listens(ros, hub, tmp_path):
+    stress = ros.listen(SkinStress, "stress")
+    numbers = itertools.count()
+
+    def sent() -> bool:
+        hub.send(one_sample(next(numbers)))
+        return True
+
+    with Children(tmp_path) as children:
+        children.start(skin_processes(SINGLE, composed=True, simulated_ports=tmp_path / "ports")[1])
+        ros.wait(lambda: 1 in hub.listen())
+        hub.send(greet())
+        ros.wait(lambda: 2 in hub.listen())
+        ros.wait(lambda: sent() and stress)
+        frequencies = ros.listen(SkinFrequencies, "frequencies")
+        ros.wait(lambda: sent() and frequencies)
+        ros.wait(lambda: stress[-1].sequence[-1] >= frequencies[-1].sequence[-1])
+        newest = {message.sequence[-1]: message.header.stamp for message in stress}
+        assert newest[frequencies[-1].sequence[-1]] == frequencies[-1].header.stamp
+        children.check()
+
+
 def test_another_number_of_pads_is_an_error_that_names_both(ros, hub, tmp_path):
     frequencies = ros.listen(SkinFrequencies, "frequencies")
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")

@@ -60,7 +60,7 @@ class Decoder:
         last = len(data) - 1
         if last > MIN_RUN and not data[0] and data.find(0, 1) == last and not (self._tail or self._discarding):
             # One frame and nothing else, as it mostly comes.
-            only = self._decode(bytes(data[1:last]))
+            only = self._decode(data[1:last])
             return [] if only is None else [only]
         data = bytes(data)
         runs = (self._thinned(data) if data.count(0) > CROWD else data).split(b"\0")
@@ -123,7 +123,7 @@ class Decoder:
         runs = [data[i:j] for i, j in zip((zeros[chosen] + 1).tolist(), zeros[chosen + 1].tolist(), strict=True)]
         return b"\0".join([data[: zeros[0]], *runs, data[zeros[-1] + 1 :]])
 
-    def _decode(self, run: bytes) -> Frame | None:
+    def _decode(self, run: bytes | bytearray) -> Frame | None:
         counters = self.counters
         if len(run) > MAX_RUN:
             counters.overrun += 1

@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -178,6 +179,12 @@ class Sample:
         return sample
 
 
+@lru_cache(maxsize=64)
+def _fields(n_cubes: int, n_pads: int) -> struct.Struct:
+    """Cuts a decoded SAMPLE into the bytes of its frequencies, faults and temperatures."""
+    return struct.Struct(f"{_FREQUENCY}x{4 * n_cubes * n_pads}s{4 * n_cubes}s{2 * n_cubes}s4x")
+
+
 def join(samples: Sequence[Sample]) -> _Arrays:
     """frequency (N, P), pad_fault (N,) and temperature (N,) of all cubes of samples with P pads, one after the other.
 
@@ -186,13 +193,10 @@ def join(samples: Sequence[Sample]) -> _Arrays:
     width = samples[0].n_pads
     parts: list[bytes] = []
     for sample in samples:
-        raw, n_cubes = sample._raw, sample.shape[0]
-        if not raw:
+        if not sample._raw:
             frequency, pad_fault, temperature = zip(*(sample._made() for sample in samples), strict=True)
             return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
-        at_fault = _FREQUENCY + 4 * n_cubes * width
-        at_temperature = at_fault + 4 * n_cubes
-        parts += raw[_FREQUENCY:at_fault], raw[at_fault:at_temperature], raw[at_temperature:-4]
+        parts += _fields(*sample.shape).unpack(sample._raw)
     return (
         np.frombuffer(b"".join(parts[::3]), _U32).reshape(sum(sample.n_cubes for sample in samples), width),
         np.frombuffer(b"".join(parts[1::3]), _U32),

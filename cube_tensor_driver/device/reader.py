@@ -41,7 +41,11 @@ DRAIN_S = 0.05
 """How long closing waits for the last requests to leave the serial ports."""
 CLOSE_S = 1.5
 
-OnFrames = Callable[[list[tuple[int, int, Frame]]], None]
+Taken = list[tuple[int, int, bytes | LinkError]]
+"""Link index, arrival in ns, and what one read of this link gave."""
+Batch = list[tuple[int, int, list[Frame]]]
+"""Link index, arrival in ns, and the frames that one read of this link completed; one or several of each link."""
+OnFrames = Callable[[Batch], None]
 OnState = Callable[[int, LinkState, LinkError | None], None]
 
 _log = logging.getLogger(__name__)
@@ -67,11 +71,11 @@ class _Session:
 class Reader:
     """Reads all links in one thread.
 
-    on_frames: called once per wake-up with [(link index, arrival ns, frame), …], in order of arrival per
-    link. on_state: called with (link index, LinkState, LinkError or None) when a link's state, or why it
-    waits, changes. Both run in the reader's thread and must return soon; an exception in them is logged and
-    the reader goes on. clock_ns: the clock of arrival times, read after the bytes, so that arrival is never
-    earlier than true. period_us: sample period to set on every hub, None leaves the hub's own.
+    on_frames: called once per wake-up with a `Batch`, in order of arrival per link. on_state: called with (link index,
+    LinkState, LinkError or None) when a link's state, or why it waits, changes. Both run in the reader's thread and
+    must return soon; an exception in them is logged and the reader goes on. clock_ns: the clock of arrival times, read
+    after the bytes, so that arrival is never earlier than true. period_us: sample period to set on every hub, None
+    leaves the hub's own.
 
     failure: what ended the thread though nobody asked it to end, None while all is well.
     """
@@ -144,14 +148,17 @@ class Reader:
                 now = time.monotonic()
                 ready = selector.select(max(0.0, tick_at - now))
                 begun = time.monotonic()
-                batch = self._serve(selector, ready, wake_read)
+                taken = self._take(selector, ready, wake_read)
                 # Where data waited for us we are late already.
                 waited = begun - now > NO_WAIT_S
-                while batch and waited and time.monotonic() - begun < self._gathering({i for i, _, _ in batch}):
+                while taken and waited and time.monotonic() - begun < self._gathering(taken):
                     time.sleep(GATHER_STEP_S)
-                    batch += self._serve(selector, selector.select(0), wake_read)
+                    taken += self._take(selector, selector.select(0), wake_read)
+                batch = self._decode(selector, taken)
                 if batch:
                     self._call(self._on_frames, batch)
+                if self._requests:
+                    self._send_requests(selector)
                 now = time.monotonic()
                 if now >= tick_at:
                     tick_at = now + TICK_S
@@ -163,15 +170,14 @@ class Reader:
         finally:
             self._shut(selector, wake_read)
 
-    def _serve(
+    def _take(
         self, selector: selectors.BaseSelector, ready: list[tuple[selectors.SelectorKey, int]], wake_read: int
-    ) -> list[tuple[int, int, Frame]]:
-        """Take all there is of the links that are ready, then look at it."""
-        taken: list[tuple[int, bytes]] = []
+    ) -> Taken:
+        """All there is of the links that are ready."""
+        taken: list[tuple[int, bytes | LinkError]] = []
         for key, events in ready:
             if key.data is None:
                 os.read(wake_read, 4096)
-                self._send_requests(selector)
                 continue
             link = self.links[key.data]
             try:
@@ -183,26 +189,40 @@ class Reader:
                     if data:
                         taken.append((key.data, data))
             except LinkError as error:
-                self._drop(selector, key.data, error)
-        batch: list[tuple[int, int, Frame]] = []
-        if not taken:
-            return batch
-        arrival_ns, now = self._clock_ns(), time.monotonic()
-        for i, data in taken:
+                taken.append((key.data, error))
+        arrival_ns = self._clock_ns() if taken else 0
+        return [(i, arrival_ns, data) for i, data in taken]
+
+    def _decode(self, selector: selectors.BaseSelector, taken: Taken) -> Batch:
+        """Look at what was taken, all at once: after each wait Python's code and data are far from the processor."""
+        batch: Batch = []
+        now = time.monotonic()
+        for i, arrival_ns, data in taken:
+            link = self.links[i]
+            if not link.is_open:  # dropped since
+                continue
+            if isinstance(data, LinkError):
+                self._drop(selector, i, data)
+                continue
+            frames: list[Frame] = []
             self._sessions[i].last_byte = now
             try:
-                for frame in self.links[i].decoder.feed(data):
+                for frame in link.decoder.feed(data):
                     if self._note(i, frame):
-                        batch.append((i, arrival_ns, frame))
-                if self.links[i].unsent:
+                        frames.append(frame)
+                if link.unsent:
                     self._watch(selector, i)
             except LinkError as error:
                 self._drop(selector, i, error)
+            if frames:
+                batch.append((i, arrival_ns, frames))
         return batch
 
-    def _gathering(self, came: set[int]) -> float:
+    def _gathering(self, taken: Taken) -> float:
         """How long to wait for links that deliver but have not yet, s."""
-        if len(came) == len(self.links):
+        # A zero that does not begin the data ends a frame.
+        came = {i for i, _, data in taken if isinstance(data, bytes) and data.find(0, 1) > 0}
+        if len(came) in (0, len(self.links)):
             return 0.0
         late = [
             session.actual_us

@@ -74,10 +74,12 @@ class Scan:
         # Per link: the skin's cubes and a sample's shape where every cube of the hub fits; what each would find again.
         self._whole: list[tuple[NDArray[np.uint16], tuple[int, int]] | None] = [None] * n_links
         self._hellos: list[Hello | None] = [None] * n_links
-        self._live = [False] * n_links
+        self._live: set[int] = set()
         self._here = [False] * n_links  # has said HELLO since it was last closed or silent
         self._waits = [False] * n_links  # has a cube that another link has too, and may have it alone later
-        self._gathered: list[list[tuple[Sample, int]]] = [[] for _ in range(n_links)]
+        # The first sample of every link that gave one, with its time, the second …
+        self._gathered: list[dict[int, tuple[Sample, int]]] = []
+        self._count = [0] * n_links  # of each link's in there
         self._taken_ns = [0] * n_links  # when the newest sample that was taken was made
 
     def hello(self, link: int, frame: Hello) -> list[str] | None:
@@ -141,14 +143,18 @@ class Scan:
 
     def live(self, link: int, live: bool) -> None:
         """Whether a link delivers samples now, so that a scan waits for it."""
-        self._live[link] = live
+        (self._live.add if live else self._live.discard)(link)
         self._here[link] &= live
 
-    def add(self, link: int, sample: Sample, stamp_ns: int) -> None:
-        """One sample, with the time it was taken at in the node's clock."""
-        self._live[link] = True
-        self.added += sample.n_cubes
-        self._gathered[link].append((sample, stamp_ns))
+    def add(self, link: int, samples: Sequence[Sample], stamps_ns: Sequence[int]) -> None:
+        """Samples in order, with the times they were taken at in the node's clock."""
+        self._live.add(link)
+        for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
+            if self._count[link] == len(self._gathered):
+                self._gathered.append({})
+            self._gathered[self._count[link]][link] = sample, stamp_ns
+            self._count[link] += 1
+            self.added += sample.shape[0]
 
     def complete(self, turns: int = 1) -> bool:
         """Whether every live link has given `turns` samples, or one has given one more, or one comes late to a scan.
@@ -156,16 +162,13 @@ class Scan:
         It does where all who have given nothing since have given one nearer to it than to its own last: to wait for
         their next would keep it a sample behind from then on.
         """
-        counts = [len(samples) for samples in self._gathered]
-        most = max(counts)
+        most = len(self._gathered)
         if most == 0 or most > turns:
             return most > 0
-        missing = [link for link, n in enumerate(counts) if n < turns and self._live[link]]
+        missing = self._live - self._gathered[-1].keys() if most == turns else self._live
         if not missing or turns > 1:
             return not missing
-        pending = [
-            (samples[0][1], taken) for samples, taken in zip(self._gathered, self._taken_ns, strict=True) if samples
-        ]
+        pending = [(made, self._taken_ns[link]) for link, (_, made) in self._gathered[0].items()]
         # A further part of the sample that was taken is late, too.
         middle = min((made + taken) / 2 if made > taken else 0.0 for made, taken in pending)
         return min(self._taken_ns[link] for link in missing) > middle
@@ -178,27 +181,27 @@ class Scan:
         room: makes arrays for so many rows of so many pads to fill, the message's own where there is one.
         """
         parts: list[tuple[NDArray[np.uint16], Sample, int]] = []
-        counts = [len(samples) for samples in self._gathered]
-        common = min((n for n, live in zip(counts, self._live, strict=True) if live), default=0) or max(counts)
-        turns = common if turns is None else min(common, turns)
-        for turn in range(turns):
-            for link, (samples, whole) in enumerate(zip(self._gathered, self._whole, strict=True)):
-                if turn < len(samples):
-                    sample, stamp_ns = samples[turn]
-                    if whole is not None and whole[1] == sample.shape and sample.first_cube == 0:
-                        parts.append((whole[0], sample, stamp_ns))
-                    elif (part := self._select(link, sample)) is not None:
-                        parts.append((*part, stamp_ns))
-        for link, samples in enumerate(self._gathered):
-            if samples:
-                self._taken_ns[link] = samples[:turns][-1][1]
-                del samples[:turns]
+        common = 0
+        while common < len(self._gathered) and self._live <= self._gathered[common].keys():
+            common += 1
+        turns = min(common or len(self._gathered), turns or len(self._gathered))
+        for scan in self._gathered[:turns]:
+            for link in sorted(scan):
+                sample, stamp_ns = scan[link]
+                self._taken_ns[link] = stamp_ns
+                self._count[link] -= 1
+                whole = self._whole[link]
+                if whole is not None and whole[1] == sample.shape and sample.first_cube == 0:
+                    parts.append((whole[0], sample, stamp_ns))
+                elif (part := self._select(link, sample)) is not None:
+                    parts.append((*part, stamp_ns))
+        del self._gathered[:turns]
         if not parts:
             return None
         rows = room(sum(len(cube) for cube, _, _ in parts), self.n_pads)
         self.rows += len(rows.cube)
         start = 0
-        for _, alike in groupby(parts, lambda part: part[1].n_pads):
+        for _, alike in groupby(parts, lambda part: part[1].shape[1]):
             cubes, taken, stamps = zip(*alike, strict=True)
             end = start + sum(map(len, cubes))
             _fill(Rows._make(field[start:end] for field in rows), cubes, taken, stamps)
@@ -207,7 +210,7 @@ class Scan:
 
     def unaccounted(self) -> int:
         """Rows that came in and are neither delivered, nor gathered, nor counted as left out: always 0."""
-        gathered = sum(sample.n_cubes for samples in self._gathered for sample, _ in samples)
+        gathered = sum(sample.n_cubes for scan in self._gathered for sample, _ in scan.values())
         return self.added - gathered - self.rows - self.unknown_cube - self.wrong_pads
 
     def _select(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
@@ -236,13 +239,14 @@ def _fill(rows: Rows, cubes: Sequence[NDArray[np.uint16]], samples: Sequence[Sam
     frequency, pad_fault, temperature = join(samples)
     width, counts = frequency.shape[1], [len(cube) for cube in cubes]
     np.concatenate(cubes, out=rows.cube)
-    rows.sequence[:] = np.array([sample.sequence for sample in samples], np.uint32).repeat(counts)
-    rows.stamp_ns[:] = np.array(stamps_ns, np.int64).repeat(counts)
+    numbers = np.array([[sample.sequence for sample in samples], stamps_ns], np.int64).repeat(counts, axis=1)
+    rows.sequence[:], rows.stamp_ns[:] = numbers
     rows.pad_fault[:] = pad_fault
     _CELSIUS.take(temperature.view(np.uint16), out=rows.temperature, mode="clip")
     # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.
     np.multiply(frequency, 1e-3, out=rows.frequency[:, :width], casting="same_kind")
-    rows.frequency[:, width:] = np.nan
+    if width < rows.frequency.shape[1]:
+        rows.frequency[:, width:] = np.nan
     if frequency.size and frequency.min() == NOT_MEASURED:
         rows.frequency[:, :width][frequency == NOT_MEASURED] = np.nan
 

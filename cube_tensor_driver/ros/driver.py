@@ -6,10 +6,12 @@ import time
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import ROSClock
+from rclpy.event_handler import PublisherEventCallbacks
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
@@ -17,8 +19,8 @@ from ..core.errors import ConfigError, LinkError
 from ..core.pipeline import Pipeline
 from ..device.clock import ClockMap
 from ..device.link import LinkConfig, LinkState
-from ..device.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats
-from ..device.reader import Reader
+from ..device.protocol import VERSION, Command, Hello, Request, Sample, Stats
+from ..device.reader import Batch, Reader
 from ..device.scan import Place, Rows, Scan
 from ..device.sequence import Account, Verdict
 from ..files.cdr import blank_frequencies
@@ -86,7 +88,11 @@ class Driver(CubeNode):
         self._blank = lru_cache(maxsize=BLANKS_KEPT)(partial(blank_frequencies, self._frame_id))
         rate = None if self._rate is None else self._rate / self._turns
         quality = queue(rate, self.value("qos_reliability"), self._turns * len(skin.cubes))
-        self._frequencies = self.create_lifecycle_publisher(SkinFrequencies, "frequencies", quality)
+        self._listened_to = False
+        matched = PublisherEventCallbacks(matched=self._on_matched)
+        self._frequencies = self.create_lifecycle_publisher(
+            SkinFrequencies, "frequencies", quality, event_callbacks=matched
+        )
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._uids: dict[int, int] = {}
         self._pipeline = Pipeline([cube.calibration for cube in skin.cubes])
@@ -138,41 +144,42 @@ class Driver(CubeNode):
         """The node's clock. Without simulated time that is the system's, asked for itself in a tenth of the time."""
         return int(self.get_clock().now().nanoseconds) if self._simulated_time else time.time_ns()
 
-    def _on_frames(self, frames: list[tuple[int, int, Frame]]) -> None:
+    def _on_frames(self, batch: Batch) -> None:
         """Reader's thread, once per wake-up."""
-        samples: dict[int, list[Sample]] = {}
-        arrived: dict[int, int] = {}  # of the newest: an earlier time than true would bend the clock's fit
-        for link, arrival_ns, frame in frames:
-            if isinstance(frame, Sample):
-                verdict = self._accounts[link].sample(frame)
-                if verdict is Verdict.RESET:
-                    self._clocks[link].reset()
-                if verdict is not Verdict.DUPLICATE:
-                    samples.setdefault(link, []).append(frame)
-                    arrived[link] = arrival_ns
-            elif isinstance(frame, Hello):
-                self._learn(link, frame)
-            elif isinstance(frame, Stats):
-                self._accounts[link].stats(frame)
-        for link, several in samples.items():
-            stamps = self._clocks[link].update([sample.device_us for sample in several], arrived[link])
-            for sample, stamp_ns in zip(several, stamps, strict=True):
-                self._scan.add(link, sample, stamp_ns)
-        if samples:
-            self._publish()
-            self._unaccounted_rows = self._scan.unaccounted()
+        for link, arrival_ns, frames in batch:
+            account, clock = self._accounts[link], self._clocks[link]
+            samples: list[Sample] = []
+            for frame in frames:
+                if isinstance(frame, Sample):
+                    verdict = account.sample(frame)
+                    if verdict is Verdict.RESET:
+                        clock.reset()
+                    if verdict is not Verdict.DUPLICATE:
+                        samples.append(frame)
+                elif isinstance(frame, Hello):
+                    self._learn(link, frame)
+                elif isinstance(frame, Stats):
+                    account.stats(frame)
+            if samples:
+                self._scan.add(link, samples, clock.update([sample.device_us for sample in samples], arrival_ns))
+        self._publish()
+        self._unaccounted_rows = self._scan.unaccounted()
 
     def _publish(self) -> None:
         """What is complete."""
         most = max(MAX_SCANS, self._turns + 1)
         while self._scan.complete(self._turns) and (rows := self._scan.take(self._room, most)) is not None:
             first_ns = int(rows.stamp_ns.min())
-            if self._take is None or self._frequencies.get_subscription_count():
+            if self._take is None or self._listened_to:
                 self._message.field["time_offset"][:] = rows.stamp_ns - first_ns
                 self._frequencies.publish(self._message.data(first_ns))
             if self._take is not None:
                 self._take(rows, first_ns, self._frame_id)
             self._published += len(rows.cube)
+
+    def _on_matched(self, event: Any) -> None:
+        """DDS says how many subscribe to `frequencies`: to ask at each message costs more."""
+        self._listened_to = event.current_count > 0
 
     def _room(self, rows: int, n_pads: int) -> Rows:
         """The fields of a message: what the scan writes there is not copied any more."""
