@@ -181,10 +181,10 @@ class Reader:
                 continue
             link = self.links[key.data]
             try:
-                if events & selectors.EVENT_WRITE and link.is_open:
+                if events & selectors.EVENT_WRITE:
                     link.flush()
                     self._watch(selector, key.data)
-                if events & selectors.EVENT_READ and link.is_open:  # else dropped since select returned
+                if events & selectors.EVENT_READ:
                     data = link.read()
                     if data:
                         taken.append((key.data, data))
