@@ -31,7 +31,7 @@ START_S, LOOK_S = 30.0, 120.0
 """How long the processes may take to start, and the browser to make its picture."""
 PERIOD = 160
 """Pictures of the markers in one period of the demo's load: 8 s at 20 Hz."""
-COUNTS, RATE, MEASURE_S = [1, 4, 16, 64, 256], 1000.0, 5.0
+COUNTS, RATE, MEASURE_S = [1, 4, 16, 64, 256, 1024, 4096], 100.0, 6.0
 """Of the scale plot: a range that most machines can do."""
 
 
