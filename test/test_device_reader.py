@@ -36,7 +36,7 @@ from cube_tensor_driver.device.protocol import (
     Stats,
     encode,
 )
-from cube_tensor_driver.device.reader import GATHER, Batch, Reader
+from cube_tensor_driver.device.reader import GATHER, Arrivals, Reader
 
 WAIT_S = 5.0  # ends a failing test; nothing is measured with it
 BACK_S = 2.0  # limit of the issue: a link is back so soon after its port
@@ -123,7 +123,7 @@ class Watch:
         self.states: queue.Queue[tuple[int, LinkState, LinkError | None, float]] = queue.Queue()
         self.reader = Reader(configs, self._on_frames, self._on_state, **options)  # type: ignore[arg-type]
 
-    def _on_frames(self, batch: Batch) -> None:
+    def _on_frames(self, batch: Arrivals) -> None:
         self.batches.append([(link, arrival_ns, frame) for link, arrival_ns, frames in batch for frame in frames])
         for item in self.batches[-1]:
             self.frames.put(item)
@@ -231,9 +231,12 @@ def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     selector = selectors.DefaultSelector()
     selector.register(link, selectors.EVENT_READ, 0)
     lost, data = LinkError("gone", "lost"), encode(make_sample(1))
-    batch = reader._decode(selector, [(0, 5, data), (0, 6, lost), (0, 7, lost), (0, 8, data)])
+    batch, failed = reader._decode(selector, [(0, 5, data), (0, 6, lost), (0, 7, lost), (0, 8, data)])
     assert [(at, [frame.sequence for frame in frames]) for _, at, frames in batch] == [(5, [1])]
-    assert link.lost == 1 and link.state is LinkState.WAITING
+    assert failed == {0: lost}
+    # Closed after the frames are delivered: a link that delivers is waited for.
+    assert link.is_open
+    link.close()
     selector.close()
 
 
@@ -570,7 +573,7 @@ def test_close_in_the_middle_of_a_reconnect(start: Start, port: str, deaf: str) 
 def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, caplog) -> None:
     seen: queue.Queue[int] = queue.Queue()
 
-    def on_frames(batch: Batch) -> None:
+    def on_frames(batch: Arrivals) -> None:
         for frame in (frame for _, _, frames in batch for frame in frames):
             if isinstance(frame, Sample):
                 seen.put(frame.sequence)

@@ -39,8 +39,8 @@ STILL = 8.0
 RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
 """Shares of a window's rows with a residual above its limit, for a cube to become strained and to stay so."""
 WAITING = 8
-"""Scans whose rows wait until they are added one after the other: what the sums are is fetched from memory once for all
-of them, which takes several times as long as to add."""
+"""Scans whose rows wait and are then added one after the other: the sums are fetched from memory once for all of them,
+which takes several times as long as adding."""
 DRIFT_LIMIT = 2e-4
 """Of the rest frequency: how far one pad wanders while all stand still, before it is called drifting."""
 

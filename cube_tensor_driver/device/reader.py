@@ -43,9 +43,9 @@ CLOSE_S = 1.5
 
 Taken = list[tuple[int, int, bytes | LinkError]]
 """Link index, arrival in ns, and what one read of this link gave."""
-Batch = list[tuple[int, int, list[Frame]]]
+Arrivals = list[tuple[int, int, list[Frame]]]
 """Link index, arrival in ns, and the frames that one read of this link completed; one or several of each link."""
-OnFrames = Callable[[Batch], None]
+OnFrames = Callable[[Arrivals], None]
 OnState = Callable[[int, LinkState, LinkError | None], None]
 
 _log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class _Session:
 class Reader:
     """Reads all links in one thread.
 
-    on_frames: called once per wake-up with a `Batch`, in order of arrival per link. on_state: called with (link index,
+    on_frames: called once per wake-up with `Arrivals`, in order of arrival per link. on_state: called with (link index,
     LinkState, LinkError or None) when a link's state, or why it waits, changes. Both run in the reader's thread and
     must return soon; an exception in them is logged and the reader goes on. clock_ns: the clock of arrival times, read
     after the bytes, so that arrival is never earlier than true. period_us: sample period to set on every hub, None
@@ -154,9 +154,12 @@ class Reader:
                 while taken and waited and time.monotonic() - begun < self._gathering(taken):
                     time.sleep(GATHER_STEP_S)
                     taken += self._take(selector, selector.select(0), wake_read)
-                batch = self._decode(selector, taken)
+                batch, failed = self._decode(selector, taken)
                 if batch:
                     self._call(self._on_frames, batch)
+                # Later than what came before: else it would seem to deliver still.
+                for i, error in failed.items():
+                    self._drop(selector, i, error)
                 if self._requests:
                     self._send_requests(selector)
                 now = time.monotonic()
@@ -193,16 +196,20 @@ class Reader:
         arrival_ns = self._clock_ns() if taken else 0
         return [(i, arrival_ns, data) for i, data in taken]
 
-    def _decode(self, selector: selectors.BaseSelector, taken: Taken) -> Batch:
-        """Look at what was taken, all at once: after each wait Python's code and data are far from the processor."""
-        batch: Batch = []
+    def _decode(self, selector: selectors.BaseSelector, taken: Taken) -> tuple[Arrivals, dict[int, LinkError]]:
+        """Look at what was taken, all at once: after each wait Python's code and data are far from the processor.
+
+        Returns the frames, and the links to close with the reason of each.
+        """
+        batch: Arrivals = []
+        failed: dict[int, LinkError] = {}
         now = time.monotonic()
         for i, arrival_ns, data in taken:
             link = self.links[i]
-            if not link.is_open:  # dropped since
+            if i in failed:
                 continue
             if isinstance(data, LinkError):
-                self._drop(selector, i, data)
+                failed[i] = data
                 continue
             frames: list[Frame] = []
             self._sessions[i].last_byte = now
@@ -213,10 +220,10 @@ class Reader:
                 if link.unsent:
                     self._watch(selector, i)
             except LinkError as error:
-                self._drop(selector, i, error)
+                failed[i] = error
             if frames:
                 batch.append((i, arrival_ns, frames))
-        return batch
+        return batch, failed
 
     def _gathering(self, taken: Taken) -> float:
         """How long to wait for links that deliver but have not yet, s."""

@@ -20,7 +20,7 @@ from ..core.pipeline import Pipeline
 from ..device.clock import ClockMap
 from ..device.link import LinkConfig, LinkState
 from ..device.protocol import VERSION, Command, Hello, Request, Sample, Stats
-from ..device.reader import Batch, Reader
+from ..device.reader import Arrivals, Reader
 from ..device.scan import Place, Rows, Scan
 from ..device.sequence import Account, Verdict
 from ..files.cdr import blank_frequencies
@@ -144,7 +144,7 @@ class Driver(CubeNode):
         """The node's clock. Without simulated time that is the system's, asked for itself in a tenth of the time."""
         return int(self.get_clock().now().nanoseconds) if self._simulated_time else time.time_ns()
 
-    def _on_frames(self, batch: Batch) -> None:
+    def _on_frames(self, batch: Arrivals) -> None:
         """Reader's thread, once per wake-up."""
         for link, arrival_ns, frames in batch:
             account, clock = self._accounts[link], self._clocks[link]
