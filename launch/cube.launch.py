@@ -4,7 +4,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
-from cube_tensor_driver.files.share import share
+from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.ros.launching import start_skin
 
 
@@ -17,10 +17,12 @@ def generate_launch_description() -> LaunchDescription:
         ),
         DeclareLaunchArgument(
             "config",
-            default_value=str(share() / "config" / "cube.yaml"),
+            default_value=str(package_data() / "config" / "cube.yaml"),
             description="Skin file (YAML) with one link.",
         ),
-        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+        DeclareLaunchArgument(
+            "namespace", default_value="", description="Namespace of the nodes and their topics."
+        ),
     ]
     values = {name: LaunchConfiguration(name) for name in ("config", "port", "namespace")}
     return LaunchDescription([*arguments, OpaqueFunction(function=start_skin, kwargs=values)])

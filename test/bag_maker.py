@@ -1,4 +1,5 @@
-"""Bags of known content, made without ROS and without the code that reads them: by rosbags' own serialiser."""
+"""Bags of known content, made without ROS and without the code that reads them: by rosbags' own
+serialiser."""
 
 from __future__ import annotations
 
@@ -7,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from cube_tensor_driver.bags.read import FREQUENCIES, INFO, STRESS, typestore
+from cube_tensor_driver.bags.write import BagWriter, quality
+from cube_tensor_driver.config.calibration import calibration_text
+from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.status import STUCK
-from cube_tensor_driver.files.bag_writer import BagWriter, quality
-from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, typestore
-from cube_tensor_driver.files.calibration import calibration_text
-from cube_tensor_driver.files.skin import read_skin
 
 START_NS = 1_700_000_000_000_000_000
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -28,40 +29,83 @@ def header(stamp_ns: int, frame_id: str = "skin_base") -> object:
 
 
 def info_of(
-    skin: object, pipeline: Pipeline, stamp_ns: int, sender: str = "reconstruction", version: int = 2
+    skin: object,
+    pipeline: Pipeline,
+    stamp_ns: int,
+    sender: str = "reconstruction",
+    version: int = 2,
 ) -> object:
     kinds = {cube.calibration.id: cube.calibration for cube in skin.cubes}
-    pose = message("geometry_msgs/msg/Pose", position=message("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0),
-                   orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0))  # fmt: skip
+    pose = message(
+        "geometry_msgs/msg/Pose",
+        position=message("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0),
+        orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )
     cubes = [
-        message("cube_tensor_driver/msg/CubeInfo", name=cube.name, frame_id=skin.frame(cube), pose=pose,
-                link=cube.link or "", index=cube.index or 0, uid=cube.uid or 0, layout=cube.calibration.layout.name,
-                pads=list(cube.calibration.layout.pads), half_side=cube.calibration.half_side,
-                calibration_id=cube.calibration.id, rest_frequency=rest[: cube.calibration.layout.n_pads])
+        message(
+            "cube_tensor_driver/msg/CubeInfo",
+            name=cube.name,
+            frame_id=skin.frame(cube),
+            pose=pose,
+            link=cube.link or "",
+            index=cube.index or 0,
+            uid=cube.uid or 0,
+            layout=cube.calibration.layout.name,
+            pads=list(cube.calibration.layout.pads),
+            half_side=cube.calibration.half_side,
+            calibration_id=cube.calibration.id,
+            rest_frequency=rest[: cube.calibration.layout.n_pads],
+        )
         for cube, rest in zip(skin.cubes, pipeline.rest_frequency, strict=True)
-    ]  # fmt: skip
-    return message(INFO, version=version, header=header(stamp_ns), sender=sender, name=skin.name, cubes=cubes,
-                   calibration_ids=list(kinds), calibrations=[calibration_text(kind) for kind in kinds.values()],
-                   covariance=np.zeros(225 * len(kinds)))  # fmt: skip
+    ]
+    return message(
+        INFO,
+        version=version,
+        header=header(stamp_ns),
+        sender=sender,
+        name=skin.name,
+        cubes=cubes,
+        calibration_ids=list(kinds),
+        calibrations=[calibration_text(kind) for kind in kinds.values()],
+        covariance=np.zeros(225 * len(kinds)),
+    )
 
 
 def frequencies_of(k: int, stamp_ns: int, frequency: np.ndarray) -> object:
     n = len(frequency)
-    return message(FREQUENCIES, header=header(stamp_ns), cube=np.arange(n, dtype=np.uint16),
-                   sequence=np.full(n, k, np.uint32), time_offset=np.arange(n, dtype=np.int32) * 100,
-                   n_pads=frequency.shape[1], frequency=frequency.astype(np.float32).ravel(),
-                   temperature=np.full(n, np.nan, np.float32), pad_fault=np.zeros(n, np.uint32))  # fmt: skip
+    return message(
+        FREQUENCIES,
+        header=header(stamp_ns),
+        cube=np.arange(n, dtype=np.uint16),
+        sequence=np.full(n, k, np.uint32),
+        time_offset=np.arange(n, dtype=np.int32) * 100,
+        n_pads=frequency.shape[1],
+        frequency=frequency.astype(np.float32).ravel(),
+        temperature=np.full(n, np.nan, np.float32),
+        pad_fault=np.zeros(n, np.uint32),
+    )
 
 
 def stress_of(source: object, pipeline: Pipeline, left_out: np.ndarray) -> object:
     """Message by message, as the node does; left_out: pads that it found stuck."""
     n = len(source.cube)
-    rows = pipeline.process(source.cube, source.frequency.reshape(n, -1), left_out, source.temperature)
+    rows = pipeline.process(
+        source.cube, source.frequency.reshape(n, -1), left_out, source.temperature
+    )
     rows.status[:] |= np.where(left_out > 0, STUCK, 0).astype(np.uint16)
-    return message(STRESS, header=source.header, cube=source.cube, sequence=source.sequence,
-                   time_offset=source.time_offset, stress=np.ascontiguousarray(rows.stress).ravel(),
-                   gradient=np.ascontiguousarray(rows.gradient).ravel(), residual=rows.residual, status=rows.status,
-                   observed=rows.observed, left_out=left_out)  # fmt: skip
+    return message(
+        STRESS,
+        header=source.header,
+        cube=source.cube,
+        sequence=source.sequence,
+        time_offset=source.time_offset,
+        stress=np.ascontiguousarray(rows.stress).ravel(),
+        gradient=np.ascontiguousarray(rows.gradient).ravel(),
+        residual=rows.residual,
+        status=rows.status,
+        observed=rows.observed,
+        left_out=left_out,
+    )
 
 
 def loads(pipeline: Pipeline, seconds: float) -> np.ndarray:
@@ -81,8 +125,8 @@ def make_bag(
 ) -> Path:
     """info, frequencies, stress, and on /force what cube 0 was pressed with: fz = 0.1 N · sin(3 t).
 
-    left_out: of each message, bits of the stuck pads of each cube; tare: from which message on all rest frequencies
-    are so many times those of the calibration.
+    left_out: of each message, bits of the stuck pads of each cube; tare: from which message on all
+    rest frequencies are so many times those of the calibration.
     """
     skin = read_skin(skin_file)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
@@ -112,5 +156,9 @@ def make_bag(
             force = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.1 * np.sin(3 * k / rate))
             zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
             wrench = message("geometry_msgs/msg/Wrench", force=force, torque=zero)
-            put("/force", stamp_ns + 3000, message(WRENCH, header=header(stamp_ns, "sensor"), wrench=wrench))
+            put(
+                "/force",
+                stamp_ns + 3000,
+                message(WRENCH, header=header(stamp_ns, "sensor"), wrench=wrench),
+            )
     return folder

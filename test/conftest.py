@@ -25,7 +25,8 @@ _domains = itertools.cycle(range(1, 101))
 
 @pytest.fixture
 def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """A DDS domain that no other test uses, of no other suite either, in the environment of this process and below."""
+    """A DDS domain that no other test uses, of no other suite either, in the environment of this
+    process and below."""
     for number in itertools.islice(_domains, 100):
         with (Path(tempfile.gettempdir()) / f"cube_tensor_domain_{number}").open("w") as mine:
             try:
@@ -66,8 +67,12 @@ def ros(domain: int) -> Iterator[Ros]:
 
 @pytest.fixture
 def deaf() -> Iterator[str]:
-    """A TCP port where connecting neither succeeds nor fails, as of a host that is switched off: its queue is full."""
-    with socket.create_server(("127.0.0.1", 0), backlog=0) as server, contextlib.ExitStack() as stack:
+    """A TCP port where connecting neither succeeds nor fails, as of a host that is switched off:
+    its queue is full."""
+    with (
+        socket.create_server(("127.0.0.1", 0), backlog=0) as server,
+        contextlib.ExitStack() as stack,
+    ):
         for _ in range(4):
             waiting = stack.enter_context(socket.socket())
             waiting.setblocking(False)
@@ -98,9 +103,12 @@ class Ros:
             assert time.monotonic() < until, f"did not happen within {seconds} s: {done}"
             self._executor.spin_once(timeout_sec=0.1)
 
-    def call(self, kind: type, service: str, request: object, wait: Callable | None = None) -> object:
-        """A service's answer. rmw_fastrtps drops the answer to a client that the server met less than 0.1 s before
-        (on a full machine it can take longer): after 5 s without one the request is sent again."""
+    def call(
+        self, kind: type, service: str, request: object, wait: Callable | None = None
+    ) -> object:
+        """A service's answer. rmw_fastrtps drops the answer to a client that the server met less
+        than 0.1 s before (on a full machine it can take longer): after 5 s without one the request
+        is sent again."""
         wait = wait or self.wait
         client = self.node.create_client(kind, service)
         wait(client.service_is_ready)

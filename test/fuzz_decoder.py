@@ -1,9 +1,10 @@
-"""Coverage-guided fuzzing of decoder and account, by hand: pip install atheris, then in the environment
+"""Coverage-guided fuzzing of decoder and account, by hand: pip install atheris, then in the
+environment
 
     python test/fuzz_decoder.py CORPUS_FOLDER -max_total_time=60
 
-Any bytes, and sound frames around any payload: nothing may be raised, whatever is decoded encodes to one frame again,
-and the book adds up.
+Any bytes, and sound frames around any payload: nothing may be raised, whatever is decoded encodes
+to one frame again, and the book adds up.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ def sound(part: bytes, any_type: bool) -> bytes:
     """A frame with a right checksum around anything."""
     if not part:
         return b"\0"
-    body = bytes([part[0] if any_type else part[0] % 6, 1]) + (len(part) - 1).to_bytes(2, "little") + part[1:]
+    body = (
+        bytes([part[0] if any_type else part[0] % 6, 1])
+        + (len(part) - 1).to_bytes(2, "little")
+        + part[1:]
+    )
     return b"\0" + cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
 
 
@@ -33,7 +38,9 @@ def one(data: bytes) -> None:
     provider = atheris.FuzzedDataProvider(data)
     mode, body = provider.ConsumeIntInRange(0, 2), provider.ConsumeBytes(4096)
     decoder, account = Decoder(), Account()
-    parts = [body, b"\0"] if mode == 0 else [sound(part, mode == 2) for part in body.split(b"\xff\xff")]
+    parts = (
+        [body, b"\0"] if mode == 0 else [sound(part, mode == 2) for part in body.split(b"\xff\xff")]
+    )
     for frame in [frame for part in parts for frame in decoder.feed(part)]:
         if len(Decoder().feed(encode(frame))) != 1:
             raise RuntimeError(f"{frame} does not encode to itself")
@@ -42,7 +49,12 @@ def one(data: bytes) -> None:
         elif isinstance(frame, Stats):
             account.stats(frame)
     counters = account.counters()
-    rest = counters["taken"] - counters["delivered"] - counters["dropped_in_hub"] - counters["lost_on_the_way"]
+    rest = (
+        counters["taken"]
+        - counters["delivered"]
+        - counters["dropped_in_hub"]
+        - counters["lost_on_the_way"]
+    )
     if account.contradictions() or rest or min(counters.values()) < 0:
         raise RuntimeError(f"the book does not add up: {counters}")
 

@@ -1,4 +1,5 @@
-"""Bags as files: written, read, cut off and repaired, damaged, made into stress again. Needs no ROS."""
+"""Bags as files: written, read, cut off and repaired, damaged, made into stress again. Needs no
+ROS."""
 
 from __future__ import annotations
 
@@ -20,23 +21,23 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
-from cube_tensor_driver.cli import main
+from cube_tensor_driver.bags.mcap import HEAD, BagReader
+from cube_tensor_driver.bags.message_codec import stress_of_today
+from cube_tensor_driver.bags.read import FREQUENCIES, INFO, STRESS, Bag, typestore
+from cube_tensor_driver.bags.repair import repair
+from cube_tensor_driver.bags.reprocess import Change, Job, Recording, reprocess
+from cube_tensor_driver.bags.write import BagWriter
+from cube_tensor_driver.cli.main import main
+from cube_tensor_driver.config.calibration import read_calibration, write_calibration
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import parse_yaml, read_yaml, write_yaml
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import PAD_FAULT, Pipeline
 from cube_tensor_driver.core.status import STUCK
-from cube_tensor_driver.files.bag_writer import BagWriter
-from cube_tensor_driver.files.bags import FREQUENCIES, INFO, STRESS, Bag, typestore
-from cube_tensor_driver.files.calibration import read_calibration, write_calibration
-from cube_tensor_driver.files.cdr import stress_of_today
-from cube_tensor_driver.files.mcap import HEAD, BagReader
-from cube_tensor_driver.files.repair import repair
-from cube_tensor_driver.files.reprocess import Change, Job, Recording, reprocess
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
-from cube_tensor_driver.files.yaml import parse_yaml, read_yaml, write_yaml
 
-SKIN = share() / "config" / "skin_demo.yaml"
+SKIN = package_data() / "config" / "skin_demo.yaml"
 KEPT = ROOT / "test" / "data" / "bag_v1"
 
 
@@ -53,22 +54,39 @@ def copy(bag, tmp_path):
 def stress(path: Path) -> dict[int, np.ndarray]:
     """Records by stamp."""
     with Bag(path) as bag:
-        return {int(stamp): one for batch, _ in bag.batches("/stress")
-                for stamp, one in zip(batch.stamp_ns, batch.field, strict=True)}  # fmt: skip
+        return {
+            int(stamp): one
+            for batch, _ in bag.batches("/stress")
+            for stamp, one in zip(batch.stamp_ns, batch.field, strict=True)
+        }
 
 
 def differing_bits(one: dict[int, np.ndarray], other: dict[int, np.ndarray]) -> int:
     assert one.keys() == other.keys()
-    names = ("cube", "sequence", "time_offset", "stress", "gradient", "residual", "status", "observed", "left_out")
+    names = (
+        "cube",
+        "sequence",
+        "time_offset",
+        "stress",
+        "gradient",
+        "residual",
+        "status",
+        "observed",
+        "left_out",
+    )
     count = 0
     for stamp, record in one.items():
         for name in names:
-            a, b = (np.ascontiguousarray(each[name]).view(np.uint8) for each in (record, other[stamp]))
+            a, b = (
+                np.ascontiguousarray(each[name]).view(np.uint8) for each in (record, other[stamp])
+            )
             count += int(np.unpackbits(a ^ b).sum())
     return count
 
 
-@pytest.mark.parametrize("options", [{}, {"storage": "sqlite3"}, {"max_seconds": 1.0}, {"max_bytes": 400_000}])
+@pytest.mark.parametrize(
+    "options", [{}, {"storage": "sqlite3"}, {"max_seconds": 1.0}, {"max_bytes": 400_000}]
+)
 def test_a_written_bag_is_read_by_rosbags(tmp_path, options):
     path = make_bag(tmp_path / "bag", SKIN, **options)
     with AnyReader([path]) as reader:  # with the definitions in the bag alone
@@ -91,24 +109,42 @@ def test_a_written_bag_is_read_by_rosbag2(tmp_path, options):
     path = make_bag(tmp_path / "bag", SKIN, **options)
     reader = rosbag2.SequentialReader()
     uri, storage = str(path), options.get("storage", "mcap")
-    reader.open(rosbag2.StorageOptions(uri=uri, storage_id=storage), rosbag2.ConverterOptions("", ""))
+    reader.open(
+        rosbag2.StorageOptions(uri=uri, storage_id=storage), rosbag2.ConverterOptions("", "")
+    )
     messages = []
     while reader.has_next():
         messages.append(reader.read_next())
     metadata = rosbag2.Info().read_metadata(uri, storage)
-    topics = {one.name: (one.type, one.type_description_hash) for one in reader.get_all_topics_and_types()}
-    assert {one.topic_type for one in reader.get_all_message_definitions()} >= {FREQUENCIES, STRESS, INFO}
+    topics = {
+        one.name: (one.type, one.type_description_hash) for one in reader.get_all_topics_and_types()
+    }
+    assert {one.topic_type for one in reader.get_all_message_definitions()} >= {
+        FREQUENCIES,
+        STRESS,
+        INFO,
+    }
     with Bag(path) as bag:
         assert messages == [(entry.topic, entry.data, entry.time_ns) for entry in bag.entries()]
-        assert topics == {one.topic: (one.msgtype, typestore().hash_rihs01(one.msgtype)) for one in bag.connections}
-        assert (metadata.starting_time.nanoseconds, metadata.message_count) == (bag.start_ns, len(messages))
+        assert topics == {
+            one.topic: (one.msgtype, typestore().hash_rihs01(one.msgtype))
+            for one in bag.connections
+        }
+        assert (metadata.starting_time.nanoseconds, metadata.message_count) == (
+            bag.start_ns,
+            len(messages),
+        )
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_threads_take_turns(tmp_path, storage):
-    """As in a recording: topics come from one thread, messages from another; with a second storage file."""
+    """As in a recording: topics come from one thread, messages from another; with a second storage
+    file."""
     written = [(("/a", "/b")[number % 2], 1000 + number) for number in range(6)]
-    with BagWriter(tmp_path / "bag", storage, max_bytes=8) as writer, ThreadPoolExecutor(1) as thread:
+    with (
+        BagWriter(tmp_path / "bag", storage, max_bytes=8) as writer,
+        ThreadPoolExecutor(1) as thread,
+    ):
         writer.add_topic("/a", WRENCH)
         for topic, time_ns in written:
             if time_ns == 1001:
@@ -116,7 +152,9 @@ def test_threads_take_turns(tmp_path, storage):
             thread.submit(writer.write, topic, time_ns, bytes(4)).result()
             thread.submit(writer.flush).result()
     with Reader(tmp_path / "bag") as reader:
-        assert [(connection.topic, time_ns) for connection, time_ns, _ in reader.messages()] == written
+        assert [
+            (connection.topic, time_ns) for connection, time_ns, _ in reader.messages()
+        ] == written
 
 
 def test_messages_come_in_the_order_in_which_rosbags_reads_them(tmp_path):
@@ -136,7 +174,10 @@ def test_messages_come_in_the_order_in_which_rosbags_reads_them(tmp_path):
     def messages(kind: type, topics: str, **span: int) -> list[tuple[str, int, bytes]]:
         with kind(tmp_path / "bag") as reader:
             wanted = [one for one in reader.connections if one.topic[1] in topics]
-            return [(one.topic, time_ns, bytes(data)) for one, time_ns, data in reader.messages(wanted, **span)]
+            return [
+                (one.topic, time_ns, bytes(data))
+                for one, time_ns, data in reader.messages(wanted, **span)
+            ]
 
     for topics in ("a", "b", "ab"):
         for span in ({}, {"start": 1105}, {"stop": 1290}, {"start": 1100, "stop": 1300}):
@@ -166,12 +207,14 @@ def test_reprocessed_is_recorded_to_the_bit(tmp_path, storage):
 
 def test_reprocess_needs_no_ros(bag, tmp_path):
     script = (
-        "import sys; from pathlib import Path; from cube_tensor_driver.files.reprocess import *\n"
+        "import sys; from pathlib import Path; from cube_tensor_driver.bags.reprocess import *\n"
         "reprocess(Job(Path(sys.argv[1]), Path(sys.argv[2]), 'bag', Change()))\n"
         "found = {'rclpy', 'cube_tensor_driver.msg', 'matplotlib'} & set(sys.modules)\n"
         "sys.exit(f'imported {found}' if found else 0)"
     )
-    subprocess.run([sys.executable, "-c", script, str(bag), str(tmp_path / "out")], check=True, cwd=ROOT)
+    subprocess.run(
+        [sys.executable, "-c", script, str(bag), str(tmp_path / "out")], check=True, cwd=ROOT
+    )
 
 
 def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
@@ -184,12 +227,21 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         for topic, kind in (("/frequencies", FREQUENCIES), ("/info", INFO)):
             writer.add_topic(topic, kind)
-        for of, stamp, sender in ((pipeline, START_NS, "reconstruction"), (tared, middle, "reconstruction"),
-                                  (pipeline, middle + 1, "driver")):  # fmt: skip
-            writer.write("/info", stamp, bytes(store.serialize_cdr(info_of(skin, of, stamp, sender), INFO)))
+        for of, stamp, sender in (
+            (pipeline, START_NS, "reconstruction"),
+            (tared, middle, "reconstruction"),
+            (pipeline, middle + 1, "driver"),
+        ):
+            writer.write(
+                "/info", stamp, bytes(store.serialize_cdr(info_of(skin, of, stamp, sender), INFO))
+            )
         for k in range(100):
             raw = frequencies_of(k, START_NS + 10_000_000 * k, loads(pipeline, 0.01 * k))
-            writer.write("/frequencies", START_NS + 10_000_000 * k, bytes(store.serialize_cdr(raw, FREQUENCIES)))
+            writer.write(
+                "/frequencies",
+                START_NS + 10_000_000 * k,
+                bytes(store.serialize_cdr(raw, FREQUENCIES)),
+            )
     reprocess(Job(tmp_path / "bag", tmp_path / "out", "bag", Change()))
     for k, record in enumerate(stress(tmp_path / "out").values()):
         of = pipeline if k < 50 else tared
@@ -198,8 +250,14 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
 
 
 def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
-    """A pad that got stuck long ago, and moves again by now: nothing in the frequencies says that it was left out."""
-    path = make_bag(tmp_path / "bag", SKIN, 150, left_out=lambda k: np.where(np.arange(16) == 3, 1 << 2, 0) * (k < 80))
+    """A pad that got stuck long ago, and moves again by now: nothing in the frequencies says that
+    it was left out."""
+    path = make_bag(
+        tmp_path / "bag",
+        SKIN,
+        150,
+        left_out=lambda k: np.where(np.arange(16) == 3, 1 << 2, 0) * (k < 80),
+    )
     reprocess(Job(path, tmp_path / "out", "bag", Change()))
     recorded = stress(path)
     assert differing_bits(recorded, stress(tmp_path / "out")) == 0
@@ -210,7 +268,9 @@ def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
     assert table["left_out"].to_numpy()[:16].tolist() == [0, 0, 0, 4] + [0] * 12
     # another tare judges anew, and does not find it
     with Bag(path) as bag:
-        ((_, _, rows, left_out), *_) = Recording(bag, "/frequencies", Change(tare=(0.0, 0.1))).batches()
+        ((_, _, rows, left_out), *_) = Recording(
+            bag, "/frequencies", Change(tare=(0.0, 0.1))
+        ).batches()
     assert not left_out.any() and (rows.status & STUCK == 0).all()
 
 
@@ -218,7 +278,10 @@ def test_stress_of_version_1_is_made_one_of_today():
     with Bag(KEPT) as bag:
         assert bag.version == 1
         entry = next(bag.entries({"/stress"}))
-        old, new = bag.decode(entry), typestore().deserialize_cdr(stress_of_today(entry.data), STRESS)
+        old, new = (
+            bag.decode(entry),
+            typestore().deserialize_cdr(stress_of_today(entry.data), STRESS),
+        )
     np.testing.assert_array_equal(old.stress, new.stress)
     np.testing.assert_array_equal(old.observed, new.observed)
     assert len(new.left_out) == len(old.cube) and not new.left_out.any()
@@ -236,35 +299,52 @@ def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
     np.testing.assert_array_equal(parquet["stress_zz_Pa"].to_numpy(), zz)
     np.testing.assert_array_equal(csv["stress_zz_Pa"].to_numpy().astype(np.float32), zz)
     for name in ("residual", "status", "observed", "sequence"):
-        np.testing.assert_array_equal(parquet[name].to_numpy(), np.concatenate([record[name] for record in records]))
+        np.testing.assert_array_equal(
+            parquet[name].to_numpy(), np.concatenate([record[name] for record in records])
+        )
     assert parquet["cube"].to_pylist()[:17] == [f"c{k:02}" for k in range(16)] + ["c00"]
     assert parquet["stamp_ns"].to_pylist()[1] == START_NS + 100
 
 
 def test_another_calibration_and_tare(bag, tmp_path, capsys):
-    """Twice the modulus is twice the stress; after a tare over one instant that instant has none."""
+    """Twice the modulus is twice the stress; after a tare over one instant that instant has
+    none."""
     known = read_skin(SKIN).cubes[0].calibration
-    write_calibration(tmp_path / "stiff.yaml", dataclasses.replace(known, modulus=2 * known.modulus))
+    write_calibration(
+        tmp_path / "stiff.yaml", dataclasses.replace(known, modulus=2 * known.modulus)
+    )
     common = ["reprocess", str(bag), "-o", str(tmp_path / "stiff"), "--jobs", "1"]
     assert main([*common, "--calibration", str(tmp_path / "stiff.yaml")]) == 0
     before, after = stress(bag), stress(tmp_path / "stiff" / "bag")
     for stamp, record in after.items():
-        np.testing.assert_allclose(record["stress"], 2 * before[stamp]["stress"], rtol=1e-5)  # float32
-    assert main(["reprocess", str(bag), "-o", str(tmp_path / "tared"), "--tare-from", "0.999", "1.001"]) == 0
+        np.testing.assert_allclose(
+            record["stress"], 2 * before[stamp]["stress"], rtol=1e-5
+        )  # float32
+    assert (
+        main(
+            ["reprocess", str(bag), "-o", str(tmp_path / "tared"), "--tare-from", "0.999", "1.001"]
+        )
+        == 0
+    )
     with Bag(tmp_path / "tared" / "bag") as made:
         assert len(made.infos("/info")) == 1
     record = stress(tmp_path / "tared" / "bag")[START_NS + 1_000_000_000]
-    # rest is float64, the frequency float32: 6e-8 of it, as strain, times the modulus of 0.3 MPa and the inversion
+    # rest is float64, the frequency float32: 6e-8 of it, as strain, times the modulus of 0.3 MPa
+    # and the inversion
     assert np.nanmax(np.abs(record["stress"])) < 1
     assert np.nanmax(np.abs(before[START_NS + 1_000_000_000]["stress"])) > 100
-    assert main(["reprocess", str(bag), "-o", str(tmp_path / "late"), "--tare-from", "50", "51"]) == 1
+    assert (
+        main(["reprocess", str(bag), "-o", str(tmp_path / "late"), "--tare-from", "50", "51"]) == 1
+    )
     assert "0 to 2.990 s" in " ".join(capsys.readouterr().err.split())
 
 
 def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(bag, tmp_path, capsys):
     """Twice the modulus for one cube; the cubes stand in another order in the file."""
     known = read_skin(SKIN).cubes[0].calibration
-    write_calibration(tmp_path / "stiff.yaml", dataclasses.replace(known, modulus=2 * known.modulus))
+    write_calibration(
+        tmp_path / "stiff.yaml", dataclasses.replace(known, modulus=2 * known.modulus)
+    )
     data = read_yaml(SKIN)
     data["cubes"][3]["calibration"] = "stiff.yaml"
     data["cubes"].reverse()
@@ -274,7 +354,9 @@ def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(bag, tmp_pat
     before, after = stress(bag), stress(tmp_path / "out" / "bag")
     factor = np.where(np.arange(16) == 3, 2, 1)[:, None]
     for stamp, record in after.items():
-        np.testing.assert_allclose(record["stress"], factor * before[stamp]["stress"], rtol=1e-5)  # float32
+        np.testing.assert_allclose(
+            record["stress"], factor * before[stamp]["stress"], rtol=1e-5
+        )  # float32
     with Bag(tmp_path / "out" / "bag") as made:
         ids = [cube.calibration_id for cube in made.infos("/info")[0].cubes]
     assert len(set(ids)) == 2 and ids.count(ids[3]) == 1
@@ -301,14 +383,19 @@ def test_reprocess_goes_on_where_it_ended(bag, tmp_path, capsys):
 def test_reprocess_on_a_dask_cluster(bag, tmp_path):
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
         address = cluster.scheduler_address
-        assert main(["reprocess", str(bag), "-o", str(tmp_path / "out"), "--scheduler", address]) == 0
+        assert (
+            main(["reprocess", str(bag), "-o", str(tmp_path / "out"), "--scheduler", address]) == 0
+        )
     assert differing_bits(stress(bag), stress(tmp_path / "out" / "bag")) == 0
 
 
 def test_cut_off_anywhere_is_repaired(bag, tmp_path):
-    """What stood in complete chunks is there after the repair, the rest is kept, whatever byte the end fell on."""
+    """What stood in complete chunks is there after the repair, the rest is kept, whatever byte the
+    end fell on."""
     rng = np.random.default_rng(7)
     whole = tmp_path / "whole"
     with Bag(bag) as source, BagWriter(whole) as writer:
@@ -334,14 +421,20 @@ def test_cut_off_anywhere_is_repaired(bag, tmp_path):
         with Bag(path) as read:
             assert sum(1 for _ in read.entries()) == complete
             # topic by topic by the index: entries counts them against what the bag says
-            assert sum(1 for connection in read.connections for _ in read.entries({connection.topic})) == complete
+            assert (
+                sum(1 for connection in read.connections for _ in read.entries({connection.topic}))
+                == complete
+            )
         kept = size - done.cut
         assert kept == max(at for at, _ in flushed if at <= size)
         assert next(path.glob("*.mcap")).read_bytes()[:kept] == data[:kept]
         assert sum(one.stat().st_size for one in path.glob("*.rest")) == done.cut
         assert repair(path).cut == 0
         # rosbag2 reads nothing where one of these is missing
-        own, good = said_of_itself(next(path.glob("*.mcap"))), said_of_itself(next(bag.glob("*.mcap")))
+        own, good = (
+            said_of_itself(next(path.glob("*.mcap"))),
+            said_of_itself(next(bag.glob("*.mcap"))),
+        )
         assert own.keys() == good.keys() and own["message_count"] == complete
         assert own["files"][0].keys() == good["files"][0].keys()
 
@@ -355,7 +448,8 @@ def said_of_itself(path: Path) -> dict:
 
 
 def test_random_damage_is_one_message_or_no_harm(tmp_path):
-    """Truncated, flipped, missing, exchanged: either all is read and equal, or one line says what is wrong."""
+    """Truncated, flipped, missing, exchanged: either all is read and equal, or one line says what
+    is wrong."""
     rng = np.random.default_rng(3)
     sqlite = make_bag(tmp_path / "sqlite", SKIN, 60, storage="sqlite3")
     mcap = make_bag(tmp_path / "mcap", SKIN, 60)
@@ -394,7 +488,12 @@ def test_random_damage_is_one_message_or_no_harm(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("nowhere", "name a bag"), ("empty", "repair"), ("text.mcap", "damaged, or no bag"), ("text.txt", "damaged")],
+    [
+        ("nowhere", "name a bag"),
+        ("empty", "repair"),
+        ("text.mcap", "damaged, or no bag"),
+        ("text.txt", "damaged"),
+    ],
 )
 def test_what_is_no_bag_is_refused(tmp_path, name, words, capsys):
     (tmp_path / "empty").mkdir()
@@ -410,7 +509,11 @@ def test_an_unknown_version_is_refused(tmp_path):
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/info", INFO)
-        writer.write("/info", 1, bytes(typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO)))
+        writer.write(
+            "/info",
+            1,
+            bytes(typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO)),
+        )
     with Bag(tmp_path / "bag") as bag, pytest.raises(BagError, match="version 7, newer than"):
         bag.infos("/info")
 
@@ -425,17 +528,23 @@ def test_the_kept_bag_of_each_version_can_be_read(tmp_path, version):
     assert len(common) > 100
     for stamp in common:
         # not to the bit: another processor may round otherwise
-        np.testing.assert_allclose(again[stamp]["stress"], recorded[stamp]["stress"], rtol=1e-4, atol=0.1)
+        np.testing.assert_allclose(
+            again[stamp]["stress"], recorded[stamp]["stress"], rtol=1e-4, atol=0.1
+        )
         np.testing.assert_array_equal(again[stamp]["status"], recorded[stamp]["status"])
-        assert (again[stamp]["left_out"] == np.where((version == 2) & (again[stamp]["cube"] == 1), 1 << 2, 0)).all()
+        assert (
+            again[stamp]["left_out"]
+            == np.where((version == 2) & (again[stamp]["cube"] == 1), 1 << 2, 0)
+        ).all()
     with Bag(kept) as bag, Bag(tmp_path / "out") as made:
         assert bag.version == bag.infos("/info")[0].version == version
         assert made.version == made.infos("/info")[0].version == 2
 
 
 def test_fit_from_a_bag(tmp_path, capsys):
-    """A cube under known loads recovers its coefficients; by forces alone, what they do not tell is named."""
-    skin = read_skin(share() / "config" / "cube.yaml")
+    """A cube under known loads recovers its coefficients; by forces alone, what they do not tell is
+    named."""
+    skin = read_skin(package_data() / "config" / "cube.yaml")
     calibration, area = skin.cubes[0].calibration, 1e-4
     modes, kind = calibration.modes, "cube_tensor_driver/msg/StressTensorStamped"
     pipeline = Pipeline([calibration], np.float32)
@@ -445,7 +554,12 @@ def test_fit_from_a_bag(tmp_path, capsys):
         writer.write(topic, stamp, bytes(typestore().serialize_cdr(one, one.__msgtype__)))
 
     with BagWriter(tmp_path / "bag") as writer:
-        for topic, of in (("/frequencies", FREQUENCIES), ("/info", INFO), ("/force", WRENCH), ("/known", kind)):
+        for topic, of in (
+            ("/frequencies", FREQUENCIES),
+            ("/info", INFO),
+            ("/force", WRENCH),
+            ("/known", kind),
+        ):
             writer.add_topic(topic, of)
         put("/info", START_NS, info_of(skin, pipeline, START_NS))
         for k in range(80):
@@ -460,12 +574,26 @@ def test_fit_from_a_bag(tmp_path, capsys):
             force = message("geometry_msgs/msg/Vector3", x=zx * area, y=yz * area, z=zz * area)
             wrench = message("geometry_msgs/msg/Wrench", force=force, torque=zero)
             put("/force", stamp, message(WRENCH, header=header(stamp, "sensor"), wrench=wrench))
-            tensor = message("cube_tensor_driver/msg/StressTensor",
-                             normal=message("geometry_msgs/msg/Vector3", x=xx, y=yy, z=zz),
-                             shear=message("geometry_msgs/msg/Vector3", x=yz, y=zx, z=xy), normal_gradient=values[6:],
-                             covariance=np.zeros(225), residual=0.0, status=0, observed=0)  # fmt: skip
+            tensor = message(
+                "cube_tensor_driver/msg/StressTensor",
+                normal=message("geometry_msgs/msg/Vector3", x=xx, y=yy, z=zz),
+                shear=message("geometry_msgs/msg/Vector3", x=yz, y=zx, z=xy),
+                normal_gradient=values[6:],
+                covariance=np.zeros(225),
+                residual=0.0,
+                status=0,
+                observed=0,
+            )
             put("/known", stamp, message(kind, header=header(stamp, "cube"), tensor=tensor))
-    common = ["fit", str(tmp_path / "bag"), "--layout", "planar", "-o", str(tmp_path / "f.yaml"), "--reference"]
+    common = [
+        "fit",
+        str(tmp_path / "bag"),
+        "--layout",
+        "planar",
+        "-o",
+        str(tmp_path / "f.yaml"),
+        "--reference",
+    ]
     assert main([*common, "/known"]) == 0
     fitted = read_calibration(tmp_path / "f.yaml")
     for name, value in calibration.coefficients.items():
@@ -490,7 +618,10 @@ def test_fit_says_what_a_bag_lacks(bag, tmp_path, capsys):
 
 def test_plot_and_info(bag, tmp_path, capsys):
     figure = tmp_path / "c03.png"
-    assert main(["plot", str(bag), "--cube", "c03", "--from", "0.5", "--to", "1.5", "-o", str(figure)]) == 0
+    assert (
+        main(["plot", str(bag), "--cube", "c03", "--from", "0.5", "--to", "1.5", "-o", str(figure)])
+        == 0
+    )
     # 300 ns after each scan: the one at 1.5 s is behind the end
     assert "100 samples" in capsys.readouterr().out and figure.stat().st_size > 20_000
     assert main(["plot", str(bag), "--cube", "c99", "-o", str(figure)]) == 1
@@ -511,7 +642,7 @@ def test_disk_full_leaves_what_was_written(bag, tmp_path):
     script = (
         "import resource, signal, sys; from pathlib import Path\n"
         "from cube_tensor_driver.core.errors import BagError\n"
-        "from cube_tensor_driver.files.bags import Bag; from cube_tensor_driver.files.bag_writer import BagWriter\n"
+        "from cube_tensor_driver.bags.read import Bag; from cube_tensor_driver.bags.write import BagWriter\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n"
         "try:\n"
         "    with Bag(Path(sys.argv[1])) as source, BagWriter(Path(sys.argv[2])) as writer:\n"
@@ -521,7 +652,9 @@ def test_disk_full_leaves_what_was_written(bag, tmp_path):
     )
     command = [sys.executable, "-c", script, str(bag), str(tmp_path / "full")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
-    assert done.returncode == 3 and "File too large" in done.stdout and "with room" in done.stdout, done.stderr
+    assert (
+        done.returncode == 3 and "File too large" in done.stdout and "with room" in done.stdout
+    ), done.stderr
     kept = repair(tmp_path / "full", keep_rest=False)
     assert kept.messages > 100
     with Bag(tmp_path / "full") as read:
@@ -530,6 +663,9 @@ def test_disk_full_leaves_what_was_written(bag, tmp_path):
 
 def test_unwritable_and_existing_folders_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    for folder, words in ((tmp_path, "is there already"), (tmp_path / "file" / "bag", "Not a directory")):
+    for folder, words in (
+        (tmp_path, "is there already"),
+        (tmp_path / "file" / "bag", "Not a directory"),
+    ):
         with pytest.raises(BagError, match=words):
             BagWriter(folder)

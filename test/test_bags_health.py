@@ -29,12 +29,17 @@ def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
     cube = np.arange(n, dtype=np.uint16)
     temperature = np.full((count, n), np.nan, np.float32)
     single, many = Health(pipeline), Health(pipeline)
-    expected = [single.update(cube, *one) for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)]
+    expected = [
+        single.update(cube, *one)
+        for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)
+    ]
     found = [
         many.update_many(cube, frequency[part], pad_fault[part], stamp_ns[part], temperature[part])
         for part in np.array_split(np.arange(count), 9)
     ]
-    for of_many, of_single in zip(zip(*found, strict=True), zip(*expected, strict=True), strict=True):
+    for of_many, of_single in zip(
+        zip(*found, strict=True), zip(*expected, strict=True), strict=True
+    ):
         np.testing.assert_array_equal(np.concatenate(of_many), of_single)
     assert bool(np.any([mask for mask, _ in expected])) == faults
     assert many.closed == single.closed

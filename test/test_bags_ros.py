@@ -23,32 +23,43 @@ from rosgraph_msgs.msg import Clock
 from test_bags_files import differing_bits, stress
 
 from conftest import ROOT
+from cube_tensor_driver.bags.read import FREQUENCIES, Bag
+from cube_tensor_driver.bags.repair import repair
+from cube_tensor_driver.bags.reprocess import Change, Job, reprocess
+from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.files.bags import FREQUENCIES, Bag
-from cube_tensor_driver.files.repair import repair
-from cube_tensor_driver.files.reprocess import Change, Job, reprocess
-from cube_tensor_driver.files.share import share
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
-from cube_tensor_driver.ros.children import Children
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import Process, record_command, skin_processes
 from cube_tensor_driver.ros.messages import read_stress, to_ns
 from cube_tensor_driver.ros.node import queue
-from cube_tensor_driver.ros.start import Process, record_command, skin_processes
 from cube_tensor_driver.simulation.inject import inject
 
-SKIN = share() / "config" / "skin_demo.yaml"
+SKIN = package_data() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MADE_ANEW = ("--exclude-topics", "/stress")
-needs_ros2_bag = pytest.mark.skipif(find_spec("ros2bag") is None, reason="needs ros2 bag, which the wheels lack")
+needs_ros2_bag = pytest.mark.skipif(
+    find_spec("ros2bag") is None, reason="needs ros2 bag, which the wheels lack"
+)
 
 
 def cube(*arguments: object) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", *map(str, arguments)], cwd=ROOT,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
+    return subprocess.Popen(
+        [sys.executable, "-m", "cube_tensor_driver.cli", *map(str, arguments)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def ros2_bag(*arguments: object) -> subprocess.Popen:
-    return subprocess.Popen(["ros2", "bag", *map(str, arguments), "--disable-keyboard-controls"],
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
+    return subprocess.Popen(
+        ["ros2", "bag", *map(str, arguments), "--disable-keyboard-controls"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def end(process: subprocess.Popen, number: int = signal.SIGINT) -> str:
@@ -61,7 +72,8 @@ def grown(folder: Path, size: int) -> bool:
 
 
 def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
-    """What a bag holds of frequencies; of one that is being written, what a repaired copy of it does."""
+    """What a bag holds of frequencies; of one that is being written, what a repaired copy of it
+    does."""
     if copy is not None:
         shutil.rmtree(copy, ignore_errors=True)
         try:
@@ -73,7 +85,9 @@ def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
     with Bag(bag) as opened:
         if "/frequencies" not in opened.topics(FREQUENCIES):
             return []
-        return [int(stamp) for batch, _ in opened.batches("/frequencies") for stamp in batch.stamp_ns]
+        return [
+            int(stamp) for batch, _ in opened.batches("/frequencies") for stamp in batch.stamp_ns
+        ]
 
 
 @pytest.fixture
@@ -89,24 +103,33 @@ def running(ros, tmp_path):
 
 
 def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
-    """Nothing lost against what another subscriber hears; and the pipeline gives the nodes' own bits again.
+    """Nothing lost against what another subscriber hears; and the pipeline gives the nodes' own
+    bits again.
 
-    Also of a pad that was found stuck before the recording began, which the frequencies alone say half a second later.
+    Also of a pad that was found stuck before the recording began, which the frequencies alone say
+    half a second later.
     """
     path = tmp_path / "bag"
     inject(tmp_path / "ports", ["kind=stuck", "link=hub1", "cube=2", "pad=6", "seconds=60"])
     running.wait(lambda: running.heard[-1].left_out[-6:].count(1 << 6))
     heard = running.listen(SkinFrequencies, "frequencies", 1000)
     running.wait(lambda: heard)
-    recorder, other = cube("record", "-o", path), cube("record", "-o", tmp_path / "other", "--storage", "sqlite3")
+    recorder, other = (
+        cube("record", "-o", path),
+        cube("record", "-o", tmp_path / "other", "--storage", "sqlite3"),
+    )
     running.wait(lambda: grown(path, 800_000))
     output = end(recorder)
     assert "/frequencies" in end(other) and other.returncode == 0
     assert recorder.returncode == 0 and "/frequencies" in output, output
     with Bag(path) as bag:
         assert {info.sender for info in bag.infos("/info")} == {"driver", "reconstruction"}
-        recorded = [int(stamp) for batch, _ in bag.batches("/frequencies") for stamp in batch.stamp_ns]
-        qos = {one.topic: one.ext.offered_qos_profiles[0].durability.name for one in bag.connections}
+        recorded = [
+            int(stamp) for batch, _ in bag.batches("/frequencies") for stamp in batch.stamp_ns
+        ]
+        qos = {
+            one.topic: one.ext.offered_qos_profiles[0].durability.name for one in bag.connections
+        }
     assert qos["/info"] == "TRANSIENT_LOCAL" and qos["/frequencies"] == "VOLATILE"
     running.wait(lambda: to_ns(heard[-1].header.stamp) >= recorded[-1])
     stamps = [to_ns(message.header.stamp) for message in heard]
@@ -123,7 +146,8 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
 
 @needs_ros2_bag
 def test_ros2_bag_records_what_is_published(running, tmp_path):
-    """As record:=true has it recorded: info from before the recording and every scan, reprocessed to the bit."""
+    """As record:=true has it recorded: info from before the recording and every scan, reprocessed
+    to the bit."""
     _, _, verb, *options = record_command("skin")
     path = tmp_path / options[options.index("-o") + 1]
     options[options.index("-o") + 1] = str(path)
@@ -136,7 +160,10 @@ def test_ros2_bag_records_what_is_published(running, tmp_path):
     end(recorder)
     recorded = frequency_stamps(path)
     stamps = [to_ns(message.header.stamp) for message in heard]
-    assert recorded == stamps[stamps.index(recorded[0]) : stamps.index(recorded[-1]) + 1] and len(recorded) > 50
+    assert (
+        recorded == stamps[stamps.index(recorded[0]) : stamps.index(recorded[-1]) + 1]
+        and len(recorded) > 50
+    )
     with Bag(path) as bag:
         assert {info.sender for info in bag.infos("/info")} == {"driver", "reconstruction"}
     reprocess(Job(path, tmp_path / "out", "bag", Change()))
@@ -178,8 +205,13 @@ def test_record_says_what_is_wrong(domain, tmp_path):
 
 
 def reconstruction(children: Children, config: Path) -> None:
-    children.start(Process("reconstruction", "cube_tensor_driver.ros.reconstruction",
-                           parameters={"config": str(config), "use_sim_time": True}))  # fmt: skip
+    children.start(
+        Process(
+            "reconstruction",
+            "cube_tensor_driver.ros.reconstruction",
+            parameters={"config": str(config), "use_sim_time": True},
+        )
+    )
 
 
 def stuck(k: int) -> np.ndarray:
@@ -189,26 +221,38 @@ def stuck(k: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("config", "command"),
-    [("skin", "replay"), ("bag", "replay"), pytest.param("bag", "ros2 bag play", marks=needs_ros2_bag)],
+    [
+        ("skin", "replay"),
+        ("bag", "replay"),
+        pytest.param("bag", "ros2 bag play", marks=needs_ros2_bag),
+    ],
 )
 def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, command):
     """To the bit, stamps included, also the second time round after the jump back.
 
-    With the bag as configuration also where the skin was tared in the middle, and a pad known to be bad.
+    With the bag as configuration also where the skin was tared in the middle, and a pad known to be
+    bad.
     """
     made = {"left_out": stuck, "tare": (90, 1.001)} if config == "bag" else {}
     path = make_bag(tmp_path / "bag", SKIN, 150, **made)
     batches = ros.listen(SkinStress, "stress", queue(None))
     infos = ros.listen(SkinInfo, "info", LATCHED)
-    clock = ros.listen(Clock, "/clock", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
+    clock = ros.listen(
+        Clock, "/clock", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
     with Children(tmp_path) as children:
         reconstruction(children, path if config == "bag" else SKIN)
         ros.wait(lambda: len(infos) == 1)
         options = (path, "--clock", "--loop", "--rate", "2")
-        player = cube("replay", *options) if command == "replay" else ros2_bag("play", *options, *MADE_ANEW)
+        player = (
+            cube("replay", *options)
+            if command == "replay"
+            else ros2_bag("play", *options, *MADE_ANEW)
+        )
 
         def twice_round() -> bool:
-            """Two beginnings and a jump back seen; how much of the first round is heard is up to discovery."""
+            """Two beginnings and a jump back seen; how much of the first round is heard is up to
+            discovery."""
             begun = [message for message in batches if to_ns(message.header.stamp) == START_NS]
             now = [to_ns(message.clock) for message in clock]
             return len(begun) >= 2 and len(infos) > 1 and min(np.diff(now), default=0) < 0
@@ -238,13 +282,20 @@ def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
     raw = ros.listen(SkinFrequencies, "frequencies", queue(None))
     infos = ros.listen(SkinInfo, "info", LATCHED)
     near, far = pty.openpty()
-    player = subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--start", "1"],
-                              cwd=ROOT, stdin=far, stdout=far, stderr=far)  # fmt: skip
+    player = subprocess.Popen(
+        [sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--start", "1"],
+        cwd=ROOT,
+        stdin=far,
+        stdout=far,
+        stderr=far,
+    )
     os.close(far)
     os.set_blocking(near, False)
     try:
         ros.wait(lambda: len(raw) > 10)
-        assert [int(one.sequence[0]) for one in raw[:10]] == list(range(100, 110)) and len(infos) == 1
+        assert [int(one.sequence[0]) for one in raw[:10]] == list(range(100, 110)) and len(
+            infos
+        ) == 1
         os.write(near, b" ")
         held: list[int] = []
 
@@ -269,7 +320,12 @@ def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
 def test_types_of_the_bag_are_offered_as_they_were(ros, tmp_path):
     path = make_bag(tmp_path / "bag", SKIN, 50)
     player = cube("replay", path, "--stress")
-    ros.wait(lambda: {name for name, _ in ros.node.get_topic_names_and_types()} >= {"/stress", "/info", "/force"})
+    ros.wait(
+        lambda: (
+            {name for name, _ in ros.node.get_topic_names_and_types()}
+            >= {"/stress", "/info", "/force"}
+        )
+    )
     offered = ros.node.get_publishers_info_by_topic("/info")[0]
     assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert ros.node.get_publishers_info_by_topic("/frequencies")[0].topic_type == FREQUENCIES

@@ -11,11 +11,26 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
-from cube_tensor_driver.view import bench
+from cube_tensor_driver.trials import bench
 
-KEYS = {"cubes", "rate_hz", "duration_s", "samples_sent", "tensors_received", "lost", "skipped", "latency_p50_ms",
-        "cpu_simulator_percent", "cpu_driver_percent", "cpu_reconstruction_percent", "latency_p99_ms",
-        "echo_cpu_percent", "ratio_to_echo", "rss_mb", "first_tensor_s"}  # fmt: skip
+KEYS = {
+    "cubes",
+    "rate_hz",
+    "duration_s",
+    "samples_sent",
+    "tensors_received",
+    "lost",
+    "skipped",
+    "latency_p50_ms",
+    "cpu_simulator_percent",
+    "cpu_driver_percent",
+    "cpu_reconstruction_percent",
+    "latency_p99_ms",
+    "echo_cpu_percent",
+    "ratio_to_echo",
+    "rss_mb",
+    "first_tensor_s",
+}
 
 
 def test_skin_counts_what_was_sent(domain, tmp_path):
@@ -23,13 +38,24 @@ def test_skin_counts_what_was_sent(domain, tmp_path):
     # pauses and a second floor are for figures only
     code = (
         "import functools, sys\n"
-        "from cube_tensor_driver import cli\n"
-        "from cube_tensor_driver.view import bench\n"
+        "from cube_tensor_driver.cli import main as cli\n"
+        "from cube_tensor_driver.trials import bench\n"
         "bench.SETTLE_S = bench.DRAIN_S = 0.2\n"
         "bench._echo = functools.cache(bench._echo)\n"
         "sys.exit(cli.main(sys.argv[1:]))"
     )
-    arguments = ["bench", "skin", "--cubes", "3", "--rate", "100", "--duration", "0.6", "--publish-period", "0.02"]
+    arguments = [
+        "bench",
+        "skin",
+        "--cubes",
+        "3",
+        "--rate",
+        "100",
+        "--duration",
+        "0.6",
+        "--publish-period",
+        "0.02",
+    ]
     json_path = tmp_path / "figures.json"
     command = [sys.executable, "-c", code, *arguments, "--json", str(json_path)]
     process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
@@ -47,7 +73,9 @@ def test_growth_of_memory_and_its_error():
     rng = np.random.default_rng(0)
     minutes = np.arange(1200) / 120
     line = 80 + 0.5 * minutes + rng.normal(0, 0.05, 1200)
-    found = bench._memory({"simulator": [999.0] * 1200, "driver": list(line), "reconstruction": [90.0] * 1200})
+    found = bench._memory(
+        {"simulator": [999.0] * 1200, "driver": list(line), "reconstruction": [90.0] * 1200}
+    )
     assert found["rss_mb"] == 90.0
     assert abs(found["rss_mb_per_minute"] - 0.5) < 4 * found["rss_mb_per_minute_error"] < 0.1
     steps = 80 + np.repeat(rng.normal(0, 0.3, 60), 20)

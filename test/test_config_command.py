@@ -10,18 +10,22 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
+from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.tensor import rotation_from_rpy
-from cube_tensor_driver.files.skin import read_skin
 
 
 def cube(*arguments: object) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "cube_tensor_driver.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False
+    )
 
 
 def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
     path = tmp_path / "skin.yaml"
-    done = cube("config", "grid", "--nx", 36, "--ny", 35, "--pitch", 0.012, "--links", 16, "-o", path)
+    done = cube(
+        "config", "grid", "--nx", 36, "--ny", 35, "--pitch", 0.012, "--links", 16, "-o", path
+    )
     assert done.returncode == 0, done.stderr
     skin = read_skin(path)
     assert len(skin.cubes) == 1260 and len(skin.links) == 16
@@ -42,7 +46,9 @@ def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
     origin = joints[0].find("origin")
     np.testing.assert_allclose(np.fromstring(origin.get("xyz"), sep=" "), skin.cubes[0].xyz)
     # URDF's rpy and ours are one convention: fixed axes x, y, z
-    np.testing.assert_allclose(rotation_from_rpy(*np.fromstring(origin.get("rpy"), sep=" ")), np.eye(3))
+    np.testing.assert_allclose(
+        rotation_from_rpy(*np.fromstring(origin.get("rpy"), sep=" ")), np.eye(3)
+    )
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,10 @@ def full_of_everything() -> Calibration:
     )
 
 
-@pytest.mark.parametrize("calibration", [illustrative("quad"), illustrative("planar"), illustrative("cube"),
-                                         full_of_everything()])  # fmt: skip
+@pytest.mark.parametrize(
+    "calibration",
+    [illustrative("quad"), illustrative("planar"), illustrative("cube"), full_of_everything()],
+)
 def test_a_calibration_survives_plain_types(calibration):
     text = json.dumps(calibration.to_dict())
     again = Calibration.from_dict(json.loads(text))
@@ -40,9 +42,18 @@ def test_a_calibration_survives_plain_types(calibration):
 
 def test_the_id_tells_any_difference_and_no_other():
     c = full_of_everything()
-    changes = [{"gain": np.ones(8)}, {"uid": 5}, {"source": "x"}, {"neglect": ()}, {"half_side": 3e-3},
-               {"temperature": None}, {"coefficients": dict(c.coefficients) | {"a": 1.5}}]  # fmt: skip
-    assert len({c.id, *(dataclasses.replace(c, **change).id for change in changes)}) == 1 + len(changes)
+    changes = [
+        {"gain": np.ones(8)},
+        {"uid": 5},
+        {"source": "x"},
+        {"neglect": ()},
+        {"half_side": 3e-3},
+        {"temperature": None},
+        {"coefficients": dict(c.coefficients) | {"a": 1.5}},
+    ]
+    assert len({c.id, *(dataclasses.replace(c, **change).id for change in changes)}) == 1 + len(
+        changes
+    )
     shuffled = dict(reversed(c.coefficients.items()))
     assert dataclasses.replace(c, coefficients=shuffled).id == c.id
     p = illustrative("planar")
@@ -53,7 +64,9 @@ def test_the_response_has_the_gains_in():
     c = full_of_everything()
     np.testing.assert_allclose(c.response, c.gain[:, None] * illustrative("planar").response)
     m = dataclasses.replace(c, coefficients=None, matrix=np.arange(56.0).reshape(8, 7))
-    np.testing.assert_allclose(Calibration.from_dict(m.to_dict()).response, c.gain[:, None] * m.matrix)
+    np.testing.assert_allclose(
+        Calibration.from_dict(m.to_dict()).response, c.gain[:, None] * m.matrix
+    )
 
 
 def test_another_layout_keeps_its_pads():
@@ -63,43 +76,48 @@ def test_another_layout_keeps_its_pads():
     assert again.layout.same_as(mine) and again.id == c.id
 
 
-@pytest.mark.parametrize("change, words", [
-    ({"gain": 1.1}, "edited by hand"),
-    ({"id": "0" * 16}, "edited by hand"),
-    ({"colour": "red"}, "unknown keys.*colour"),
-    ({"schema": 2}, "schema 2.*schema 1"),
-    ({"layout": "ring"}, "'ring'"),
-    ({"layout": "quad"}, "has 4 pads|lacks this symmetry"),
-    ({"symmetry": "round"}, "'round'"),
-    ({"symmetry": 3}, "symmetry is 3"),
-    ({"symmetry": "none"}, "56 coefficients"),
-    ({"noise": 0}, "noise holds 0"),
-    ({"beta": -0.1}, "beta holds -0.1"),
-    ({"modulus": [1, 2]}, "modulus has shape"),
-    ({"rest_frequency": "1e5"}, "2.0e-3"),
-    ({"rest_frequency": float("nan")}, "NaN"),
-    ({"half_side": -1}, "half_side"),
-    ({"half_side": [1]}, "half_side has shape"),
-    ({"matrix": [[1]]}, "both"),
-    ({"coefficients": None}, "neither"),
-    ({"coefficients": None, "matrix": [[1]]}, "matrix has shape"),
-    ({"coefficients": 3}, "coefficients is 3"),
-    ({"covariance": [[1]]}, "covariance has shape"),
-    ({"neglect": "xx"}, "list"),
-    ({"neglect": ["aa"]}, "'aa'"),
-    ({"uid": -1}, "uid is -1"),
-    ({"uid": "0x1"}, "whole number"),
-    ({"temperature": {"reference": 25, "coefficients": [[0.1]]}}, "1 lists"),
-    ({"modulus": True}, "must be numbers"),
-    ({"gain": [[1], [2, 3]]}, "must be numbers"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"gain": 1.1}, "edited by hand"),
+        ({"id": "0" * 16}, "edited by hand"),
+        ({"colour": "red"}, "unknown keys.*colour"),
+        ({"schema": 2}, "schema 2.*schema 1"),
+        ({"layout": "ring"}, "'ring'"),
+        ({"layout": "quad"}, "has 4 pads|lacks this symmetry"),
+        ({"symmetry": "round"}, "'round'"),
+        ({"symmetry": 3}, "symmetry is 3"),
+        ({"symmetry": "none"}, "56 coefficients"),
+        ({"noise": 0}, "noise holds 0"),
+        ({"beta": -0.1}, "beta holds -0.1"),
+        ({"modulus": [1, 2]}, "modulus has shape"),
+        ({"rest_frequency": "1e5"}, "2.0e-3"),
+        ({"rest_frequency": float("nan")}, "NaN"),
+        ({"half_side": -1}, "half_side"),
+        ({"half_side": [1]}, "half_side has shape"),
+        ({"matrix": [[1]]}, "both"),
+        ({"coefficients": None}, "neither"),
+        ({"coefficients": None, "matrix": [[1]]}, "matrix has shape"),
+        ({"coefficients": 3}, "coefficients is 3"),
+        ({"covariance": [[1]]}, "covariance has shape"),
+        ({"neglect": "xx"}, "list"),
+        ({"neglect": ["aa"]}, "'aa'"),
+        ({"uid": -1}, "uid is -1"),
+        ({"uid": "0x1"}, "whole number"),
+        ({"temperature": {"reference": 25, "coefficients": [[0.1]]}}, "1 lists"),
+        ({"modulus": True}, "must be numbers"),
+        ({"gain": [[1], [2, 3]]}, "must be numbers"),
+    ],
+)
 def test_a_bad_calibration_is_refused_with_the_reason(change, words):
     good = illustrative("planar").to_dict()
     with pytest.raises(CalibrationError, match=words):
         Calibration.from_dict(good | change)
 
 
-@pytest.mark.parametrize("key", ["layout", "rest_frequency", "noise", "modulus", "half_side", "schema"])
+@pytest.mark.parametrize(
+    "key", ["layout", "rest_frequency", "noise", "modulus", "half_side", "schema"]
+)
 def test_a_missing_key_is_named(key):
     data = illustrative("planar").to_dict()
     del data[key]

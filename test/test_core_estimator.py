@@ -8,13 +8,23 @@ from scipy.stats import chi2 as chi2_truth
 
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import SymmetryError
-from cube_tensor_driver.core.estimator import FALSE_ALARM, chi2_limit, chi2_tail, make_estimator, summary
+from cube_tensor_driver.core.estimator import (
+    FALSE_ALARM,
+    chi2_limit,
+    chi2_tail,
+    make_estimator,
+    summary,
+)
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE
 from cube_tensor_driver.core.response import response
 from cube_tensor_driver.core.symmetry import find_structure
 
-PAIRS = [(layout, g) for layout in ("quad", "planar", "cube") for g in ("full", "slab", "mirrors", "none")][1:]
+PAIRS = [
+    (layout, g)
+    for layout in ("quad", "planar", "cube")
+    for g in ("full", "slab", "mirrors", "none")
+][1:]
 
 
 def random_case(layout: str, symmetry: str, seed: int = 0):
@@ -36,16 +46,22 @@ def test_recovers_what_was_put_in(layout, symmetry):
     truth, got = states @ modes.components.T, states @ a.T @ estimator.matrix.T
     seen = estimator.observed
     assert np.all(np.isnan(got[:, ~seen])) and np.all(np.isfinite(got[:, seen]))
-    np.testing.assert_allclose(got[:, seen], truth[:, seen], rtol=0, atol=1e-10 * np.abs(truth).max())
+    np.testing.assert_allclose(
+        got[:, seen], truth[:, seen], rtol=0, atol=1e-10 * np.abs(truth).max()
+    )
     assert np.all(estimator.chi2(states @ a.T) < 1e-18)
     assert estimator.dof == len(a) - np.linalg.matrix_rank(a)
     # exactly the components that no hidden combination of modes can change are observed
     hidden = np.linalg.svd(a)[2][np.linalg.matrix_rank(a) :]
     nonzero = np.any(modes.components, axis=1)
-    np.testing.assert_array_equal(seen, nonzero & (np.abs(modes.components @ hidden.T).max(axis=1, initial=0) < 1e-9))
+    np.testing.assert_array_equal(
+        seen, nonzero & (np.abs(modes.components @ hidden.T).max(axis=1, initial=0) < 1e-9)
+    )
 
 
-@pytest.mark.parametrize("layout, symmetry", [p for p in PAIRS if p != ("quad", "none")])  # which sees nothing alone
+@pytest.mark.parametrize(
+    "layout, symmetry", [p for p in PAIRS if p != ("quad", "none")]
+)  # which sees nothing alone
 def test_scatter_is_as_stated(layout, symmetry):
     modes, a, rng = random_case(layout, symmetry, 1)
     noise = rng.uniform(0.5, 2, len(a))
@@ -58,12 +74,18 @@ def test_scatter_is_as_stated(layout, symmetry):
     sizes = np.sqrt(np.diag(stated))
     scatter = np.atleast_2d(np.cov(got.T))
     np.testing.assert_allclose(np.sqrt(np.diag(scatter)), sizes, rtol=0.03)
-    np.testing.assert_allclose(scatter / np.outer(sizes, sizes), stated / np.outer(sizes, sizes), atol=0.05)
-    np.testing.assert_allclose(got.mean(axis=0), (modes.components @ state)[seen], atol=5 * sizes.max() / 100)
+    np.testing.assert_allclose(
+        scatter / np.outer(sizes, sizes), stated / np.outer(sizes, sizes), atol=0.05
+    )
+    np.testing.assert_allclose(
+        got.mean(axis=0), (modes.components @ state)[seen], atol=5 * sizes.max() / 100
+    )
     if estimator.dof:
         chi2 = estimator.chi2(v)
         assert chi2.mean() == pytest.approx(estimator.dof, rel=0.06)
-        assert np.mean(chi2 > estimator.limit) == pytest.approx(FALSE_ALARM, abs=5 * np.sqrt(FALSE_ALARM / 1e4))
+        assert np.mean(chi2 > estimator.limit) == pytest.approx(
+            FALSE_ALARM, abs=5 * np.sqrt(FALSE_ALARM / 1e4)
+        )
 
 
 def test_unequal_noise_weighs_the_pads():
@@ -78,14 +100,21 @@ def test_unequal_noise_weighs_the_pads():
 
 def test_what_the_layouts_see():
     quad, planar, cube = (illustrative(n) for n in ("quad", "planar", "cube"))
-    see = {c.layout.name: components_seen(make_estimator(c.response, c.noise, c.modes)) for c in (quad, planar, cube)}
+    see = {
+        c.layout.name: components_seen(make_estimator(c.response, c.noise, c.modes))
+        for c in (quad, planar, cube)
+    }
     assert see["quad"] == {"zx", "zz_z"}  # zz_z only because the illustrative f is 0
     assert see["planar"] == set(PLANE.names)
     assert see["cube"] == set(COMPONENTS)
     alone = make_estimator(quad.response, quad.noise, quad.modes, neglect=("xx", "xx_z", "xx_x"))
     assert components_seen(alone) == {"zz", "zx", "zz_x", "zz_z"} and alone.dof == 0
     hidden = make_estimator(cube.response, cube.noise, SPACE, targets=np.eye(21)).observed
-    assert {n for n, seen in zip(SPACE.names, hidden, strict=True) if not seen} == {"yz_x", "zx_y", "xy_z"}
+    assert {n for n, seen in zip(SPACE.names, hidden, strict=True) if not seen} == {
+        "yz_x",
+        "zx_y",
+        "xy_z",
+    }
     with pytest.raises(SymmetryError, match="'zy'"):
         make_estimator(quad.response, quad.noise, quad.modes, neglect=("zy",))
 
@@ -93,7 +122,9 @@ def test_what_the_layouts_see():
 def test_the_summary_of_a_layout():
     c = illustrative("cube")
     s = summary(c.structure, c.response)
-    keys = "pads modes n_coefficients rank_uniform condition_uniform rank_gradient condition_gradient"
+    keys = (
+        "pads modes n_coefficients rank_uniform condition_uniform rank_gradient condition_gradient"
+    )
     assert list(s) == [*keys.split(), "unobservable", "noise"]
     assert (s["n_coefficients"], s["rank_uniform"], s["rank_gradient"]) == (12, 6, 12)
     assert s["unobservable"] == ["yz_x", "zx_y", "xy_z"] and s["noise"]["yz_x"] is None
@@ -103,7 +134,11 @@ def test_the_summary_of_a_layout():
     assert s["condition_uniform"] == pytest.approx(singular[0] / singular[-1])
     quad = illustrative("quad", ("xx", "xx_z", "xx_x"))
     s = summary(quad.structure, quad.response, quad.neglect)
-    assert s["rank_uniform"] == s["rank_gradient"] == 2 and s["unobservable"] == ["xx", "xx_z", "xx_x"]
+    assert s["rank_uniform"] == s["rank_gradient"] == 2 and s["unobservable"] == [
+        "xx",
+        "xx_z",
+        "xx_x",
+    ]
     json.dumps(s, allow_nan=False)
 
 
@@ -113,7 +148,10 @@ def test_missing_pads_cost_what_they_must():
     assert components_seen(one) == set(PLANE.names) and one.dof == 0 and np.isnan(one.limit)
     assert np.all(one.matrix[one.observed, 2] == 0)
     whole = make_estimator(c.response, c.noise, c.modes)
-    assert np.all(np.diag(one.covariance)[one.observed] >= np.diag(whole.covariance)[one.observed] * (1 - 1e-12))
+    assert np.all(
+        np.diag(one.covariance)[one.observed]
+        >= np.diag(whole.covariance)[one.observed] * (1 - 1e-12)
+    )
     none = make_estimator(c.response, c.noise, c.modes, missing=np.arange(8))
     assert not none.observed.any() and none.dof == 0 and none.rank == 0
 
@@ -134,12 +172,14 @@ def test_chi_square_limits(dof):
 
 
 def opposite(layout) -> np.ndarray:
-    return np.array([np.argmin(np.linalg.norm(layout.positions + x, axis=1)) for x in layout.positions])
+    return np.array(
+        [np.argmin(np.linalg.norm(layout.positions + x, axis=1)) for x in layout.positions]
+    )
 
 
 def suspects_after(sigmas: float, draws: int = 2000):
-    """How often the residual rings, the suspects are exactly the broken pad and its opposite, miss the
-    broken pad."""
+    """How often the residual rings, the suspects are exactly the broken pad and its opposite, miss
+    the broken pad."""
     rng = np.random.default_rng(7)
     c = illustrative("cube")
     estimator = make_estimator(c.response, c.noise, c.modes)

@@ -1,4 +1,5 @@
-"""Fit: known coefficients and gains come back, within what is stated, from loads with noise and outliers."""
+"""Fit: known coefficients and gains come back, within what is stated, from loads with noise and
+outliers."""
 
 import dataclasses
 
@@ -17,7 +18,9 @@ from cube_tensor_driver.core.symmetry import find_structure
 class Bench:
     """20 loads on a cube with 5 % spread of gains and 0.1 % noise."""
 
-    def __init__(self, layout: str, symmetry: str, seed: int, loads: int = 20, noise: float = 1e-3) -> None:
+    def __init__(
+        self, layout: str, symmetry: str, seed: int, loads: int = 20, noise: float = 1e-3
+    ) -> None:
         rng = np.random.default_rng(seed)
         self.base = illustrative(layout)
         self.structure = find_structure(self.base.layout, symmetry)
@@ -35,10 +38,17 @@ class Bench:
 
     def errors(self, result) -> np.ndarray:
         """Errors of the coefficients in units of their stated deviations."""
-        return np.array([(result.coefficients[n] - c) / result.deviations[n] for n, c in self.coefficients.items()])
+        return np.array(
+            [
+                (result.coefficients[n] - c) / result.deviations[n]
+                for n, c in self.coefficients.items()
+            ]
+        )
 
 
-@pytest.mark.parametrize("layout, symmetry", [("planar", "full"), ("planar", "mirrors"), ("quad", "mirrors")])
+@pytest.mark.parametrize(
+    "layout, symmetry", [("planar", "full"), ("planar", "mirrors"), ("quad", "mirrors")]
+)
 def test_errors_are_within_their_stated_deviations(layout, symmetry):
     errors, gains, scatter = [], [], []
     for seed in range(12):
@@ -66,7 +76,9 @@ def test_without_noise_it_is_exact():
     bench = Bench("planar", "full", 1, noise=0)
     result = fit(bench.structure, bench.loads, bench.readings, 1.0)
     np.testing.assert_allclose(
-        [result.coefficients[n] for n in bench.coefficients], list(bench.coefficients.values()), atol=1e-9
+        [result.coefficients[n] for n in bench.coefficients],
+        list(bench.coefficients.values()),
+        atol=1e-9,
     )
     np.testing.assert_allclose(result.gain, bench.gain, atol=1e-9)
     np.testing.assert_allclose(result.fitted, bench.readings, atol=1e-4)
@@ -85,7 +97,9 @@ def test_outliers_are_forgotten():
 def test_noise_of_another_size_is_found():
     bench = Bench("planar", "full", 3)
     result = fit(bench.structure, bench.loads, bench.readings, bench.noise / 10)
-    assert result.scale == pytest.approx(10, rel=0.3) and result.chi2 / result.dof == pytest.approx(100, rel=0.4)
+    assert result.scale == pytest.approx(10, rel=0.3) and result.chi2 / result.dof == pytest.approx(
+        100, rel=0.4
+    )
     assert np.abs(bench.errors(result)).max() < 4  # deviations follow the scatter found
 
 
@@ -97,9 +111,14 @@ def test_what_the_loads_leave_open_is_said_and_following_the_advice_settles_it()
     bench.readings = bench.loads @ a.T + bench.noise * rng.normal(size=(20, 8))
     result = bench.fit()
     assert result.undetermined == ("e", "f", "g", "h")
-    assert np.isnan([result.coefficients[n] for n in "efgh"] + [result.deviations[n] for n in "efgh"]).all()
+    assert np.isnan(
+        [result.coefficients[n] for n in "efgh"] + [result.deviations[n] for n in "efgh"]
+    ).all()
     assert np.abs(bench.errors(result)[:3]).max() < 4
-    assert len(result.advice) == 2 and "add a load of zz_x alone, sigma_zz growing along x" in result.advice[0]
+    assert (
+        len(result.advice) == 2
+        and "add a load of zz_x alone, sigma_zz growing along x" in result.advice[0]
+    )
     with pytest.raises(FitError, match=r"do not determine e, f.*fixed"):
         result.calibration(bench.base)
     advised = [text.split("a load of ")[1].split()[0] for text in result.advice]
@@ -126,13 +145,19 @@ def test_a_fit_becomes_a_calibration():
     bench = Bench("planar", "mirrors", 6)
     result = bench.fit()
     c = result.calibration(bench.base, created="2024-05-01T12:00:00Z", source="loads.csv")
-    assert c.symmetry == "mirrors" and c.source == "loads.csv" and Calibration.from_dict(c.to_dict()).id == c.id
+    assert (
+        c.symmetry == "mirrors"
+        and c.source == "loads.csv"
+        and Calibration.from_dict(c.to_dict()).id == c.id
+    )
     np.testing.assert_allclose(bench.loads @ c.response.T, result.fitted, rtol=1e-9, atol=1e-6)
     assert np.all(c.noise >= bench.base.noise)
 
 
 def test_readings_from_frequencies():
-    c = dataclasses.replace(illustrative("planar"), temperature=TemperatureModel(25, np.full((8, 1), 1e-4)))
+    c = dataclasses.replace(
+        illustrative("planar"), temperature=TemperatureModel(25, np.full((8, 1), 1e-4))
+    )
     v = np.random.default_rng(0).normal(size=(5, 8)) * 1e3
     f = pad_frequency(v, c.rest_frequency * 1.001, c.beta, c.modulus)
     np.testing.assert_allclose(measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
@@ -145,9 +170,11 @@ def test_readings_from_frequencies():
 
 def test_loads_from_a_reference_force_sensor():
     states = traction_loads(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
-    assert dict(zip(SPACE.names, states[0], strict=True)) | {"zz": -3e4, "zx": 1e4, "yz": 2e4} == dict(
-        zip(SPACE.names, states[0], strict=True)
-    )
+    assert dict(zip(SPACE.names, states[0], strict=True)) | {
+        "zz": -3e4,
+        "zx": 1e4,
+        "yz": 2e4,
+    } == dict(zip(SPACE.names, states[0], strict=True))
     assert np.count_nonzero(states) == 3
     with pytest.raises(FitError, match="area"):
         traction_loads(SPACE, np.ones((1, 3)), 0)
@@ -161,21 +188,29 @@ def test_without_gains_fewer_loads_are_enough():
     assert fit(c.structure, loads, readings).gain.shape == (8,)
 
 
-@pytest.mark.parametrize("change, words", [
-    ({"loads": np.zeros((20, 7))}, "all loads are zero"),
-    ({"loads": np.ones((20, 8))}, "shape"),
-    ({"readings": np.ones((19, 8))}, "shape"),
-    ({"readings": np.full((20, 8), np.nan)}, r"reading 1, \+z-x: nan"),
-    ({"loads": np.full((20, 7), np.inf)}, "load 1, zz: inf"),
-    ({"noise": 0}, "noise is 0"),
-    ({"noise": np.ones(3)}, "noise"),
-    ({"fixed": {"k": 1.0}}, "'k'.*a, b, c_plus_d"),
-    ({"loads": "heavy"}, "numbers"),
-    ({"loads": np.zeros((0, 7)), "readings": np.zeros((0, 8))}, "at least one"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"loads": np.zeros((20, 7))}, "all loads are zero"),
+        ({"loads": np.ones((20, 8))}, "shape"),
+        ({"readings": np.ones((19, 8))}, "shape"),
+        ({"readings": np.full((20, 8), np.nan)}, r"reading 1, \+z-x: nan"),
+        ({"loads": np.full((20, 7), np.inf)}, "load 1, zz: inf"),
+        ({"noise": 0}, "noise is 0"),
+        ({"noise": np.ones(3)}, "noise"),
+        ({"fixed": {"k": 1.0}}, "'k'.*a, b, c_plus_d"),
+        ({"loads": "heavy"}, "numbers"),
+        ({"loads": np.zeros((0, 7)), "readings": np.zeros((0, 8))}, "at least one"),
+    ],
+)
 def test_what_cannot_be_fitted_is_an_error_with_its_reason(change, words):
     bench = Bench("planar", "full", 7)
-    case = {"loads": bench.loads, "readings": bench.readings, "noise": bench.noise, "fixed": None} | change
+    case = {
+        "loads": bench.loads,
+        "readings": bench.readings,
+        "noise": bench.noise,
+        "fixed": None,
+    } | change
     with pytest.raises(FitError, match=words):
         fit(bench.structure, case["loads"], case["readings"], case["noise"], case["fixed"])
 

@@ -28,7 +28,9 @@ def test_the_law_is_the_circuit(strain, beta, area):
     def circuit(d: float) -> float:
         return k * d / (resistance * (eps * area + parasitic * d))
 
-    assert pad_stress(circuit(strain * rest), circuit(rest), beta, 3e5) == pytest.approx(3e5 * (strain - 1), abs=1e-6)
+    assert pad_stress(circuit(strain * rest), circuit(rest), beta, 3e5) == pytest.approx(
+        3e5 * (strain - 1), abs=1e-6
+    )
 
 
 @given(STRAINS, BETAS)
@@ -43,7 +45,9 @@ def test_stress_and_frequency_are_inverses(strain, beta):
 def test_the_slope_is_the_derivative(strain, beta):
     f = float(pad_frequency(3e5 * (strain - 1), 1e5, beta, 3e5))
     step = 1e-5 * min(f, float(highest_frequency(1e5, beta)) - f)
-    numeric = (pad_stress(f + step, 1e5, beta, 3e5) - pad_stress(f - step, 1e5, beta, 3e5)) / (2 * step)
+    numeric = (pad_stress(f + step, 1e5, beta, 3e5) - pad_stress(f - step, 1e5, beta, 3e5)) / (
+        2 * step
+    )
     assert stress_slope(f, 1e5, beta, 3e5) == pytest.approx(numeric, rel=1e-4)
 
 
@@ -51,20 +55,26 @@ def test_the_linear_law_touches_the_exact_one_at_rest():
     assert stress_slope(1e5, 1e5, 0.3, 3e5) == pytest.approx(3e5 * 1.3 / 1e5)
     f = 1e5 * (1 + np.array([-1e-3, 1e-3, -1e-2, 1e-2]))
     gap = linear_pad_stress(f, 1e5, 0.3, 3e5) - pad_stress(f, 1e5, 0.3, 3e5)
-    np.testing.assert_allclose(gap, -3e5 * 1.3 * 0.3 * (f / 1e5 - 1) ** 2, rtol=0.01)  # -E (1 + beta) beta u^2
+    np.testing.assert_allclose(
+        gap, -3e5 * 1.3 * 0.3 * (f / 1e5 - 1) ** 2, rtol=0.01
+    )  # -E (1 + beta) beta u^2
 
 
 def test_the_papers_equation_7_needs_r_over_k():
-    """dv = (E/d) (R/k) (eps S + C' d)^2 / (eps S) df; with k/R its value depends on the resistor at the same
-    r."""
+    """dv = (E/d) (R/k) (eps S + C' d)^2 / (eps S) df; with k/R its value depends on the resistor at
+    the same r."""
     k, eps_area, parasitic, d, modulus = 0.7, 3e-14, 2e-11, 4e-4, 3e5
     beta = parasitic * d / eps_area
     for resistance in (1e4, 1e5):
         f0 = k * d / (resistance * (eps_area + parasitic * d))
         shift = 1e-6 * f0
         rest = (eps_area + parasitic * d) ** 2 / eps_area * modulus / d * shift
-        assert resistance / k * rest == pytest.approx(linear_pad_stress(f0 + shift, f0, beta, modulus), rel=1e-6)
-        assert k / resistance * rest != pytest.approx(linear_pad_stress(f0 + shift, f0, beta, modulus), rel=0.5)
+        assert resistance / k * rest == pytest.approx(
+            linear_pad_stress(f0 + shift, f0, beta, modulus), rel=1e-6
+        )
+        assert k / resistance * rest != pytest.approx(
+            linear_pad_stress(f0 + shift, f0, beta, modulus), rel=0.5
+        )
 
 
 def test_beyond_the_range_is_no_number():

@@ -25,7 +25,10 @@ QUAD_NEGLECT = ("xx", "xx_z", "xx_x")
 
 def individual(layout: str, seed: int, **changes):
     """An illustrative calibration whose pads all differ."""
-    rng, c = np.random.default_rng(seed), illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+    rng, c = (
+        np.random.default_rng(seed),
+        illustrative(layout, QUAD_NEGLECT if layout == "quad" else ()),
+    )
     n = c.layout.n_pads
     return dataclasses.replace(
         c,
@@ -40,7 +43,10 @@ def individual(layout: str, seed: int, **changes):
 
 def frequencies(calibration, states):
     return pad_frequency(
-        states @ calibration.response.T, calibration.rest_frequency, calibration.beta, calibration.modulus
+        states @ calibration.response.T,
+        calibration.rest_frequency,
+        calibration.beta,
+        calibration.modulus,
     )
 
 
@@ -74,9 +80,15 @@ def check_rows(rows, expected, tolerance):
 @pytest.mark.parametrize("layout", ["quad", "planar", "cube"])
 @pytest.mark.parametrize("make", [illustrative, individual])
 def test_recovers_the_applied_fields(layout, make, dtype, tolerance):
-    c = make(layout, 3) if make is individual else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+    c = (
+        make(layout, 3)
+        if make is individual
+        else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+    )
     states = states_of(c, 50)
-    rows = Pipeline([c] * 50, dtype).process(np.arange(50), frequencies(c, states), np.zeros(50, np.uint32))
+    rows = Pipeline([c] * 50, dtype).process(
+        np.arange(50), frequencies(c, states), np.zeros(50, np.uint32)
+    )
     check_rows(rows, truth(c, states), tolerance)
     assert rows.status.tolist() == [0] * 50
     assert rows.stress.dtype == rows.gradient.dtype == rows.residual.dtype == dtype
@@ -89,7 +101,10 @@ def test_recovers_the_applied_fields(layout, make, dtype, tolerance):
 
 @pytest.mark.parametrize("dtype, tolerance", DTYPES)
 def test_cubes_of_all_kinds_in_one_batch(dtype, tolerance):
-    kinds = [individual(name, seed) for seed, name in enumerate(["planar", "cube", "quad", "planar", "quad"])]
+    kinds = [
+        individual(name, seed)
+        for seed, name in enumerate(["planar", "cube", "quad", "planar", "quad"])
+    ]
     pipeline = Pipeline(kinds, dtype)
     cube = np.array([4, 0, 1, 3, 2, 0, 1, 4, 4])
     frequency, expected = np.full((9, 24), np.nan), np.zeros((9, 15))
@@ -101,7 +116,9 @@ def test_cubes_of_all_kinds_in_one_batch(dtype, tolerance):
         rows = pipeline.process(cube, frequency)
         check_rows(rows, expected, tolerance)
         assert not rows.status.any()
-    assert np.isnan(rows.residual[cube == 4]).all() and np.all(rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1)
+    assert np.isnan(rows.residual[cube == 4]).all() and np.all(
+        rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1
+    )
     pads = pipeline.pad_stress(cube, frequency)
     assert np.isnan(pads[0, 4:]).all() and np.isfinite(pads[2]).all()
     k = kinds[0]
@@ -177,10 +194,16 @@ def test_strange_rows_end_in_their_status_never_in_an_error():
     wild = rng.choice([0, -1, np.nan, np.inf, -np.inf, 1e300, 1e-300, 1e5, 4.4e5], size=(500, 8))
     with np.errstate(all="raise"):
         for dtype in (np.float32, np.float64):
-            rows = Pipeline([c] * 3, dtype).process(rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500))
+            rows = Pipeline([c] * 3, dtype).process(
+                rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500)
+            )
             assert not np.isinf(joined(rows)).any()
     empty = pipeline.process(np.empty(0, int), np.empty((0, 8)), np.empty(0, np.uint32))
-    assert empty.stress.shape == (0, 6) and empty.gradient.shape == (0, 9) and empty.status.shape == (0,)
+    assert (
+        empty.stress.shape == (0, 6)
+        and empty.gradient.shape == (0, 9)
+        and empty.status.shape == (0,)
+    )
 
 
 def test_wrong_shapes_and_settings_are_errors():
@@ -242,7 +265,10 @@ def test_tare_moves_the_rest_frequency():
 
 def test_the_temperature_model_is_taken_out():
     model = TemperatureModel(25, np.outer(np.linspace(-1, 1, 8), [1e-3, 1e-5]))
-    c, plain = dataclasses.replace(illustrative("planar"), temperature=model), illustrative("planar")
+    c, plain = (
+        dataclasses.replace(illustrative("planar"), temperature=model),
+        illustrative("planar"),
+    )
     states = states_of(c, 4)
     warm = np.array([40.0, np.nan, 25.0, 10.0])
     frequency = frequencies(c, states)
@@ -262,7 +288,9 @@ def test_covariance_of_a_cube_with_a_bad_pad():
     pipeline = Pipeline([illustrative("quad"), c])
     whole, less = np.diag(pipeline.covariance(1)), np.diag(pipeline.covariance(1, 1))
     seen = np.isfinite(whole)
-    assert np.all(less[seen] >= whole[seen] * (1 - 1e-9)) and np.isnan(np.diag(pipeline.covariance(0))[0])
+    assert np.all(less[seen] >= whole[seen] * (1 - 1e-9)) and np.isnan(
+        np.diag(pipeline.covariance(0))[0]
+    )
     alone = make_estimator(c.response, c.noise, c.modes).covariance
     np.testing.assert_allclose(whole[6:], np.diag(alone)[6:] / c.half_side**2)
 
@@ -279,14 +307,19 @@ def mixed_skin(kinds: int, count: int = 60):
 @pytest.mark.parametrize("kinds", [3, 12])
 @pytest.mark.parametrize("bad", [False, True])
 def test_scans_at_once_and_in_turn_are_one_by_one_to_the_bit(kinds, bad):
-    """As recorded batches, and as a message of several turns: with few and many calibrations, with bad pads."""
+    """As recorded batches, and as a message of several turns: with few and many calibrations, with
+    bad pads."""
     pipeline, cube, frequency = mixed_skin(kinds)
     pad_fault = np.zeros(frequency.shape[:2], np.uint32)
     if bad:
         frequency[:, 7, 1], frequency[2, 30, 0], pad_fault[4:, 11] = np.nan, 1e9, 2
-    singly = [pipeline.process(cube, f, fault) for f, fault in zip(frequency, pad_fault, strict=True)]
+    singly = [
+        pipeline.process(cube, f, fault) for f, fault in zip(frequency, pad_fault, strict=True)
+    ]
     at_once = pipeline.process(cube, frequency, pad_fault)
-    in_turn = pipeline.process(np.tile(cube, 7), frequency.reshape(-1, pipeline.n_pads), pad_fault.ravel())
+    in_turn = pipeline.process(
+        np.tile(cube, 7), frequency.reshape(-1, pipeline.n_pads), pad_fault.ravel()
+    )
     for name, *several in zip(StressRows._fields, at_once, in_turn, strict=True):
         expected = np.concatenate([getattr(rows, name) for rows in singly])
         for found in several:
@@ -298,24 +331,32 @@ def test_one_cube_alone_is_the_same_cube_among_many_scans():
     """numpy multiplies a single row by another routine."""
     for layout in ("quad", "planar", "cube"):
         pipeline = Pipeline([individual(layout, 1)], np.float32)
-        f = (pipeline.rest_frequency * (1 - 0.01 * np.random.default_rng(1).random((50, 1, pipeline.n_pads)))).astype(
-            "f4"
-        )
+        f = (
+            pipeline.rest_frequency
+            * (1 - 0.01 * np.random.default_rng(1).random((50, 1, pipeline.n_pads)))
+        ).astype("f4")
         cube = np.zeros(1, np.uint16)
         at_once = pipeline.process(cube, f)
-        np.testing.assert_array_equal(at_once.stress, [pipeline.process(cube, one).stress[0] for one in f])
+        np.testing.assert_array_equal(
+            at_once.stress, [pipeline.process(cube, one).stress[0] for one in f]
+        )
 
 
 def test_mixed_layouts_cost_no_more_than_the_larger_one():
-    """Absent pads are no bad pads: half planar cubes among cubes of 24 pads are cheaper than all of 24 pads."""
+    """Absent pads are no bad pads: half planar cubes among cubes of 24 pads are cheaper than all of
+    24 pads."""
 
     def skin(layouts):
-        pipeline = Pipeline([illustrative(layouts[k * len(layouts) // 1024]) for k in range(1024)], np.float32)
+        pipeline = Pipeline(
+            [illustrative(layouts[k * len(layouts) // 1024]) for k in range(1024)], np.float32
+        )
         f = (0.99 * pipeline.rest_frequency).astype(np.float32)
         return lambda: pipeline.process(np.arange(1024, dtype=np.uint16), f)
 
     mixed, wide = skin(["planar", "cube"]), skin(["cube"])
-    costs = np.min([[timeit.timeit(mixed, number=3), timeit.timeit(wide, number=3)] for _ in range(50)], axis=0)
+    costs = np.min(
+        [[timeit.timeit(mixed, number=3), timeit.timeit(wide, number=3)] for _ in range(50)], axis=0
+    )
     assert costs[0] < 1.5 * costs[1], costs  # 0.8 measured; the slow way for bad pads took 5
 
 
@@ -334,18 +375,28 @@ def cost_of(count: int, dtype) -> np.ndarray:
     def ours():
         return pipeline.process(cube, f, fault)
 
-    return np.min([[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)], axis=0)
+    return np.min(
+        [[timeit.timeit(bare, number=5), timeit.timeit(ours, number=5)] for _ in range(100)], axis=0
+    )
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_speed_against_bare_numpy(dtype):
-    """In a process of its own: what other tests left behind, memory in pieces and threads, counts for neither side."""
+    """In a process of its own: what other tests left behind, memory in pieces and threads, counts
+    for neither side."""
     costs = f"[cost_of(n, np.{dtype}).tolist() for n in (1260, 1024, 64)]"
     script = f"from test_core_pipeline import *; print({costs})"
-    done = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, text=True,
-                          timeout=60, check=True)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
     (bare, ours), (_, large), (_, small) = json.loads(done.stdout)
-    # 1.73 measured; a busy host slows calls more than arithmetic, and numpy 1 takes 2 us more for its error state
+    # 1.73 measured; a busy host slows calls more than arithmetic, and numpy 1 takes 2 us more for
+    # its error state
     assert ours < 2.4 * bare, (ours, bare)
     assert large < 12 * small
 
@@ -372,7 +423,8 @@ def test_no_loop_over_rows():
 
 
 def test_messages_of_ever_other_cubes_fill_no_memory():
-    """Stalls make messages of parts of the skin: what is kept of their columns is bounded, in both that keep it."""
+    """Stalls make messages of parts of the skin: what is kept of their columns is bounded, in both
+    that keep it."""
     pipeline = Pipeline([illustrative("planar")] * 200)
     health = Health(pipeline)
     held = []
@@ -403,5 +455,7 @@ print(strange())
 import cube_tensor_driver.core.tensor, cube_tensor_driver.core.scene
 print(strange())
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60
+    )
     assert done.stdout.splitlines() == ["[]", "['transforms3d']"], done.stdout + done.stderr

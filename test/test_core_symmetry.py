@@ -1,4 +1,5 @@
-"""Layouts, modes and the response that symmetry leaves: against the paper's matrix and characters."""
+"""Layouts, modes and the response that symmetry leaves: against the paper's matrix and
+characters."""
 
 import numpy as np
 import pytest
@@ -42,10 +43,18 @@ PAPER_ROWS = """
 """
 # Number of coefficients by layout and group, with PLANE or SPACE modes.
 COUNTS = {
-    ("quad", "slab"): 7, ("quad", "mirrors"): 7, ("quad", "none"): 28,
-    ("planar", "full"): 7, ("planar", "slab"): 14, ("planar", "mirrors"): 14, ("planar", "none"): 56,
-    ("cube", "full"): 12, ("cube", "slab"): 36, ("cube", "mirrors"): 72, ("cube", "none"): 504,
-}  # fmt: skip
+    ("quad", "slab"): 7,
+    ("quad", "mirrors"): 7,
+    ("quad", "none"): 28,
+    ("planar", "full"): 7,
+    ("planar", "slab"): 14,
+    ("planar", "mirrors"): 14,
+    ("planar", "none"): 56,
+    ("cube", "full"): 12,
+    ("cube", "slab"): 36,
+    ("cube", "mirrors"): 72,
+    ("cube", "none"): 504,
+}
 PAIRS = sorted(COUNTS)
 
 
@@ -53,7 +62,9 @@ def paper_matrix(**letters: float) -> np.ndarray:
     def value(text: str) -> float:
         return -letters[text[1:]] if text[0] == "-" else letters[text]
 
-    return np.array([[value(t) for t in row.split()] for row in PAPER_ROWS.split("\n") if row.strip()])
+    return np.array(
+        [[value(t) for t in row.split()] for row in PAPER_ROWS.split("\n") if row.strip()]
+    )
 
 
 def random_response(structure: Structure, seed: int = 0) -> np.ndarray:
@@ -62,7 +73,16 @@ def random_response(structure: Structure, seed: int = 0) -> np.ndarray:
 
 
 def test_the_pads_of_the_built_in_layouts():
-    assert LAYOUTS["planar"].pads == ("+z-x", "+z+x", "-z-x", "-z+x", "+x-z", "+x+z", "-x-z", "-x+z")
+    assert LAYOUTS["planar"].pads == (
+        "+z-x",
+        "+z+x",
+        "-z-x",
+        "-z+x",
+        "+x-z",
+        "+x+z",
+        "-x-z",
+        "-x+z",
+    )
     assert LAYOUTS["quad"].pads == LAYOUTS["planar"].pads[:4]
     cube = LAYOUTS["cube"]
     assert cube.pads[:8] == LAYOUTS["planar"].pads and len(set(cube.pads)) == 24
@@ -78,20 +98,23 @@ def test_a_layout_survives_plain_types():
     assert not LAYOUTS["quad"].same_as(LAYOUTS["planar"])
 
 
-@pytest.mark.parametrize("change, words", [
-    ({"normals": [[0, 0, 2]]}, "normal"),
-    ({"positions": [[0, 0, 0.9]]}, "not on the face"),
-    ({"positions": [[0.9, 0, 1]]}, "face ends at 1"),
-    ({"positions": [[0, 0, 1], [0, 0, 1]], "normals": [[0, 0, 1], [0, 0, 1]]}, "coincide"),
-    ({"positions": [[0, 0]]}, "x, y, z"),
-    ({"positions": "left"}, "x, y, z"),
-    ({"positions": [[0, 0, float("nan")]]}, "finite"),
-    ({"pad_size": 0}, "pad_size"),
-    ({"pad_size": "big"}, "pad_size"),
-    ({"colour": "red"}, "colour"),
-    ({"positions": [], "normals": []}, "x, y, z"),
-    ({"positions": [[0, 0, 1], [0.5, 0, 1]]}, "2 positions but 1 normals"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"normals": [[0, 0, 2]]}, "normal"),
+        ({"positions": [[0, 0, 0.9]]}, "not on the face"),
+        ({"positions": [[0.9, 0, 1]]}, "face ends at 1"),
+        ({"positions": [[0, 0, 1], [0, 0, 1]], "normals": [[0, 0, 1], [0, 0, 1]]}, "coincide"),
+        ({"positions": [[0, 0]]}, "x, y, z"),
+        ({"positions": "left"}, "x, y, z"),
+        ({"positions": [[0, 0, float("nan")]]}, "finite"),
+        ({"pad_size": 0}, "pad_size"),
+        ({"pad_size": "big"}, "pad_size"),
+        ({"colour": "red"}, "colour"),
+        ({"positions": [], "normals": []}, "x, y, z"),
+        ({"positions": [[0, 0, 1], [0.5, 0, 1]]}, "2 positions but 1 normals"),
+    ],
+)
 def test_a_bad_layout_is_refused_with_the_reason(change, words):
     good = {"name": "mine", "positions": [[0, 0, 1]], "normals": [[0, 0, 1]], "pad_size": 0.4}
     assert Layout.from_dict(good).pads == ("+z",)
@@ -134,7 +157,9 @@ def test_a_field_becomes_a_state_and_back():
     stress, gradient = SPACE.field(state)
     read = np.concatenate([to_six(stress), np.einsum("niij->nij", gradient).reshape(5, 9)], axis=1)
     np.testing.assert_allclose(state @ SPACE.components.T, read, atol=1e-14)
-    np.testing.assert_array_equal(PLANE.state(np.array([[3, 9, 1, 9, 2, 9.0]])), [[1, 2, 3, 0, 0, 0, 0]])
+    np.testing.assert_array_equal(
+        PLANE.state(np.array([[3, 9, 1, 9, 2, 9.0]])), [[1, 2, 3, 0, 0, 0, 0]]
+    )
     np.testing.assert_array_equal(to_six(to_matrix(np.arange(6.0))), np.arange(6.0))
 
 
@@ -162,13 +187,19 @@ def test_the_action_on_modes_composes(i, j):
     inverse = np.linalg.inv(a)
     np.testing.assert_allclose(SPACE.action(inverse) @ SPACE.action(a), np.eye(21), atol=1e-12)
     cube = LAYOUTS["cube"]
-    np.testing.assert_array_equal(pad_action(cube, a @ b), pad_action(cube, a) @ pad_action(cube, b))
+    np.testing.assert_array_equal(
+        pad_action(cube, a @ b), pad_action(cube, a) @ pad_action(cube, b)
+    )
 
 
 @pytest.mark.parametrize("layout, symmetry", PAIRS)
 def test_the_number_of_coefficients(layout, symmetry):
     structure = find_structure(LAYOUTS[layout], symmetry)
-    assert structure.n_coefficients == COUNTS[layout, symmetry] == count_by_characters(LAYOUTS[layout], symmetry)
+    assert (
+        structure.n_coefficients
+        == COUNTS[layout, symmetry]
+        == count_by_characters(LAYOUTS[layout], symmetry)
+    )
     flat = structure.basis.reshape(structure.n_coefficients, -1)
     assert np.linalg.matrix_rank(flat) == structure.n_coefficients
     assert set(np.unique(flat)) <= {-1.0, 0.0, 1.0}
@@ -178,7 +209,8 @@ def test_the_number_of_coefficients(layout, symmetry):
 
 @pytest.mark.parametrize("layout, symmetry", PAIRS)
 def test_turned_loads_are_seen_by_turned_pads(layout, symmetry):
-    """A M(R) = P(R) A, and the recovered state turns with the load, for every element of every group."""
+    """A M(R) = P(R) A, and the recovered state turns with the load, for every element of every
+    group."""
     structure = find_structure(LAYOUTS[layout], symmetry)
     modes, a = structure.modes, random_response(structure)
     state = np.random.default_rng(2).normal(size=modes.n_modes)
@@ -197,7 +229,10 @@ def test_projection_averages_over_the_group(layout, symmetry):
     structure = find_structure(LAYOUTS[layout], symmetry)
     a = np.random.default_rng(3).normal(size=structure.basis.shape[1:])
     elements = layout_group(structure.layout, symmetry)
-    mean = np.mean([pad_action(structure.layout, r).T @ a @ structure.modes.action(r) for r in elements], axis=0)
+    mean = np.mean(
+        [pad_action(structure.layout, r).T @ a @ structure.modes.action(r) for r in elements],
+        axis=0,
+    )
     coefficients, unexplained = project(structure, a)
     np.testing.assert_allclose(response(structure, coefficients), mean, atol=1e-12)
     assert unexplained == pytest.approx(np.linalg.norm(a - mean) / np.linalg.norm(a))
@@ -211,12 +246,16 @@ def test_the_derived_basis_spans_the_papers_matrix():
     np.testing.assert_allclose(response(structure, letters), paper_matrix(**letters), atol=1e-15)
     assert find_structure(LAYOUTS["planar"], "mirrors", PAPER).n_coefficients == 16
     equilibrium = find_structure(LAYOUTS["planar"], "full")
-    merged = {k: v for k, v in letters.items() if k not in "cd"} | {"c_plus_d": letters["c"] + letters["d"]}
+    merged = {k: v for k, v in letters.items() if k not in "cd"} | {
+        "c_plus_d": letters["c"] + letters["d"]
+    }
     shear = np.zeros((8, 7))
     for column, mode in enumerate(PLANE.names):
         shear[PAPER.names.index(mode), column] = 1
     shear[PAPER.names.index("xz"), PLANE.names.index("zx")] = 1
-    np.testing.assert_allclose(response(equilibrium, merged), paper_matrix(**letters) @ shear, atol=1e-14)
+    np.testing.assert_allclose(
+        response(equilibrium, merged), paper_matrix(**letters) @ shear, atol=1e-14
+    )
 
 
 def test_the_printed_inverses_fail_and_the_corrected_ones_agree_with_least_squares():
@@ -232,24 +271,37 @@ def test_the_printed_inverses_fail_and_the_corrected_ones_agree_with_least_squar
     tilt, lift = -v1 + v2 - v3 + v4, v5 + v6 - v7 - v8
     bottom = 4 * (c["e"] * c["g"] - c["f"] * c["h"])
     assert (c["g"] * tilt - c["h"] * lift) / bottom == pytest.approx(zz_x)
-    assert abs((c["h"] * tilt - c["g"] * lift) / bottom - zz_x) > 0.1  # eq. 5: g and h on the wrong brackets
+    assert (
+        abs((c["h"] * tilt - c["g"] * lift) / bottom - zz_x) > 0.1
+    )  # eq. 5: g and h on the wrong brackets
     structure = find_structure(LAYOUTS["planar"])
     coefficients = {k: x for k, x in c.items() if k not in "cd"} | {"c_plus_d": c["c"] + c["d"]}
-    estimator = make_estimator(response(structure, coefficients), np.ones(8), PLANE, targets=np.eye(7))
+    estimator = make_estimator(
+        response(structure, coefficients), np.ones(8), PLANE, targets=np.eye(7)
+    )
     np.testing.assert_allclose(estimator.matrix @ v, state, atol=1e-13)
 
 
 def test_the_prototypes_readings_are_sums_of_the_response():
-    """Eqs. 8 to 10 with V for the frequency shift: P_grad is the true gradient only where xx_x is known."""
+    """Eqs. 8 to 10 with V for the frequency shift: P_grad is the true gradient only where xx_x is
+    known."""
     structure = find_structure(LAYOUTS["quad"], "slab")
     a = response(structure, ILLUSTRATIVE)
-    shown = {"zz": (0, -4 * 1.4), "xx": (0, 4 * 0.3), "zx": (1, 4 * 0.5), "zz_x": (2, -4 * 0.9), "xx_x": (2, 4 * 0.3)}
+    shown = {
+        "zz": (0, -4 * 1.4),
+        "xx": (0, 4 * 0.3),
+        "zx": (1, 4 * 0.5),
+        "zz_x": (2, -4 * 0.9),
+        "xx_x": (2, 4 * 0.3),
+    }
     expected = np.zeros((7, 3))
     for mode, (reading, value) in shown.items():
         expected[PLANE.names.index(mode), reading] = value
     np.testing.assert_allclose(prototype(a.T), expected, atol=1e-14)
     v1, v2, v3, v4 = shift = np.array([1.0, 20, 300, 4000])
-    np.testing.assert_array_equal(prototype(shift), [-v1 - v2 - v3 - v4, -v1 + v2 + v3 - v4, v1 - v2 + v3 - v4])
+    np.testing.assert_array_equal(
+        prototype(shift), [-v1 - v2 - v3 - v4, -v1 + v2 + v3 - v4, v1 - v2 + v3 - v4]
+    )
 
 
 def test_a_symmetry_that_the_layout_lacks_names_the_pad():
@@ -264,7 +316,9 @@ def test_a_symmetry_that_the_layout_lacks_names_the_pad():
 def test_the_illustrative_responses_agree_with_each_other():
     whole = {"quad": "slab", "planar": "full", "cube": "full"}
     a = {
-        n: response(find_structure(LAYOUTS[n], g), illustrative_coefficients(find_structure(LAYOUTS[n], g)))
+        n: response(
+            find_structure(LAYOUTS[n], g), illustrative_coefficients(find_structure(LAYOUTS[n], g))
+        )
         for n, g in whole.items()
     }
     np.testing.assert_array_equal(a["quad"], a["planar"][:4])
@@ -272,8 +326,11 @@ def test_the_illustrative_responses_agree_with_each_other():
     np.testing.assert_allclose(a["cube"][:8] @ plane_in_space, a["planar"], atol=1e-15)
     for name, symmetry in (("planar", "mirrors"), ("cube", "slab"), ("cube", "none")):
         structure = find_structure(LAYOUTS[name], symmetry)
-        np.testing.assert_allclose(response(structure, illustrative_coefficients(structure)), a[name], atol=1e-15)
-    # as many combinations as any response of this symmetry has: only yz_x, zx_y and xy_z stay hidden
+        np.testing.assert_allclose(
+            response(structure, illustrative_coefficients(structure)), a[name], atol=1e-15
+        )
+    # as many combinations as any response of this symmetry has: only yz_x, zx_y and xy_z stay
+    # hidden
     assert (
         np.linalg.matrix_rank(a["cube"])
         == np.linalg.matrix_rank(random_response(find_structure(LAYOUTS["cube"])))
@@ -294,7 +351,17 @@ def test_coefficients_that_do_not_fit_are_named():
 
 def test_every_component_has_its_place():
     assert COMPONENTS[:6] == ("xx", "yy", "zz", "yz", "zx", "xy")
-    assert COMPONENTS[6:] == ("xx_x", "xx_y", "xx_z", "yy_x", "yy_y", "yy_z", "zz_x", "zz_y", "zz_z")
+    assert COMPONENTS[6:] == (
+        "xx_x",
+        "xx_y",
+        "xx_z",
+        "yy_x",
+        "yy_y",
+        "yy_z",
+        "zz_x",
+        "zz_y",
+        "zz_z",
+    )
     assert default_modes(LAYOUTS["quad"]) is PLANE and default_modes(LAYOUTS["cube"]) is SPACE
     assert set(GENERATORS) == {"full", "slab", "mirrors", "none"}
     np.testing.assert_array_equal(PAPER.components[4], [0, 0.5, 0, 0.5, 0, 0, 0, 0])

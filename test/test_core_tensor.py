@@ -33,9 +33,15 @@ def test_principal_stresses_are_tractions_along_their_directions():
         np.testing.assert_allclose(
             traction(STRESS, directions[:, k]), values[:, k, None] * directions[:, k], atol=1e-12
         )
-    np.testing.assert_allclose(directions @ directions.transpose(0, 2, 1), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        directions @ directions.transpose(0, 2, 1), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12
+    )
     values, directions = principal_stresses(np.array([[np.nan, 0, 0, 0, 0, 0], [1, 2, 3, 0, 0, 0]]))
-    assert np.isnan(values[0]).all() and np.isnan(directions[0]).all() and values[1].tolist() == [3, 2, 1]
+    assert (
+        np.isnan(values[0]).all()
+        and np.isnan(directions[0]).all()
+        and values[1].tolist() == [3, 2, 1]
+    )
 
 
 def test_invariants_are_those_of_the_principal_stresses():
@@ -43,7 +49,9 @@ def test_invariants_are_those_of_the_principal_stresses():
     np.testing.assert_allclose(
         invariants(STRESS), np.stack([a + b + c, a * b + b * c + c * a, a * b * c], 1), atol=1e-12
     )
-    np.testing.assert_allclose(von_mises(STRESS), np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2), atol=1e-12)
+    np.testing.assert_allclose(
+        von_mises(STRESS), np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2), atol=1e-12
+    )
     assert von_mises(np.array([5.0, 0, 0, 0, 0, 0])) == 5  # uniaxial
     assert von_mises(np.array([0, 0, 0, 0, 2.0, 0])) == pytest.approx(2 * np.sqrt(3))  # shear
 
@@ -60,12 +68,18 @@ def test_traction_on_the_faces_is_a_column():
 def test_rotations_compose(one, two):
     r1, r2 = rotation_from_rpy(*one), rotation_from_rpy(*two)
     gradient = SPACE.gradient
-    np.testing.assert_allclose(rotate_stress(rotate_stress(STRESS, r1), r2), rotate_stress(STRESS, r2 @ r1), atol=1e-12)
     np.testing.assert_allclose(
-        rotate_gradient(rotate_gradient(gradient, r1), r2), rotate_gradient(gradient, r2 @ r1), atol=1e-12
+        rotate_stress(rotate_stress(STRESS, r1), r2), rotate_stress(STRESS, r2 @ r1), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        rotate_gradient(rotate_gradient(gradient, r1), r2),
+        rotate_gradient(gradient, r2 @ r1),
+        atol=1e-12,
     )
     np.testing.assert_allclose(rotate_stress(rotate_stress(STRESS, r1), r1.T), STRESS, atol=1e-12)
-    np.testing.assert_allclose(invariants(rotate_stress(STRESS, r1)), invariants(STRESS), atol=1e-10)
+    np.testing.assert_allclose(
+        invariants(rotate_stress(STRESS, r1)), invariants(STRESS), atol=1e-10
+    )
 
 
 @given(ANGLES)
@@ -106,7 +120,9 @@ def test_rpy_and_quaternions_agree(rpy):
 
 
 def test_quaternions_are_in_ros_order():
-    np.testing.assert_allclose(quaternion_from_rpy(0, 0, np.pi / 2), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
+    np.testing.assert_allclose(
+        quaternion_from_rpy(0, 0, np.pi / 2), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15
+    )
     for bad in ([0, 0, 0, 0], [np.nan, 0, 0, 1]):
         with pytest.raises(CubeError, match="quaternion"):
             rotation_from_quaternion(bad)
@@ -122,6 +138,8 @@ def test_the_wrench_is_the_integral_over_the_face():
     area = (side / n) ** 2
     force, torque = contact_wrench(stress, gradient, side)
     np.testing.assert_allclose(force[0], [5 * side**2, 4 * side**2, zz.sum() * area])
-    np.testing.assert_allclose(torque[0], [(y * zz).sum() * area, -(x * zz).sum() * area, 0], rtol=1e-4)
+    np.testing.assert_allclose(
+        torque[0], [(y * zz).sum() * area, -(x * zz).sum() * area, 0], rtol=1e-4
+    )
     force, torque = contact_wrench(np.full((1, 6), np.nan), np.full((1, 9), np.nan), side)
     assert not force.any() and not torque.any()

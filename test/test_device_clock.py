@@ -18,7 +18,8 @@ EPOCH_NS = 1_700_000_000 * 10**9
 
 
 def usb_bursts(true_s: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.float64]:
-    """All that is ready is handed over every 16 ms (the FTDI latency timer), plus the scheduler's delay."""
+    """All that is ready is handed over every 16 ms (the FTDI latency timer), plus the scheduler's
+    delay."""
     return np.ceil((true_s + BASE_S) / 0.016) * 0.016 + random.exponential(50e-6, len(true_s))
 
 
@@ -36,7 +37,8 @@ DELAYS = [(usb_bursts, 237.0), (usb_bursts, 90.7), (random_delays, 100.0), (stal
 
 
 class Run:
-    """One hub for duration_s: what the map made of it, errors in ms against true time plus BASE_S."""
+    """One hub for duration_s: what the map made of it, errors in ms against true time plus
+    BASE_S."""
 
     def __init__(self, delay, rate: float, drift_ppm: float, duration_s: float, seed: int) -> None:
         random = np.random.default_rng(seed)
@@ -48,7 +50,9 @@ class Run:
         stamps = []
         edges = [0, *(np.flatnonzero(np.diff(arrival_ns) > 100_000) + 1), len(true_s)]
         for start, stop in pairwise(edges):
-            stamps.append(self.clock.update(device_us[start:stop].tolist(), int(arrival_ns[stop - 1])))
+            stamps.append(
+                self.clock.update(device_us[start:stop].tolist(), int(arrival_ns[stop - 1]))
+            )
         self.true_s, self.arrival_ns, self.stamp_ns = true_s, arrival_ns, np.concatenate(stamps)
         # The last arrival of a group stands for all of it, at most 0.1 ms later than their own.
         self.error_ms = (self.stamp_ns - EPOCH_NS) * 1e-6 - (true_s + BASE_S) * 1e3
@@ -68,8 +72,8 @@ def test_stamps_and_drift(delay, rate: float, drift_ppm: float) -> None:
 
 
 def test_bursts_in_step_with_the_samples() -> None:
-    """1 kHz and 16 ms: the least delay creeps through a whole sample period before it repeats, so until then
-    1 ms is the best that can be known; the scheduler's 50 µs come on top."""
+    """1 kHz and 16 ms: the least delay creeps through a whole sample period before it repeats, so
+    until then 1 ms is the best that can be known; the scheduler's 50 µs come on top."""
     for seed, drift_ppm in enumerate((-100.0, -37.0, 55.0)):
         run = Run(usb_bursts, 1000.0, drift_ppm, 65.0, seed)
         assert np.abs(run.error_ms[run.true_s > 10.0]).max() < 1.2
@@ -106,8 +110,8 @@ def test_restart_inside_one_batch() -> None:
 
 @pytest.mark.parametrize("step_us", [5_000_000, 300_000, -300_000, 40_000, -40_000])
 def test_device_clock_set(step_us: int) -> None:
-    """A clock that jumps while samples go on: right again within three buckets (seconds) and as sharp as
-    before."""
+    """A clock that jumps while samples go on: right again within three buckets (seconds) and as
+    sharp as before."""
     clock = ClockMap()
     errors = []
     for k in range(3000):  # 30 s at 100 Hz, 0.1 ms of delay
@@ -153,7 +157,8 @@ def test_device_time_of_64_bits() -> None:
     assert stamps == [EPOCH_NS - 20_000_000, EPOCH_NS - 10_000_000, EPOCH_NS]
 
 
-# (sequence, device time in ms) -> verdict; then delivered, missing, duplicate, out of order, resets.
+# (sequence, device time in ms) -> verdict; then delivered, missing, duplicate, out of order,
+# resets.
 N, L, D, R = Verdict.NEW, Verdict.LATE, Verdict.DUPLICATE, Verdict.RESET
 TOP = 2**32 - 1
 SEQUENCES = {
@@ -166,14 +171,26 @@ SEQUENCES = {
     "gap over the wrap": ([(TOP - 1, 50), (1, 80)], [N, N], (2, 2, 0, 0, 0)),
     "late over the wrap": ([(TOP, 50), (1, 70), (0, 60)], [N, N, L], (3, 0, 0, 1, 0)),
     "restart from far": ([(5000, 50_000), (0, 1)], [N, R], (2, 0, 0, 0, 1)),
-    "restart to a seen number": ([(0, 900), (1, 910), (0, 2), (1, 12)], [N, N, R, N], (4, 0, 0, 0, 1)),
-    "restart soon after joining": ([(40, 5000), (41, 5010), (0, 1), (1, 11)], [N, N, R, N], (4, 0, 0, 0, 1)),
-    "restart into a gap": ([(5, 5050), (9, 5090), (7, 3), (8, 13)], [N, N, R, N], (4, 3 + 7, 0, 0, 1)),
+    "restart to a seen number": (
+        [(0, 900), (1, 910), (0, 2), (1, 12)],
+        [N, N, R, N],
+        (4, 0, 0, 0, 1),
+    ),
+    "restart soon after joining": (
+        [(40, 5000), (41, 5010), (0, 1), (1, 11)],
+        [N, N, R, N],
+        (4, 0, 0, 0, 1),
+    ),
+    "restart into a gap": (
+        [(5, 5050), (9, 5090), (7, 3), (8, 13)],
+        [N, N, R, N],
+        (4, 3 + 7, 0, 0, 1),
+    ),
     "before the first": ([(5, 50), (4, 40), (6, 60)], [N, L, N], (3, 0, 0, 1, 0)),
     "two before the first": ([(5, 50), (3, 30), (4, 40)], [N, L, L], (3, 0, 0, 2, 0)),
     "clock set back, count goes on": ([(5, 5000), (6, 1), (7, 11)], [N, R, N], (3, 0, 0, 0, 1)),
     "far ahead is a restart": ([(TOP // 4, 50_000), (TOP // 2, 1)], [N, R], (2, 0, 0, 0, 1)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", list(SEQUENCES))
@@ -188,7 +205,8 @@ def test_sequence(name: str) -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_sequence_conserves(data: st.DataObject) -> None:
-    """Drops, copies and local disorder: taken = delivered + missing, received = delivered + duplicate."""
+    """Drops, copies and local disorder: taken = delivered + missing, received = delivered +
+    duplicate."""
     start = data.draw(st.sampled_from([0, 1000, TOP - 20]))
     taken = data.draw(st.integers(1, 50))
     received = []

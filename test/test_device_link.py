@@ -1,5 +1,5 @@
-"""Links over real pseudo-terminals and local TCP sockets; what cannot be provoked as root goes through
-errno."""
+"""Links over real pseudo-terminals and local TCP sockets; what cannot be provoked as root goes
+through errno."""
 
 from __future__ import annotations
 
@@ -103,7 +103,9 @@ def test_tcp_both_ways_and_lost(server: socket.socket) -> None:
     peer, _ = server.accept()
     with peer:
         with socket.socket(fileno=os.dup(link.fileno())) as same:
-            assert same.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY), "requests must not be held back"
+            assert same.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY), (
+                "requests must not be held back"
+            )
         peer.sendall(b"hello")
         assert readable(link) == b"hello"
         link.write(b"answer")
@@ -147,7 +149,8 @@ def test_output_is_bounded(server: socket.socket) -> None:
 
 
 def test_close_discards_what_the_hub_does_not_read(pty: tuple[int, str], monkeypatch) -> None:
-    """Else the kernel waits up to 30 s in closing a real serial port; for a pseudo-terminal it never does."""
+    """Else the kernel waits up to 30 s in closing a real serial port; for a pseudo-terminal it
+    never does."""
     flushed = []
     monkeypatch.setattr(termios, "tcflush", lambda fd, which: flushed.append(which))
     link = opened(Link(LinkConfig("a", pty[1])))
@@ -194,7 +197,14 @@ def test_regular_file_is_no_serial_port(tmp_path: Path) -> None:
     assert failed.value.kind == "not_serial"
 
 
-NEVER = ["", "socket://", "socket://host", "socket://host:0", "socket://host:99999", "socket://[::1:5"]
+NEVER = [
+    "",
+    "socket://",
+    "socket://host",
+    "socket://host:0",
+    "socket://host:99999",
+    "socket://[::1:5",
+]
 
 
 @pytest.mark.parametrize("port", NEVER)
@@ -219,7 +229,9 @@ def test_busy(pty: tuple[int, str]) -> None:
     opened(Link(LinkConfig("b", pty[1]))).close()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may open every port; see test_classified_by_errno")
+@pytest.mark.skipif(
+    os.geteuid() == 0, reason="root may open every port; see test_classified_by_errno"
+)
 def test_no_permission(pty: tuple[int, str]) -> None:
     Path(pty[1]).chmod(0)
     with pytest.raises(LinkError, match="dialout") as failed:
@@ -297,7 +309,9 @@ def test_tcp_tries_every_address(server: socket.socket, monkeypatch: pytest.Monk
     with socket.create_server(("127.0.0.1", 0)) as dead:
         dead_address = dead.getsockname()
     good = server.getsockname()
-    found = [(socket.AF_INET, socket.SOCK_STREAM, 0, "", address) for address in (dead_address, good)]
+    found = [
+        (socket.AF_INET, socket.SOCK_STREAM, 0, "", address) for address in (dead_address, good)
+    ]
     monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *a, **o: list(found))
     opened(Link(LinkConfig("a", f"socket://name:{good[1]}"))).close()
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cube_tensor_driver.device.prepared import Prepared
 from cube_tensor_driver.device.protocol import Sample, encode
+from cube_tensor_driver.simulation.prepared_frames import Prepared
 
 LOWEST = {"with zeros": 0, "without a zero byte": 0x01010101}
 """Of frequencies, faults and temperatures: COBS codes long runs without a zero another way."""
@@ -20,7 +20,9 @@ LOWEST = {"with zeros": 0, "without a zero byte": 0x01010101}
     n_cubes=st.integers(0, 20),
     n_pads=st.integers(1, 24),
     seed=st.integers(0, 2**32 - 1),
-    numbers=st.lists(st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1)), min_size=1, max_size=5),
+    numbers=st.lists(
+        st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1)), min_size=1, max_size=5
+    ),
 )
 def test_the_same_bytes_as_encode(lowest, n_cubes, n_pads, seed, numbers):
     random = np.random.default_rng(seed)
@@ -30,8 +32,12 @@ def test_the_same_bytes_as_encode(lowest, n_cubes, n_pads, seed, numbers):
         whole = np.maximum(values.view("u1"), np.uint8(lowest & 1)).view("<u4").reshape(shape)
         return whole if kind == "<u4" else whole.astype("<u2").view(kind)
 
-    sample = Sample(7, 3, 11, some((n_cubes, n_pads), "<u4"), some(n_cubes, "<u4"), some(n_cubes, "<i2"))
+    sample = Sample(
+        7, 3, 11, some((n_cubes, n_pads), "<u4"), some(n_cubes, "<u4"), some(n_cubes, "<i2")
+    )
     prepared = Prepared(sample)
     for sequence, device_us in numbers:
-        again = Sample(sequence, 3, device_us, sample.frequency, sample.pad_fault, sample.temperature)
+        again = Sample(
+            sequence, 3, device_us, sample.frequency, sample.pad_fault, sample.temperature
+        )
         assert prepared.encode(sequence, device_us) == encode(again)

@@ -1,5 +1,5 @@
-"""Wire protocol: the dumps of docs/protocol.md are the golden data; every case whole, byte by byte and in
-junk."""
+"""Wire protocol: the dumps of docs/protocol.md are the golden data; every case whole, byte by byte
+and in junk."""
 
 from __future__ import annotations
 
@@ -129,7 +129,12 @@ def test_decoded_values() -> None:
     """Field by field, so that encoder and decoder cannot be wrong in the same way."""
     (hello,) = Decoder().feed(dump("wire", "hello"))
     assert isinstance(hello, Hello)
-    assert (hello.hub_uid, hello.firmware, hello.n_pads, hello.flags) == (0x1122334455667788, 0x10203, 4, 0)
+    assert (hello.hub_uid, hello.firmware, hello.n_pads, hello.flags) == (
+        0x1122334455667788,
+        0x10203,
+        4,
+        0,
+    )
     assert (hello.period_us, hello.n_cubes, hello.cube_uids.tolist()) == (10_000, 2, [0xA1, 0xA2])
     (sample,) = Decoder().feed(dump("wire", "sample"))
     assert isinstance(sample, Sample)
@@ -150,12 +155,24 @@ def test_arrays_are_views_that_cannot_be_written() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("feed", [lambda data, d: d.feed(data), by_byte], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize(
+    "feed", [lambda data, d: d.feed(data), by_byte], ids=["whole", "byte by byte"]
+)
 def test_junk_around_loses_no_frame(name: str, feed) -> None:
     good = FRAMES[name]
     cut = encode(good)[:-5]  # no closing zero: the next frame's opening zero ends it
     decoder = Decoder()
-    stream = JUNK + encode(good) + JUNK + encode(good) + cut + encode(good) + b"\0\0\0" + encode(good)[1:] + JUNK
+    stream = (
+        JUNK
+        + encode(good)
+        + JUNK
+        + encode(good)
+        + cut
+        + encode(good)
+        + b"\0\0\0"
+        + encode(good)[1:]
+        + JUNK
+    )
     assert same(feed(stream, decoder), [good] * 4)
     assert decoder.counters.frames == 4
     assert sum(errors(decoder).values()) == 3
@@ -181,9 +198,15 @@ BAD = {
     "byte after the payload": (wire(bytes([0x03, 1, 18, 0]) + STATS_PAYLOAD + b"\0"), "length"),
     "sample with a byte too many": (wire(bytes([2, 1, 21, 0]) + bytes(21)), "length"),
     "empty hello": (wire(bytes([0x01, 1, 0, 0])), "length"),
-    "hello says 1 cube, has none": (wire(bytes([1, 1, 20, 0]) + bytes(12) + b"\1" + bytes(7)), "length"),
+    "hello says 1 cube, has none": (
+        wire(bytes([1, 1, 20, 0]) + bytes(12) + b"\1" + bytes(7)),
+        "length",
+    ),
     "empty sample": (wire(bytes([0x02, 1, 0, 0])), "length"),
-    "sample says 1 cube, has none": (wire(bytes([2, 1, 20, 0]) + bytes(6) + b"\1" + bytes(13)), "length"),
+    "sample says 1 cube, has none": (
+        wire(bytes([2, 1, 20, 0]) + bytes(6) + b"\1" + bytes(13)),
+        "length",
+    ),
     "request too short": (wire(bytes([0x10, 1, 4, 0]) + bytes(4)), "length"),
     "ack too short": (wire(bytes([0x11, 1, 5, 0]) + bytes(5)), "length"),
     "overrun": (b"\0" + b"\1" * (MAX_RUN + 1) + b"\0", "overrun"),
@@ -191,7 +214,9 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", list(BAD))
-@pytest.mark.parametrize("feed", [lambda data, d: d.feed(data), by_byte], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize(
+    "feed", [lambda data, d: d.feed(data), by_byte], ids=["whole", "byte by byte"]
+)
 def test_bad_run_is_counted_once_and_named(name: str, feed) -> None:
     data, counter = BAD[name]
     decoder = Decoder()
@@ -233,11 +258,21 @@ def test_every_field_holds_its_whole_range(frame: Frame) -> None:
 
 
 def test_longest_frame_passes() -> None:
-    """65530 of 65535 bytes of payload, without a zero byte in the arrays: the worst case of COBS."""
+    """65530 of 65535 bytes of payload, without a zero byte in the arrays: the worst case of
+    COBS."""
     n = (65535 - 20) // 10
-    ones = Sample(1, 0, 1, np.full((n, 1), 0x01010101, "<u4"), np.full(n, 0x01010101, "<u4"), np.full(n, 0x101, "<i2"))
+    ones = Sample(
+        1,
+        0,
+        1,
+        np.full((n, 1), 0x01010101, "<u4"),
+        np.full(n, 0x01010101, "<u4"),
+        np.full(n, 0x101, "<i2"),
+    )
     assert same(Decoder().feed(encode(ones)), [ones])
-    too_long = Sample(1, 0, 1, np.ones((n + 1, 1), "<u4"), np.ones(n + 1, "<u4"), np.ones(n + 1, "<i2"))
+    too_long = Sample(
+        1, 0, 1, np.ones((n + 1, 1), "<u4"), np.ones(n + 1, "<u4"), np.ones(n + 1, "<i2")
+    )
     with pytest.raises(ProtocolError, match=r"65540 bytes, the limit is 65535"):
         encode(too_long)
 
@@ -257,7 +292,10 @@ def test_memory_is_bounded() -> None:
         (Stats(0, -1, 0), "Stats"),
         (Hello(1 << 64, 0, 8, 1, np.zeros(0, "<u8")), "Hello"),
         (Hello(1, 0, 8, 1, np.zeros(2, "<i8")), "cube_uids is int64"),
-        (Sample(0, 0, 0, np.zeros((2, 8)), np.zeros(2, "<u4"), np.zeros(2, "<i2")), "frequency is float64"),
+        (
+            Sample(0, 0, 0, np.zeros((2, 8)), np.zeros(2, "<u4"), np.zeros(2, "<i2")),
+            "frequency is float64",
+        ),
         (
             Sample(0, 0, 0, np.zeros(8, "<u4"), np.zeros(2, "<u4"), np.zeros(2, "<i2")),
             "1 dimensions, must have 2",
@@ -266,7 +304,10 @@ def test_memory_is_bounded() -> None:
             Sample(0, 0, 0, np.zeros((2, 8), "<u4"), np.zeros(3, "<u4"), np.zeros(2, "<i2")),
             r"pad_fault .*\(3,\)",
         ),
-        (Sample(0, 0, 0, np.zeros((1, 300), "<u4"), np.zeros(1, "<u4"), np.zeros(1, "<i2")), "Sample"),
+        (
+            Sample(0, 0, 0, np.zeros((1, 300), "<u4"), np.zeros(1, "<u4"), np.zeros(1, "<i2")),
+            "Sample",
+        ),
         ("a string", "cannot encode str"),
     ],
 )
@@ -298,7 +339,8 @@ def test_fuzz_any_bytes(pieces: list[bytes]) -> None:
 @settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_fuzz_damaged_stream(data: st.DataObject) -> None:
-    """Flips, cuts and insertions: each touches at most the runs it hits; every other frame comes through."""
+    """Flips, cuts and insertions: each touches at most the runs it hits; every other frame comes
+    through."""
     stream = bytearray(b"".join(encode(frame) for frame in FRAMES.values()) * 3)
     n_frames = 3 * len(FRAMES)
     damages = data.draw(st.integers(0, 5))
@@ -316,7 +358,8 @@ def test_fuzz_damaged_stream(data: st.DataObject) -> None:
     for start in range(0, len(stream), step):
         decoder.feed(bytes(stream[start : start + step]))
     assert conserved(decoder, bytes(stream))
-    # One damage can hit two frames only where a cut takes the closing and the opening zero between them.
+    # One damage can hit two frames only where a cut takes the closing and the opening zero between
+    # them.
     assert decoder.counters.frames >= n_frames - 2 * damages
     assert decoder.counters.frames <= n_frames
 
@@ -329,7 +372,9 @@ def test_fuzz_damaged_stream(data: st.DataObject) -> None:
     st.integers(0, 2**64 - 1),
     st.integers(0, 2**32 - 1),
 )
-def test_fuzz_round_trip(n_cubes: int, n_pads: int, sequence: int, device_us: int, seed: int) -> None:
+def test_fuzz_round_trip(
+    n_cubes: int, n_pads: int, sequence: int, device_us: int, seed: int
+) -> None:
     random = np.random.default_rng(seed)
     sample = Sample(
         sequence,
@@ -357,11 +402,17 @@ def test_arrays_of_several_frames_are_those_of_each_in_order() -> None:
     random = np.random.default_rng(5)
     samples = [
         Sample(
-            number, 0, 0, random.integers(1, 2**32, (n, 3)).astype("<u4"), random.integers(0, 2**32, n).astype("<u4"),
+            number,
+            0,
+            0,
+            random.integers(1, 2**32, (n, 3)).astype("<u4"),
+            random.integers(0, 2**32, n).astype("<u4"),
             random.integers(-(2**15), 2**15, n).astype("<i2"),
         )
         for number, n in enumerate((2, 5, 1))
-    ]  # fmt: skip
+    ]
     decoded = [Decoder().feed(encode(sample))[0] for sample in samples]
     for found, name in zip(join(decoded), ("frequency", "pad_fault", "temperature"), strict=True):
-        np.testing.assert_array_equal(found, np.concatenate([getattr(sample, name) for sample in samples]))
+        np.testing.assert_array_equal(
+            found, np.concatenate([getattr(sample, name) for sample in samples])
+        )

@@ -1,5 +1,5 @@
-"""The reader over real pseudo-terminals and TCP sockets; the test plays the hub on the other end, frame by
-frame."""
+"""The reader over real pseudo-terminals and TCP sockets; the test plays the hub on the other end,
+frame by frame."""
 
 from __future__ import annotations
 
@@ -53,7 +53,9 @@ def open_files() -> int:
 class FakeHub:
     """The device's end of a link: frames out, requests in."""
 
-    def __init__(self, send: Callable[[bytes], object], receive: Callable[[], bytes], fd: int) -> None:
+    def __init__(
+        self, send: Callable[[bytes], object], receive: Callable[[], bytes], fd: int
+    ) -> None:
         self.send, self._receive, self._fd = send, receive, fd
         self._decoder = Decoder()
         self._inbox: list[Frame] = []
@@ -124,7 +126,9 @@ class Watch:
         self.reader = Reader(configs, self._on_frames, self._on_state, **options)  # type: ignore[arg-type]
 
     def _on_frames(self, batch: Arrivals) -> None:
-        self.batches.append([(link, arrival_ns, frame) for link, arrival_ns, frames in batch for frame in frames])
+        self.batches.append(
+            [(link, arrival_ns, frame) for link, arrival_ns, frames in batch for frame in frames]
+        )
         for item in self.batches[-1]:
             self.frames.put(item)
 
@@ -163,7 +167,9 @@ def start() -> Iterator[Start]:
         began = time.monotonic()
         watch.reader.close()
         assert time.monotonic() - began < 1.0
-        assert [link.state for link in watch.reader.links] == [LinkState.CLOSED] * len(watch.reader.links)
+        assert [link.state for link in watch.reader.links] == [LinkState.CLOSED] * len(
+            watch.reader.links
+        )
     assert not [thread for thread in threading.enumerate() if thread.name == "cube reader"]
 
 
@@ -205,15 +211,21 @@ def test_one_callback_for_all_that_is_there(start: Start, hub: PtyHub) -> None:
     hub.sample(*range(10))
     assert [watch.frame(Sample).sequence for _ in range(10)] == list(range(10))
     # The kernel may hand over one write in two pieces, not in ten.
-    assert sum(any(isinstance(frame, Sample) for _, _, frame in batch) for batch in watch.batches) <= 3
+    assert (
+        sum(any(isinstance(frame, Sample) for _, _, frame in batch) for batch in watch.batches) <= 3
+    )
 
 
 def test_who_comes_first_waits_for_those_that_deliver() -> None:
-    reader = Reader([LinkConfig(name, "/dev/none") for name in "abc"], print, print, period_us=10_000)
+    reader = Reader(
+        [LinkConfig(name, "/dev/none") for name in "abc"], print, print, period_us=10_000
+    )
     for link, session in zip(reader.links, reader._sessions, strict=True):
         link.state, session.greeted = LinkState.OPEN, True
     whole, part = b"\0\x01\0", b"\0\x01"
-    assert reader._gathering([(0, 0, whole), (1, 0, part)]) == GATHER[1]  # a fifth of 10 ms would be longer
+    assert (
+        reader._gathering([(0, 0, whole), (1, 0, part)]) == GATHER[1]
+    )  # a fifth of 10 ms would be longer
     reader._sessions[1].actual_us = 2_000
     assert reader._gathering([(0, 0, whole)]) == pytest.approx(GATHER[0] * 2e-3)
     assert reader._gathering([(0, 0, part)]) == 0  # nothing to hold back
@@ -223,7 +235,8 @@ def test_who_comes_first_waits_for_those_that_deliver() -> None:
 
 
 def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
-    """Two looks of one wake-up may both find the port gone; frames of before the loss are delivered all the same."""
+    """Two looks of one wake-up may both find the port gone; frames of before the loss are delivered
+    all the same."""
     reader = Reader([LinkConfig("a", hub.port)], lambda batch: None, lambda *state: None)
     (link,), (session,) = reader.links, reader._sessions
     link.open()
@@ -231,7 +244,9 @@ def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     selector = selectors.DefaultSelector()
     selector.register(link, selectors.EVENT_READ, 0)
     lost, data = LinkError("gone", "lost"), encode(make_sample(1))
-    batch, failed = reader._decode(selector, [(0, 5, data), (0, 6, lost), (0, 7, lost), (0, 8, data)])
+    batch, failed = reader._decode(
+        selector, [(0, 5, data), (0, 6, lost), (0, 7, lost), (0, 8, data)]
+    )
     assert [(at, [frame.sequence for frame in frames]) for _, at, frames in batch] == [(5, [1])]
     assert failed == {0: lost}
     # Closed after the frames are delivered: a link that delivers is waited for.
@@ -284,7 +299,9 @@ def test_replugged_under_a_new_device(start: Start, tmp_path: Path) -> None:
     hub.unplug()
 
 
-def test_return_after_a_long_absence_resets_the_pause(start: Start, tmp_path: Path, monkeypatch) -> None:
+def test_return_after_a_long_absence_resets_the_pause(
+    start: Start, tmp_path: Path, monkeypatch
+) -> None:
     """The pause has grown to its limit; the port's return ends it."""
     monkeypatch.setattr("cube_tensor_driver.device.link.BACKOFF_S", (60.0, 60.0))
     port = tmp_path / "hub"
@@ -310,8 +327,8 @@ def test_no_sample_before_hello_is_delivered(start: Start, hub: PtyHub) -> None:
 
 
 def test_wrong_hub_is_refused_and_the_right_one_found(start: Start, tmp_path: Path) -> None:
-    """Two matches of a pattern, the wanted hub on the second; then it comes back under the first one's
-    name."""
+    """Two matches of a pattern, the wanted hub on the second; then it comes back under the first
+    one's name."""
     wrong, right = PtyHub(tmp_path / "hub0"), PtyHub(tmp_path / "hub1")
     watch = start(LinkConfig("a", str(tmp_path / "hub*"), hub_uid=0xB))
     wrong.expect(Command.HELLO)
@@ -330,7 +347,12 @@ def test_wrong_hub_is_refused_and_the_right_one_found(start: Start, tmp_path: Pa
     back.greet(uid=0xB)
     back.sample(2)
     assert watch.frame(Sample).sequence == 2
-    greeted = {frame.hub_uid for batch in watch.batches for _, _, frame in batch if isinstance(frame, Hello)}
+    greeted = {
+        frame.hub_uid
+        for batch in watch.batches
+        for _, _, frame in batch
+        if isinstance(frame, Hello)
+    }
     assert greeted == {0xB}
     back.unplug()
 
@@ -460,7 +482,10 @@ def test_garbage_is_counted_and_no_frame_lost(start: Start, hub: PtyHub) -> None
         assert watch.frame(Sample).sequence == k
     counters = watch.reader.links[0].counters
     assert counters["frames"] == 101
-    assert sum(counters[name] for name in ("crc", "framing", "length", "version", "unknown_type")) >= 100
+    assert (
+        sum(counters[name] for name in ("crc", "framing", "length", "version", "unknown_type"))
+        >= 100
+    )
 
 
 def test_other_version_is_named(start: Start, hub: PtyHub) -> None:
@@ -510,7 +535,8 @@ def test_tcp_by_name(start: Start) -> None:
 
 
 def test_slow_links_delay_nobody(start: Start, hub: PtyHub, monkeypatch) -> None:
-    """A host that never answers, a name look-up that hangs, a hub that never reads, and one that works."""
+    """A host that never answers, a name look-up that hangs, a hub that never reads, and one that
+    works."""
     hanging = threading.Event()
     look_up = socket.getaddrinfo
 
@@ -546,7 +572,8 @@ def test_slow_links_delay_nobody(start: Start, hub: PtyHub, monkeypatch) -> None
             hub.sample(k)
             assert watch.frame(Sample, link=3).sequence == k
             delays.append(time.monotonic() - sent)
-        # The median, since any one delay can be the scheduler's: far below every time-out of the slow links.
+        # The median, since any one delay can be the scheduler's: far below every time-out of the
+        # slow links.
         assert np.median(delays) < 0.01
         for link in (0, 1):
             assert not watch.reader.links[link].is_open

@@ -1,4 +1,5 @@
-"""From samples to rows: which cube a value belongs to, what is left out and counted, when a scan is complete."""
+"""From samples to rows: which cube a value belongs to, what is left out and counted, when a scan is
+complete."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.device.protocol import Hello, Sample
-from cube_tensor_driver.device.scan import Place, Scan
+from cube_tensor_driver.device.scan import CubeAddress, Scan
 from cube_tensor_driver.device.sequence import Account
 
 
@@ -19,18 +20,21 @@ def hello(uids, n_pads=2):
 def sample(sequence, hertz, first=0, fault=0, celsius=-32768):
     frequency = np.rint(np.array(hertz) * 1e3).astype("<u4")
     n = len(frequency)
-    return Sample(sequence, first, 0, frequency, np.full(n, fault, "<u4"), np.full(n, celsius, "<i2"))
+    return Sample(
+        sequence, first, 0, frequency, np.full(n, fault, "<u4"), np.full(n, celsius, "<i2")
+    )
 
 
 def two_links():
-    # cube 0 on link 1 index 0; cube 1 on link 0 index 1; cube 2 by uid 77 anywhere; cube 3 on link 1 index 1
+    # cube 0 on link 1 index 0; cube 1 on link 0 index 1; cube 2 by uid 77 anywhere; cube 3 on link
+    # 1 index 1
     scan = Scan(
         2,
         [
-            Place("a", 1, 0, None, 2),
-            Place("b", 0, 1, None, 2),
-            Place("c", None, None, 77, 2),
-            Place("d", 1, 1, None, 2),
+            CubeAddress("a", 1, 0, None, 2),
+            CubeAddress("b", 0, 1, None, 2),
+            CubeAddress("c", None, None, 77, 2),
+            CubeAddress("d", 1, 1, None, 2),
         ],
     )
     assert scan.hello(0, hello([77, 5])) == []
@@ -80,9 +84,13 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
         return None if rows is None else rows.sequence.tolist()
 
     for link, turn, expected in (
-        (0, 0, [0, 0]), (1, 0, [0, 0]),  # each begins for itself
-        (0, 1, None), (1, 1, [1, 1, 1, 1]), (1, 2, None), (0, 2, [2, 2, 2, 2]),
-    ):  # fmt: skip
+        (0, 0, [0, 0]),
+        (1, 0, [0, 0]),  # each begins for itself
+        (0, 1, None),
+        (1, 1, [1, 1, 1, 1]),
+        (1, 2, None),
+        (0, 2, [2, 2, 2, 2]),
+    ):
         give(link, turn)
         assert taken() == expected, (link, turn)
     scan = two_links()
@@ -114,16 +122,17 @@ def test_a_sample_in_two_frames_goes_on_at_once():
 
 
 def test_not_measured_is_nan_and_millihertz_survive():
-    scan = Scan(1, [Place("a", 0, 0, None, 2)])
+    scan = Scan(1, [CubeAddress("a", 0, 0, None, 2)])
     scan.hello(0, hello([1]))
     scan.add(0, [sample(0, [[0.0, 100_000.001]])], [0])
     frequency = scan.take().frequency
-    # 1 mHz is below float32's spacing at 100 kHz (7.8 mHz): the nearest float32 is what must come out
+    # 1 mHz is below float32's spacing at 100 kHz (7.8 mHz): the nearest float32 is what must come
+    # out
     assert np.isnan(frequency[0, 0]) and frequency[0, 1] == np.float32(100_000.001)
 
 
 def test_strangers_are_counted_and_left_out():
-    scan = Scan(1, [Place("a", 0, 1, None, 2)])
+    scan = Scan(1, [CubeAddress("a", 0, 1, None, 2)])
     assert scan.hello(0, hello([1, 2, 3])) == [
         "the hub's cubes 0 (uid 0x1), 2 (uid 0x3) not in the skin file: add it there",
     ]
@@ -134,7 +143,7 @@ def test_strangers_are_counted_and_left_out():
 
 
 def test_another_number_of_pads_names_both_and_invents_nothing():
-    scan = Scan(1, [Place("a", 0, 0, None, 8), Place("b", 0, 1, None, 2)])
+    scan = Scan(1, [CubeAddress("a", 0, 0, None, 8), CubeAddress("b", 0, 1, None, 2)])
     (problem,) = scan.hello(0, hello([1, 2]))
     assert "cube a" in problem and "reports 2 pads" in problem and "layout has 8" in problem
     scan.add(0, [sample(0, [[1.0, 2.0], [3.0, 4.0]])], [0])
@@ -147,9 +156,9 @@ def test_another_number_of_pads_names_both_and_invents_nothing():
 @pytest.mark.parametrize(
     ("place", "words"),
     [
-        (Place("a", 0, 5, None, 2), ["index 5", "2 cubes"]),
-        (Place("a", 0, None, 99, 2), ["a (uid 0x63)", "no cube of this uid"]),
-        (Place("a", 1, None, 5, 2), ["uid 0x5", "on this link", "file on another"]),
+        (CubeAddress("a", 0, 5, None, 2), ["index 5", "2 cubes"]),
+        (CubeAddress("a", 0, None, 99, 2), ["a (uid 0x63)", "no cube of this uid"]),
+        (CubeAddress("a", 1, None, 5, 2), ["uid 0x5", "on this link", "file on another"]),
     ],
 )
 def test_what_does_not_fit_is_said(place, words):
@@ -160,17 +169,19 @@ def test_what_does_not_fit_is_said(place, words):
 
 
 def test_a_repeated_hello_says_nothing_and_a_changed_one_counts():
-    scan = Scan(1, [Place("a", None, None, 5, 2)])
+    scan = Scan(1, [CubeAddress("a", None, None, 5, 2)])
     assert scan.hello(0, hello([5])) == []
     assert scan.hello(0, hello([5])) is None
-    assert scan.hello(0, hello([4, 5])) == ["the hub's cube 0 (uid 0x4) not in the skin file: add it there"]
+    assert scan.hello(0, hello([4, 5])) == [
+        "the hub's cube 0 (uid 0x4) not in the skin file: add it there"
+    ]
     scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0]])], [0])
     assert scan.take().frequency.tolist() == [[2.0, 2.0]]
 
 
 def test_two_cubes_with_one_uid_give_rows_of_one():
     """On one hub, and on two: the second takes over only when the first is gone."""
-    scan = Scan(2, [Place("a", None, None, 5, 2), Place("b", None, None, 6, 2)])
+    scan = Scan(2, [CubeAddress("a", None, None, 5, 2), CubeAddress("b", None, None, 6, 2)])
     (problem,) = scan.hello(0, hello([5, 5, 6]))
     assert problem == "the hub's cube 1 (uid 0x5) left out: an earlier one has the same uid"
     (problem, *_) = scan.hello(1, hello([5, 7]))
@@ -182,7 +193,9 @@ def test_two_cubes_with_one_uid_give_rows_of_one():
     assert scan.unknown_cube == 3 and scan.unaccounted() == 0
     assert scan.hello(1, hello([5, 7])) is None
     scan.live(0, False)
-    assert scan.hello(1, hello([5, 7])) == ["the hub's cube 1 (uid 0x7) not in the skin file: add it there"]
+    assert scan.hello(1, hello([5, 7])) == [
+        "the hub's cube 1 (uid 0x7) not in the skin file: add it there"
+    ]
     scan.add(1, [sample(1, [[4.0, 4.0], [5.0, 5.0]])], [0])
     assert scan.take().cube.tolist() == [0]
     # the first comes back: now it is the second
@@ -190,7 +203,7 @@ def test_two_cubes_with_one_uid_give_rows_of_one():
 
 
 def test_a_hub_of_strangers_is_one_line():
-    scan = Scan(1, [Place("a", 0, 0, None, 2), Place("b", None, None, 1000, 2)])
+    scan = Scan(1, [CubeAddress("a", 0, 0, None, 2), CubeAddress("b", None, None, 1000, 2)])
     problems = scan.hello(0, hello(range(1, 41)))
     assert problems == [
         "the hub's cubes 1 (uid 0x2), 2 (uid 0x3), 3 (uid 0x4), 4 (uid 0x5), 5 (uid 0x6), 6 (uid 0x7), 7 (uid 0x8), "
@@ -216,22 +229,35 @@ def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
 
 def test_samples_take_the_arrival_of_their_read():
     """An earlier one would be earlier than true, and bend the clock's fit."""
-    driver = pytest.importorskip("cube_tensor_driver.ros.driver", reason="needs rclpy: run this with ./cube test")
+    driver = pytest.importorskip(
+        "cube_tensor_driver.ros.driver", reason="needs rclpy: run this with ./cube test"
+    )
     asked = []
     clocks = [
-        SimpleNamespace(update=lambda *given, link=link: asked.append((link, *given)) or given[0]) for link in (0, 1)
+        SimpleNamespace(update=lambda *given, link=link: asked.append((link, *given)) or given[0])
+        for link in (0, 1)
     ]
     scan = SimpleNamespace(add=lambda *given: None, unaccounted=lambda: 0)
-    node = SimpleNamespace(_accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _publish=lambda: None)
+    node = SimpleNamespace(
+        _accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _publish=lambda: None
+    )
     given = ((0, 10, 2), (1, 10, 1), (0, 20, 1))
     driver.Driver._on_frames(
-        node, [(link, at, [sample(at + n, [[1.0]]) for n in range(many)]) for link, at, many in given]
+        node,
+        [(link, at, [sample(at + n, [[1.0]]) for n in range(many)]) for link, at, many in given],
     )
     assert [(link, arrival_ns, len(times)) for link, times, arrival_ns in asked] == list(given)
 
 
 def test_pads_that_a_cube_has_not_are_nan():
-    scan = Scan(2, [Place("wide", 0, 0, None, 3), Place("narrow", 1, 0, None, 2), Place("narrow", 1, 1, None, 2)])
+    scan = Scan(
+        2,
+        [
+            CubeAddress("wide", 0, 0, None, 3),
+            CubeAddress("narrow", 1, 0, None, 2),
+            CubeAddress("narrow", 1, 1, None, 2),
+        ],
+    )
     scan.hello(0, hello([1], 3))
     scan.hello(1, hello([2, 3], 2))
     scan.add(0, [sample(0, [[1.0, 0.0, 3.0]])], [0])

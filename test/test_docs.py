@@ -1,4 +1,5 @@
-"""The documentation builds without a warning, and every command on its pages runs: here, or in a test named here."""
+"""The documentation builds without a warning, and every command on its pages runs: here, or in a
+test named here."""
 
 from __future__ import annotations
 
@@ -22,23 +23,18 @@ PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONT
 ELSEWHERE = {
     "./cube demo": "test_end_to_end.py::test_ended_demo_leaves_no_process",
     "./cube record -o run1": "test_bags_ros.py::test_recorded_is_published_and_reprocessed_is_live",
-    "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml":
-        "test_bags_files.py::test_fit_from_a_bag",
-    "./cube inject kind=unplug link=hub0 seconds=2":
-        "test_faults.py::test_inject_speaks_to_the_pipe_or_says_that_nobody_listens",
-    "./cube inject kind=stuck link=hub1 cube=3 pad=5 seconds=10":
-        "test_faults.py::test_inject_speaks_to_the_pipe_or_says_that_nobody_listens",
-    "./cube torture --duration 600 --seed 7 --json torture.json":
-        "test_reliability_torture.py::test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong",
-    "./cube demo --config config/examples/sole.yaml --load config/examples/gait.yaml --duration 3.3 --figure gait.png":
-        "test_examples.py::test_sole_finds_the_ground_reaction_force_and_its_centre",
-    "./cube demo --config config/examples/forearm.yaml --load config/examples/forearm_load.yaml --view":
-        "test_examples.py::test_forearm_runs_with_both_layouts",
+    "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml": "test_bags_files.py::test_fit_from_a_bag",
+    "./cube inject kind=unplug link=hub0 seconds=2": "test_faults.py::test_inject_speaks_to_the_pipe_or_says_that_nobody_listens",
+    "./cube inject kind=stuck link=hub1 cube=3 pad=5 seconds=10": "test_faults.py::test_inject_speaks_to_the_pipe_or_says_that_nobody_listens",
+    "./cube torture --duration 600 --seed 7 --json torture.json": "test_reliability_torture.py::test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong",
+    "./cube demo --config config/examples/sole.yaml --load config/examples/gait.yaml --duration 3.3 --figure gait.png": "test_examples.py::test_sole_finds_the_ground_reaction_force_and_its_centre",
+    "./cube demo --config config/examples/forearm.yaml --load config/examples/forearm_load.yaml --view": "test_examples.py::test_forearm_runs_with_both_layouts",
     "./cube test": ".ci/run",
     "./cube lint": ".ci/run",
     "./cube exec CMD": ".ci/run",
-}  # fmt: skip
-"""What runs for minutes, needs what a page of its own does not have, or is this suite: where it is run instead."""
+}
+"""What runs for minutes, needs what a page of its own does not have, or is this suite: where it is
+run instead."""
 ENDLESS = {
     "./cube demo --view": "shows it",
     "./cube demo --config skin.yaml --load load.yaml": "c0 ",
@@ -49,7 +45,9 @@ ENDLESS = {
 
 def commands(page: Path) -> list[str]:
     """Lines of a page that call ./cube, each once, without what follows a # or several spaces."""
-    lines = re.findall(r"^ {4,}(\./cube [^#\n]*?)(?: {2,}.*| *#.*)?$", page.read_text(), re.MULTILINE)
+    lines = re.findall(
+        r"^ {4,}(\./cube [^#\n]*?)(?: {2,}.*| *#.*)?$", page.read_text(), re.MULTILINE
+    )
     return list(dict.fromkeys(lines))
 
 
@@ -59,15 +57,27 @@ def named(page: Path) -> list[str]:
 
 
 def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "cube_tensor_driver.cli", *arguments], cwd=folder, text=True,
-                          capture_output=True, timeout=120, check=False)  # fmt: skip
+    return subprocess.run(
+        [sys.executable, "-m", "cube_tensor_driver.cli", *arguments],
+        cwd=folder,
+        text=True,
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
 
 
 def run_until(arguments: list[str], folder: Path, said: str) -> None:
     """In a terminal of its own, until it has said that; then Ctrl-C, and it ends well."""
     near, far = pty.openpty()
-    process = subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", *arguments], cwd=folder, stdin=far,
-                               stdout=far, stderr=far, start_new_session=True)  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cube_tensor_driver.cli", *arguments],
+        cwd=folder,
+        stdin=far,
+        stdout=far,
+        stderr=far,
+        start_new_session=True,
+    )
     os.close(far)
     heard, until = "", time.monotonic() + 60
     try:
@@ -100,7 +110,9 @@ def stage(page: Path, folder: Path) -> None:
         shutil.copy(ROOT / "config" / "calibration" / "planar.yaml", folder / "new.yaml")
     if page.name == "simulation.md":
         shutil.copy(ROOT / "config" / "cube.yaml", folder / "skin.yaml")
-        (folder / "load.yaml").write_text(re.search(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S)[1])
+        (folder / "load.yaml").write_text(
+            re.search(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S)[1]
+        )
 
 
 def test_documentation_builds_without_a_warning(tmp_path):
@@ -112,7 +124,9 @@ def test_documentation_builds_without_a_warning(tmp_path):
     assert "rest_frequency" in api and "contacts" in api
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if commands(page)], ids=lambda page: page.name
+)
 def test_commands_of_a_page_run(page, tmp_path, domain):
     stage(page, tmp_path)
     for command in commands(page):
@@ -135,7 +149,7 @@ def test_what_is_run_elsewhere_is_on_a_page_and_is_run_there():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_in_sentences_exist_with_their_options(page):
-    from cube_tensor_driver.cli import parser
+    from cube_tensor_driver.cli.main import parser
 
     for command in named(page):
         words = command.split()[1:]
@@ -146,13 +160,19 @@ def test_commands_in_sentences_exist_with_their_options(page):
             names.append(words[0])
             sub = found[words.pop(0)]
         assert names, f"{page.name}: {command}"
-        options = {word.strip("[],|…").partition("=")[0] for word in words if word.strip("[").startswith("-")}
+        options = {
+            word.strip("[],|…").partition("=")[0]
+            for word in words
+            if word.strip("[").startswith("-")
+        }
         assert options <= set(sub._option_string_actions), f"{page.name}: {command}"
 
 
 def choices(parser) -> dict | None:
     """Commands below a parser."""
-    return next((action.choices for action in parser._actions if hasattr(action, "add_parser")), None)
+    return next(
+        (action.choices for action in parser._actions if hasattr(action, "add_parser")), None
+    )
 
 
 def test_ros_commands_name_what_the_package_has():
@@ -172,10 +192,15 @@ def test_ros_commands_name_what_the_package_has():
 def test_programs_of_a_page_run(name):
     import numpy as np
 
-    from cube_tensor_driver.core.scene import Places
+    from cube_tensor_driver.core.scene import CubePoses
 
-    there = {"places": Places(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002)), "values": np.zeros((1, 15))}
-    programs = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / name).read_text(), re.MULTILINE | re.DOTALL)
+    there = {
+        "places": CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002)),
+        "values": np.zeros((1, 15)),
+    }
+    programs = re.findall(
+        r"^```python\n(.*?)^```", (ROOT / "docs" / name).read_text(), re.MULTILINE | re.DOTALL
+    )
     assert programs
     for program in programs:
         exec(program, there)

@@ -5,27 +5,29 @@ import pytest
 
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS
-from cube_tensor_driver.elastic import bench as benches
 from cube_tensor_driver.elastic import body as bodies
-from cube_tensor_driver.elastic import paper
-from cube_tensor_driver.elastic.bench import Bench
 from cube_tensor_driver.elastic.body import Body
-from cube_tensor_driver.elastic.material import Material
-from cube_tensor_driver.elastic.paper import dent, plates
-from cube_tensor_driver.elastic.rod import Contact, Rod
-from cube_tensor_driver.elastic.study import study
+from cube_tensor_driver.research import paper
+from cube_tensor_driver.research import virtual_bench as benches
+from cube_tensor_driver.research.material import Material
+from cube_tensor_driver.research.paper import dent, plates
+from cube_tensor_driver.research.rod import Contact, Rod
+from cube_tensor_driver.research.study import study
+from cube_tensor_driver.research.virtual_bench import Bench
 
 BODY = Body()
 
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Triangles at the cube as the section makes them: enough for what does not ask how exact the pads are."""
+    """Triangles at the cube as the section makes them: enough for what does not ask how exact the
+    pads are."""
     monkeypatch.setattr(benches, "_CUTS", 0)
 
 
 def uniaxial(stretch, young, poisson):
-    """Cauchy sigma_zz of the neo-Hookean body at this stretch along z, free along x, none along y."""
+    """Cauchy sigma_zz of the neo-Hookean body at this stretch along z, free along x, none along
+    y."""
     mu, lam = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
     low, high = 0.1, 10.0  # bisection for P_xx = 0, which grows with the stretch along x
     for _ in range(200):
@@ -74,7 +76,8 @@ def test_shear_leaves_the_linear_normal_sum_alone_and_not_the_finite_one(coarse)
 
 
 def test_pads_converge_with_the_mesh_at_the_cube(monkeypatch):
-    """P_shear of plates that press and shear: 0.13 % from the triangles at the cube cut in four once more.
+    """P_shear of plates that press and shear: 0.13 % from the triangles at the cube cut in four
+    once more.
 
     2.1 % is found where they are not cut at all.
     """
@@ -86,7 +89,8 @@ def test_pads_converge_with_the_mesh_at_the_cube(monkeypatch):
 
 
 def test_plates_that_grip_shear_the_body_as_it_stands():
-    """Without a cube the middle of an evenly pressed block takes mu s / h more, for small s, and stays pressed."""
+    """Without a cube the middle of an evenly pressed block takes mu s / h more, for small s, and
+    stays pressed."""
     steps = [plates(BODY, 2e-3, bonded=False), plates(BODY, 2e-3, 0.1e-3, gripped=True)]
     state = Bench(BODY, cube=False).run(steps).state
     shear = -BODY.young / (2 * (1 + BODY.poisson)) * 0.1e-3 / BODY.height
@@ -100,7 +104,9 @@ def test_a_mirrored_rod_mirrors_the_pads(coarse):
 
 
 def test_too_large_a_load_is_refused(coarse, monkeypatch):
-    monkeypatch.setattr(benches, "_HALVINGS", 1)  # each further one doubles the time until it gives up
+    monkeypatch.setattr(
+        benches, "_HALVINGS", 1
+    )  # each further one doubles the time until it gives up
     with pytest.raises(ElasticError, match="too large even in 2 parts; press less"):
         Bench(BODY, finite=True, size=2.0).run([plates(BODY, 12e-3)])
 
@@ -109,10 +115,12 @@ def test_too_large_a_load_is_refused(coarse, monkeypatch):
 
 
 def test_a_round_rod_presses_as_hertz_says():
-    """Two-dimensional contact on a half plane: P = pi E* a^2 / 4R, and the mean square of x over p is a^2 / 4.
+    """Two-dimensional contact on a half plane: P = pi E* a^2 / 4R, and the mean square of x over p
+    is a^2 / 4.
 
-    K. L. Johnson, Contact Mechanics (1985), 4.2. The half plane is 200 x 100 mm, 35 times a; 1.1 % is found for a
-    contact that sets in over 0.005 mm, 0.2 % and 0.1 % for a half and a quarter of that, 20 % for 0.05 mm.
+    K. L. Johnson, Contact Mechanics (1985), 4.2. The half plane is 200 x 100 mm, 35 times a; 1.1 %
+    is found for a contact that sets in over 0.005 mm, 0.2 % and 0.1 % for a half and a quarter of
+    that, 20 % for 0.05 mm.
     """
     body = Body(200e-3, 1.0, 100e-3, 10e-3)
     radius = 50e-3
@@ -124,7 +132,9 @@ def test_a_round_rod_presses_as_hertz_says():
     force = 5e-3 * Contact(bench._top, rod, 5e-3, body.young, False).force(u)[vertical]
     square = force @ (5e-3 * bench.basis.doflocs[0, vertical]) ** 2 / force.sum()
     assert 4e-3 < 2 * np.sqrt(square) < 7e-3
-    assert force.sum() == pytest.approx(np.pi * body.young / (1 - body.poisson**2) * square / radius, rel=0.015)
+    assert force.sum() == pytest.approx(
+        np.pi * body.young / (1 - body.poisson**2) * square / radius, rel=0.015
+    )
 
 
 @pytest.mark.parametrize("finite", [False, True])
@@ -142,10 +152,12 @@ def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(coarse, finite
 
 @pytest.mark.parametrize(("bonded", "last"), [(True, (2.6e-3, 2e-3)), (False, (1.5e-3,))])
 def test_a_deep_rod_folds_no_element(coarse, bonded, last):
-    """Into the 3.5 mm above the cube: P_shear grows (bonded: ever faster), is that of a finer mesh, and is found
+    """Into the 3.5 mm above the cube: P_shear grows (bonded: ever faster), is that of a finer mesh,
+    and is found
     again where it was before at that depth: nothing rubs, and no node stays on the rod's edge.
 
-    0.2 % is found between the meshes; a sliding bottom that is held at one point is wrong by 5 % at 1.5 mm.
+    0.2 % is found between the meshes; a sliding bottom that is held at one point is wrong by 5 % at
+    1.5 mm.
     """
     depths = (0.5e-3, 1e-3, 1.5e-3, 2e-3, *last)
     steps = [dent(BODY, Rod(depth, 1e-3), bonded) for depth in depths]
@@ -160,7 +172,8 @@ def test_a_deep_rod_folds_no_element(coarse, bonded, last):
 
 @pytest.mark.parametrize("finite", [False, True])
 def test_a_sliding_bottom_stays_on_average(coarse, finite):
-    """And what keeps it there is spread evenly: in proportion to the mean's weights, on the bottom alone."""
+    """And what keeps it there is spread evenly: in proportion to the mean's weights, on the bottom
+    alone."""
     bench, nothing = Bench(BODY, finite=finite, size=1.0), np.zeros(0)
     rod = Rod(0.3e-3, 1e-3)
     u = bench._newton(np.zeros(bench.basis.N), bench._task(dent(BODY, rod, bonded=False), nothing))
@@ -170,7 +183,9 @@ def test_a_sliding_bottom_stays_on_average(coarse, finite):
     weights = bench._mean[bench._component == 0]
     even = weights * (weights @ sideways) / (weights @ weights)
     assert np.abs(sideways - even).max() < 1e-6 * np.abs(left).max()
-    assert (np.abs(even).max() > 1e-4 * np.abs(left).max()) == finite  # linear: the rod has no force along x
+    assert (
+        np.abs(even).max() > 1e-4 * np.abs(left).max()
+    ) == finite  # linear: the rod has no force along x
 
 
 def test_prototype_signs():
@@ -185,7 +200,8 @@ def test_rod_sweep_splits_the_signal(coarse):
 
 
 def test_study_error_falls_with_the_square_of_the_side(monkeypatch):
-    """The pads see the second derivative of the stress: the error of a stress goes as (d0 / depth)^2."""
+    """The pads see the second derivative of the stress: the error of a stress goes as (d0 /
+    depth)^2."""
     monkeypatch.setattr(bodies, "_SPACE_MESHES", ((1.0, 0.3, 6.0),) * 3)
     result = study(sides=(1e-3, 0.5e-3), widths=(5e-3,), offsets=(-8e-3, -2e-3, 2e-3, 8e-3))
     zz, slope = COMPONENTS.index("zz"), COMPONENTS.index("zz_x")

@@ -1,4 +1,5 @@
-"""./cube fem, ./cube study, ./cube paper as a user runs them: tables, files and pictures out, one line per mistake."""
+"""./cube fem, ./cube study, ./cube paper as a user runs them: tables, files and pictures out, one
+line per mistake."""
 
 from __future__ import annotations
 
@@ -15,16 +16,16 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
-from cube_tensor_driver import cli
+from cube_tensor_driver.cli import fem
+from cube_tensor_driver.cli import main as cli
+from cube_tensor_driver.cli import paper as view_paper
+from cube_tensor_driver.cli import study as view_study
+from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.elastic import body as bodies
-from cube_tensor_driver.elastic import paper
-from cube_tensor_driver.elastic.study import Study
-from cube_tensor_driver.files.calibration import read_calibration
-from cube_tensor_driver.view import fem
-from cube_tensor_driver.view import paper as view_paper
-from cube_tensor_driver.view import study as view_study
+from cube_tensor_driver.research import paper
+from cube_tensor_driver.research.study import Study
 
 SMALL = ("--width", "20", "--height", "12", "--meshes", "2")
 
@@ -41,22 +42,38 @@ def cube(*arguments: object) -> list[str]:
 def test_fem_shows_and_writes_what_is_asked(tmp_path):
     out, saved = tmp_path / "fem.json", tmp_path / "mine.yaml"
     command = cube("fem", *SMALL, "--json", out, "--figures", tmp_path / "pictures", "-o", saved)
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads(out.read_text())
     assert {"matrix", "coefficients", "structure_residual", "convergence", "seconds"} <= set(result)
     matrix = np.array(result["matrix"])
-    assert matrix.shape == (8, 7) and result["modes"] == ["zz", "zx", "xx", "zz_x", "zz_z", "xx_z", "xx_x"]
+    assert matrix.shape == (8, 7) and result["modes"] == [
+        "zz",
+        "zx",
+        "xx",
+        "zz_x",
+        "zz_z",
+        "xx_z",
+        "xx_x",
+    ]
     assert list(result["coefficients"]) == ["a", "b", "c_plus_d", "e", "f", "g", "h"]
-    assert [row["unknowns"] for row in result["convergence"]] == sorted(r["unknowns"] for r in result["convergence"])
+    assert [row["unknowns"] for row in result["convergence"]] == sorted(
+        r["unknowns"] for r in result["convergence"]
+    )
     assert re.search(rf"V1 \+z-x +{matrix[0, 0]:.4f} +{matrix[0, 1]:.4f} ", done.stdout)
     for words in ("c_plus_d", "change to the next", "left, %", "rank 7 of 7"):
         assert words in done.stdout
     assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [
-        "convergence.png", "loads.png", "response.png",
-    ]  # fmt: skip
+        "convergence.png",
+        "loads.png",
+        "response.png",
+    ]
     assert all(path.stat().st_size > 10_000 for path in (tmp_path / "pictures").iterdir())
-    assert saved.read_text().startswith(f"# Made by: ./cube fem --width 20 --height 12 --meshes 2 -o {saved}\n")
+    assert saved.read_text().startswith(
+        f"# Made by: ./cube fem --width 20 --height 12 --meshes 2 -o {saved}\n"
+    )
     # a slab has not the full symmetry: seven coefficients would lose part of it
     assert result["structure_residual"] > 1e-3
     assert np.array_equal(read_calibration(saved).response, matrix)
@@ -65,7 +82,10 @@ def test_fem_shows_and_writes_what_is_asked(tmp_path):
 def test_space_on_a_coarse_mesh(coarse, tmp_path, capsys):
     out, saved = tmp_path / "fem.json", tmp_path / "cube.yaml"
     arguments = ["fem", "--3d", "--width", "12", "--height", "12", "--meshes", "1", "--rigid"]
-    assert cli.main([*arguments, "--json", str(out), "--figures", str(tmp_path), "-o", str(saved)]) == 0
+    assert (
+        cli.main([*arguments, "--json", str(out), "--figures", str(tmp_path), "-o", str(saved)])
+        == 0
+    )
     result = json.loads(out.read_text())
     assert np.array(result["matrix"]).shape == (24, 21)
     assert result["rank"] == 18 and result["unobservable"] == ["yz_x", "zx_y", "xy_z"]
@@ -83,16 +103,31 @@ def test_a_layout_of_ones_own(tmp_path):
     assert cli.main(["fem", *SMALL, "--layout", str(path), "--json", str(out)]) == 0
     result = json.loads(out.read_text())
     assert (
-        result["pads"] == ["+z", "+x", "-x", "-z"] and result["symmetry"] == "full" and "zx" in result["unobservable"]
+        result["pads"] == ["+z", "+x", "-x", "-z"]
+        and result["symmetry"] == "full"
+        and "zx" in result["unobservable"]
     )
 
 
 def test_a_layout_of_ones_own_in_space(coarse, tmp_path, capsys):
-    """One pad in the middle of each face tells the three normal stresses and their slopes along themselves."""
+    """One pad in the middle of each face tells the three normal stresses and their slopes along
+    themselves."""
     faces = [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]
     path, out = tmp_path / "six.yaml", tmp_path / "fem.json"
     path.write_text(f"name: six\npad_size: 0.6\npositions: {faces}\nnormals: {faces}\n")
-    arguments = ["fem", "--3d", "--width", "12", "--height", "12", "--meshes", "1", "--rigid", "--layout", str(path)]
+    arguments = [
+        "fem",
+        "--3d",
+        "--width",
+        "12",
+        "--height",
+        "12",
+        "--meshes",
+        "1",
+        "--rigid",
+        "--layout",
+        str(path),
+    ]
     assert cli.main([*arguments, "--json", str(out)]) == 0
     result = json.loads(out.read_text())
     assert np.array(result["matrix"]).shape == (6, 21) and result["symmetry"] == "full"
@@ -130,18 +165,23 @@ def test_every_flag_reaches_the_solver(computed):
     assert cli.main(["fem", *flags.split()]) == 1
     body, layout, symmetry, meshes, _ = computed[0]
     assert body == bodies.Body(0.03, 0.03, 0.02, 0.005, 1e5, 0.4, np.inf, 0.30, "stress")
-    assert layout.pad_size == pytest.approx(0.6) and layout.positions[1] == pytest.approx([0.5, 0, 1])
+    assert layout.pad_size == pytest.approx(0.6) and layout.positions[1] == pytest.approx(
+        [0.5, 0, 1]
+    )
     assert (symmetry, meshes) == ("mirrors", 2)
 
 
 @pytest.mark.parametrize(
-    ("flags", "size", "centre"), [("--pad half", 1.0, 0.5), ("--pad 0.5", 0.25, 0.5), ("--pad-centre 1.2", 0.4, 0.6)]
+    ("flags", "size", "centre"),
+    [("--pad half", 1.0, 0.5), ("--pad 0.5", 0.25, 0.5), ("--pad-centre 1.2", 0.4, 0.6)],
 )
 def test_pads(computed, flags, size, centre):
     """A pad's width alone puts it 1 mm from the middle; on a cube of 4 mm that is half of d0."""
     assert cli.main(["fem", *flags.split()]) == 1
     layout = computed[0][1]
-    assert layout.pad_size == pytest.approx(size) and layout.positions[1] == pytest.approx([centre, 0, 1])
+    assert layout.pad_size == pytest.approx(size) and layout.positions[1] == pytest.approx(
+        [centre, 0, 1]
+    )
 
 
 def work(*_):
@@ -162,7 +202,10 @@ def refused(capsys, arguments, words):
     [
         ("--poisson 0.5", ["poisson is 0.5", "[0, 0.5)"]),
         ("--side 11", ["side is 11 mm", "height is 11 mm"]),
-        ("--pad 1.2 --pad-centre 0.5", ["+z-x and +z+x overlap: 1.2 mm wide, 1 mm apart", "narrower"]),
+        (
+            "--pad 1.2 --pad-centre 0.5",
+            ["+z-x and +z+x overlap: 1.2 mm wide, 1 mm apart", "narrower"],
+        ),
         ("--pad 2.5", ["2.5 mm wide", "reach to 2.25 mm", "faces end at 2 mm", "--pad-centre"]),
         ("--pad 0.001", ["mesh resolves 0.002 mm", "wider"]),
         ("--pad wide", ["'wide'", "half, or a width in mm"]),
@@ -200,9 +243,11 @@ def test_a_mistake_is_one_line_before_any_work(monkeypatch, capsys, flags, words
         ("study --figure x.abc", ["x.abc", "no format of a picture"]),
     ],
 )
-def test_every_output_is_asked_about_before_any_work(monkeypatch, capsys, tmp_path, arguments, words):
+def test_every_output_is_asked_about_before_any_work(
+    monkeypatch, capsys, tmp_path, arguments, words
+):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(f"cube_tensor_driver.commands.{arguments.split()[0]}", work)
+    monkeypatch.setattr(f"cube_tensor_driver.cli.commands.{arguments.split()[0]}", work)
     refused(capsys, arguments, words)
     assert not list(tmp_path.iterdir())
 
@@ -211,13 +256,19 @@ def test_too_little_memory_is_said_before_any_work(monkeypatch, capsys):
     monkeypatch.setattr(bodies, "available_memory", lambda: 1e8)
     monkeypatch.setattr("cube_tensor_driver.elastic.fem.make_solid", None)
     assert cli.main(["fem", "--3d"]) == 1
-    assert re.search(r"about \d\.\d GB of memory and 0\.1 GB are available", capsys.readouterr().err)
+    assert re.search(
+        r"about \d\.\d GB of memory and 0\.1 GB are available", capsys.readouterr().err
+    )
 
 
 def test_control_c_ends_it_quietly(tmp_path):
     command = cube("fem", "-o", tmp_path / "cube.yaml", "--json", tmp_path / "fem.json")
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
-        assert process.stdout and "steel cube of 4 mm" in process.stdout.readline()  # it works from here on
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
+        assert (
+            process.stdout and "steel cube of 4 mm" in process.stdout.readline()
+        )  # it works from here on
         process.send_signal(signal.SIGINT)
         output, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and not errors and not output
@@ -227,7 +278,7 @@ def test_control_c_ends_it_quietly(tmp_path):
 def test_control_c_in_a_destructor_is_not_lost():
     code = """
 import signal, sys, threading
-from cube_tensor_driver.cli import interrupt_again
+from cube_tensor_driver.cli.main import interrupt_again
 
 class Trap:
     def __del__(self):
@@ -241,7 +292,9 @@ try:
 except KeyboardInterrupt:
     print("interrupted")
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     assert done.stdout == "interrupted\n" and not done.stderr
 
 
@@ -250,7 +303,10 @@ def test_an_interrupted_run_leaves_no_file(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("cube_tensor_driver.elastic.fem.linear_response", interrupt)
-    assert cli.main(["fem", "-o", str(tmp_path / "cube.yaml"), "--json", str(tmp_path / "fem.json")]) == 130
+    assert (
+        cli.main(["fem", "-o", str(tmp_path / "cube.yaml"), "--json", str(tmp_path / "fem.json")])
+        == 130
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -261,7 +317,10 @@ def test_an_interrupted_write_leaves_the_old_calibration(tmp_path, monkeypatch):
     saved = tmp_path / "cube.yaml"
     saved.write_text("old")
     monkeypatch.setattr(Path, "replace", interrupt)
-    assert cli.main(["fem", "--width", "20", "--height", "12", "--meshes", "1", "-o", str(saved)]) == 130
+    assert (
+        cli.main(["fem", "--width", "20", "--height", "12", "--meshes", "1", "-o", str(saved)])
+        == 130
+    )
     assert saved.read_text() == "old"
 
 
@@ -273,7 +332,9 @@ def test_shipped_calibrations_are_what_their_commands_make(name, tmp_path, reque
     arguments = shlex.split(command.group(1))
     assert arguments[-2:] == ["-o", f"config/calibration/{name}.yaml"]
     bound = 1e-6  # rounding differs from machine to machine
-    if name == "cube":  # the whole takes minutes: on a coarse mesh it agrees as well as that mesh can
+    if (
+        name == "cube"
+    ):  # the whole takes minutes: on a coarse mesh it agrees as well as that mesh can
         request.getfixturevalue("coarse")
         arguments[-2:-2], bound = ["--meshes", "1"], 0.05
     arguments[-1] = str(tmp_path / "again.yaml")
@@ -286,7 +347,8 @@ def test_shipped_calibrations_are_what_their_commands_make(name, tmp_path, reque
 
 
 def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
-    """Errors of 50 % under 2 mm and 10 % under 10 mm; the quad layout does not see yy. test_elastic_bench runs it."""
+    """Errors of 50 % under 2 mm and 10 % under 10 mm; the quad layout does not see yy.
+    test_elastic_bench runs it."""
     error = {name: np.tile([[[0.5], [0.1]]], (2, 1, 15)) for name in LAYOUTS}
     error["quad"][..., 1] = np.nan
     error["cube"][1] = 0.3
@@ -301,11 +363,21 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
         error,
     )
     monkeypatch.setattr(view_study, "study", lambda progress: found)
-    assert cli.main(["study", "--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")]) == 0
+    assert (
+        cli.main(["study", "--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")])
+        == 0
+    )
     result = json.loads((tmp_path / "s.json").read_text())
-    assert np.array(result["error"]["cube"]).shape == (2, 2, 15) and result["error"]["quad"][0][0][1] is None
+    assert (
+        np.array(result["error"]["cube"]).shape == (2, 2, 15)
+        and result["error"]["quad"][0][0][1] is None
+    )
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["yy", "·", "·", "10", "10", "10", "never"] in rows and ["zz", *["10"] * 5, "never"] in rows
+    assert ["yy", "·", "·", "10", "10", "10", "never"] in rows and [
+        "zz",
+        *["10"] * 5,
+        "never",
+    ] in rows
     assert (tmp_path / "s.png").stat().st_size > 10_000
 
 
@@ -324,14 +396,23 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     monkeypatch.setattr(view_paper, "progress_bar", bar)
     monkeypatch.setattr(view_paper, "experiments", one)
     monkeypatch.setattr(
-        view_paper, "rod_sweep", lambda progress: paper.rod_sweep(places=(0.0, 2e-3), progress=progress)
+        view_paper,
+        "rod_sweep",
+        lambda progress: paper.rod_sweep(places=(0.0, 2e-3), progress=progress),
     )
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())
     assert made == [
-        "experiment_1_finite.png", "experiment_1_linear.png", "figure_4.png", "paper.json", "rod_positions.png",
-    ]  # fmt: skip
-    assert json.loads((tmp_path / "p" / "paper.json").read_text())["rod positions"]["place"] == [0.0, 2e-3]
+        "experiment_1_finite.png",
+        "experiment_1_linear.png",
+        "figure_4.png",
+        "paper.json",
+        "rod_positions.png",
+    ]
+    assert json.loads((tmp_path / "p" / "paper.json").read_text())["rod positions"]["place"] == [
+        0.0,
+        2e-3,
+    ]
     assert told == sorted(told) and told[0] == 0 and 0.9 < told[-1] <= 1  # one bar
 
 
@@ -342,12 +423,15 @@ def _experiment() -> paper.Experiment:
 
 
 def test_every_picture_of_the_paper_is_there_and_shown():
-    shown = set(re.findall(r"\(paper/([a-z0-9_]+\.png)\)", (ROOT / "docs" / "paper.md").read_text()))
+    shown = set(
+        re.findall(r"\(paper/([a-z0-9_]+\.png)\)", (ROOT / "docs" / "paper.md").read_text())
+    )
     assert shown and shown == {path.name for path in (ROOT / "docs" / "paper").glob("*.png")}
 
 
 def test_the_figures_of_the_papers_page_are_those_of_its_json():
-    """paper.json is what ./cube paper wrote beside the pictures; each figure of the claims' table is made of it."""
+    """paper.json is what ./cube paper wrote beside the pictures; each figure of the claims' table
+    is made of it."""
     text = (ROOT / "docs" / "paper.md").read_text().replace("−", "-")
     found = json.loads((ROOT / "docs" / "paper" / "paper.json").read_text())
     experiment = {
@@ -363,14 +447,17 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
         return found[f"{experiment[name]}, {kind}"][what][row][column] / 1e3
 
     def four(name: str, digits: int, column: int) -> list[str]:
-        """Linear and finite of one experiment at its end, then of its sliding or gripped one, kHz."""
+        """Linear and finite of one experiment at its end, then of its sliding or gripped one,
+        kHz."""
         other = {"a": "a, sliding", "b": "b, gripped", "c": "c, sliding"}[name]
         kinds = [(one, kind) for one in (name, other) for kind in ("linear", "finite")]
         return [f"{last(*one, 'prototype', column):.{digits}f}" for one in kinds]
 
     said = [
         "{} kHz linear, {} kHz finite; sliding: {} and {} kHz".format(*four("a", 1, 0)),
-        "{} kHz linear, {} kHz finite; gripped after sliding {} and {} kHz".format(*four("b", 2, 1)),
+        "{} kHz linear, {} kHz finite; gripped after sliding {} and {} kHz".format(
+            *four("b", 2, 1)
+        ),
         "{} kHz linear, {} kHz finite; sliding bottom: {} and {} kHz".format(*four("c", 2, 2)),
         "{} kHz linear, {} kHz finite; sliding bottom: {} and {} kHz".format(*four("c", 2, 1)),
     ]
@@ -379,17 +466,27 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
         said.append(f"{before:.2f} → {after:.2f} kHz, {100 * (after / before - 1):.1f} %")
     for name, mode in (("a", 0), ("a, sliding", 0), ("b", 1), ("c", 0), ("c", 3)):
         digits = 1 if mode else 0
-        said.append(" for ".join(f"{last(name, 'linear', what, mode):.{digits}f}" for what in ("recovered", "truth")))
+        said.append(
+            " for ".join(
+                f"{last(name, 'linear', what, mode):.{digits}f}" for what in ("recovered", "truth")
+            )
+        )
     pads = 1e-3 * np.array(found[f"{experiment['c']}, finite"]["pads"])[:, :4]
     both = pads @ np.array([[-1, 1, 1, -1], [1, -1, 1, -1]]).T
     said.append(" | ".join(f"{shear:.2f}, {grad:.2f}" for shear, grad in both[[3, 5, 7, 9, 11]]))
     rods = found["rod positions"]
-    for place, *parts in zip(*(rods[key] for key in ("place", "signal", "shear", "crosstalk")), strict=True):
+    for place, *parts in zip(
+        *(rods[key] for key in ("place", "signal", "shear", "crosstalk")), strict=True
+    ):
         if place:
             numbers = [f"{part / 1e3 + 0.0:.1f}".replace("-0.0", "0.0") for part in parts]
-            said.append(f"| {1e3 * place:g} | {' | '.join(numbers)} | {100 * parts[1] / parts[0]:.0f} % |")
+            said.append(
+                f"| {1e3 * place:g} | {' | '.join(numbers)} | {100 * parts[1] / parts[0]:.0f} % |"
+            )
     slab = read_calibration(ROOT / "config" / "calibration" / "planar_slab.yaml").response[:4]
-    said += [", ".join(f"{value:.3f}" for value in slab[:, column]) for column in (1, 3)]  # zx and zz_x
+    said += [
+        ", ".join(f"{value:.3f}" for value in slab[:, column]) for column in (1, 3)
+    ]  # zx and zz_x
     assert len(said) == 22
     for words in said:
         assert words in text, words

@@ -13,7 +13,11 @@ FULL = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])  # matrix position -> compone
 coordinate = st.floats(-3.0, 3.0)
 depth = st.floats(0.3, 3.0)
 point = st.tuples(coordinate, coordinate, depth.map(lambda h: -h)).map(np.array)
-force = st.tuples(coordinate, coordinate, coordinate).map(np.array).filter(lambda f: np.linalg.norm(f) > 0.01)
+force = (
+    st.tuples(coordinate, coordinate, coordinate)
+    .map(np.array)
+    .filter(lambda f: np.linalg.norm(f) > 0.01)
+)
 poisson = st.floats(0.0, 0.5)
 
 
@@ -26,7 +30,9 @@ def one(x, f, nu):
 @given(point, force, poisson)
 def test_equilibrium(x, f, nu):
     _, gradient = one(x, f, nu)
-    assert np.einsum("ijj->i", gradient) == pytest.approx(0.0, abs=1e-12 * (1 + abs(gradient).max()))
+    assert np.einsum("ijj->i", gradient) == pytest.approx(
+        0.0, abs=1e-12 * (1 + abs(gradient).max())
+    )
 
 
 @given(point, force, poisson)
@@ -40,10 +46,12 @@ def test_gradient_is_the_derivative_of_the_stress(x, f, nu):
 
 @given(point, force, st.floats(0.0, 0.49))
 def test_compatibility_beltrami_michell(x, f, nu):
-    """Laplace sigma_ij + trace_,ij / (1 + nu) = 0: with balance and a free surface there is one answer."""
+    """Laplace sigma_ij + trace_,ij / (1 + nu) = 0: with balance and a free surface there is one
+    answer."""
     h = 1e-4
     second = np.stack(
-        [(one(x + h * e, f, nu)[1] - one(x - h * e, f, nu)[1]) / (2 * h) for e in np.eye(3)], axis=-1
+        [(one(x + h * e, f, nu)[1] - one(x - h * e, f, nu)[1]) / (2 * h) for e in np.eye(3)],
+        axis=-1,
     )  # ijkl: d2 sigma_ij / dx_k dx_l
     residual = np.einsum("ijkk->ij", second) + np.einsum("mmij->ij", second) / (1 + nu)
     scale = np.linalg.norm(f) / np.linalg.norm(x) ** 4
@@ -85,8 +93,14 @@ def test_printed_components(nu):
     r2, rho = x * x + y * y, np.sqrt(x * x + y * y + z * z)
     k = 1 / (2 * np.pi)
     pressed, _ = one(np.array([x, y, -z]), np.array([0, 0, -1.0]), nu)
-    sxx = k * ((1 - 2 * nu) / r2 * ((1 - z / rho) * (x * x - y * y) / r2 + z * y * y / rho**3) - 3 * z * x * x / rho**5)
-    sxy = k * ((1 - 2 * nu) / r2 * ((1 - z / rho) * 2 * x * y / r2 - x * y * z / rho**3) - 3 * x * y * z / rho**5)
+    sxx = k * (
+        (1 - 2 * nu) / r2 * ((1 - z / rho) * (x * x - y * y) / r2 + z * y * y / rho**3)
+        - 3 * z * x * x / rho**5
+    )
+    sxy = k * (
+        (1 - 2 * nu) / r2 * ((1 - z / rho) * 2 * x * y / r2 - x * y * z / rho**3)
+        - 3 * x * y * z / rho**5
+    )
     assert pressed[0, 0] == pytest.approx(sxx, rel=1e-12)
     assert pressed[2, 2] == pytest.approx(-3 * k * z**3 / rho**5, rel=1e-12)
     assert pressed[0, 2] == pytest.approx(3 * k * x * z * z / rho**5, rel=1e-12)
@@ -96,11 +110,18 @@ def test_printed_components(nu):
     a = rho + z
     sxx = k * (
         -3 * x**3 / rho**5
-        + (1 - 2 * nu) * (x / rho**3 - 3 * x / (rho * a**2) + x**3 / (rho**3 * a**2) + 2 * x**3 / (rho**2 * a**3))
+        + (1 - 2 * nu)
+        * (x / rho**3 - 3 * x / (rho * a**2) + x**3 / (rho**3 * a**2) + 2 * x**3 / (rho**2 * a**3))
     )
     syy = k * (
         -3 * x * y * y / rho**5
-        + (1 - 2 * nu) * (x / rho**3 - x / (rho * a**2) + x * y * y / (rho**3 * a**2) + 2 * x * y * y / (rho**2 * a**3))
+        + (1 - 2 * nu)
+        * (
+            x / rho**3
+            - x / (rho * a**2)
+            + x * y * y / (rho**3 * a**2)
+            + 2 * x * y * y / (rho**2 * a**3)
+        )
     )
     assert slid[0, 0] == pytest.approx(sxx, rel=1e-12)
     assert slid[1, 1] == pytest.approx(syy, rel=1e-12)
@@ -116,12 +137,14 @@ def test_force_over_a_plane_below():
     angle = (t + 1) / 2 * top  # r = tan(angle) opens up the far field
     r, weight = np.tan(angle), weight / 2 * top / np.cos(angle) ** 2
     phi = 2 * np.pi * np.arange(16) / 16
-    points = np.stack([np.outer(r, np.cos(phi)), np.outer(r, np.sin(phi)), np.full((60, 16), -1.0)], axis=-1).reshape(
-        -1, 3
-    )
+    points = np.stack(
+        [np.outer(r, np.cos(phi)), np.outer(r, np.sin(phi)), np.full((60, 16), -1.0)], axis=-1
+    ).reshape(-1, 3)
     stress, _ = contact.field(points, np.zeros((1, 3)), [f], 0.4)
     area = np.repeat(weight * r * 2 * np.pi / 16, 16)
-    below = (area[:, None] * stress[:, [4, 3, 2]]).sum(axis=0)  # the lower part has the outward normal +z
+    below = (area[:, None] * stress[:, [4, 3, 2]]).sum(
+        axis=0
+    )  # the lower part has the outward normal +z
     assert below == pytest.approx(f, abs=1e-3)  # what lies beyond the disc: 3 F / (2 * 2000)
 
 
@@ -140,11 +163,14 @@ def test_hertz_on_the_axis(nu):
     assert gradient[:, 2, 2] == pytest.approx(-p0 / a * 2 * h / (1 + h * h) ** 2, rel=1e-4)
 
 
-@pytest.mark.parametrize("patch", [
-    lambda n: contact.disc(1.0, [0.3, 0, -1], order=n),
-    lambda n: contact.hertz(1.0, [0.3, 0, -1], order=n),
-    lambda n: contact.rectangle([2.0, 1.0], [0.3, 0, -1], order=2 * n),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "patch",
+    [
+        lambda n: contact.disc(1.0, [0.3, 0, -1], order=n),
+        lambda n: contact.hertz(1.0, [0.3, 0, -1], order=n),
+        lambda n: contact.rectangle([2.0, 1.0], [0.3, 0, -1], order=2 * n),
+    ],
+)
 def test_patches_converge_and_carry_their_force(patch):
     points = np.array([[0.2, 0.1, -0.5], [0.9, 0.3, -0.5], [2.0, -1.0, -0.5]])
     exact, _ = contact.field(points, *patch(24), 0.4)
@@ -162,18 +188,23 @@ def test_leading_axes_broadcast():
     stress, gradient = contact.field(points, sources, forces, 0.45)
     assert stress.shape == (5, 4, 6) and gradient.shape == (5, 4, 6, 3)
     alone = contact.field(points, sources[3], forces[3], 0.45)
-    assert np.allclose(stress[3], alone[0], rtol=1e-12) and np.allclose(gradient[3], alone[1], rtol=1e-12)
+    assert np.allclose(stress[3], alone[0], rtol=1e-12) and np.allclose(
+        gradient[3], alone[1], rtol=1e-12
+    )
 
 
-@pytest.mark.parametrize("points, sources, forces, nu, words", [
-    ([[0, 0, 1.0]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "negative z"),
-    ([[0, 0, -1.0]], [[0, 0, 0.1]], [[0, 0, 1]], 0.3, "z = 0"),
-    ([[0, 0, -1.0]], [[0, 0, 0]], [[0, 0, 1]], 0.51, r"0\.51"),
-    ([[0, 0, 0.0]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "below the surface"),
-    ([[0, 0, -1.0]], [[0, 0, 0]], [[0, 0, 1], [0, 0, 1]], 0.3, "1 sources but 2 forces"),
-    ([[0, 0, np.nan]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "finite"),
-    ([[0, 0]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "shape"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "points, sources, forces, nu, words",
+    [
+        ([[0, 0, 1.0]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "negative z"),
+        ([[0, 0, -1.0]], [[0, 0, 0.1]], [[0, 0, 1]], 0.3, "z = 0"),
+        ([[0, 0, -1.0]], [[0, 0, 0]], [[0, 0, 1]], 0.51, r"0\.51"),
+        ([[0, 0, 0.0]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "below the surface"),
+        ([[0, 0, -1.0]], [[0, 0, 0]], [[0, 0, 1], [0, 0, 1]], 0.3, "1 sources but 2 forces"),
+        ([[0, 0, np.nan]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "finite"),
+        ([[0, 0]], [[0, 0, 0]], [[0, 0, 1]], 0.3, "shape"),
+    ],
+)
 def test_bad_input(points, sources, forces, nu, words):
     with pytest.raises(ElasticError, match=words):
         contact.field(points, sources, forces, nu)

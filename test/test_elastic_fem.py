@@ -10,25 +10,26 @@ import skfem
 from scipy.sparse.linalg import spsolve
 from skfem.helpers import dot
 
+from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError, LayoutError, SymmetryError
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import fem, mesh
-from cube_tensor_driver.elastic.bench import Bench
 from cube_tensor_driver.elastic.body import Body, strip_layout
 from cube_tensor_driver.elastic.fem import calibration_from_fem, compute_response
 from cube_tensor_driver.elastic.pads import interval_weights
 from cube_tensor_driver.elastic.solid import Solid, brick_stiffness, lame, stiffness
-from cube_tensor_driver.files.calibration import read_calibration
+from cube_tensor_driver.research.virtual_bench import Bench
 
 HALVES = strip_layout(LAYOUTS["planar"], 1.0)
 RIGID = float("inf")
 
 
 def applied(layout, modes):
-    """Mean of sigma_nn over each pad of the undisturbed field: linear, so its value at the pad's centre."""
+    """Mean of sigma_nn over each pad of the undisturbed field: linear, so its value at the pad's
+    centre."""
     n, x = layout.normals, layout.positions
     field = modes.stress[None] + np.einsum("mijk,pk->pmij", modes.gradient, x)
     return np.einsum("pi,pmij,pj->pm", n, field, n)
@@ -78,7 +79,8 @@ def test_without_a_cube_pads_feel_the_applied_field(plane, layout):
 
 
 def rigid_disc(poisson, r, angle):
-    """sigma_rr and sigma_rt round a bonded rigid disc r = 1 under remote sigma_xx = 1, plane strain.
+    """sigma_rr and sigma_rt round a bonded rigid disc r = 1 under remote sigma_xx = 1, plane
+    strain.
 
     N. I. Muskhelishvili, Some Basic Problems (1953), 59; here by Michell's series with u(1) = 0.
     """
@@ -91,7 +93,8 @@ def rigid_disc(poisson, r, angle):
 
 
 def disc_pad_error(poisson, cuts):
-    """Relative error of the mean sigma_rr on the arc 0 .. 45 degrees of a rigid disc, in a ring 1 .. 3."""
+    """Relative error of the mean sigma_rr on the arc 0 .. 45 degrees of a rigid disc, in a ring 1
+    .. 3."""
     flat = skfem.MeshTri.init_tensor(np.linspace(0, 1, cuts + 1), np.linspace(0, 1, 2 * cuts + 1))
     curved = skfem.MeshTri2.from_mesh(flat)
     r, angle = 3.0 ** curved.doflocs[0], np.pi / 2 * curved.doflocs[1]
@@ -115,7 +118,11 @@ def disc_pad_error(poisson, cuts):
     component[basis.get_dofs(elements=True).all("u^2")] = 1
     inner = np.zeros(basis.N, dtype=bool)
     inner[basis.get_dofs(inside).all()] = True
-    held = inner | ((np.abs(x[0]) < 1e-9) & (component == 0)) | ((np.abs(x[1]) < 1e-9) & (component == 1))
+    held = (
+        inner
+        | ((np.abs(x[0]) < 1e-9) & (component == 0))
+        | ((np.abs(x[1]) < 1e-9) & (component == 1))
+    )
     u = np.zeros(basis.N)
     u[~held] = spsolve(matrix[~held][:, ~held].tocsc(), force[~held])
     reaction = matrix @ u
@@ -125,7 +132,9 @@ def disc_pad_error(poisson, cuts):
     by_angle = np.argsort(place)
     weights = interval_weights(place[by_angle], 4, 1, 0.0, 0.5)
     kappa = 3 - 4 * poisson
-    exact = (kappa + 1) / 4 + (kappa + 1) / (2 * kappa) * 2 / np.pi  # the mean of cos 2t on the arc is 2 / pi
+    exact = (kappa + 1) / 4 + (kappa + 1) / (
+        2 * kappa
+    ) * 2 / np.pi  # the mean of cos 2t on the arc is 2 / pi
     return abs(-weights @ radial[by_angle] / (np.pi / 4) / exact - 1)
 
 
@@ -175,7 +184,8 @@ def test_square_body_has_the_papers_structure(square):
 
 
 def test_slab_deviates_from_the_papers_structure(slab):
-    """Measured with this code, 60 x 11 mm; mirrors explain all of it, the exchange of x and z does not."""
+    """Measured with this code, 60 x 11 mm; mirrors explain all of it, the exchange of x and z does
+    not."""
     stated = dict(zip(PLANE.names, (0.048, 0.109, 0.045, 0.027, 0.029, 0.026, 0.028), strict=True))
     assert slab.mode_residual == pytest.approx(stated, abs=0.001)
     mirrors = compute_response(Body(), HALVES, "mirrors", meshes=1)
@@ -184,7 +194,8 @@ def test_slab_deviates_from_the_papers_structure(slab):
 
 @pytest.mark.parametrize("result", ["slab", "square"])
 def test_coefficients_converge_with_the_mesh(result, request):
-    """The middle mesh is within 0.5 % of the finest in every coefficient; f, near zero, within 1e-4."""
+    """The middle mesh is within 0.5 % of the finest in every coefficient; f, near zero, within
+    1e-4."""
     rows = request.getfixturevalue(result).convergence
     assert rows[1]["coefficients"] == pytest.approx(rows[2]["coefficients"], rel=5e-3, abs=1e-4)
     assert rows[0]["change"] < 1e-3 and rows[1]["change"] < 1e-3
@@ -194,13 +205,19 @@ def test_coefficients_converge_with_the_mesh(result, request):
 def test_the_default_is_right():
     """Every coefficient of the default body and pads, against triangles cut in four once more.
 
-    0.5 % is asked and 0.022 % found. The finer mesh stops its rings at 0.01, which moves the means over strips, that
-    end before the corner, by less than 0.005 %.
+    0.5 % is asked and 0.022 % found. The finer mesh stops its rings at 0.01, which moves the means
+    over strips, that end before the corner, by less than 0.005 %.
     """
     body, layout = Body(), LAYOUTS["planar"]
     row = compute_response(body, layout, meshes=3).convergence[-1]
-    finer = Solid(mesh.section((15.0, 2.75), (0.3, 0.7), 3, smallest=0.01), lame(1.0, 0.48), lame(200e9 / 0.3e6, 0.3))
-    truth = project(fem.find_structure(layout, "full"), fem.linear_response(finer, layout, lambda _: None))[0]
+    finer = Solid(
+        mesh.section((15.0, 2.75), (0.3, 0.7), 3, smallest=0.01),
+        lame(1.0, 0.48),
+        lame(200e9 / 0.3e6, 0.3),
+    )
+    truth = project(
+        fem.find_structure(layout, "full"), fem.linear_response(finer, layout, lambda _: None)
+    )[0]
     assert 1.5 * row["unknowns"] < finer.basis.N
     assert row["coefficients"] == pytest.approx(truth, rel=5e-4)
 
@@ -288,14 +305,17 @@ def test_cubic_body_has_the_full_structure(coarse):
 # what is refused
 
 
-@pytest.mark.parametrize("changes, words", [
-    ({"poisson": 0.5}, r"poisson is 0\.5; .* \[0, 0\.5\)"),
-    ({"cube_poisson": 0.6}, r"cube_poisson is 0\.6"),
-    ({"side": 11e-3}, "cube's side is 11 mm but the body's height is 11 mm"),
-    ({"young": 0.0}, r"young is 0\.0"),
-    ({"width": float("nan")}, "width is nan"),
-    ({"plane": "x"}, "'strain' or 'stress'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"poisson": 0.5}, r"poisson is 0\.5; .* \[0, 0\.5\)"),
+        ({"cube_poisson": 0.6}, r"cube_poisson is 0\.6"),
+        ({"side": 11e-3}, "cube's side is 11 mm but the body's height is 11 mm"),
+        ({"young": 0.0}, r"young is 0\.0"),
+        ({"width": float("nan")}, "width is nan"),
+        ({"plane": "x"}, "'strain' or 'stress'"),
+    ],
+)
 def test_bad_bodies(changes, words):
     with pytest.raises(ElasticError, match=words):
         Body(**changes)
@@ -366,16 +386,23 @@ def test_result_as_plain_types(square):
 
 def test_progress_counts_to_the_end():
     seen = []
-    compute_response(Body(cube_young=RIGID), HALVES, meshes=2, progress=lambda *step: seen.append(step))
+    compute_response(
+        Body(cube_young=RIGID), HALVES, meshes=2, progress=lambda *step: seen.append(step)
+    )
     assert [done for done, _, _ in seen] == list(range(9)) and seen[-1] == (8, 8, "done")
 
 
-@pytest.mark.parametrize("name, layout, body", [
-    ("planar", "planar", Body(height=60e-3)),
-    ("planar_slab", "planar", Body()),
-    ("quad", "quad", Body()),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, layout, body",
+    [
+        ("planar", "planar", Body(height=60e-3)),
+        ("planar_slab", "planar", Body()),
+        ("quad", "quad", Body()),
+    ],
+)
 def test_shipped_calibrations_are_what_the_code_computes(name, layout, body):
-    shipped = read_calibration(Path(__file__).parents[1] / "config" / "calibration" / f"{name}.yaml")
+    shipped = read_calibration(
+        Path(__file__).parents[1] / "config" / "calibration" / f"{name}.yaml"
+    )
     computed = compute_response(body, LAYOUTS[layout], shipped.symmetry, meshes=2).matrix
     assert np.abs(shipped.response - computed).max() < 1e-3

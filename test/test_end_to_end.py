@@ -1,4 +1,5 @@
-"""The main job in real processes: simulator, pseudo-terminal, driver, DDS, reconstruction, DDS, subscriber."""
+"""The main job in real processes: simulator, pseudo-terminal, driver, DDS, reconstruction, DDS,
+subscriber."""
 
 from __future__ import annotations
 
@@ -26,33 +27,39 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from conftest import ROOT
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.protocol import Hello, Request, Sample, encode
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
-from cube_tensor_driver.files.yaml import parse_yaml
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
-from cube_tensor_driver.ros.children import Children, ros_arguments
+from cube_tensor_driver.processes.children import Children, ros_arguments
+from cube_tensor_driver.processes.skin_processes import skin_processes
 from cube_tensor_driver.ros.messages import read_frequencies, read_stress
-from cube_tensor_driver.ros.start import skin_processes
 
-SKIN = share() / "config" / "skin_demo.yaml"
-SINGLE = share() / "config" / "cube.yaml"
+SKIN = package_data() / "config" / "skin_demo.yaml"
+SINGLE = package_data() / "config" / "cube.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def demo(*arguments: str) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-m", "cube_tensor_driver.cli", "demo", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+    )
 
 
 def test_demo_loses_nothing_and_is_right(domain, tmp_path):
     path = tmp_path / "demo.json"
-    process = demo("--headless", "--cubes", "16", "--rate", "100", "--duration", "3", "--json", str(path))
+    process = demo(
+        "--headless", "--cubes", "16", "--rate", "100", "--duration", "3", "--json", str(path)
+    )
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 0, output + errors
     result = json.loads(path.read_text())
@@ -60,7 +67,8 @@ def test_demo_loses_nothing_and_is_right(domain, tmp_path):
     assert result["samples_sent"] == 16 * 100 * 3
     assert result["tensors_received"] == result["samples_received"] == result["samples_sent"]
     assert result["lost"] == 0 and result["crc_errors"] == 0
-    # float32 carries 6e-8; pads at a strain of 0.1 have 1e-6 of their stress, times what the inversion adds
+    # float32 carries 6e-8; pads at a strain of 0.1 have 1e-6 of their stress, times what the
+    # inversion adds
     assert result["error_rel_rms"] < 1e-5
     assert 0 < result["latency_p50_ms"] <= result["latency_p99_ms"]
     for name in ("driver", "reconstruction"):
@@ -129,9 +137,20 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
             if process.node and scans > 1:
                 process.parameters["publish_period"] = scans / skin.rate
             children.start(process)
-        ros.wait(lambda: len(batches) > 50 and len(raw) > 80 and len(tensors) > 20 and len(wrenches) > 20)
-        ros.wait(lambda: {status.name for array in diagnostics for status in array.status} >= {
-            "/driver: rows", "/driver: link hub0", "/driver: link hub1", "/reconstruction: rows"})  # fmt: skip
+        ros.wait(
+            lambda: len(batches) > 50 and len(raw) > 80 and len(tensors) > 20 and len(wrenches) > 20
+        )
+        ros.wait(
+            lambda: (
+                {status.name for array in diagnostics for status in array.status}
+                >= {
+                    "/driver: rows",
+                    "/driver: link hub0",
+                    "/driver: link hub1",
+                    "/reconstruction: rows",
+                }
+            )
+        )
         # who comes late still gets the latched info, of both nodes
         infos = ros.listen(SkinInfo, "info", LATCHED)
         ros.wait(lambda: len(infos) == 2)
@@ -139,7 +158,10 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
 
     # whole hubs in order; where the machine paused, several samples of a hub come together
     for message in batches:
-        assert set(map(tuple, np.reshape(message.cube, (-1, 8)).tolist())) <= {tuple(range(8)), tuple(range(8, 16))}
+        assert set(map(tuple, np.reshape(message.cube, (-1, 8)).tolist())) <= {
+            tuple(range(8)),
+            tuple(range(8, 16)),
+        }
     counts = np.bincount(np.concatenate([message.cube for message in batches]), minlength=16)
     assert counts.min() > 0.5 * counts.max()
     assert np.median([len(message.cube) for message in batches]) == 16 * scans
@@ -149,7 +171,9 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     names = ("xx", "yy", "zz", "yz", "zx", "xy")
     seen = [name for k, name in enumerate(names) if rows.observed[0] >> k & 1]
     assert seen == ["xx", "zz", "zx"]
-    assert np.isnan(rows.stress[:, [1, 3, 5]]).all() and np.isfinite(rows.stress[:, [0, 2, 4]]).all()
+    assert (
+        np.isnan(rows.stress[:, [1, 3, 5]]).all() and np.isfinite(rows.stress[:, [0, 2, 4]]).all()
+    )
 
     # what the batch says of a cube, its own topic says too, with the covariance of the core
     by_time = {}
@@ -165,22 +189,33 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     np.testing.assert_array_equal(tensor.tensor.normal_gradient, gradient)
     assert tensor.header.frame_id == "skin_c05"
     expected = Pipeline([cube.calibration for cube in skin.cubes]).covariance(5)
-    np.testing.assert_allclose(np.reshape(tensor.tensor.covariance, (15, 15)), expected, rtol=1e-5)  # noise in float32
+    np.testing.assert_allclose(
+        np.reshape(tensor.tensor.covariance, (15, 15)), expected, rtol=1e-5
+    )  # noise in float32
 
     # force = w² σ·n on the cube's own face of 4 mm, what is not observed counts as 0; always finite
     wrench = wrenches[-1]
     stress, gradient = by_time[wrench.header.stamp.sec * 10**9 + wrench.header.stamp.nanosec]
     force, torque = wrench.wrench.force, wrench.wrench.torque
-    np.testing.assert_allclose([force.x, force.y, force.z], 0.004**2 * np.array([stress[4], 0, stress[2]]), rtol=1e-6)
     np.testing.assert_allclose(
-        [torque.x, torque.y, torque.z], [0, -(0.004**4) / 12 * gradient[6], 0], rtol=1e-6, atol=1e-30
+        [force.x, force.y, force.z], 0.004**2 * np.array([stress[4], 0, stress[2]]), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        [torque.x, torque.y, torque.z],
+        [0, -(0.004**4) / 12 * gradient[6], 0],
+        rtol=1e-6,
+        atol=1e-30,
     )
 
     # the latched info holds all that makes the same tensors of the recorded frequencies again
     info = infos[0]
-    assert info.version == SkinInfo.VERSION and [cube.name for cube in info.cubes] == [cube.name for cube in skin.cubes]
+    assert info.version == SkinInfo.VERSION and [cube.name for cube in info.cubes] == [
+        cube.name for cube in skin.cubes
+    ]
     texts = dict(zip(info.calibration_ids, info.calibrations, strict=True))
-    calibrations = [Calibration.from_dict(parse_yaml(texts[cube.calibration_id], "info")) for cube in info.cubes]
+    calibrations = [
+        Calibration.from_dict(parse_yaml(texts[cube.calibration_id], "info")) for cube in info.cubes
+    ]
     replay = Pipeline(calibrations, np.float32)
     stored = {tuple(read_stress(m)[0].sequence): read_stress(m)[1] for m in batches}
     compared = 0
@@ -208,7 +243,8 @@ def test_driver_waits_for_a_port_that_is_not_there_yet(ros, tmp_path):
 
 
 class Hub:
-    """A hub under the test's control: the near end of a pseudo-terminal whose far end is the driver's port."""
+    """A hub under the test's control: the near end of a pseudo-terminal whose far end is the
+    driver's port."""
 
     def __init__(self, folder: Path, name: str) -> None:
         folder.mkdir(exist_ok=True)
@@ -242,7 +278,11 @@ def hub(tmp_path):
 
 def one_sample(sequence: int, hertz: float = 100_000.0, n_pads: int = 8) -> bytes:
     frequency = np.full((1, n_pads), round(hertz * 1e3), "<u4")
-    return encode(Sample(sequence, 0, 10_000 * sequence, frequency, np.zeros(1, "<u4"), np.full(1, -32768, "<i2")))
+    return encode(
+        Sample(
+            sequence, 0, 10_000 * sequence, frequency, np.zeros(1, "<u4"), np.full(1, -32768, "<i2")
+        )
+    )
 
 
 def greet(n_pads: int = 8) -> bytes:
@@ -308,7 +348,11 @@ def test_beyond_the_law_is_a_fault_and_no_number(ros, hub, tmp_path):
         ros.wait(lambda: 1 in hub.listen())
         hub.send(greet())
         ros.wait(lambda: 2 in hub.listen())
-        ros.wait(lambda: ros.node.count_publishers("stress") and ros.node.count_subscribers("frequencies"))
+        ros.wait(
+            lambda: (
+                ros.node.count_publishers("stress") and ros.node.count_subscribers("frequencies")
+            )
+        )
         frequency = np.full((1, 8), 100_000_000, "<u4")
         frequency[0, 3] = 0  # not measured
         frequency[0, 5] = 4_000_000_000  # 4 MHz; the law ends at f0 (1 + β)/β = 433 kHz
@@ -316,13 +360,25 @@ def test_beyond_the_law_is_a_fault_and_no_number(ros, hub, tmp_path):
 
         def arrived() -> bool:
             number = next(sequence)
-            hub.send(encode(Sample(number, 0, 10_000 * number, frequency, np.zeros(1, "<u4"), np.zeros(1, "<i2"))))
+            hub.send(
+                encode(
+                    Sample(
+                        number,
+                        0,
+                        10_000 * number,
+                        frequency,
+                        np.zeros(1, "<u4"),
+                        np.zeros(1, "<i2"),
+                    )
+                )
+            )
             return bool(batches)
 
         ros.wait(arrived)
         _, rows = read_stress(batches[0])
         assert rows.status[0] & SkinStress.PAD_FAULT
-        # six pads cannot tell seven unknowns apart: something is missing, and what is there is at rest
+        # six pads cannot tell seven unknowns apart: something is missing, and what is there is at
+        # rest
         assert np.isnan(rows.stress[0]).any()
         seen = rows.stress[0][np.isfinite(rows.stress[0])]
         assert np.abs(seen).max(initial=0) < 1e-3
@@ -378,7 +434,18 @@ def test_a_hub_with_more_cubes_than_the_skin_gives_those_it_has(ros, hub, tmp_pa
         def arrived() -> bool:
             number = next(sequence)
             frequency = np.full((3, 8), 100_000_000, "<u4")
-            hub.send(encode(Sample(number, 0, 10_000 * number, frequency, np.zeros(3, "<u4"), np.zeros(3, "<i2"))))
+            hub.send(
+                encode(
+                    Sample(
+                        number,
+                        0,
+                        10_000 * number,
+                        frequency,
+                        np.zeros(3, "<u4"),
+                        np.zeros(3, "<i2"),
+                    )
+                )
+            )
             return bool(frequencies)
 
         ros.wait(arrived)
@@ -396,7 +463,11 @@ def test_another_protocol_version_is_an_error_that_names_both(ros, hub, tmp_path
         start_single(children, tmp_path)
         ros.wait(lambda: 1 in hub.listen())
         hub.send(of_version(2))
-        ros.wait(lambda: "protocol version 2, this driver version 1" in link_status(diagnostics).get("", ""))
+        ros.wait(
+            lambda: (
+                "protocol version 2, this driver version 1" in link_status(diagnostics).get("", "")
+            )
+        )
         ros.wait(lambda: "protocol version 2, this driver version 1" in children.log("driver"))
         children.check()
 
@@ -421,7 +492,13 @@ def of_version(version: int) -> bytes:
     ],
 )
 def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, parameters, words):
-    command = [sys.executable, "-m", f"cube_tensor_driver.ros.{executable}", "--ros-args", *ros_arguments(parameters)]
+    command = [
+        sys.executable,
+        "-m",
+        f"cube_tensor_driver.ros.{executable}",
+        "--ros-args",
+        *ros_arguments(parameters),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 1
     text = done.stdout + done.stderr
@@ -437,7 +514,11 @@ def test_lifecycle_by_hand(ros, tmp_path):
     driver.parameters["autostart"] = False
 
     def change(number: int) -> None:
-        answer = ros.call(ChangeState, "/driver/change_state", ChangeState.Request(transition=Transition(id=number)))
+        answer = ros.call(
+            ChangeState,
+            "/driver/change_state",
+            ChangeState.Request(transition=Transition(id=number)),
+        )
         assert answer.success
 
     def state() -> int:

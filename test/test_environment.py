@@ -1,4 +1,5 @@
-"""Set-up: what is missing is said before any work, an interrupted step is done again, nothing is left running."""
+"""Set-up: what is missing is said before any work, an interrupted step is done again, nothing is
+left running."""
 
 from __future__ import annotations
 
@@ -21,16 +22,26 @@ import environment
 
 
 def test_missing_system_packages_are_named_with_the_command(monkeypatch):
-    monkeypatch.setattr(environment.shutil, "which", lambda name: None if name in ("c++", "cmake") else "/usr/bin/x")
-    monkeypatch.setattr(environment.importlib.util, "find_spec", lambda name: None if name == "ensurepip" else object())
+    monkeypatch.setattr(
+        environment.shutil, "which", lambda name: None if name in ("c++", "cmake") else "/usr/bin/x"
+    )
+    monkeypatch.setattr(
+        environment.importlib.util,
+        "find_spec",
+        lambda name: None if name == "ensurepip" else object(),
+    )
     monkeypatch.setattr(sysconfig, "get_paths", lambda: {"include": "/none"})
     python = f"python{sys.version_info.major}.{sys.version_info.minor}"
     with pytest.raises(environment.SetupError) as caught:
         environment.check_system()
-    assert f"sudo apt install -y build-essential cmake {python}-venv {python}-dev" in str(caught.value)
+    assert f"sudo apt install -y build-essential cmake {python}-venv {python}-dev" in str(
+        caught.value
+    )
 
 
-@pytest.mark.parametrize(("machine", "version"), [("aarch64", (3, 11)), ("x86_64", (3, 14)), ("x86_64", (3, 9))])
+@pytest.mark.parametrize(
+    ("machine", "version"), [("aarch64", (3, 11)), ("x86_64", (3, 14)), ("x86_64", (3, 9))]
+)
 def test_a_platform_without_wheels_is_told_the_way_out(monkeypatch, machine, version):
     monkeypatch.setattr(platform, "machine", lambda: machine)
     monkeypatch.setattr(environment.sys, "version_info", (*version, 0))
@@ -56,10 +67,16 @@ def test_a_sourced_ros_that_lacks_something_is_told_how_to_get_it(monkeypatch):
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")
     monkeypatch.setenv("ROS_DISTRO", "jazzy")
     monkeypatch.setattr(environment.shutil, "which", lambda name: None)
-    monkeypatch.setattr(environment.importlib.util, "find_spec", lambda name: None if name == "cobs" else object())
+    monkeypatch.setattr(
+        environment.importlib.util, "find_spec", lambda name: None if name == "cobs" else object()
+    )
     with pytest.raises(environment.SetupError) as caught:
         environment.sourced_ros()
-    for word in ("missing: cobs, colcon", "rosdep install --from-paths", "python3-colcon-common-extensions"):
+    for word in (
+        "missing: cobs, colcon",
+        "rosdep install --from-paths",
+        "python3-colcon-common-extensions",
+    ):
         assert word in str(caught.value)
 
 
@@ -84,15 +101,19 @@ def test_a_step_is_done_again_until_it_succeeded_with_these_inputs(tmp_path):
 def test_a_failed_step_shows_the_end_of_its_log(tmp_path):
     log = tmp_path / "log"
     with pytest.raises(environment.SetupError) as caught:
-        environment.run([sys.executable, "-c", "print('the reason'); exit(3)"], dict(os.environ), log)
-    assert "code 3" in str(caught.value) and "the reason" in str(caught.value) and str(log) in str(caught.value)
+        environment.run(
+            [sys.executable, "-c", "print('the reason'); exit(3)"], dict(os.environ), log
+        )
+    assert (
+        "code 3" in str(caught.value)
+        and "the reason" in str(caught.value)
+        and str(log) in str(caught.value)
+    )
 
 
 def test_an_interrupted_step_leaves_no_process(tmp_path):
     # A step with a child of its own that ignores SIGTERM, as compilers under colcon may.
-    grandchild = (
-        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"
-    )
+    grandchild = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"
     child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {grandchild!r}])"
     script = (
         f"import sys, signal; sys.path.insert(0, {str(ROOT / 'tools')!r})\n"
@@ -121,7 +142,11 @@ def test_an_interrupted_step_leaves_no_process(tmp_path):
 
 def test_help_needs_no_environment(tmp_path):
     done = subprocess.run(
-        [ROOT / "cube", "--help"], capture_output=True, text=True, check=False, env={"PATH": os.environ["PATH"]}
+        [ROOT / "cube", "--help"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PATH": os.environ["PATH"]},
     )
     assert done.returncode == 0
     for command in ("demo", "test", "lint", "exec"):
@@ -130,9 +155,15 @@ def test_help_needs_no_environment(tmp_path):
 
 def test_no_python_is_said_with_the_way_out(tmp_path):
     for name in ("sh", "dirname", "readlink", "cat"):
-        (tmp_path / name).symlink_to(Path("/bin") / name if Path("/bin", name).exists() else Path("/usr/bin") / name)
+        (tmp_path / name).symlink_to(
+            Path("/bin") / name if Path("/bin", name).exists() else Path("/usr/bin") / name
+        )
     done = subprocess.run(
-        [ROOT / "cube", "demo"], capture_output=True, text=True, check=False, env={"PATH": str(tmp_path)}
+        [ROOT / "cube", "demo"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PATH": str(tmp_path)},
     )
     assert done.returncode == 1
     assert "no Python 3.10 to 3.13 found" in done.stderr and "sudo apt install" in done.stderr

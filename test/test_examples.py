@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.tensor import rotation_from_rpy
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
 
-FOLDER = share() / "config" / "examples"
+FOLDER = package_data() / "config" / "examples"
 
 
 def test_forearm_is_a_cylinder_of_mixed_cubes_that_look_outwards():
@@ -27,7 +27,10 @@ def test_forearm_is_a_cylinder_of_mixed_cubes_that_look_outwards():
     np.testing.assert_allclose(places[:, 1:], 0.04 * out[:, 1:], atol=1e-4)
     np.testing.assert_allclose(out[:, 0], 0, atol=1e-12)
     assert len(np.unique(places, axis=0)) == 240
-    assert Counter(cube.calibration.layout.name for cube in skin.cubes) == {"planar": 200, "cube": 40}
+    assert Counter(cube.calibration.layout.name for cube in skin.cubes) == {
+        "planar": 200,
+        "cube": 40,
+    }
     assert len(skin.links) == 6
 
 
@@ -41,9 +44,24 @@ def test_sole_is_flat_and_on_a_grid():
 def demo(tmp_path: Path, skin: str, load: str, *arguments: str) -> dict:
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     path = tmp_path / "figures.json"
-    command = ["demo", "--config", str(FOLDER / skin), "--load", str(FOLDER / load), "--headless", "--json", str(path)]
-    done = subprocess.run([sys.executable, "-m", "cube_tensor_driver.cli", *command, *arguments], cwd=ROOT,
-                          capture_output=True, text=True, timeout=90, check=False)  # fmt: skip
+    command = [
+        "demo",
+        "--config",
+        str(FOLDER / skin),
+        "--load",
+        str(FOLDER / load),
+        "--headless",
+        "--json",
+        str(path),
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "cube_tensor_driver.cli", *command, *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(path.read_text())
 
@@ -54,8 +72,8 @@ def test_sole_finds_the_ground_reaction_force_and_its_centre(domain, tmp_path):
     # float32 carries 6e-8, see test_end_to_end
     assert result["error_rel_rms"] < 1e-5
     error = np.divide(result["force_error_n"], result["force_peak_n"])
-    # what the half space carries beyond the outline, 1 to 2 % of the pressure and 20 to 35 % of the shear, and what the
-    # field sags between cubes, 3 %: docs/examples.md
+    # what the half space carries beyond the outline, 1 to 2 % of the pressure and 20 to 35 % of the
+    # shear, and what the field sags between cubes, 3 %: docs/examples.md
     assert error[2] < 0.04 and error[0] < 0.3 and error[1] < 0.3
     assert result["centre_error_mm"] < 1.5
     assert picture.stat().st_size > 10_000

@@ -10,18 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.protocol import Hello, Sample, Stats
 from cube_tensor_driver.device.sequence import Account, Verdict
-from cube_tensor_driver.files.skin import read_skin
-from cube_tensor_driver.files.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.simulation.faults import FRAME, KINDS, Fault, Injector, parse_faults
 from cube_tensor_driver.simulation.hub import SimulatedHub
 from cube_tensor_driver.simulation.inject import inject
-from cube_tensor_driver.simulation.reckoning import Reckoning
-from cube_tensor_driver.view.torture import CUTS, failures, schedule
+from cube_tensor_driver.simulation.torture_verification import TortureVerification
+from cube_tensor_driver.trials.torture import CUTS, failures, schedule
 
 PERIOD_US = 2000
 VALUES = np.arange(1, 17, dtype="<u4").reshape(2, 8) * 1_000_000
@@ -62,7 +62,9 @@ class Bench:
         for _ in range(samples):
             injector.step(self.hub.next_us)
             if self.hub.started:
-                data = injector.frame(self, self.hub.sample(injector.values(self, VALUES, self.hub.next_us)))
+                data = injector.frame(
+                    self, self.hub.sample(injector.values(self, VALUES, self.hub.next_us))
+                )
                 self.line.send(data, self.hub.next_us)
             else:
                 self.hub.next_us += PERIOD_US
@@ -88,7 +90,10 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
     assert counters["taken"] == 100 == counters["delivered"] + counters["lost_on_the_way"]
     for sample in samples:
         np.testing.assert_array_equal(sample.frequency, VALUES)
-    lost, noise = counters["lost_on_the_way"], decoder.counters.crc + decoder.counters.framing + decoder.counters.length
+    lost, noise = (
+        counters["lost_on_the_way"],
+        decoder.counters.crc + decoder.counters.framing + decoder.counters.length,
+    )
     expected = {
         "drop": (lost == 20, noise == 0),
         "flip": (lost == 20, noise >= 20),
@@ -132,7 +137,9 @@ def test_faults_of_pads_and_hub_change_what_the_hub_says():
     np.testing.assert_allclose(warm.frequency, VALUES * (1 + 10 * 50e-6), rtol=1e-6)
     assert warm.temperature[0] == 3500
     assert [(fault["kind"], start, end) for start, end, _, fault in injector.book][:2] == [
-        ("short", 10_000, 20_000), ("stuck", 30_000, 40_000)]  # fmt: skip
+        ("short", 10_000, 20_000),
+        ("stuck", 30_000, 40_000),
+    ]
 
 
 def test_restart_wrap_and_clock():
@@ -144,7 +151,10 @@ def test_restart_wrap_and_clock():
     _, samples = bench.play(injector, 12)
     times = [sample.device_us for sample in samples]
     assert times[5] - times[4] == 2000 and times[10] - times[9] == 2000 + 1_500_000
-    bench.hub.started, bench.hub.next_us = True, bench.hub.next_us + (-bench.hub.next_us % PERIOD_US)
+    bench.hub.started, bench.hub.next_us = (
+        True,
+        bench.hub.next_us + (-bench.hub.next_us % PERIOD_US),
+    )
     bench.play(injector, 5)
     bench.hub.started = True
     _, samples = bench.play(injector, 4)
@@ -181,10 +191,21 @@ def test_a_fault_that_is_none_is_told(text, words):
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-                    lambda child: st.lists(child, max_size=3) | st.dictionaries(
-                        st.sampled_from(["kind", "at", "link", "seconds", "count", "cube", "pad", "value", "x"]),
-                        child | st.sampled_from(sorted(KINDS)), max_size=4)))  # fmt: skip
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda child: (
+            st.lists(child, max_size=3)
+            | st.dictionaries(
+                st.sampled_from(
+                    ["kind", "at", "link", "seconds", "count", "cube", "pad", "value", "x"]
+                ),
+                child | st.sampled_from(sorted(KINDS)),
+                max_size=4,
+            )
+        ),
+    )
+)
 def test_any_data_is_faults_or_our_error(data):
     try:
         faults = parse_faults(data, "x")
@@ -196,7 +217,11 @@ def test_any_data_is_faults_or_our_error(data):
 
 
 def test_the_wrong_link_cube_or_pad():
-    for fault in ({"kind": "drop", "link": "hub9"}, {"kind": "open", "cube": 2}, {"kind": "short", "pad": 8}):
+    for fault in (
+        {"kind": "drop", "link": "hub9"},
+        {"kind": "open", "cube": 2},
+        {"kind": "short", "pad": 8},
+    ):
         with pytest.raises(ConfigError, match="allowed"):
             faulty(fault)
 
@@ -209,7 +234,11 @@ def test_inject_speaks_to_the_pipe_or_says_that_nobody_listens(tmp_path):
         inject(tmp_path, ["kind=drop"])
     reader = os.open(tmp_path / ".faults", os.O_RDONLY | os.O_NONBLOCK)
     inject(tmp_path, ["kind=unplug", "link=hub0", "seconds=2"])
-    assert parse_yaml(os.read(reader, 1000), "pipe") == {"kind": "unplug", "link": "hub0", "seconds": 2}
+    assert parse_yaml(os.read(reader, 1000), "pipe") == {
+        "kind": "unplug",
+        "link": "hub0",
+        "seconds": 2,
+    }
     os.close(reader)
 
 
@@ -232,16 +261,23 @@ INSTANTS, COUNT = 40, 200
 
 @pytest.fixture(scope="module")
 def skin(tmp_path_factory):
-    from cube_tensor_driver.files.grid import grid
+    from cube_tensor_driver.config.grid import grid
 
     path = tmp_path_factory.mktemp("skin") / "skin.yaml"
     write_yaml(path, grid("skin", 4, 1, 0.012, 2, "planar", "planar", 500.0, "/dev/null{}"))
     return read_skin(path)
 
 
-def judged(skin, spoil=lambda k, sequence, stamp, frequency, rows: None, skip=(), faults=(), counted=0, published=0):
+def judged(
+    skin,
+    spoil=lambda k, sequence, stamp, frequency, rows: None,
+    skip=(),
+    faults=(),
+    counted=0,
+    published=0,
+):
     """What the judge says of COUNT samples of both hubs, after `spoil` had its hands on them."""
-    reckoning = Reckoning(skin, INSTANTS)
+    reckoning = TortureVerification(skin, INSTANTS)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     cube = np.arange(4, dtype=np.uint16)
     for k in range(COUNT):
@@ -255,7 +291,9 @@ def judged(skin, spoil=lambda k, sequence, stamp, frequency, rows: None, skip=()
         reckoning.stress(cube, sequence, stamp, rows)
     run = {"first": 0, "last": COUNT - 1, "start_us": PERIOD_US, "period_us": PERIOD_US, "boot": 0}
     links = {name: {"runs": [run], "dropped": 0, "cubes": []} for name in ("hub0", "hub1")}
-    return reckoning.close({"start_time_ns": 0, "links": links, "faults": list(faults)}, 10**12, counted, published)
+    return reckoning.close(
+        {"start_time_ns": 0, "links": links, "faults": list(faults)}, 10**12, counted, published
+    )
 
 
 def test_the_judge_finds_nothing_where_nothing_is(skin):
@@ -278,9 +316,19 @@ def test_the_judge_finds_what_is_wrong(skin):
             frequency[1, 4] = np.nextafter(frequency[1, 4], np.float32(0))
 
     assert judged(skin, bit)["wrong"] == 1
-    fault = [60_000, 160_000, "hub0", {"kind": "noisy", "cube": 1, "pad": 4, "value": 1e-3, "seconds": 0.1}]
+    fault = [
+        60_000,
+        160_000,
+        "hub0",
+        {"kind": "noisy", "cube": 1, "pad": 4, "value": 1e-3, "seconds": 0.1},
+    ]
     assert judged(skin, bit, faults=[fault])["wrong"] == 0
-    other = [60_000, 160_000, "hub0", {"kind": "noisy", "cube": 1, "pad": 5, "value": 1e-3, "seconds": 0.1}]
+    other = [
+        60_000,
+        160_000,
+        "hub0",
+        {"kind": "noisy", "cube": 1, "pad": 5, "value": 1e-3, "seconds": 0.1},
+    ]
     assert judged(skin, bit, faults=[other])["wrong"] == 1
 
     def tensor(k, sequence, stamp, frequency, rows):
@@ -310,8 +358,20 @@ def test_the_judge_finds_what_is_wrong(skin):
 
 def test_limits_of_the_figures():
     good = dict.fromkeys(
-        ("missed_by_judge", "unaccounted", "wrong", "wrong_tensors", "false_alarms", "crashes", "threads_leaked"), 0
+        (
+            "missed_by_judge",
+            "unaccounted",
+            "wrong",
+            "wrong_tensors",
+            "false_alarms",
+            "crashes",
+            "threads_leaked",
+        ),
+        0,
     )
     good |= {"rss_growth_mb": 1.0, "worst_reconnect_s": 1.0, "stamp_error_p99_ms": 0.5}
     assert failures(good) == []
-    assert failures({**good, "unaccounted": 1, "stamp_error_p99_ms": 1.2}) == ["unaccounted", "stamp_error_p99_ms"]
+    assert failures({**good, "unaccounted": 1, "stamp_error_p99_ms": 1.2}) == [
+        "unaccounted",
+        "stamp_error_p99_ms",
+    ]

@@ -6,35 +6,41 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.scene import Places
+from cube_tensor_driver.core.scene import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.elastic import contact
-from cube_tensor_driver.elastic.field_study import field_study
 from cube_tensor_driver.elastic.surface import Surface
+from cube_tensor_driver.research.field_study import field_study
 
 DEPTH, POISSON, HALF_SIDE = 4e-3, 0.48, 2e-3
 
 
-def flat(nx: int, ny: int, pitch: float) -> Places:
-    x, y = np.meshgrid((np.arange(nx) - (nx - 1) / 2) * pitch, (np.arange(ny) - (ny - 1) / 2) * pitch)
+def flat(nx: int, ny: int, pitch: float) -> CubePoses:
+    x, y = np.meshgrid(
+        (np.arange(nx) - (nx - 1) / 2) * pitch, (np.arange(ny) - (ny - 1) / 2) * pitch
+    )
     position = np.stack([x.ravel(), y.ravel(), np.zeros(nx * ny)], axis=1)
-    return Places(position, np.tile(np.eye(3), (nx * ny, 1, 1)), np.full(nx * ny, HALF_SIDE))
+    return CubePoses(position, np.tile(np.eye(3), (nx * ny, 1, 1)), np.full(nx * ny, HALF_SIDE))
 
 
-def at(points: np.ndarray, width: float, force: tuple, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stress and gradient at points of the cubes' plane, DEPTH below a ball of this contact width."""
+def at(
+    points: np.ndarray, width: float, force: tuple, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stress and gradient at points of the cubes' plane, DEPTH below a ball of this contact
+    width."""
     below = np.column_stack([points[:, :2], np.full(len(points), -DEPTH)])
     return contact.field(below, *contact.hertz(width / 2, force, centre), POISSON)
 
 
-def measured(places: Places, width: float, force: tuple, centre: np.ndarray) -> np.ndarray:
+def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) -> np.ndarray:
     """What cubes that see everything give: (N, 15)."""
     stress, gradient = at(places.position, width, force, centre)
     return np.concatenate([stress, gradient[:, :3].reshape(len(stress), 9)], axis=1)
 
 
 def errors(pitch: float, width: float, places: int = 8) -> tuple[float, float]:
-    """Relative rms error of the pressure without and with gradients, over contacts anywhere in a cell."""
+    """Relative rms error of the pressure without and with gradients, over contacts anywhere in a
+    cell."""
     skin = flat(7, 7, pitch)
     without, with_them = Surface(skin, DEPTH, 6, gradients=False), Surface(skin, DEPTH, 6)
     random = np.random.default_rng(1)
@@ -43,13 +49,18 @@ def errors(pitch: float, width: float, places: int = 8) -> tuple[float, float]:
         centre = pitch * (random.random(2) - 0.5)
         truth = -at(with_them.points, width, (0, 0, -3), centre)[0][:, 2]
         values = measured(skin, width, (0, 0, -3), centre)
-        row[:] = [np.mean((s.field(values).pressure - truth) ** 2) / np.mean(truth**2) for s in (without, with_them)]
+        row[:] = [
+            np.mean((s.field(values).pressure - truth) ** 2) / np.mean(truth**2)
+            for s in (without, with_them)
+        ]
     without_rms, with_rms = np.sqrt(squares.mean(axis=0))
     return float(without_rms), float(with_rms)
 
 
 # The factors are half of what was measured, so that they fail when the gradients stop helping.
-@pytest.mark.parametrize(("pitch", "width", "factor"), [(0.006, 0.010, 3.0), (0.006, 0.020, 1.5), (0.012, 0.020, 1.3)])
+@pytest.mark.parametrize(
+    ("pitch", "width", "factor"), [(0.006, 0.010, 3.0), (0.006, 0.020, 1.5), (0.012, 0.020, 1.3)]
+)
 def test_gradients_make_the_field_better(pitch, width, factor):
     without, with_them = errors(pitch, width)
     assert with_them < 0.2
@@ -57,7 +68,8 @@ def test_gradients_make_the_field_better(pitch, width, factor):
 
 
 def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
-    """One gradient is better than none and worse than two, for the field; a planar cube knows less of the place."""
+    """One gradient is better than none and worse than two, for the field; a planar cube knows less
+    of the place."""
     study = field_study(np.array([0.006, 0.012]), np.array([0.02]), cases=3)
     alone, whole, planar = np.moveaxis(study.error[0], 1, 0)
     assert (whole < planar).all() and (planar < alone).all()
@@ -70,7 +82,9 @@ def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
 def test_value_and_gradient_are_met_at_the_cubes():
     skin = flat(5, 5, 0.008)
     values = measured(skin, 0.01, (0, 0, -2), np.array([0.001, -0.002]))
-    fine = Surface(skin, DEPTH, 81)  # an odd number: the middle point of a patch is the cube's own place
+    fine = Surface(
+        skin, DEPTH, 81
+    )  # an odd number: the middle point of a patch is the cube's own place
     field = fine.field(values).pressure.reshape(25, 81, 81)
     peak = field.max()
     # the ridge of 1e-6 lets it miss by its root, a thousandth
@@ -119,7 +133,8 @@ def test_contact_has_the_load_s_place_and_force():
     skin = flat(9, 9, 0.006)
     force, centre = np.array([0.6, -0.4, -3.0]), np.array([0.0023, -0.0031])
     (found,) = Surface(skin, DEPTH).contacts(measured(skin, 0.012, force, centre), 300.0)
-    # of what spreads beyond a skin of 54 mm nothing comes back: 3 (1 - (1 + (27/4)²)^-3/2) N is 0.3 % less
+    # of what spreads beyond a skin of 54 mm nothing comes back: 3 (1 - (1 + (27/4)²)^-3/2) N is 0.3
+    # % less
     assert found.normal_force == pytest.approx(3.0, rel=0.02)
     # shear falls as 3 depth x² / (2 π r⁵): 1.5 depth / 27 mm of it lies outside
     shear = found.force[:2] / force[:2]
@@ -136,18 +151,27 @@ def test_two_contacts_are_two_the_stronger_first():
     left, right = np.array([-0.03, 0.0]), np.array([0.03, 0.002])
     values = measured(skin, 0.008, (0, 0, -1), left) + measured(skin, 0.008, (0, 0, -2), right)
     first, second = Surface(skin, DEPTH).contacts(values, 300.0)
-    assert first.normal_force == pytest.approx(2, rel=0.1) and second.normal_force == pytest.approx(1, rel=0.1)
-    assert np.linalg.norm(first.position[:2] - right) < 1e-3 and np.linalg.norm(second.position[:2] - left) < 1e-3
+    assert first.normal_force == pytest.approx(2, rel=0.1) and second.normal_force == pytest.approx(
+        1, rel=0.1
+    )
+    assert (
+        np.linalg.norm(first.position[:2] - right) < 1e-3
+        and np.linalg.norm(second.position[:2] - left) < 1e-3
+    )
 
 
 def test_a_turned_skin_gives_the_turned_field():
     skin = flat(5, 4, 0.008)
     turn = rotation_from_rpy(0.7, -1.1, 2.0)
-    moved = Places(skin.position @ turn.T + [1.0, 2.0, 3.0], turn @ skin.rotation, skin.half_side)
+    moved = CubePoses(
+        skin.position @ turn.T + [1.0, 2.0, 3.0], turn @ skin.rotation, skin.half_side
+    )
     values = measured(skin, 0.01, (0.3, 0.2, -2), np.array([0.002, 0.001]))
     straight, turned = Surface(skin, DEPTH), Surface(moved, DEPTH)
     peak = np.nanmax(straight.field(values).pressure)
-    np.testing.assert_allclose(turned.field(values).pressure, straight.field(values).pressure, atol=1e-6 * peak)
+    np.testing.assert_allclose(
+        turned.field(values).pressure, straight.field(values).pressure, atol=1e-6 * peak
+    )
     (a,), (b,) = straight.contacts(values, 300.0), turned.contacts(values, 300.0)
     np.testing.assert_allclose(b.position, turn @ a.position + [1, 2, 3], atol=1e-8)
     np.testing.assert_allclose(b.force, turn @ a.force, atol=1e-6)
@@ -161,12 +185,14 @@ def test_what_no_surface_is(depth, side):
 
 def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_is():
     pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.view.carpet import Raster, is_flat
+    from cube_tensor_driver.browser.surface_layer import Raster, is_flat
 
     turn, place = rotation_from_rpy(0.3, -0.8, 2.0), np.array([0.2, -0.1, 0.4])
     skin = flat(5, 3, 0.01)
     keep = np.delete(np.arange(15), 7)  # a hole in the middle
-    skin = Places((skin.position @ turn.T + place)[keep], skin.rotation[keep] @ turn, skin.half_side[keep])
+    skin = CubePoses(
+        (skin.position @ turn.T + place)[keep], skin.rotation[keep] @ turn, skin.half_side[keep]
+    )
     surface = Surface(skin, DEPTH, 2)
     colours = np.random.default_rng(2).random((len(surface.points), 3))
     assert is_flat(surface.points, skin.rotation[surface.cube], surface.spacing)
@@ -179,7 +205,9 @@ def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_i
     np.testing.assert_array_equal(image[..., 3] == 0, hole)
     for point, colour in zip(surface.points, colours, strict=True):
         x, y, _ = (point - place) @ turn / surface.spacing
-        np.testing.assert_array_equal(image[round(2.5 - y), round(4.5 + x), :3], (255 * colour).astype(np.uint8))
+        np.testing.assert_array_equal(
+            image[round(2.5 - y), round(4.5 + x), :3], (255 * colour).astype(np.uint8)
+        )
 
     # with the cubes in it, each as a square of its own turn
     turned = skin._replace(rotation=skin.rotation @ rotation_from_rpy(0, 0, np.pi / 4))
@@ -192,7 +220,9 @@ def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_i
         across = np.arange(columns) - (columns - 1) / 2 - x
         up = (rows - 1) / 2 - np.arange(rows) - y
         # |x| + |y| < half the diagonal of a square that is turned by 45 degrees
-        inside = np.abs(across) + np.abs(up)[:, None] < np.sqrt(2) * skin.half_side[cube] / (surface.spacing / 8)
+        inside = np.abs(across) + np.abs(up)[:, None] < np.sqrt(2) * skin.half_side[cube] / (
+            surface.spacing / 8
+        )
         assert inside.sum() > 10
         painted |= inside
         expected = (255 * (1 - colours[cube])).astype(np.uint8)

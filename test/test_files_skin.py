@@ -1,4 +1,5 @@
-"""Skin files: what is read, and that every mistake gives one message: file, key, what was found, what is allowed."""
+"""Skin files: what is read, and that every mistake gives one message: file, key, what was found,
+what is allowed."""
 
 from __future__ import annotations
 
@@ -8,12 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from cube_tensor_driver.config.calibration import read_calibration
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import check_skin, read_skin
+from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError
-from cube_tensor_driver.files.calibration import read_calibration
-from cube_tensor_driver.files.grid import grid
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import check_skin, read_skin
-from cube_tensor_driver.files.yaml import parse_yaml, write_yaml
 
 GOOD = grid("skin", 3, 2, 0.012, 2, "planar", "planar", 100.0, "/dev/ttyACM{}")
 
@@ -26,25 +27,40 @@ def read(tmp_path: Path, data: object):
 
 @pytest.mark.parametrize("name", ["skin_demo.yaml", "cube.yaml"])
 def test_shipped_skins(name):
-    skin = read_skin(share() / "config" / name)
+    skin = read_skin(package_data() / "config" / name)
     assert len(skin.cubes) == {"skin_demo.yaml": 16, "cube.yaml": 1}[name]
     assert skin.n_pads == 8
 
 
 def test_shipped_calibrations_have_their_id():
-    paths = sorted((share() / "config" / "calibration").glob("*.yaml"))
+    paths = sorted((package_data() / "config" / "calibration").glob("*.yaml"))
     assert paths
     for path in paths:
         assert read_calibration(path).id in path.read_text()
 
 
 def test_grid_deals_every_cube_once():
-    # 7 cubes on 3 links: 3, 2, 2, indices from 0 on each link, positions centred and one pitch apart
+    # 7 cubes on 3 links: 3, 2, 2, indices from 0 on each link, positions centred and one pitch
+    # apart
     data = grid("skin", 7, 1, 0.5, 3, "planar", "planar", 10.0, "p{}")
     assert [(cube["link"], cube["index"]) for cube in data["cubes"]] == [
-        ("hub0", 0), ("hub0", 1), ("hub0", 2), ("hub1", 0), ("hub1", 1), ("hub2", 0), ("hub2", 1),
-    ]  # fmt: skip
-    assert [cube["pose"]["xyz"][0] for cube in data["cubes"]] == [-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5]
+        ("hub0", 0),
+        ("hub0", 1),
+        ("hub0", 2),
+        ("hub1", 0),
+        ("hub1", 1),
+        ("hub2", 0),
+        ("hub2", 1),
+    ]
+    assert [cube["pose"]["xyz"][0] for cube in data["cubes"]] == [
+        -1.5,
+        -1.0,
+        -0.5,
+        0.0,
+        0.5,
+        1.0,
+        1.5,
+    ]
 
 
 def test_pose_and_uid(tmp_path):
@@ -52,7 +68,12 @@ def test_pose_and_uid(tmp_path):
     del data["cubes"][4]["index"]
     data["cubes"][4].update(uid="0xc0be", pose={"xyz": [1, 2, 3], "rpy": [0.1, 0.2, 0.3]})
     cube = read(tmp_path, data).cubes[4]
-    assert (cube.uid, cube.index, cube.xyz, cube.rpy) == (0xC0BE, None, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
+    assert (cube.uid, cube.index, cube.xyz, cube.rpy) == (
+        0xC0BE,
+        None,
+        (1.0, 2.0, 3.0),
+        (0.1, 0.2, 0.3),
+    )
 
 
 def change(*path, to=None, remove=False):
@@ -70,10 +91,19 @@ def change(*path, to=None, remove=False):
 @pytest.mark.parametrize(
     ("break_it", "words"),
     [
-        (change("speed", to=3), ["top level", "unknown key 'speed'", "allowed: name, parent_frame"]),
+        (
+            change("speed", to=3),
+            ["top level", "unknown key 'speed'", "allowed: name, parent_frame"],
+        ),
         (change("links", 0, "prot", to="x"), ["links[0]", "'prot'", "name, port, baud"]),
-        (change("cubes", 3, "pose", "xyz", to=[1, 2]), ["cubes[3].pose.xyz", "found [1, 2]", "three finite numbers"]),
-        (change("cubes", 1, "index", to="two"), ["cubes[1].index", "'two'", "integer from 0 to 65535"]),
+        (
+            change("cubes", 3, "pose", "xyz", to=[1, 2]),
+            ["cubes[3].pose.xyz", "found [1, 2]", "three finite numbers"],
+        ),
+        (
+            change("cubes", 1, "index", to="two"),
+            ["cubes[1].index", "'two'", "integer from 0 to 65535"],
+        ),
         (change("cubes", 1, "index", to=-1), ["cubes[1].index", "found -1", "0 to 65535"]),
         (change("cubes", 2, "name", to="c 2"), ["cubes[2].name", "'c 2'", "letters, digits"]),
         (change("cubes", 2, "name", to="c1"), ["cubes", "name 'c1' is there twice"]),
@@ -86,16 +116,25 @@ def change(*path, to=None, remove=False):
         (change("cubes", 2, "link", to="hub9"), ["cubes[2].link", "'hub9'", "hub0, hub1"]),
         (change("cubes", 2, "index", to=1), ["link and index 'hub0', 1 is there twice"]),
         (change("cubes", 2, "uid", to=5), ["cubes[2]", "both uid and index"]),
-        (change("cubes", 2, "index", remove=True), ["cubes[2]", "neither uid nor both link and index"]),
+        (
+            change("cubes", 2, "index", remove=True),
+            ["cubes[2]", "neither uid nor both link and index"],
+        ),
         (change("cubes", 0, "layout", to="cube"), ["cubes[0].layout", "'cube'", "'planar'"]),
-        (change("cubes", 0, "calibration", to="nope"), ["cubes[0].calibration", "'nope'", "planar, planar_slab"]),
+        (
+            change("cubes", 0, "calibration", to="nope"),
+            ["cubes[0].calibration", "'nope'", "planar, planar_slab"],
+        ),
         (change("links", to=[]), ["links", "at least one"]),
         (change("parent_frame", remove=True), ["'parent_frame' is missing"]),
         (change("rate", to=0), ["rate", "found 0", "0.1 to 10000"]),
         (change("rate", to=float("nan")), ["rate", "found nan"]),
-        (change("cubes", 0, "pose", "rpy", to=[0.0, float("inf"), 0.0]), ["pose.rpy[1]", "found inf", "finite"]),
+        (
+            change("cubes", 0, "pose", "rpy", to=[0.0, float("inf"), 0.0]),
+            ["pose.rpy[1]", "found inf", "finite"],
+        ),
     ],
-)  # fmt: skip
+)
 def test_one_message_per_mistake(tmp_path, break_it, words):
     data = copy.deepcopy(GOOD)
     break_it(data)
@@ -115,7 +154,9 @@ def test_uids_once_in_any_spelling(tmp_path):
         data["cubes"][number]["uid"] = uid
     for link in data["links"]:
         link["hub_uid"] = 7
-    with pytest.raises(ConfigError, match=r"hub_uid 0x7 is there twice; .* \(and 1 more: ./cube config check"):
+    with pytest.raises(
+        ConfigError, match=r"hub_uid 0x7 is there twice; .* \(and 1 more: ./cube config check"
+    ):
         read(tmp_path, data)
     path = tmp_path / "skin.yaml"
     assert check_skin(path)[1] == [
@@ -127,7 +168,9 @@ def test_uids_once_in_any_spelling(tmp_path):
 def test_a_hub_reads_one_number_of_pads(tmp_path):
     data = copy.deepcopy(GOOD)
     data["cubes"][1].update(layout="cube", calibration="cube")
-    with pytest.raises(ConfigError, match="those on the link 'hub0' have 8 and 24 pads; a hub reads one number"):
+    with pytest.raises(
+        ConfigError, match="those on the link 'hub0' have 8 and 24 pads; a hub reads one number"
+    ):
         read(tmp_path, data)
 
 
@@ -182,7 +225,7 @@ def test_missing_file_and_folder_and_size(tmp_path, monkeypatch):
         read_skin(tmp_path / "none.yaml")
     with pytest.raises(ConfigError, match="Is a directory"):
         read_skin(tmp_path)
-    monkeypatch.setattr("cube_tensor_driver.files.yaml.MAX_BYTES", 10)
+    monkeypatch.setattr("cube_tensor_driver.config.yaml.MAX_BYTES", 10)
     with pytest.raises(ConfigError, match="the limit is 10"):
         read(tmp_path, GOOD)
 

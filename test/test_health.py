@@ -5,15 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core import status
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.health import Health
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, PAD_FAULT, RANGE, REPORTED, RESIDUAL, SHORT, STUCK
+from cube_tensor_driver.core.status import (
+    DRIFT,
+    NOISY,
+    OPEN,
+    PAD_FAULT,
+    RANGE,
+    REPORTED,
+    RESIDUAL,
+    SHORT,
+    STUCK,
+)
 from cube_tensor_driver.core.window import WINDOW_S
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
 from cube_tensor_driver.simulation.cubes import SimulatedCubes
 from cube_tensor_driver.simulation.load import Load, default_script
 
@@ -35,13 +45,17 @@ class Skin:
     def frequency(self) -> np.ndarray:
         n = len(self.cube)
         phase = np.arange(8) + np.arange(n)[:, None]
-        state = 10e3 * np.sin(2 * np.pi * 0.5 * self.row * 1e-9 * PERIOD_NS + phase[:, : CALIBRATION.modes.n_modes])
+        state = 10e3 * np.sin(
+            2 * np.pi * 0.5 * self.row * 1e-9 * PERIOD_NS + phase[:, : CALIBRATION.modes.n_modes]
+        )
         v = self._moving * state @ CALIBRATION.response.T
         f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
         f *= 1 + self._noise * self._random.standard_normal((n, 8))
         return np.rint(f * 1e3) * 1e-3
 
-    def play(self, seconds: float, harm=lambda frequency, row: None, pad_fault: int = 0) -> np.ndarray:
+    def play(
+        self, seconds: float, harm=lambda frequency, row: None, pad_fault: int = 0
+    ) -> np.ndarray:
         """Returns the last mask of bad pads."""
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             frequency = self.frequency()
@@ -78,7 +92,8 @@ def test_nothing_healthy_is_called_ill(moving, noise):
 
 @pytest.mark.parametrize("frequency", [1.0, 3.0, 6.0])
 def test_a_load_that_moves_fast_is_no_noise(frequency):
-    """Though one pad of each cube feels 30 times as much of it as the others, and all more than their noise."""
+    """Though one pad of each cube feels 30 times as much of it as the others, and all more than
+    their noise."""
     health = Health(Pipeline([CALIBRATION] * 8, np.float32))
     cube, random = np.arange(8, dtype=np.uint16), np.random.default_rng(5)
     stress = np.where(np.eye(8) > 0, -20e3, -20e3 / 30)
@@ -91,10 +106,13 @@ def test_a_load_that_moves_fast_is_no_noise(frequency):
 
 
 def test_a_load_that_moves_while_hubs_stall_is_no_noise():
-    """Up to 60 ms of rows at 500 Hz, then up to 0.2 s of none, as on a machine with too much to do; the demo's load at
-    four times its speed."""
-    skin = read_skin(share() / "config" / "skin_demo.yaml")
-    load, cubes = Load(skin, default_script()), SimulatedCubes([cube.calibration for cube in skin.cubes])
+    """Up to 60 ms of rows at 500 Hz, then up to 0.2 s of none, as on a machine with too much to do;
+    the demo's load at four times its speed."""
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    load, cubes = (
+        Load(skin, default_script()),
+        SimulatedCubes([cube.calibration for cube in skin.cubes]),
+    )
     table = [cubes.frequency(*load.at(k * load.period / 1000), 0.0) * 1e-3 for k in range(1000)]
     health = Health(Pipeline([cube.calibration for cube in skin.cubes], np.float32))
     cube, random, begin = np.arange(16, dtype=np.uint16), np.random.default_rng(1), 0
@@ -102,13 +120,16 @@ def test_a_load_that_moves_while_hubs_stall_is_no_noise():
         end = begin + int(random.integers(1, 30))
         for row in range(begin, end):
             stamp = np.full(16, 2_000_000 * row)
-            health.update(cube, table[row % 1000].astype(np.float32), np.zeros(16, np.uint32), stamp)
+            health.update(
+                cube, table[row % 1000].astype(np.float32), np.zeros(16, np.uint32), stamp
+            )
         begin = end + int(random.integers(0, 99))
     assert not health.collect()[0].any()
 
 
 class Press:
-    """Cubes of which one pad is pressed harder than the others, and rows are missing, of each cube on its own."""
+    """Cubes of which one pad is pressed harder than the others, and rows are missing, of each cube
+    on its own."""
 
     def __init__(self, cubes: int, missing: float) -> None:
         self._random = np.random.default_rng(3)
@@ -119,7 +140,9 @@ class Press:
         """noise: (cubes, 8) of the frequency. Returns the bits found."""
         stress = np.where(np.arange(8) == np.arange(self._cubes)[:, None] % 8, -10e3, -1e3)
         for row in range(round(seconds * 1e9 / PERIOD_NS)):
-            cube = np.flatnonzero(self._random.random(self._cubes) >= self._missing).astype(np.uint16)
+            cube = np.flatnonzero(self._random.random(self._cubes) >= self._missing).astype(
+                np.uint16
+            )
             v = stress[cube] * np.sin(2 * np.pi * 0.5 * row * 1e-9 * PERIOD_NS)
             f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
             f = (f * (1 + noise[cube] * self._random.standard_normal(f.shape))).astype(np.float32)
@@ -246,7 +269,9 @@ def test_a_residual_is_of_the_cube_and_has_hysteresis():
     skin = Skin()
 
     def bend(share):
-        return lambda frequency, row: frequency[2].__setitem__(5, frequency[2, 5] * (1 + 0.01 * (row % 50 < share)))
+        return lambda frequency, row: frequency[2].__setitem__(
+            5, frequency[2, 5] * (1 + 0.01 * (row % 50 < share))
+        )
 
     skin.play(2)
     assert not skin.health.strained.any()
@@ -270,7 +295,9 @@ def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
     together.update(cube, frequency, none, np.zeros(6))
     for row in range(6):
         singly.update(cube[row : row + 1], frequency[row : row + 1], none[:1], np.zeros(1))
-    for one, other in zip((together.last, *together.window()), (singly.last, *singly.window()), strict=True):
+    for one, other in zip(
+        (together.last, *together.window()), (singly.last, *singly.window()), strict=True
+    ):
         np.testing.assert_array_equal(one, other)
     assert together.rows.tolist() == [1, 2, 0, 0, 3, 0]
 
@@ -286,7 +313,10 @@ def test_a_batch_of_several_scans_is_the_scans_one_after_the_other():
         of_batch = together.health.update(
             np.tile(singly.cube, 10), frequency.reshape(-1, 8), faults.ravel(), stamp_ns.ravel()
         )
-        one_by_one = [singly.health.update(singly.cube, *one) for one in zip(frequency, faults, stamp_ns, strict=True)]
+        one_by_one = [
+            singly.health.update(singly.cube, *one)
+            for one in zip(frequency, faults, stamp_ns, strict=True)
+        ]
         for whole, parts in zip(of_batch, zip(*one_by_one, strict=True), strict=True):
             np.testing.assert_array_equal(whole, np.concatenate(parts))
         masks.append(of_batch[0])
@@ -297,7 +327,8 @@ def test_a_batch_of_several_scans_is_the_scans_one_after_the_other():
 
 
 def test_a_jump_back_in_time_begins_a_new_window():
-    """What was gathered before is of another time: it goes neither into sums nor into the share of bad residuals."""
+    """What was gathered before is of another time: it goes neither into sums nor into the share of
+    bad residuals."""
     skin = Skin()
     skin.play(1.2)
     before = skin.health.closed
@@ -329,14 +360,21 @@ def test_bits_are_those_of_the_message():
 def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
     """The one is bad, the other is not; and neither is said twice."""
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from cube_tensor_driver.files.share import share
-    from cube_tensor_driver.files.skin import read_skin
+    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.ros.cube_health import CubeHealth
 
     skin = Skin(16)
-    words = CubeHealth(read_skin(share() / "config" / "skin_demo.yaml"), skin.pipeline, skin.health)
+    words = CubeHealth(
+        read_skin(package_data() / "config" / "skin_demo.yaml"), skin.pipeline, skin.health
+    )
     said = []
-    for harm in (lambda frequency, row: None, set_pad(np.nan), set_pad(np.nan), *[lambda frequency, row: None] * 3):
+    for harm in (
+        lambda frequency, row: None,
+        set_pad(np.nan),
+        set_pad(np.nan),
+        *[lambda frequency, row: None] * 3,
+    ):
         skin.play(2 * WINDOW_S, harm)
         said.append(words.statuses({})[1])
     pad = CALIBRATION.layout.pads[5]

@@ -1,4 +1,5 @@
-"""Launch files: every argument described, the processes of the one shared list, and a skin that starts and ends."""
+"""Launch files: every argument described, the processes of the one shared list, and a skin that
+starts and ends."""
 
 from __future__ import annotations
 
@@ -12,16 +13,17 @@ from pathlib import Path
 import pytest
 
 from conftest import ROOT
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.yaml import read_yaml
-from cube_tensor_driver.ros.start import record_command, skin_processes
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.yaml import read_yaml
+from cube_tensor_driver.processes.skin_processes import record_command, skin_processes
 
-SKIN = share() / "config" / "skin_demo.yaml"
+SKIN = package_data() / "config" / "skin_demo.yaml"
 
 
 def test_one_list_serves_launch_and_demo():
     names = [
-        process.executable for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True)
+        process.executable
+        for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True)
     ]
     assert names == ["simulator", "reconstruction", "driver", "markers", "contacts"]
     assert [process.executable for process in skin_processes(SKIN, composed=True)] == ["composed"]
@@ -30,22 +32,32 @@ def test_one_list_serves_launch_and_demo():
 
 def test_every_executable_of_the_list_is_a_script_and_a_module():
     cmake = (ROOT / "CMakeLists.txt").read_text()
-    every = skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True) + skin_processes(
-        SKIN, composed=True
-    )
+    every = skin_processes(
+        SKIN, simulated_ports=Path("p"), markers=True, contacts=True
+    ) + skin_processes(SKIN, composed=True)
     for process in every:
         script = ROOT / "scripts" / process.executable
-        assert os.access(script, os.X_OK) and f"from {process.module} import main" in script.read_text()
+        assert (
+            os.access(script, os.X_OK)
+            and f"from {process.module} import main" in script.read_text()
+        )
         assert f"scripts/{process.executable}" in cmake
 
 
 def test_each_recording_has_a_folder_of_its_own():
-    """ros2 bag refuses one that is there; info is asked for also from before the recording, in words ros2 bag knows."""
+    """ros2 bag refuses one that is there; info is asked for also from before the recording, in
+    words ros2 bag knows."""
     command = record_command("skin", "left/arm")
-    assert re.fullmatch(r"left_arm_skin_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", command[command.index("-o") + 1])
+    assert re.fullmatch(
+        r"left_arm_skin_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", command[command.index("-o") + 1]
+    )
     assert command[-3:] == ["/left/arm/frequencies", "/left/arm/stress", "/left/arm/info"]
     profiles = read_yaml(Path(command[command.index("--qos-profile-overrides-path") + 1]))
-    assert [profiles[topic]["durability"] for topic in command[-3:]] == ["volatile", "volatile", "transient_local"]
+    assert [profiles[topic]["durability"] for topic in command[-3:]] == [
+        "volatile",
+        "volatile",
+        "transient_local",
+    ]
     assert record_command("skin")[-1] == "/info" and record_command("skin")[6].startswith("skin_")
     policies = pytest.importorskip("rclpy.qos", reason="needs rclpy")
     for profile in profiles.values():
@@ -64,18 +76,31 @@ def test_every_argument_is_described(name):
     arguments = description.get_launch_arguments()
     assert {"config", "namespace"} <= {argument.name for argument in arguments}
     for argument in arguments:
-        assert len(argument.description) > 15 and "no description" not in argument.description, argument.name
+        assert len(argument.description) > 15 and "no description" not in argument.description, (
+            argument.name
+        )
 
 
 def test_a_simulated_skin_starts_and_ends(domain):
     pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
     if shutil.which("ros2") is None:
         pytest.skip("needs the command ros2 (ros2cli and ros2launch), which the wheels lack")
-    command = ["ros2", "launch", "cube_tensor_driver", "skin.launch.py", f"config:={SKIN}", "simulate:=true"]
+    command = [
+        "ros2",
+        "launch",
+        "cube_tensor_driver",
+        "skin.launch.py",
+        f"config:={SKIN}",
+        "simulate:=true",
+    ]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )  # fmt: skip
+    )
     try:
         lines = []
         for line in process.stdout:
@@ -91,10 +116,17 @@ def test_a_simulated_skin_starts_and_ends(domain):
 
 
 def test_transitions_by_events_of_launch(domain):
-    """A LifecycleNode of launch_ros drives a node that does not start by itself, each step when the last is done."""
+    """A LifecycleNode of launch_ros drives a node that does not start by itself, each step when the
+    last is done."""
     pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
     from launch import LaunchDescription, LaunchService
-    from launch.actions import EmitEvent, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
+    from launch.actions import (
+        EmitEvent,
+        OpaqueFunction,
+        RegisterEventHandler,
+        Shutdown,
+        TimerAction,
+    )
     from launch.event_handlers import OnProcessStart
     from launch.events import matches_action
     from launch_ros.actions import LifecycleNode
@@ -102,12 +134,19 @@ def test_transitions_by_events_of_launch(domain):
     from launch_ros.events.lifecycle import ChangeState
     from lifecycle_msgs.msg import Transition
 
-    node = LifecycleNode(package="cube_tensor_driver", executable="reconstruction", name="reconstruction", namespace="",
-                         parameters=[{"config": str(SKIN), "autostart": False}])  # fmt: skip
+    node = LifecycleNode(
+        package="cube_tensor_driver",
+        executable="reconstruction",
+        name="reconstruction",
+        namespace="",
+        parameters=[{"config": str(SKIN), "autostart": False}],
+    )
     seen = []
 
     def change(number: int) -> EmitEvent:
-        return EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=number))
+        return EmitEvent(
+            event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=number)
+        )
 
     def then(state: str, action: object) -> RegisterEventHandler:
         note = OpaqueFunction(function=lambda _: seen.append(state))
@@ -121,7 +160,9 @@ def test_transitions_by_events_of_launch(domain):
             [
                 node,
                 RegisterEventHandler(
-                    OnProcessStart(target_action=node, on_start=[change(Transition.TRANSITION_CONFIGURE)])
+                    OnProcessStart(
+                        target_action=node, on_start=[change(Transition.TRANSITION_CONFIGURE)]
+                    )
                 ),
                 then("inactive", change(Transition.TRANSITION_ACTIVATE)),
                 then("active", Shutdown(reason="done")),

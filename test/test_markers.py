@@ -1,4 +1,5 @@
-"""The picture of a skin: its geometry against hand-made cases, its message as other nodes read it."""
+"""The picture of a skin: its geometry against hand-made cases, its message as other nodes read
+it."""
 
 from __future__ import annotations
 
@@ -9,19 +10,27 @@ import pytest
 
 from cube_tensor_driver.core import scene
 from cube_tensor_driver.core.pipeline import StressRows
-from cube_tensor_driver.core.scene import QUANTITIES, Newest, Places
+from cube_tensor_driver.core.scene import QUANTITIES, CubePoses, Newest
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL
 from cube_tensor_driver.core.tensor import rotation_from_quaternion, rotation_from_rpy
 
 
-def places(n: int = 3, turn: np.ndarray | None = None) -> Places:
+def places(n: int = 3, turn: np.ndarray | None = None) -> CubePoses:
     position = np.stack([0.01 * np.arange(n), np.zeros(n), np.zeros(n)], axis=1)
-    return Places(position, np.tile(np.eye(3) if turn is None else turn, (n, 1, 1)), np.full(n, 0.002))
+    return CubePoses(
+        position, np.tile(np.eye(3) if turn is None else turn, (n, 1, 1)), np.full(n, 0.002)
+    )
 
 
 def rows(values: np.ndarray, status: object = 0) -> StressRows:
     n = len(values)
-    return StressRows(values[:, :6], values[:, 6:], np.ones(n), np.full(n, status, np.uint16), np.zeros(n, np.uint16))
+    return StressRows(
+        values[:, :6],
+        values[:, 6:],
+        np.ones(n),
+        np.full(n, status, np.uint16),
+        np.zeros(n, np.uint16),
+    )
 
 
 def test_traction_pushes_to_the_face_and_pulls_away_from_it():
@@ -79,28 +88,44 @@ def test_health_says_doubtful_no_tensor_and_stale():
     newest.update(np.array([0, 1, 2, 9]), rows(np.zeros((4, 15))), 10.0)  # cube 9 is not ours
     newest.update(np.array([1]), rows(values[:1], PAD_FAULT), 10.5)
     newest.update(np.array([2]), rows(values[:1], INVALID | PAD_FAULT), 10.5)
-    assert newest.health(10.6, 1.0).tolist() == [scene.FINE, scene.DOUBTFUL, scene.FAULTY, scene.STALE]
-    assert newest.health(11.2, 1.0).tolist() == [scene.STALE, scene.DOUBTFUL, scene.FAULTY, scene.STALE]
+    assert newest.health(10.6, 1.0).tolist() == [
+        scene.FINE,
+        scene.DOUBTFUL,
+        scene.FAULTY,
+        scene.STALE,
+    ]
+    assert newest.health(11.2, 1.0).tolist() == [
+        scene.STALE,
+        scene.DOUBTFUL,
+        scene.FAULTY,
+        scene.STALE,
+    ]
     believed = newest.believed(newest.health(10.6, 1.0))
     assert np.isnan(believed).all(axis=1).tolist() == [False, False, True, True]
     crosses = scene.fault_crosses(places(4), newest.health(10.6, 1.0))
-    assert (np.ptp(crosses[0], axis=1) == 0).all() and (np.ptp(crosses[1:], axis=2).max(axis=(1, 2)) > 0.004).all()
+    assert (np.ptp(crosses[0], axis=1) == 0).all() and (
+        np.ptp(crosses[1:], axis=2).max(axis=(1, 2)) > 0.004
+    ).all()
 
 
 def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
-    """Of 400 cubes at 50 Hz one row in a hundred has a residual above its limit, of cube 7 from 2 s to 4 s nearly all;
-    shown within a window that holds nothing else, and hidden within one."""
+    """Of 400 cubes at 50 Hz one row in a hundred has a residual above its limit, of cube 7 from 2 s
+    to 4 s nearly all; shown within a window that holds nothing else, and hidden within one."""
     n, random = 400, np.random.default_rng(4)
     newest = Newest(n)
     for step in range(300):
         now, chance = step / 50, np.full(n, 0.01)
         chance[7] = 0.9 if 2 <= now < 4 else 0.01
-        newest.update(np.arange(n), rows(np.zeros((n, 15)), random.binomial(1, chance) * RESIDUAL), now)
+        newest.update(
+            np.arange(n), rows(np.zeros((n, 15)), random.binomial(1, chance) * RESIDUAL), now
+        )
         health = newest.health(now, 1.0)
         assert (np.delete(health, 7) == scene.FINE).all()
         if not (2 < now < 3 or 4 < now < 5):
             assert health[7] == (scene.DOUBTFUL if 3 <= now <= 4 else scene.FINE), now
-    newest.update(np.arange(n), rows(np.zeros((n, 15)), np.full(n, PAD_FAULT)), -100.0)  # a bag plays again
+    newest.update(
+        np.arange(n), rows(np.zeros((n, 15)), np.full(n, PAD_FAULT)), -100.0
+    )  # a bag plays again
     newest.update(np.arange(n), rows(np.zeros((n, 15))), -99.0)
     assert (newest.health(-99.0, 1.0) == scene.FINE).all()
 
@@ -110,20 +135,22 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from std_msgs.msg import Header
     from visualization_msgs.msg import Marker, MarkerArray
 
+    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.pipeline import Pipeline
-    from cube_tensor_driver.files.share import share
-    from cube_tensor_driver.files.skin import read_skin
     from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
-    from cube_tensor_driver.ros.children import Children
+    from cube_tensor_driver.plot.documentation import draw_markers
+    from cube_tensor_driver.processes.children import Children
+    from cube_tensor_driver.processes.skin_processes import Process
     from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
-    from cube_tensor_driver.ros.start import Process
-    from cube_tensor_driver.view.figures import draw_markers
 
-    skin = read_skin(share() / "config" / "skin_demo.yaml")
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     n, pressed, silent = len(skin.cubes), 6, 15
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     info = ros.node.create_publisher(SkinInfo, "info", latched)
-    info.publish(info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns()))
+    info.publish(
+        info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns())
+    )
     publisher = ros.node.create_publisher(SkinStress, "stress", 10)
     pictures, contacts = ros.listen(MarkerArray, "markers"), ros.listen(SkinContacts, "contacts")
     values = np.full((n, 15), np.nan)
@@ -138,7 +165,12 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
 
     def drawn() -> bool:
         sent()
-        return bool(contacts and contacts[-1].position and pictures and "20 kPa" in pictures[-1].markers[-1].text)
+        return bool(
+            contacts
+            and contacts[-1].position
+            and pictures
+            and "20 kPa" in pictures[-1].markers[-1].text
+        )
 
     with Children(tmp_path) as children:
         for name, given in (("markers", {"crosses": True}), ("contacts", {})):
@@ -148,28 +180,39 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
 
     markers = {marker.ns: marker for marker in pictures[-1].markers}
     assert len(pictures[-1].markers) <= 8
-    assert all(marker.header.frame_id == "skin_base" and marker.action == Marker.ADD for marker in markers.values())
+    assert all(
+        marker.header.frame_id == "skin_base" and marker.action == Marker.ADD
+        for marker in markers.values()
+    )
     cubes = markers["cubes 0"]
     assert cubes.type == Marker.CUBE_LIST and len(cubes.points) == len(cubes.colors) == n
-    # RViz 2 shades a box's −z face least among those that one sees from above: the boxes stand on their heads.
+    # RViz 2 shades a box's −z face least among those that one sees from above: the boxes stand on
+    # their heads.
     q = cubes.pose.orientation
     turn = rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
     np.testing.assert_allclose(turn, np.diag([-1, 1, -1]), atol=1e-12)
     points = np.array([[p.x, p.y, p.z] for p in cubes.points]) @ turn.T
     np.testing.assert_allclose(points, [cube.xyz for cube in skin.cubes], atol=1e-12)
     bar = np.array([[p.x, p.y, p.z] for p in markers["legend bar"].points]) * np.diag(turn)
-    assert markers["legend bar"].pose.orientation == q and (np.diff(bar[:, 0]) > 0).all() and not bar[:, 2].any()
+    assert (
+        markers["legend bar"].pose.orientation == q
+        and (np.diff(bar[:, 0]) > 0).all()
+        and not bar[:, 2].any()
+    )
     colours = np.array([[c.r, c.g, c.b, c.a] for c in cubes.colors])
     np.testing.assert_allclose(colours[pressed], [0xFD / 255, 0xE7 / 255, 0x25 / 255, 1], atol=1e-6)
     np.testing.assert_allclose(colours[silent, :3], scene.GREY, atol=1e-6)
     traction = np.array([[p.x, p.y, p.z] for p in markers["traction"].points]).reshape(n, 3, 2, 3)
     shaft = traction[pressed, 0, 1] - traction[pressed, 0, 0]
-    np.testing.assert_allclose(shaft / np.linalg.norm(shaft), np.array([1, 0, -5]) / np.sqrt(26), atol=1e-6)
+    np.testing.assert_allclose(
+        shaft / np.linalg.norm(shaft), np.array([1, 0, -5]) / np.sqrt(26), atol=1e-6
+    )
     assert not np.ptp(np.delete(traction, pressed, 0), axis=2).any()
     faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
     assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
     assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
-    # RViz 2 makes blanks over a metre wide where scale.x does not say, and first looks for the text without it
+    # RViz 2 makes blanks over a metre wide where scale.x does not say, and first looks for the text
+    # without it
     assert not markers["legend"].text[0].isspace() and not markers["legend"].text[-1].isspace()
     assert 0.4 < markers["legend"].scale.x / markers["legend"].scale.z < 0.8
     # RViz sets a second line 1 cm lower and knows no letter that takes two bytes
@@ -188,7 +231,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
 
 def test_rods_lie_around_their_lines_with_the_radii_asked_for():
     pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.view.stage import SIDES, rods
+    from cube_tensor_driver.browser.scene_3d import SIDES, rods
 
     lines = np.random.default_rng(3).normal(size=(7, 2, 3))
     lines[0, 1] = lines[0, 0] + [0, 0, 2.0]  # along an axis
@@ -211,7 +254,7 @@ def test_rods_lie_around_their_lines_with_the_radii_asked_for():
 
 def test_a_click_finds_the_cube_in_front():
     pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.view.stage import hit
+    from cube_tensor_driver.browser.scene_3d import hit
 
     around = 2 * np.pi * np.arange(24) / 24
     ring = np.stack([0 * around, np.cos(around), np.sin(around)], axis=1)
@@ -220,7 +263,9 @@ def test_a_click_finds_the_cube_in_front():
         aside = 0.1 * pitch * np.array([1.0, 0, 0])
         assert hit(ring, pitch, 5 * ring[cube] + aside, -2 * ring[cube]) == cube
     assert hit(ring, pitch, np.array([1.01 * pitch, 5, 0]), np.array([0, -1.0, 0])) is None
-    flat = np.stack([*(a.ravel() for a in np.meshgrid(np.arange(6.0), np.arange(5.0))), np.zeros(30)], axis=1)
+    flat = np.stack(
+        [*(a.ravel() for a in np.meshgrid(np.arange(6.0), np.arange(5.0))), np.zeros(30)], axis=1
+    )
     eye = np.array([2.5, -8, 6.0])  # as the page looks at a skin
     for cube in range(30):
         assert hit(flat, 1.0, eye, flat[cube] + [0.2, -0.2, 0] - eye) == cube

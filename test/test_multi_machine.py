@@ -1,7 +1,8 @@
-"""Two machines: simulator and driver on one, reconstruction and a recorder on the other; the cable between them is cut.
+"""Two machines: simulator and driver on one, reconstruction and a recorder on the other; the cable
+between them is cut.
 
-The machines are network namespaces joined by a veth cable; shared memory, which would reach from one to the other, is
-off, as it is between real machines.
+The machines are network namespaces joined by a veth cable; shared memory, which would reach from
+one to the other, is off, as it is between real machines.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
-from cube_tensor_driver.files.bags import STRESS, Bag
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.ros.children import ros_arguments
-from cube_tensor_driver.ros.start import Process, skin_processes
+from cube_tensor_driver.bags.read import STRESS, Bag
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.processes.children import ros_arguments
+from cube_tensor_driver.processes.skin_processes import Process, skin_processes
 
-SKIN = share() / "config" / "skin_demo.yaml"
+SKIN = package_data() / "config" / "skin_demo.yaml"
 CUBES, RATE = 16, 100
 QUEUE_S = 2.0
 """What queues hold: ros/node.py."""
@@ -43,12 +44,28 @@ class Hosts:
         for name in self._names.values():
             ip("netns", "add", name)
         robot, desk = self._names.values()
-        ip("link", "add", "cable", "netns", robot, "type", "veth", "peer", "name", "cable", "netns", desk)
+        ip(
+            "link",
+            "add",
+            "cable",
+            "netns",
+            robot,
+            "type",
+            "veth",
+            "peer",
+            "name",
+            "cable",
+            "netns",
+            desk,
+        )
         for number, name in enumerate((robot, desk), 1):
             ip("-n", name, "link", "set", "lo", "up")
             ip("-n", name, "address", "add", f"10.231.77.{number}/24", "dev", "cable")
             ip("-n", name, "link", "set", "cable", "up")
-        for name in (robot, desk):  # Fast DDS never takes up a network that was not there when it started
+        for name in (
+            robot,
+            desk,
+        ):  # Fast DDS never takes up a network that was not there when it started
             wait(lambda name=name: "state UP" in ip("-n", name, "link", "show", "cable"))
 
     def cable(self, state: str) -> None:
@@ -56,11 +73,27 @@ class Hosts:
         ip("-n", self._names["robot"], "link", "set", "cable", state)
 
     def start(self, host: str, process: Process) -> None:
-        command = ["ip", "netns", "exec", self._names[host], sys.executable, "-u", "-m", process.module]
-        command += [*process.arguments, *(["--ros-args", *ros_arguments(process.parameters)] if process.node else [])]
+        command = [
+            "ip",
+            "netns",
+            "exec",
+            self._names[host],
+            sys.executable,
+            "-u",
+            "-m",
+            process.module,
+        ]
+        command += [
+            *process.arguments,
+            *(["--ros-args", *ros_arguments(process.parameters)] if process.node else []),
+        ]
         with (self.folder / f"{process.executable}.log").open("wb") as log:
             self._running[process.executable] = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
             )
 
     def end(self, *executables: str) -> None:
@@ -113,8 +146,12 @@ def rows(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     with Bag(path) as bag:
         (topic,) = bag.topics(STRESS)
         messages = [(bag.decode(entry), entry.time_ns) for entry in bag.entries({topic})]
-    cube, sequence = (np.concatenate([getattr(one, name) for one, _ in messages]) for name in ("cube", "sequence"))
-    arrival = np.repeat([time_ns for _, time_ns in messages], [len(one.cube) for one, _ in messages])
+    cube, sequence = (
+        np.concatenate([getattr(one, name) for one, _ in messages]) for name in ("cube", "sequence")
+    )
+    arrival = np.repeat(
+        [time_ns for _, time_ns in messages], [len(one.cube) for one, _ in messages]
+    )
     return cube, sequence.astype(np.int64), arrival
 
 
@@ -122,15 +159,21 @@ def lost_on_the_way(path: Path) -> int:
     """What the reconstruction said last of messages lost."""
     with Bag(path) as bag:
         arrays = [bag.decode(entry) for entry in bag.entries({"/diagnostics"})]
-    said = [int(pair.value) for array in arrays for status in array.status for pair in status.values
-            if pair.key == "messages lost on the way"]  # fmt: skip
+    said = [
+        int(pair.value)
+        for array in arrays
+        for status in array.status
+        for pair in status.values
+        if pair.key == "messages lost on the way"
+    ]
     return said[-1]
 
 
 def sampled(book: dict) -> dict[tuple[int, int], int]:
     """When each row was sampled, ns of the wall clock, by cube and sequence number."""
     return {
-        (cube, run["first"] + k): book["start_time_ns"] + 1000 * (run["start_us"] + k * run["period_us"])
+        (cube, run["first"] + k): book["start_time_ns"]
+        + 1000 * (run["start_us"] + k * run["period_us"])
         for link in book["links"].values()
         for run in link["runs"]
         for k in range(run["last"] - run["first"] + 1)
@@ -161,7 +204,8 @@ def test_a_cut_cable_costs_what_queues_do_not_hold_and_that_is_counted(hosts, tm
         hosts.cable("up")
         cuts.append((begun, time.time_ns()))
         flows()
-    # what queues held came in one burst: the next diagnostics, a second later, say what they did not
+    # what queues held came in one burst: the next diagnostics, a second later, say what they did
+    # not
     flows()
     flows()
     hosts.end("simulator")
@@ -173,7 +217,9 @@ def test_a_cut_cable_costs_what_queues_do_not_hold_and_that_is_counted(hosts, tm
     assert len(came) == len(cube)  # nothing twice
     times = sampled(json.loads(book.read_text()))
     first, last = min(times[one] for one in came), max(times[one] for one in came)
-    gone = np.array([time_ns for one, time_ns in times.items() if first < time_ns < last and one not in came])
+    gone = np.array(
+        [time_ns for one, time_ns in times.items() if first < time_ns < last and one not in came]
+    )
     # the short cut costs nothing; the long one what is older than the queues when the cable is back
     down, up = cuts[1]
     slack = 0.5e9  # until DDS has sent again what it holds

@@ -1,4 +1,5 @@
-"""The package as a whole: what is installed, which way imports point, what is documented and pinned."""
+"""The package as a whole: what is installed, which way imports point, what is documented and
+pinned."""
 
 from __future__ import annotations
 
@@ -15,22 +16,34 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "cube_tensor_driver"
 # A folder may import those after it, never those before it.
-FLOORS = [["cli.py"], ["commands.py"], ["view"], ["ros"], ["simulation"], ["files", "device", "elastic"], ["core"]]
-# Each heavy library in as few files as it needs.
+FLOORS = [
+    ["cli"],
+    ["trials"],
+    ["browser"],
+    ["ros"],
+    ["plot", "terminal"],
+    ["processes"],
+    ["simulation"],
+    ["bags", "research"],
+    ["device", "elastic", "config"],
+    ["core"],
+]
+# Each heavy library in as few folders as it needs.
 HOMES = {
-    "rclpy": {"ros", "view"},
+    "rclpy": {"ros", "browser", "trials", "cli"},
     "serial": {"device"},
-    "cobs": {"device"},
-    "yaml": {"files"},
-    "jsonschema": {"files"},
-    "rich": {"view"},
-    "rosbags": {"files"},
-    "pyarrow": {"files"},
-    "distributed": {"view"},
-    "skfem": {"elastic"},
+    "cobs": {"device", "simulation"},
+    "yaml": {"config"},
+    "jsonschema": {"config"},
+    "rich": {"terminal", "trials", "cli"},
+    "matplotlib": {"plot"},
+    "rosbags": {"bags"},
+    "pyarrow": {"bags"},
+    "distributed": {"cli"},
+    "skfem": {"elastic", "research"},
     "transforms3d": {"core"},
     "launch": {"ros"},
-    "viser": {"view"},
+    "viser": {"browser"},
 }
 
 
@@ -57,10 +70,16 @@ def test_imports_point_one_way():
             continue
         for module in imports(path):
             parts = module.split(".")
-            if parts[0] == "cube_tensor_driver" and len(parts) > 1 and parts[1] not in ("msg", "srv"):
+            if (
+                parts[0] == "cube_tensor_driver"
+                and len(parts) > 1
+                and parts[1] not in ("msg", "srv")
+            ):
                 target = parts[1] if parts[1] in floor else parts[1] + ".py"
                 same = target == top
-                assert same or floor[target] > floor[top], f"{path.relative_to(ROOT)} imports {module}"
+                assert same or floor[target] > floor[top], (
+                    f"{path.relative_to(ROOT)} imports {module}"
+                )
 
 
 def test_heavy_libraries_stay_at_home():
@@ -68,7 +87,9 @@ def test_heavy_libraries_stay_at_home():
         for module in imports(path):
             home = HOMES.get(module.split(".")[0])
             if home is not None:
-                assert path.relative_to(PACKAGE).parts[0] in home, f"{path.relative_to(ROOT)} imports {module}"
+                assert path.relative_to(PACKAGE).parts[0] in home, (
+                    f"{path.relative_to(ROOT)} imports {module}"
+                )
 
 
 def test_core_needs_numpy_and_nothing_else():
@@ -80,7 +101,9 @@ def test_core_needs_numpy_and_nothing_else():
         "tops = {name.split('.')[0] for name in set(sys.modules) - before}\n"
         "print(*sorted(t for t in tops if t not in sys.stdlib_module_names))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     assert set(done.stdout.split()) <= {"cube_tensor_driver", "numpy", "transforms3d"}
 
 
@@ -112,14 +135,26 @@ def test_every_dependency_is_declared_and_pinned():
     wheels = {"serial": "pyserial", "yaml": "pyyaml", "skfem": "scikit-fem"}
     # Parts of wheels that are named already.
     parts = {"mpl_toolkits": "matplotlib"}
-    declared = {element.text for element in ElementTree.parse(ROOT / "package.xml").iter() if "depend" in element.tag}
-    locked = set(re.findall(r"^([a-z0-9-]+)==", (ROOT / "tools/requirements.lock").read_text(), re.MULTILINE))
+    declared = {
+        element.text
+        for element in ElementTree.parse(ROOT / "package.xml").iter()
+        if "depend" in element.tag
+    }
+    locked = set(
+        re.findall(r"^([a-z0-9-]+)==", (ROOT / "tools/requirements.lock").read_text(), re.MULTILINE)
+    )
     used = {module.split(".")[0] for path in PACKAGE.rglob("*.py") for module in imports(path)}
-    for name in {parts.get(name, name) for name in used} - sys.stdlib_module_names - {"cube_tensor_driver"}:
+    for name in (
+        {parts.get(name, name) for name in used} - sys.stdlib_module_names - {"cube_tensor_driver"}
+    ):
         if name not in without_key:
-            assert keys.get(name, name) in declared, f"{name} is imported but package.xml does not name it"
+            assert keys.get(name, name) in declared, (
+                f"{name} is imported but package.xml does not name it"
+            )
         if name in keys or name in without_key:
-            assert wheels.get(name, name) in locked, f"{name} is imported but requirements.lock does not pin it"
+            assert wheels.get(name, name) in locked, (
+                f"{name} is imported but requirements.lock does not pin it"
+            )
 
 
 def test_every_locked_wheel_has_a_hash():
@@ -133,18 +168,25 @@ def test_installed_package_has_module_and_messages(tmp_path):
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     import os
 
-    elsewhere = [path for path in sys.path if path and Path(path).resolve() not in (ROOT, ROOT / "test")]
+    elsewhere = [
+        path for path in sys.path if path and Path(path).resolve() not in (ROOT, ROOT / "test")
+    ]
     script = (
         "import cube_tensor_driver, cube_tensor_driver.core.pipeline, cube_tensor_driver.ros.driver\n"
         "from cube_tensor_driver.msg import SkinStress, StressTensorStamped\n"
         "from cube_tensor_driver.srv import Tare\n"
-        "from cube_tensor_driver.files.skin import read_skin\n"
-        "from cube_tensor_driver.files.share import share\n"
-        "print(len(read_skin(share() / 'config' / 'skin_demo.yaml').cubes), cube_tensor_driver.__file__)"
+        "from cube_tensor_driver.config.skin import read_skin\n"
+        "from cube_tensor_driver.config.package_data import package_data\n"
+        "print(len(read_skin(package_data() / 'config' / 'skin_demo.yaml').cubes), cube_tensor_driver.__file__)"
     )
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(elsewhere)}
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path, env=env, check=False
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=env,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     count, file = done.stdout.split()
@@ -159,6 +201,8 @@ def test_messages_say_unit_and_unknown():
             if line.startswith("#"):
                 comment = True
             elif re.match(r"[a-z]\S* [a-z_]+", line):
-                assert comment or path.name == "StressTensorStamped.msg", f"{path.name}: {line} has no comment"
+                assert comment or path.name == "StressTensorStamped.msg", (
+                    f"{path.name}: {line} has no comment"
+                )
             elif not line.strip():
                 comment = False

@@ -1,4 +1,5 @@
-"""Ten million bytes of all kinds of noise through the decoder, and any text through the readers of files."""
+"""Ten million bytes of all kinds of noise through the decoder, and any text through the readers of
+files."""
 
 from __future__ import annotations
 
@@ -9,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cube_tensor_driver.config.calibration import read_calibration
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.device.decoder import MAX_RUN, Decoder
 from cube_tensor_driver.device.protocol import Ack, Request, Sample, Stats, encode
-from cube_tensor_driver.files.calibration import read_calibration
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
 
 EACH = 2_000_000
 SHIPPED = {
-    read_calibration: share() / "config" / "calibration" / "cube.yaml",
-    read_skin: share() / "config" / "skin_demo.yaml",
+    read_calibration: package_data() / "config" / "calibration" / "cube.yaml",
+    read_skin: package_data() / "config" / "skin_demo.yaml",
 }
 
 
@@ -28,7 +29,9 @@ def clean(size: int) -> bytes:
     frames, length, number = [], 0, 0
     while length < size:
         frequency = random.integers(90_000_000, 110_000_000, (8, 8)).astype("<u4")
-        frame = encode(Sample(number, 0, 1000 * number, frequency, np.zeros(8, "<u4"), np.zeros(8, "<i2")))
+        frame = encode(
+            Sample(number, 0, 1000 * number, frequency, np.zeros(8, "<u4"), np.zeros(8, "<i2"))
+        )
         frames.append(frame)
         length, number = length + len(frame), number + 1
     return b"".join(frames)
@@ -44,12 +47,16 @@ def harmed(size: int) -> bytes:
 
 NOISE = {
     "random": lambda size: np.random.default_rng(3).bytes(size),
-    "mostly zeros and ones": lambda size: np.random.default_rng(4).integers(0, 2, size).astype(np.uint8).tobytes(),
+    "mostly zeros and ones": lambda size: (
+        np.random.default_rng(4).integers(0, 2, size).astype(np.uint8).tobytes()
+    ),
     "harmed frames": harmed,
     "no zero at all": lambda size: b"\x55" * size,
     # The shortest runs that could be frames, and fail in their last byte.
     "late failures": lambda size: (b"\1" * 14 + b"\2\0") * (size // 16),
-    "late failures, sound ones between": lambda size: (b"\1" * 14 + b"\2\0" + b"\2\7" * 7 + b"\1\0") * (size // 32),
+    "late failures, sound ones between": lambda size: (
+        (b"\1" * 14 + b"\2\0" + b"\2\7" * 7 + b"\1\0") * (size // 32)
+    ),
     "zeros and ones in turn": lambda size: b"\0\1" * (size // 2),
 }
 
@@ -65,7 +72,8 @@ def feed(decoder: Decoder, data: bytes) -> float:
 
 @pytest.mark.parametrize("name", list(NOISE))
 def test_ten_million_bytes_of_noise(name: str) -> None:
-    """No exception, bounded memory, every run counted once, and no slower than three times clean frames."""
+    """No exception, bounded memory, every run counted once, and no slower than three times clean
+    frames."""
     good, bad = clean(EACH // 4), NOISE[name](EACH)
     decoder = Decoder()
     feed(decoder, bad)
@@ -80,11 +88,16 @@ def test_ten_million_bytes_of_noise(name: str) -> None:
     assert alone.counters == counters  # runs in a crowd are counted as what they are one by one
     part = bad[: EACH // 4]
     # The best of several, one after the other: other processes only ever add.
-    ratios = [(feed(Decoder(), part) / len(part)) / (feed(Decoder(), good) / len(good)) for _ in range(5)]
+    ratios = [
+        (feed(Decoder(), part) / len(part)) / (feed(Decoder(), good) / len(good)) for _ in range(5)
+    ]
     assert min(ratios) < 3.0
 
 
-FRAMES = [encode(frame) for frame in (Request(1), Request(4, 10_000), Ack(4, 0, 10_000), Stats(5, 4, 3, 2))]
+FRAMES = [
+    encode(frame)
+    for frame in (Request(1), Request(4, 10_000), Ack(4, 0, 10_000), Stats(5, 4, 3, 2))
+]
 PIECES = st.one_of(
     st.sampled_from(FRAMES),
     st.sampled_from(FRAMES).map(lambda frame: encode(Stats(1, 2, 3), version=2) + frame),
@@ -113,14 +126,18 @@ def test_a_crowd_of_short_runs_is_what_they_are_one_by_one(pieces: list[bytes], 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 @pytest.mark.parametrize("read", list(SHIPPED), ids=lambda read: read.__name__)
-def test_damaged_files_are_read_or_our_error(tmp_path_factory: pytest.TempPathFactory, read, data) -> None:
+def test_damaged_files_are_read_or_our_error(
+    tmp_path_factory: pytest.TempPathFactory, read, data
+) -> None:
     lines = SHIPPED[read].read_text().splitlines()
     path = tmp_path_factory.mktemp("fuzz") / "file.yaml"
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(lines) - 1))
         line = lines[at]
         cut = data.draw(st.integers(0, len(line)))
-        lines[at] = line[:cut] + data.draw(st.text(max_size=6)) + line[cut + data.draw(st.integers(0, 4)) :]
+        lines[at] = (
+            line[:cut] + data.draw(st.text(max_size=6)) + line[cut + data.draw(st.integers(0, 4)) :]
+        )
     path.write_text("\n".join(lines), errors="replace")
     try:
         read(path)

@@ -28,14 +28,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 from test_end_to_end import SINGLE, Hub
 
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.device.protocol import Hello, Sample, encode
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
-from cube_tensor_driver.ros.children import Children, ros_arguments
+from cube_tensor_driver.processes.children import Children, ros_arguments
+from cube_tensor_driver.processes.skin_processes import Process, skin_processes
 from cube_tensor_driver.ros.messages import read_stress
-from cube_tensor_driver.ros.start import Process, skin_processes
 from cube_tensor_driver.srv import Tare
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -44,7 +44,7 @@ PERIOD_S = 0.01
 UID = 0xCD
 
 
-class Stage:
+class Scene3D:
     """A hub that plays frequencies in real time, both nodes, and what they publish."""
 
     def __init__(self, ros, tmp_path, children):
@@ -76,7 +76,18 @@ class Stage:
             f = self.pads * (1 + 8e-6 * self.noise.standard_normal(8))
             millihertz = np.rint(1e3 * f).astype("<u4")[None]
             device_us = round(1e6 * PERIOD_S * self.number)
-            self.hub.send(encode(Sample(self.number, 0, device_us, millihertz, np.zeros(1, "<u4"), np.zeros(1, "<i2"))))
+            self.hub.send(
+                encode(
+                    Sample(
+                        self.number,
+                        0,
+                        device_us,
+                        millihertz,
+                        np.zeros(1, "<u4"),
+                        np.zeros(1, "<i2"),
+                    )
+                )
+            )
             self.number += 1
 
     def wait(self, done, seconds=20.0):
@@ -108,7 +119,7 @@ class Stage:
 @pytest.fixture
 def stage(ros, tmp_path):
     with Children(tmp_path) as children:
-        stage = Stage(ros, tmp_path, children)
+        stage = Scene3D(ros, tmp_path, children)
         try:
             yield stage
         finally:
@@ -130,7 +141,9 @@ def test_tare_is_refused_taken_told_kept_and_undone(stage):
     stage.pads = loaded(5000.0)
     stage.seconds(0.3)
     answer = stage.tare()
-    assert not answer.success and ("moves" in answer.message or "data since the start" in answer.message)
+    assert not answer.success and (
+        "moves" in answer.message or "data since the start" in answer.message
+    )
     answer = stage.tare("nobody")
     assert not answer.success and "no cube 'nobody'" in answer.message and "c0" in answer.message
     stage.seconds(2)
@@ -179,7 +192,8 @@ def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
 
 
 def test_a_silent_link_is_noticed_in_time(stage):
-    """max(3 sample periods, 0.2 s), as the driver says itself; what the scheduler adds differs from time to time."""
+    """max(3 sample periods, 0.2 s), as the driver says itself; what the scheduler adds differs from
+    time to time."""
     stage.start()
 
     def said():
@@ -204,7 +218,9 @@ def test_parameters_live(stage):
         kinds = {float: ("double_value", ParameterType.PARAMETER_DOUBLE), str: ("string_value", 4)}
         field, number = kinds[type(value)]
         parameter = Parameter(name=name, value=ParameterValue(type=number, **{field: value}))
-        answer = stage.call(SetParameters, f"/{node}/set_parameters", SetParameters.Request(parameters=[parameter]))
+        answer = stage.call(
+            SetParameters, f"/{node}/set_parameters", SetParameters.Request(parameters=[parameter])
+        )
         return answer.results[0]
 
     stage.hub.requests.clear()
@@ -229,25 +245,39 @@ def test_the_security_policy_allows_what_the_nodes_do(stage):
         stage.children.start(Process(name, f"cube_tensor_driver.ros.{name}"))
     stage.start()
     node = stage.ros.node
-    profiles = list(ElementTree.parse(share() / "config" / "security" / "policy.xml").iter("profile"))
+    profiles = list(
+        ElementTree.parse(package_data() / "config" / "security" / "policy.xml").iter("profile")
+    )
     found = {
         "publish": node.get_publisher_names_and_types_by_node,
         "subscribe": node.get_subscriber_names_and_types_by_node,
         "reply": node.get_service_names_and_types_by_node,
     }
-    assert {profile.get("node") for profile in profiles} == {"driver", "reconstruction", "markers", "contacts"}
+    assert {profile.get("node") for profile in profiles} == {
+        "driver",
+        "reconstruction",
+        "markers",
+        "contacts",
+    }
     for profile in profiles:
         name = profile.get("node")
         stage.wait(lambda name=name: (name, "/") in node.get_node_names_and_namespaces())
-        stage.wait(lambda name=name: len(found["reply"](name, "/")) >= 11)  # 6 of parameters, 5 of the lifecycle
+        stage.wait(
+            lambda name=name: len(found["reply"](name, "/")) >= 11
+        )  # 6 of parameters, 5 of the lifecycle
         for part in (*profile.iter("topics"), *profile.iter("services")):
             (what,) = part.attrib
             names = [item.text.replace("~", f"/{name}") for item in part]
             allowed = {each if each.startswith("/") else f"/{each}" for each in names}
             there = [each for each, _ in found[what](name, "/")]
-            assert [one for one in there if not any(fnmatch(one, each) for each in allowed)] == [], (name, what)
+            assert [
+                one for one in there if not any(fnmatch(one, each) for each in allowed)
+            ] == [], (name, what)
             idle = {each for each in allowed if not any(fnmatch(one, each) for one in there)}
-            assert idle <= {"/clock", "/cubes/*"}, (name, what)  # with use_sim_time; when somebody listens
+            assert idle <= {"/clock", "/cubes/*"}, (
+                name,
+                what,
+            )  # with use_sim_time; when somebody listens
     stage.children.check()
 
 
@@ -255,9 +285,16 @@ def test_the_security_policy_allows_what_the_nodes_do(stage):
 def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
     """Beside the other node, which goes on: what comes in meanwhile must not leak either."""
     processes = skin_processes(SINGLE, simulated_ports=tmp_path / "ports")
-    next(process for process in processes if process.executable == executable).parameters["autostart"] = False
+    next(process for process in processes if process.executable == executable).parameters[
+        "autostart"
+    ] = False
     kind = Transition
-    cycle = (kind.TRANSITION_CONFIGURE, kind.TRANSITION_ACTIVATE, kind.TRANSITION_DEACTIVATE, kind.TRANSITION_CLEANUP)
+    cycle = (
+        kind.TRANSITION_CONFIGURE,
+        kind.TRANSITION_ACTIVATE,
+        kind.TRANSITION_DEACTIVATE,
+        kind.TRANSITION_CLEANUP,
+    )
     with Children(tmp_path) as children:
         for process in processes:
             children.start(process)
@@ -269,7 +306,9 @@ def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
         def run(cycles):
             for _ in range(cycles):
                 for number in cycle:
-                    future = client.call_async(ChangeState.Request(transition=Transition(id=number)))
+                    future = client.call_async(
+                        ChangeState.Request(transition=Transition(id=number))
+                    )
                     ros.wait(future.done)
                     assert future.result().success, children.log(executable)[-500:]
             return process.num_threads(), process.num_fds(), process.memory_info().rss / 2**20
@@ -279,7 +318,8 @@ def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
         late = run(50)
         # DDS ends a thread of its own now and then; what grows would have grown by 50.
         assert late[0] - threads < 5 and late[1] - fds < 5, (threads, fds, late)
-        # rclpy keeps about 1 kB of each of the ten entities that a cycle makes and destroys; the rest is allocator.
+        # rclpy keeps about 1 kB of each of the ten entities that a cycle makes and destroys; the
+        # rest is allocator.
         assert late[2] - early < 2.0, f"{late[2] - early:.2f} MB in 50 cycles"
         children.check()
 
@@ -328,12 +368,18 @@ def test_lifecycle_in_the_middle_of_a_reconnect(ros, tmp_path, deaf):
         ("deaf", "switch the bridge on", signal.SIGTERM),
     ],
 )
-def test_what_cannot_be_opened_is_said_with_the_fix_and_shut_down_at_once(domain, tmp_path, deaf, what, words, number):
+def test_what_cannot_be_opened_is_said_with_the_fix_and_shut_down_at_once(
+    domain, tmp_path, deaf, what, words, number
+):
     """Signals come in the middle of a reconnect."""
     near, far = os.openpty()
     tty = os.ttyname(far)
-    port = {"missing": "/nowhere/ttyACM0", "not serial": str(tmp_path / "file"), "refused": "socket://127.0.0.1:9",
-            "deaf": deaf}.get(what, tty)  # fmt: skip
+    port = {
+        "missing": "/nowhere/ttyACM0",
+        "not serial": str(tmp_path / "file"),
+        "refused": "socket://127.0.0.1:9",
+        "deaf": deaf,
+    }.get(what, tty)
     (tmp_path / "file").touch()
     command = [sys.executable, "-u", "-m", "cube_tensor_driver.ros.driver", "--ros-args"]
     command += ros_arguments({"config": str(SINGLE), "port": port})
@@ -343,7 +389,9 @@ def test_what_cannot_be_opened_is_said_with_the_fix_and_shut_down_at_once(domain
         Path(tty).chmod(0)
         if os.geteuid() == 0:  # root without what lets it pass
             command = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search", *command]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
+    )
     said = ""
     try:
         while words not in said:
@@ -371,6 +419,8 @@ def test_a_driver_that_cannot_read_any_more_ends_with_an_error(domain):
         "main()"
     )
     command = [sys.executable, "-c", code, "--ros-args", *ros_arguments({"config": str(SINGLE)})]
-    process = subprocess.run(command, capture_output=True, text=True, env=os.environ, timeout=30, check=False)
+    process = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ, timeout=30, check=False
+    )
     assert process.returncode == 1
     assert "cannot go on: ZeroDivisionError" in process.stderr

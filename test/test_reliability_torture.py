@@ -1,4 +1,5 @@
-"""A short torture: the whole chain in real processes under a mix of faults, judged to the last sample and bit."""
+"""A short torture: the whole chain in real processes under a mix of faults, judged to the last
+sample and bit."""
 
 from __future__ import annotations
 
@@ -12,8 +13,19 @@ from conftest import ROOT
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
-KEYS = {"samples_sent", "delivered", "counted", "unaccounted", "wrong", "reconnects", "worst_reconnect_s",
-        "stamp_error_p99_ms", "threads_leaked", "rss_growth_mb", "crashes"}  # fmt: skip
+KEYS = {
+    "samples_sent",
+    "delivered",
+    "counted",
+    "unaccounted",
+    "wrong",
+    "reconnects",
+    "worst_reconnect_s",
+    "stamp_error_p99_ms",
+    "threads_leaked",
+    "rss_growth_mb",
+    "crashes",
+}
 
 
 def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(domain, tmp_path):
@@ -21,8 +33,11 @@ def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(domain, 
     command = ["torture", "--duration", "8", "--seed", "3", "--json", str(path)]
     process = subprocess.Popen(
         [sys.executable, "-m", "cube_tensor_driver.cli", *command],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=ROOT,
+    )
     try:
         output, _ = process.communicate(timeout=120)
     finally:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cube_tensor_driver.config.tare import read_tare, remove_tare, tare_path, write_tare
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import ConfigError, TareError
 from cube_tensor_driver.core.health import HOLD, Health
@@ -16,7 +17,6 @@ from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.tare import DriftTracker, measure_rest
 from cube_tensor_driver.core.window import WINDOW_S
-from cube_tensor_driver.files.tare import read_tare, remove_tare, tare_path, write_tare
 
 CALIBRATION = illustrative("planar")
 NAMES = ["a", "b", "c"]
@@ -49,7 +49,9 @@ class Skin:
             self.seconds += 1 / RATE
 
     def tare(self, cubes=(0, 1, 2), duration=1.0):
-        self.pipeline.rest_frequency = measure_rest(self.pipeline, self.health, cubes, duration, NAMES)
+        self.pipeline.rest_frequency = measure_rest(
+            self.pipeline, self.health, cubes, duration, NAMES
+        )
         self.health.refresh()
         return self.pipeline.rest_frequency
 
@@ -139,14 +141,17 @@ def test_a_cube_that_is_silent_is_refused_and_bad_pads_keep_their_rest():
         skin.tare()
     for _ in range(3 * RATE):
         f = pads()[:1].astype(np.float32)
-        skin.health.update(np.arange(1), f, np.zeros(1, np.uint32), np.array([round(skin.seconds * 1e9)]))
+        skin.health.update(
+            np.arange(1), f, np.zeros(1, np.uint32), np.array([round(skin.seconds * 1e9)])
+        )
         skin.seconds += 1 / RATE
     with pytest.raises(TareError, match="cube b: no data"):
         skin.tare([1])
 
 
 def test_a_steady_load_survives_an_hour_of_drift_tracking_and_drift_does_not():
-    """In simulated time: cubes a and c are loaded after 10 s, for an hour; b and c drift by 20 ppm a minute."""
+    """In simulated time: cubes a and c are loaded after 10 s, for an hour; b and c drift by 20 ppm
+    a minute."""
     skin = Skin()
     load, hour = np.linspace(-0.02, 0.02, 8), 3600.0
 
@@ -217,4 +222,8 @@ def test_damaged_files_are_our_errors(tmp_path_factory, data):
     except ConfigError as error:
         assert path.name in str(error)
     else:
-        assert stored is not None and stored.rest_frequency.shape == (8,) and (stored.rest_frequency > 0).all()
+        assert (
+            stored is not None
+            and stored.rest_frequency.shape == (8,)
+            and (stored.rest_frequency > 0).all()
+        )

@@ -1,4 +1,5 @@
-"""The browser view in a real browser: a load that comes, a cube that is chosen, a tare, a replay that is steered."""
+"""The browser view in a real browser: a load that comes, a cube that is chosen, a tare, a replay
+that is steered."""
 
 from __future__ import annotations
 
@@ -31,20 +32,30 @@ from selenium.webdriver.common.keys import Keys
 from websockets.sync.client import connect
 
 from conftest import ROOT, end
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.device.scan import Rows
-from cube_tensor_driver.files.share import share
-from cube_tensor_driver.files.skin import read_skin
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
-from cube_tensor_driver.ros.children import Children
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.ros.messages import frequencies_message, to_ns
-from cube_tensor_driver.ros.start import Process
 from cube_tensor_driver.srv import SteerReplay
 
-CHROMIUM, DRIVER = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
-FLAGS = ("--headless", "--no-sandbox", "--disable-background-networking", "--enable-unsafe-swiftshader",
-         "--use-gl=angle", "--use-angle=swiftshader", "--window-size=900,600")  # fmt: skip
-CONFIG = share() / "config" / "skin_demo.yaml"
+CHROMIUM, DRIVER = (
+    shutil.which("chromium") or shutil.which("google-chrome"),
+    shutil.which("chromedriver"),
+)
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-background-networking",
+    "--enable-unsafe-swiftshader",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--window-size=900,600",
+)
+CONFIG = package_data() / "config" / "skin_demo.yaml"
 SKIN = read_skin(CONFIG)
 N = len(SKIN.cubes)
 PRESSED, RATE, NOISE = 10, 50.0, 8e-6
@@ -93,7 +104,14 @@ class Skin(threading.Thread):
         while not self._ended.wait(1 / RATE):
             frequency = self._frequency * (1 + NOISE * noise.standard_normal(self._frequency.shape))
             sequence, now = np.full(N, self.sent, np.uint32), np.full(N, time.time_ns())
-            scan = Rows(cubes, sequence, now, frequency.astype(np.float32), np.full(N, np.nan, np.float32), none)
+            scan = Rows(
+                cubes,
+                sequence,
+                now,
+                frequency.astype(np.float32),
+                np.full(N, np.nan, np.float32),
+                none,
+            )
             self._publisher.publish(frequencies_message(scan, "skin_base"))
             self.sent += 1
 
@@ -108,8 +126,13 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
     skin = Skin(ros.node)
     with ExitStack() as stack:
         children = stack.enter_context(Children(tmp_path))
-        children.start(Process("reconstruction", "cube_tensor_driver.ros.reconstruction",
-                               parameters={"config": str(CONFIG), "tare_folder": str(tmp_path / "tare")}))  # fmt: skip
+        children.start(
+            Process(
+                "reconstruction",
+                "cube_tensor_driver.ros.reconstruction",
+                parameters={"config": str(CONFIG), "tare_folder": str(tmp_path / "tare")},
+            )
+        )
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         skin.start()
         stack.callback(skin.end)
@@ -118,8 +141,14 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
         sleeper = socket.socket()
         sleeper.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         sleeper.connect((HERE, port))
-        stack.enter_context(connect(f"ws://{HERE}:{port}", sock=sleeper, max_queue=1,
-                                    subprotocols=[f"viser-v{viser.__version__}"]))  # fmt: skip
+        stack.enter_context(
+            connect(
+                f"ws://{HERE}:{port}",
+                sock=sleeper,
+                max_queue=1,
+                subprotocols=[f"viser-v{viser.__version__}"],
+            )
+        )
         page = stack.enter_context(browser(url))
 
         ros.wait(lambda: f"{N} of {N} cubes" in text(page) and "live" in text(page), 40)
@@ -144,8 +173,13 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
         ros.wait(lambda: abs(shown(page) + 20e3) < 200, 40)
         assert page.execute_script("return document.querySelectorAll('.uplot canvas').length") == 4
 
-        # what the page shows as tared is tared on the topic; a load that moved within its windows would refuse it
-        ros.wait(lambda: heard and rows(heard)[-1][0] > pressed_ns + 2e9 and abs(newest(heard) + 20e3) < 200)
+        # what the page shows as tared is tared on the topic; a load that moved within its windows
+        # would refuse it
+        ros.wait(
+            lambda: (
+                heard and rows(heard)[-1][0] > pressed_ns + 2e9 and abs(newest(heard) + 20e3) < 200
+            )
+        )
         clicked_ns = time.time_ns()
         press(page, "tare")
         ros.wait(lambda: "tare done" in text(page) or "tare refused" in text(page), 40)
@@ -153,7 +187,9 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
         ros.wait(lambda: abs(shown(page)) < 200, 40)
         ros.wait(lambda: abs(newest(heard)) < 200)
         tared_ns = min(at for at, zz in rows(heard) if at > clicked_ns and abs(zz) < 200)
-        print(f"from the click on tare to the first tared row: {1e-6 * (tared_ns - clicked_ns):.0f} ms")
+        print(
+            f"from the click on tare to the first tared row: {1e-6 * (tared_ns - clicked_ns):.0f} ms"
+        )
         press(page, "clear tare")
         ros.wait(lambda: abs(shown(page) + 20e3) < 200, 40)
         ros.wait(lambda: abs(newest(heard) + 20e3) < 200)
@@ -170,8 +206,13 @@ def test_a_replay_is_steered_from_the_page(ros, tmp_path):
     """A bag of 6 s whose cubes swing with a period of 2 s."""
     path = make_bag(tmp_path / "bag", CONFIG, 600)
     heard = ros.listen(SkinStress, "stress")
-    replay = subprocess.Popen([sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--view"],
-                              cwd=ROOT, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # fmt: skip
+    replay = subprocess.Popen(
+        [sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--view"],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         url = next(line for line in replay.stderr if "http://" in line).split()[0]
         with browser(url) as page:
@@ -204,8 +245,13 @@ def test_a_replay_is_steered_from_the_page(ros, tmp_path):
             ros.wait(lambda: position() > 5.8, 40)
             ros.wait(lambda: float(slider.get_attribute("aria-valuenow")) > 5.8, 40)
             assert f"{N} of {N} cubes" in text(page)
-        refused = ros.call(SteerReplay, "player/steer", SteerReplay.Request(position=6.5, paused=True))
-        assert not refused.success and "6.5 s is not in the bag, which is 5.990 s long" in refused.message
+        refused = ros.call(
+            SteerReplay, "player/steer", SteerReplay.Request(position=6.5, paused=True)
+        )
+        assert (
+            not refused.success
+            and "6.5 s is not in the bag, which is 5.990 s long" in refused.message
+        )
         replay.terminate()
         assert replay.wait(timeout=10) == 0
         assert "Traceback" not in replay.stderr.read()
@@ -218,7 +264,9 @@ def text(page: webdriver.Chrome) -> str:
 
 
 def buttons(page: webdriver.Chrome) -> list[str]:
-    return page.execute_script("return [...document.querySelectorAll('button')].map(b => b.innerText.trim())")
+    return page.execute_script(
+        "return [...document.querySelectorAll('button')].map(b => b.innerText.trim())"
+    )
 
 
 def press(page: webdriver.Chrome, label: str) -> None:
@@ -234,7 +282,9 @@ def shown(page: webdriver.Chrome) -> float:
 
 def rows(heard: list) -> list[tuple[int, float]]:
     """When each message was measured, ns, and zz of its pressed cube, Pa."""
-    return [(to_ns(message.header.stamp), float(message.stress[6 * PRESSED + 2])) for message in heard]
+    return [
+        (to_ns(message.header.stamp), float(message.stress[6 * PRESSED + 2])) for message in heard
+    ]
 
 
 def newest(heard: list) -> float:
@@ -256,4 +306,8 @@ def hosts(page: webdriver.Chrome) -> set[str | None]:
         for event in events
         if event["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated")
     ]
-    return {urlparse(url).hostname for url in urls if urlparse(url).scheme not in ("data", "blob", "chrome")}
+    return {
+        urlparse(url).hostname
+        for url in urls
+        if urlparse(url).scheme not in ("data", "blob", "chrome")
+    }

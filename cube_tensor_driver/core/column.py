@@ -1,4 +1,5 @@
-"""The cube column of a message: which cube each row is of. A hub's cubes stay the same, and so what is made of them."""
+"""The cube column of a message: which cube each row is of. A hub's cubes stay the same, and so what
+is made of them."""
 
 from __future__ import annotations
 
@@ -8,13 +9,15 @@ from typing import Generic, TypeVar
 import numpy as np
 
 SKINS_KEPT = 4
-"""Columns of so many times all cubes stay: the whole skin's, each hub's, of a few scans at once. Others come and go."""
+"""Columns of so many times all cubes stay: the whole skin's, each hub's, of a few scans at once.
+Others come and go."""
 
 Made = TypeVar("Made")
 
 
 class Columns(Generic[Made]):
-    """What `make` makes of a column (N,) alone, kept from call to call; the least recently asked for go first."""
+    """What `make` makes of a column (N,) alone, kept from call to call; the least recently asked
+    for go first."""
 
     def __init__(self, make: Callable[[np.ndarray], Made], cubes: int) -> None:
         """cubes: how many the skin has."""
@@ -43,7 +46,8 @@ class Columns(Generic[Made]):
 
 
 def turns(cube: np.ndarray) -> int:
-    """How many times the same rising cubes stand one after the other in a column (N,); 0: it is none such."""
+    """How many times the same rising cubes stand one after the other in a column (N,); 0: it is
+    none such."""
     falls = np.flatnonzero(cube[1:] <= cube[:-1])
     n = int(falls[0]) + 1 if len(falls) else len(cube)
     if not n or len(cube) % n or (cube.reshape(-1, n) != cube[:n]).any():

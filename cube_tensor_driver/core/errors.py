@@ -22,11 +22,13 @@ class FitError(CubeError):
 
 
 class ProtocolError(CubeError):
-    """A frame that cannot be put into bytes: a field or an array outside what the protocol carries."""
+    """A frame that cannot be put into bytes: a field or an array outside what the protocol
+    carries."""
 
 
 class LinkError(CubeError):
-    """A link that cannot be opened or was lost; `kind` is one word for programs, the text names the fix."""
+    """A link that cannot be opened or was lost; `kind` is one word for programs, the text names the
+    fix."""
 
     def __init__(self, message: str, kind: str) -> None:
         super().__init__(message)
@@ -38,7 +40,8 @@ class ElasticError(CubeError):
 
 
 class ConfigError(CubeError):
-    """A configuration file or parameter that cannot be used: file, key, what was found, what is allowed."""
+    """A configuration file or parameter that cannot be used: file, key, what was found, what is
+    allowed."""
 
 
 class MessageError(CubeError):

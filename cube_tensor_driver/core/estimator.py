@@ -1,12 +1,16 @@
-"""Inversion of a response by weighted least squares: what the pads see, how well, and what does not fit.
+"""Inversion of a response by weighted least squares: what the pads see, how well, and what does not
+fit.
 
-With W = diag(1 / noise) and W A = U1 S V1' (the singular values above RANK_TOLERANCE of the largest):
+With W = diag(1 / noise) and W A = U1 S V1' (the singular values above RANK_TOLERANCE of the
+largest):
 
     components    T V1 S^-1 U1' W v           T: components of a state, see Modes.components
     covariance    T V1 S^-2 V1' T'
-    chi-square    |U2' W v|^2                 U2: the rest of U, with as many columns as there is redundancy
+    chi-square    |U2' W v|^2                 U2: the rest of U, with as many columns as there is
+    redundancy
 
-Source: the paper's eqs. 2 to 5 are the closed forms for one layout; docs/physics.md corrects 4 and 5.
+Source: the paper's eqs. 2 to 5 are the closed forms for one layout; docs/physics.md corrects 4 and
+5.
 """
 
 from __future__ import annotations
@@ -22,13 +26,16 @@ import numpy as np
 from .modes import Modes
 from .symmetry import Structure
 
-# A combination of modes counts as unseen when the pads answer it with less than this part of the strongest.
+# A combination of modes counts as unseen when the pads answer it with less than this part of the
+# strongest.
 RANK_TOLERANCE = 1e-4
-# A component counts as observed when at most this part of it lies along unseen combinations of modes.
+# A component counts as observed when at most this part of it lies along unseen combinations of
+# modes.
 LEAK_TOLERANCE = 1e-3
 # Chance that pads with nothing but their stated noise set the residual bit.
 FALSE_ALARM = 1e-3
-# A pad is cleared when another explains the residual better by odds of 100 to 1: 2 ln(odds) of chi-square.
+# A pad is cleared when another explains the residual better by odds of 100 to 1: 2 ln(odds) of
+# chi-square.
 SUSPECT_MARGIN = 2 * math.log(100)
 
 
@@ -36,7 +43,8 @@ SUSPECT_MARGIN = 2 * math.log(100)
 class Estimator:
     """Linear maps for one response, noise and set of present pads.
 
-    matrix: (T, P) pad stresses to targets; rows of unobserved targets NaN, columns of missing pads 0
+    matrix: (T, P) pad stresses to targets; rows of unobserved targets NaN, columns of missing pads
+    0
     observed: (T,) bool
     covariance: (T, T), NaN in rows and columns of unobserved targets
     null: (dof, P) whitened rows; chi-square is the sum of squares of null @ v
@@ -61,13 +69,14 @@ class Estimator:
         return np.sum((np.asarray(pad_stress) @ self.null.T) ** 2, axis=-1)
 
     def suspects(self, pad_stress: np.ndarray) -> np.ndarray:
-        """(N, P) bool: the pads of which one broken alone explains a bad chi-square of (N, P) pad stresses.
+        """(N, P) bool: the pads of which one broken alone explains a bad chi-square of (N, P) pad
+        stresses.
 
-        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, z = null v, u_p its column of U2'. A row
-        marks pads when chi-square is above its limit and what is left without the best pad is below the limit
-        of one degree less; marked are the best and all that explain as much within SUSPECT_MARGIN, none when
-        that is every pad. Pads opposite through the centre of a symmetric cube always come as a pair: a
-        gradient takes up their difference.
+        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, z = null v, u_p its column of
+        U2'. A row marks pads when chi-square is above its limit and what is left without the best
+        pad is below the limit of one degree less; marked are the best and all that explain as much
+        within SUSPECT_MARGIN, none when that is every pad. Pads opposite through the centre of a
+        symmetric cube always come as a pair: a gradient takes up their difference.
         """
         v = np.atleast_2d(np.asarray(pad_stress, dtype=float))
         if self.dof < 2:
@@ -94,8 +103,8 @@ def make_estimator(
     """The estimator of the COMPONENTS (or of targets @ state) from the pads that are not missing.
 
     response: (P, M) in Pa per Pa; noise: (P,) standard deviation of each pad's stress in Pa
-    missing: indices of pads to leave out; neglect: names of modes stated to be zero, which are then reported
-    unobserved themselves; targets: (T, M), default modes.components
+    missing: indices of pads to leave out; neglect: names of modes stated to be zero, which are then
+    reported unobserved themselves; targets: (T, M), default modes.components
     """
     response, noise = np.asarray(response, dtype=float), np.asarray(noise, dtype=float)
     targets = modes.components if targets is None else np.asarray(targets, dtype=float)
@@ -107,7 +116,9 @@ def make_estimator(
     v1 = vt[:rank].T
     t = targets[:, kept]
     size = np.linalg.norm(targets, axis=1)
-    leak = np.linalg.norm(t - (t @ v1) @ v1.T, axis=1) + np.linalg.norm(np.delete(targets, kept, axis=1), axis=1)
+    leak = np.linalg.norm(t - (t @ v1) @ v1.T, axis=1) + np.linalg.norm(
+        np.delete(targets, kept, axis=1), axis=1
+    )
     observed = (size > 0) & (leak <= LEAK_TOLERANCE * size)
 
     half = t @ v1 / s[:rank]
@@ -118,11 +129,14 @@ def make_estimator(
     covariance[~observed] = covariance[:, ~observed] = np.nan
     null = np.zeros((len(present) - rank, len(response)))
     null[:, present] = u[:, rank:].T / noise[present]
-    return Estimator(matrix, observed, covariance, null, chi2_limit(len(null), FALSE_ALARM), rank, noise)
+    return Estimator(
+        matrix, observed, covariance, null, chi2_limit(len(null), FALSE_ALARM), rank, noise
+    )
 
 
 def chi2_tail(x: float, dof: int) -> float:
-    """Probability that a chi-square of dof degrees of freedom exceeds x: Q(dof/2, x/2) by recurrence."""
+    """Probability that a chi-square of dof degrees of freedom exceeds x: Q(dof/2, x/2) by
+    recurrence."""
     if x <= 0:
         return 1.0
     h = x / 2
@@ -133,15 +147,19 @@ def chi2_tail(x: float, dof: int) -> float:
     return tail
 
 
-def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] = ()) -> dict[str, Any]:
+def summary(
+    structure: Structure, response: np.ndarray, neglect: Sequence[str] = ()
+) -> dict[str, Any]:
     """What a response (P, M) lets a layout see, in plain types.
 
     rank_uniform, rank_gradient: of the columns of uniform and gradient modes, and their condition
-    unobservable: modes hidden from the pads; noise: {mode: standard deviation per unit of pad noise}
-    None stands for what there is not.
+    unobservable: modes hidden from the pads; noise: {mode: standard deviation per unit of pad
+    noise} None stands for what there is not.
     """
     modes, n_pads = structure.modes, structure.layout.n_pads
-    estimator = make_estimator(response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes))
+    estimator = make_estimator(
+        response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes)
+    )
     deviations = np.sqrt(np.diag(estimator.covariance))
     result: dict[str, Any] = {
         "pads": list(structure.layout.pads),
@@ -155,7 +173,9 @@ def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] =
         s = s[s > RANK_TOLERANCE * s[0]] if s.size else s
         result[f"rank_{part}"] = len(s)
         result[f"condition_{part}"] = float(s[0] / s[-1]) if s.size else None
-    result["unobservable"] = [name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen]
+    result["unobservable"] = [
+        name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen
+    ]
     result["noise"] = {
         name: float(d) if seen else None
         for name, d, seen in zip(modes.names, deviations, estimator.observed, strict=True)
@@ -165,7 +185,8 @@ def summary(structure: Structure, response: np.ndarray, neglect: Sequence[str] =
 
 @lru_cache
 def chi2_limit(dof: int, probability: float) -> float:
-    """The x that chi-square of dof degrees of freedom exceeds with this probability; NaN for dof = 0."""
+    """The x that chi-square of dof degrees of freedom exceeds with this probability; NaN for dof =
+    0."""
     if dof < 1:
         return math.nan
     low, high = 0.0, 1.0

@@ -2,10 +2,10 @@
 
     v_np = g_p sum_k c_k (B_k s_n)_p + noise
 
-s_n: known state of load n, v_np: stress that pad p showed, B_k: basis of the structure. The product of g and
-c is settled by gains that average 1 over each set of pads that the symmetry carries onto each other. Solved
-by Gauss-Newton steps on weighted residuals: Huber's weights first, then Tukey's, which forget outliers
-altogether.
+s_n: known state of load n, v_np: stress that pad p showed, B_k: basis of the structure. The product
+of g and c is settled by gains that average 1 over each set of pads that the symmetry carries onto
+each other. Solved by Gauss-Newton steps on weighted residuals: Huber's weights first, then Tukey's,
+which forget outliers altogether.
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """
 
@@ -20,7 +20,16 @@ from .calibration import Calibration
 from .errors import FitError
 from .modes import Modes
 from .oscillator import pad_stress
-from .robust import STAGES, STEPS, hidden_directions, least_squares, robust_covariance, scatter, touched, weights_of
+from .robust import (
+    STAGES,
+    STEPS,
+    hidden_directions,
+    least_squares,
+    robust_covariance,
+    scatter,
+    touched,
+    weights_of,
+)
 from .symmetry import Structure
 
 FOLDS = 10  # of the cross-validation
@@ -30,12 +39,16 @@ FOLDS = 10  # of the cross-validation
 class Fit:
     """What loads say about a structure.
 
-    coefficients, deviations: {name: value} and standard deviations in Pa per Pa, NaN where not determined
+    coefficients, deviations: {name: value} and standard deviations in Pa per Pa, NaN where not
+    determined
     covariance: (K, K) of the coefficients; gain, gain_deviation: (P,)
-    scale: scatter found, in units of the stated noise; chi2, dof: over the readings that are not outliers
-    held_out: rms error on loads left out of the fit over rms reading (cross-validation), without outliers
+    scale: scatter found, in units of the stated noise; chi2, dof: over the readings that are not
+    outliers
+    held_out: rms error on loads left out of the fit over rms reading (cross-validation), without
+    outliers
     fitted: (N, P) Pa; outliers: (N, P) bool, readings that had no weight
-    undetermined: names of coefficients that these loads leave open; advice: which loads to add, in words
+    undetermined: names of coefficients that these loads leave open; advice: which loads to add, in
+    words
     """
 
     structure: Structure
@@ -56,10 +69,13 @@ class Fit:
     def calibration(self, base: Calibration, created: str = "", source: str = "") -> Calibration:
         """base with what was fitted, and with its noise raised to the scatter found.
 
-        FitError when coefficients are undetermined: add the loads of `advice`, or give them as `fixed`.
+        FitError when coefficients are undetermined: add the loads of `advice`, or give them as
+        `fixed`.
         """
         if self.undetermined:
-            raise FitError(f"no calibration: {'; '.join(self.advice)}. Or give the open coefficients as fixed")
+            raise FitError(
+                f"no calibration: {'; '.join(self.advice)}. Or give the open coefficients as fixed"
+            )
         return replace(
             base,
             layout=self.structure.layout,
@@ -74,8 +90,11 @@ class Fit:
         )
 
 
-def measured_stress(base: Calibration, frequency: np.ndarray, temperature: np.ndarray | None = None) -> np.ndarray:
-    """(N, P) Pa from frequencies (N, P) by a calibration's pad law; FitError names one out of range."""
+def measured_stress(
+    base: Calibration, frequency: np.ndarray, temperature: np.ndarray | None = None
+) -> np.ndarray:
+    """(N, P) Pa from frequencies (N, P) by a calibration's pad law; FitError names one out of
+    range."""
     f = np.asarray(frequency, dtype=float)
     if f.ndim != 2 or f.shape[1] != base.layout.n_pads:
         raise FitError(
@@ -95,13 +114,17 @@ def measured_stress(base: Calibration, frequency: np.ndarray, temperature: np.nd
 
 
 def traction_loads(modes: Modes, force: np.ndarray, area: float) -> np.ndarray:
-    """(N, M) states for forces (N, 3) in N of a reference sensor over an area in m^2 of the face +z.
+    """(N, M) states for forces (N, 3) in N of a reference sensor over an area in m^2 of the face
+    +z.
 
-    Uniform zz, yz and zx; the stresses along the skin are taken as 0: nothing holds the layer sideways.
+    Uniform zz, yz and zx; the stresses along the skin are taken as 0: nothing holds the layer
+    sideways.
     """
     f = np.asarray(force, dtype=float)
     if f.ndim != 2 or f.shape[1] != 3 or not area > 0:
-        raise FitError(f"forces have shape {f.shape} and the area is {area} m^2; needed are (loads, 3) and above 0")
+        raise FitError(
+            f"forces have shape {f.shape} and the area is {area} m^2; needed are (loads, 3) and above 0"
+        )
     stress = np.zeros((len(f), 6))
     stress[:, [4, 3, 2]] = f / area
     return modes.state(stress)
@@ -117,8 +140,10 @@ def fit(
 ) -> Fit:
     """Coefficients and gains from loads (N, M) in Pa and measured pad stresses (N, P) in Pa.
 
-    noise: standard deviation of readings in Pa, one or (P,); fixed: coefficients known from elsewhere
-    gains: False takes every gain as 1, for loads that reach too few pads to tell gains from coefficients
+    noise: standard deviation of readings in Pa, one or (P,); fixed: coefficients known from
+    elsewhere
+    gains: False takes every gain as 1, for loads that reach too few pads to tell gains from
+    coefficients
     FitError for wrong shapes, NaN, loads of zero, and loads that determine no coefficient at all.
     """
     fixed = dict(fixed or {})
@@ -131,7 +156,10 @@ def fit(
     open_ = touched(hidden, len(model.free))
     names = [structure.names[k] for k in model.free]
     if len(names) and open_.all():
-        raise FitError("these loads determine no coefficient: " + "; ".join(_advise(model, theta, x, hidden, open_)))
+        raise FitError(
+            "these loads determine no coefficient: "
+            + "; ".join(_advise(model, theta, x, hidden, open_))
+        )
     covariance = robust_covariance(jacobian, model.residuals(theta, design, y) / scale, scale)
     covariance[: len(names)][open_] = covariance[:, : len(names)][:, open_] = np.nan
     k = np.full((structure.n_coefficients,) * 2, 0.0)
@@ -162,7 +190,9 @@ def fit(
 class _Model:
     """theta = free coefficients, then coordinates of the gains around 1."""
 
-    def __init__(self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float], gains: bool) -> None:
+    def __init__(
+        self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float], gains: bool
+    ) -> None:
         self.structure, self.noise = structure, noise
         self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
         self.start = np.array([fixed.get(name, 0.0) for name in structure.names], dtype=float)
@@ -227,12 +257,19 @@ def _check(structure, loads, measured, noise, fixed):
             f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} needs "
             f"(loads, {n_modes}) and (loads, {n_pads}) with at least one load"
         )
-    for what, array, columns in (("load", x, structure.modes.names), ("reading", y, structure.layout.pads)):
+    for what, array, columns in (
+        ("load", x, structure.modes.names),
+        ("reading", y, structure.layout.pads),
+    ):
         if not np.all(np.isfinite(array)):
             n, i = np.argwhere(~np.isfinite(array))[0]
-            raise FitError(f"{what} {n + 1}, {columns[i]}: {array[n, i]}; correct or remove this row")
+            raise FitError(
+                f"{what} {n + 1}, {columns[i]}: {array[n, i]}; correct or remove this row"
+            )
     if noise.shape not in ((), (n_pads,)) or not np.all(noise > 0):
-        raise FitError(f"noise is {noise.tolist()}; it must be one number or {n_pads}, each above 0 Pa")
+        raise FitError(
+            f"noise is {noise.tolist()}; it must be one number or {n_pads}, each above 0 Pa"
+        )
     if not np.any(x):
         raise FitError("all loads are zero; record loads that press, shear or bend the skin")
     unknown = set(fixed) - set(structure.names)
@@ -254,24 +291,34 @@ def _held_out(model: _Model, design: np.ndarray, y: np.ndarray, kept: np.ndarray
     return float(np.sqrt(np.mean(errors[kept] ** 2) / np.mean(y[kept] ** 2)))
 
 
-def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray) -> list[str]:
+def _advise(
+    model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray
+) -> list[str]:
     """Sentences that name single-mode loads, found greedily, which would determine what is open."""
     advice = []
     theta = theta.copy()
-    theta[: len(open_)][open_] = 0.5  # any value: without one, the new load's gains would seem undetermined
+    theta[: len(open_)][open_] = (
+        0.5  # any value: without one, the new load's gains would seem undetermined
+    )
     loads, size = x, np.sqrt(np.mean(x[x != 0] ** 2))
     while open_.any():
         trials = [np.vstack([loads, size * np.eye(x.shape[1])[m]]) for m in range(x.shape[1])]
-        hiddens = [hidden_directions(model.jacobian(theta, model.design(trial))) for trial in trials]
+        hiddens = [
+            hidden_directions(model.jacobian(theta, model.design(trial))) for trial in trials
+        ]
         counts = [(touched(h, len(open_)).sum(), h.shape[1]) for h in hiddens]
         best = min(range(len(counts)), key=counts.__getitem__)
         still = touched(hiddens[best], len(open_))
         names = [model.structure.names[k] for k, o in zip(model.free, open_, strict=True) if o]
         if hiddens[best].shape[1] >= hidden.shape[1]:
-            advice.append(f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry")
+            advice.append(
+                f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry"
+            )
             break
         settled = [
-            model.structure.names[k] for k, now, then in zip(model.free, open_, still, strict=True) if now and not then
+            model.structure.names[k]
+            for k, now, then in zip(model.free, open_, still, strict=True)
+            if now and not then
         ]
         mode = model.structure.modes.names[best]
         advice.append(
@@ -285,5 +332,6 @@ def _advise(model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray,
 def describe_mode(name: str) -> str:
     """A mode's name in words, such as "sigma_zz growing along x"."""
     return " against ".join(
-        f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform") for part in name.split("-")
+        f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform")
+        for part in name.split("-")
     )

@@ -1,8 +1,10 @@
-"""Health of pads and cubes, from frequencies alone: what is broken, said at once and without flicker.
+"""Health of pads and cubes, from frequencies alone: what is broken, said at once and without
+flicker.
 
-Every row is looked at when it comes: a pad that cannot be (open, short, out of range) is left out of that very row.
-What needs statistics (stuck, noisy, drifting) is judged over windows of WINDOW_S of the rows' own time. A condition
-lasts until it was absent for HOLD windows. All arrays are (cubes, pads); nothing loops over cubes.
+Every row is looked at when it comes: a pad that cannot be (open, short, out of range) is left out
+of that very row. What needs statistics (stuck, noisy, drifting) is judged over windows of WINDOW_S
+of the rows' own time. A condition lasts until it was absent for HOLD windows. All arrays are
+(cubes, pads); nothing loops over cubes.
 
     strain    d/d_rest - 1 of the pad's law (oscillator.py)
 """
@@ -22,7 +24,8 @@ from .status import LEFT_OUT, OPEN, RANGE, REPORTED, RESIDUAL, SHORT
 from .window import WINDOW_S, Judge, Statistics, Window, still_strained
 
 BACK_NS = round(2e9 * WINDOW_S)
-"""Times that lie further back than this before the window's end are another time: a recording played again."""
+"""Times that lie further back than this before the window's end are another time: a recording
+played again."""
 HOLD = 3
 HISTORY = 20
 """Windows remembered, for tare: 10 s."""
@@ -36,7 +39,9 @@ class _Column(NamedTuple):
 
     turns: int  # how many times the same rising cubes stand in it, 0: not so
     cube: np.ndarray  # (n,) of one turn
-    cubes: slice | np.ndarray  # the same, as a slice where they are neighbours: numpy does not copy those
+    cubes: (
+        slice | np.ndarray
+    )  # the same, as a slice where they are neighbours: numpy does not copy those
     low: np.ndarray  # (n, P)
     high: np.ndarray
     pads: int  # how many there are in a turn
@@ -46,10 +51,11 @@ class _Column(NamedTuple):
 class Health:
     """Watches the cubes of a pipeline.
 
-    state: (cubes, P) uint16, the bits above, now; mask: (cubes,) uint32, bit p: pad p is left out; status: (cubes,)
-    uint16, all pads' bits together; strained: (cubes,) bool, residual above its level; last: (cubes, P) Hz, newest
-    frequencies; rows: (cubes,) how many came since `collect`; history: the last windows; still: (cubes,) bool, nothing
-    moved in the last one; temperature: (cubes,) °C, newest; closed: how many windows have ended.
+    state: (cubes, P) uint16, the bits above, now; mask: (cubes,) uint32, bit p: pad p is left out;
+    status: (cubes,) uint16, all pads' bits together; strained: (cubes,) bool, residual above its
+    level; last: (cubes, P) Hz, newest frequencies; rows: (cubes,) how many came since `collect`;
+    history: the last windows; still: (cubes,) bool, nothing moved in the last one; temperature:
+    (cubes,) °C, newest; closed: how many windows have ended.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
@@ -94,7 +100,12 @@ class Health:
         """Take the pipeline's rest frequencies anew, after tare."""
         pads = [(c.beta, c.modulus, c.noise) for c in self._pipeline.calibrations]
         beta, modulus, noise = (
-            np.array([np.pad(each[k], (0, self._shape[1] - len(each[k])), constant_values=1.0) for each in pads])
+            np.array(
+                [
+                    np.pad(each[k], (0, self._shape[1] - len(each[k])), constant_values=1.0)
+                    for each in pads
+                ]
+            )
             for k in range(3)
         )
         rest = self._pipeline.rest_frequency
@@ -116,9 +127,10 @@ class Health:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Look at the rows of a message, before they are reconstructed.
 
-        cube (N,) indices; frequency (N, P) Hz; pad_fault (N,) bits; stamp_ns (N,) times; temperature (N,) °C.
-        Cubes that stand in it several times, always in the same order, are looked at turn by turn.
-        Returns (N,) uint32, bits of the pads to leave out of each row, and (N,) uint16, status bits of its cube.
+        cube (N,) indices; frequency (N, P) Hz; pad_fault (N,) bits; stamp_ns (N,) times;
+        temperature (N,) °C. Cubes that stand in it several times, always in the same order, are
+        looked at turn by turn. Returns (N,) uint32, bits of the pads to leave out of each row, and
+        (N,) uint16, status bits of its cube.
         LayoutError: a shape or a cube that the pipeline does not have.
         """
         column = self._column(cube, frequency.shape)
@@ -128,8 +140,13 @@ class Health:
             return self._look_at_any(cube, frequency, pad_fault, stamp_ns, temperature)
         batches = column.turns, len(column.cube)
         known = None if temperature is None else temperature.reshape(batches)
-        mask, status = self._look_at_many(column, frequency.reshape(*batches, -1), pad_fault.reshape(batches),
-                                          stamp_ns.reshape(batches).max(axis=1), known)  # fmt: skip
+        mask, status = self._look_at_many(
+            column,
+            frequency.reshape(*batches, -1),
+            pad_fault.reshape(batches),
+            stamp_ns.reshape(batches).max(axis=1),
+            known,
+        )
         return mask.ravel(), status.ravel()
 
     def update_many(
@@ -140,23 +157,28 @@ class Health:
         stamp_ns: np.ndarray,
         temperature: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`update` of B messages with the same cubes one after the other, to the same bits, for what was recorded.
+        """`update` of B messages with the same cubes one after the other, to the same bits, for
+        what was recorded.
 
-        cube (N,), frequency (B, N, P), pad_fault, stamp_ns and temperature (B, N). Returns (B, N) bits of the pads to
-        leave out, and (B, N) status.
+        cube (N,), frequency (B, N, P), pad_fault, stamp_ns and temperature (B, N). Returns (B, N)
+        bits of the pads to leave out, and (B, N) status.
         """
         column = self._column(cube, frequency.shape[1:])
         if column.turns == 0:
             parts = [
-                self._look_at_any(cube, *one) for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)
+                self._look_at_any(cube, *one)
+                for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)
             ]
             masks, statuses = (np.array(part) for part in zip(*parts, strict=True))
             return masks, statuses
         batches = len(frequency) * column.turns, len(column.cube)
         mask, status = self._look_at_many(
-            column, frequency.reshape(*batches, -1), pad_fault.reshape(batches), stamp_ns.reshape(batches).max(axis=1),
+            column,
+            frequency.reshape(*batches, -1),
+            pad_fault.reshape(batches),
+            stamp_ns.reshape(batches).max(axis=1),
             temperature.reshape(batches),
-        )  # fmt: skip
+        )
         return mask.reshape(pad_fault.shape), status.reshape(pad_fault.shape)
 
     def _look(
@@ -204,7 +226,9 @@ class Health:
             self.rows[cube[chosen]] += 1
         if temperature is not None:
             self.temperature[cube] = temperature
-        self._mark_impossible(cube, frequency, (frequency > self._low[cube]) & (frequency < self._high[cube]))
+        self._mark_impossible(
+            cube, frequency, (frequency > self._low[cube]) & (frequency < self._high[cube])
+        )
         self._mark_reported(cube, pad_fault)
         return pad_fault | self.mask[cube], self.status[cube]
 
@@ -224,7 +248,9 @@ class Health:
         k = 0
         while k < len(frequency):
             known = None if temperature is None else temperature[k]
-            masks[k], statuses[k] = self._look(column, frequency[k], pad_fault[k], int(stamp_ns[k]), known)
+            masks[k], statuses[k] = self._look(
+                column, frequency[k], pad_fault[k], int(stamp_ns[k]), known
+            )
             end = k = k + 1
             low, high = (self._window_end or 0) - BACK_NS, self._window_end or 0
             while end < len(frequency) and quiet[end] and low <= stamp_ns[end] < high:
@@ -252,8 +278,15 @@ class Health:
         one = cube[: len(cube) // count].copy() if count else cube[:0]
         together = count and int(one[-1]) - int(one[0]) + 1 == len(one)
         cubes = slice(int(one[0]), int(one[-1]) + 1) if together else one
-        return _Column(count, one, cubes, self._low[cubes], self._high[cubes], int(self._exists[cubes].sum()),
-                       np.zeros(len(one), np.uint16))  # fmt: skip
+        return _Column(
+            count,
+            one,
+            cubes,
+            self._low[cubes],
+            self._high[cubes],
+            int(self._exists[cubes].sum()),
+            np.zeros(len(one), np.uint16),
+        )
 
     def _strange(self, cube: np.ndarray, shape: tuple[int, ...]) -> LayoutError:
         return LayoutError(
@@ -262,7 +295,8 @@ class Health:
         )
 
     def _go_on(self, stamp_ns: int) -> None:
-        """Time goes on; the window ends where it is over. What fell back in time begins a new one."""
+        """Time goes on; the window ends where it is over. What fell back in time begins a new
+        one."""
         end = self._window_end
         if end is None or stamp_ns < end - BACK_NS:
             self._clear_window()
@@ -279,14 +313,17 @@ class Health:
             np.add.at(self._bad_residual, cube[bad], 1)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What was found since the last call: bits (cubes, P), strained (cubes,), rows (cubes,); begins anew."""
+        """What was found since the last call: bits (cubes, P), strained (cubes,), rows (cubes,);
+        begins anew."""
         found = self._seen | self.state, self._strained_seen | self.strained, self.rows
         self._seen = np.zeros_like(self._seen)
         self._strained_seen = np.zeros_like(self._strained_seen)
         self.rows = np.zeros_like(self.rows)
         return found
 
-    def _mark_impossible(self, cube: np.ndarray, frequency: np.ndarray, possible: np.ndarray) -> None:
+    def _mark_impossible(
+        self, cube: np.ndarray, frequency: np.ndarray, possible: np.ndarray
+    ) -> None:
         rows = np.flatnonzero((~possible & self._exists[cube]).any(axis=1))
         cube, frequency, possible = cube[rows], frequency[rows], possible[rows]
         bits = np.where(frequency >= self._open[cube], OPEN, RANGE)

@@ -1,4 +1,5 @@
-"""Layouts: where the pads of a cube sit. Frame: z out of the skin, x and y along it; lengths in d0."""
+"""Layouts: where the pads of a cube sit. Frame: z out of the skin, x and y along it; lengths in
+d0."""
 
 from __future__ import annotations
 
@@ -37,11 +38,17 @@ class Layout:
         positions = _vectors(self.positions, "positions")
         normals = _vectors(self.normals, "normals")
         if len(positions) != len(normals):
-            raise LayoutError(f"layout {self.name!r}: {len(positions)} positions but {len(normals)} normals")
+            raise LayoutError(
+                f"layout {self.name!r}: {len(positions)} positions but {len(normals)} normals"
+            )
         if not 1 <= len(positions) <= MAX_PADS:
-            raise LayoutError(f"layout {self.name!r}: {len(positions)} pads; allowed are 1 to {MAX_PADS}")
+            raise LayoutError(
+                f"layout {self.name!r}: {len(positions)} pads; allowed are 1 to {MAX_PADS}"
+            )
         if not 0 < self.pad_size <= 2:
-            raise LayoutError(f"layout {self.name!r}: pad_size {self.pad_size}; allowed is above 0, up to 2")
+            raise LayoutError(
+                f"layout {self.name!r}: pad_size {self.pad_size}; allowed is above 0, up to 2"
+            )
         for i, (x, n) in enumerate(zip(positions, normals, strict=True)):
             if sorted(np.abs(n)) != [0, 0, 1]:
                 raise LayoutError(
@@ -60,7 +67,9 @@ class Layout:
                 )
             for j in range(i):
                 if np.allclose(x, positions[j], atol=1e-9) and np.array_equal(n, normals[j]):
-                    raise LayoutError(f"layout {self.name!r}: pads {j + 1} and {i + 1} coincide at {x.tolist()}")
+                    raise LayoutError(
+                        f"layout {self.name!r}: pads {j + 1} and {i + 1} coincide at {x.tolist()}"
+                    )
         positions.flags.writeable = normals.flags.writeable = False
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "normals", normals)
@@ -72,12 +81,16 @@ class Layout:
 
     @cached_property
     def pads(self) -> tuple[str, ...]:
-        """Stable names: face, then side of the face, such as "+z-x"; a second pad there is "+z-x#2"."""
+        """Stable names: face, then side of the face, such as "+z-x"; a second pad there is
+        "+z-x#2"."""
         plain = [
-            _signed_axes(n) + _signed_axes(x - n * (x @ n)) for x, n in zip(self.positions, self.normals, strict=True)
+            _signed_axes(n) + _signed_axes(x - n * (x @ n))
+            for x, n in zip(self.positions, self.normals, strict=True)
         ]
         repeats = [plain[:i].count(name) for i, name in enumerate(plain)]
-        return tuple(f"{name}#{k + 1}" if k else name for name, k in zip(plain, repeats, strict=True))
+        return tuple(
+            f"{name}#{k + 1}" if k else name for name, k in zip(plain, repeats, strict=True)
+        )
 
     @property
     def planar(self) -> bool:
@@ -89,7 +102,9 @@ class Layout:
         try:
             return self.pads.index(pad)
         except ValueError:
-            raise LayoutError(f"layout {self.name!r} has no pad {pad!r}; its pads are {', '.join(self.pads)}") from None
+            raise LayoutError(
+                f"layout {self.name!r} has no pad {pad!r}; its pads are {', '.join(self.pads)}"
+            ) from None
 
     def same_as(self, other: Layout) -> bool:
         """True when both have the same pads in the same order."""
@@ -111,7 +126,8 @@ class Layout:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Layout:
-        """A layout from plain types: name, positions, normals, optional pad_size; LayoutError if wrong."""
+        """A layout from plain types: name, positions, normals, optional pad_size; LayoutError if
+        wrong."""
         if not isinstance(data, Mapping):
             raise LayoutError(f"a layout is a table with name, positions, normals; found {data!r}")
         unknown = set(data) - {"name", "positions", "normals", "pad_size"}
@@ -123,7 +139,9 @@ class Layout:
             )
         size = data.get("pad_size", PAD_SIZE)
         if isinstance(size, bool) or not isinstance(size, (int, float)):
-            raise LayoutError(f"layout: pad_size is {size!r}; it must be a number in units of the half side")
+            raise LayoutError(
+                f"layout: pad_size is {size!r}; it must be a number in units of the half side"
+            )
         return cls(str(data["name"]), data["positions"], data["normals"], size)
 
 
@@ -131,9 +149,13 @@ def _vectors(value: Any, what: str) -> np.ndarray:
     try:
         vectors = np.array(value, dtype=float)
     except (TypeError, ValueError):
-        raise LayoutError(f"layout: {what} must be a list of [x, y, z] numbers; found {value!r}") from None
+        raise LayoutError(
+            f"layout: {what} must be a list of [x, y, z] numbers; found {value!r}"
+        ) from None
     if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.all(np.isfinite(vectors)):
-        raise LayoutError(f"layout: {what} must be a list of [x, y, z] finite numbers; found shape {vectors.shape}")
+        raise LayoutError(
+            f"layout: {what} must be a list of [x, y, z] finite numbers; found shape {vectors.shape}"
+        )
     return vectors
 
 
@@ -148,14 +170,17 @@ def _section(sides: str, name: str, offset: float = PAD_OFFSET) -> Layout:
         return (1.0 if text[0] == "+" else -1.0) * np.eye(3)[AXES.index(text[1])]
 
     normals = np.array([axis(pad[:2]) for pad in sides.split()])
-    return Layout(name, normals + offset * np.array([axis(pad[2:]) for pad in sides.split()]), normals)
+    return Layout(
+        name, normals + offset * np.array([axis(pad[2:]) for pad in sides.split()]), normals
+    )
 
 
 _PLANAR = "+z-x +z+x -z-x -z+x +x-z +x+z -x-z -x+z"  # V1 .. V8 of the paper
 _CYCLE = str.maketrans("xyz", "yzx")
 _CUBE = " ".join([_PLANAR, _PLANAR.translate(_CYCLE), _PLANAR.translate(_CYCLE).translate(_CYCLE)])
 
-# cube: the planar section in the planes z-x, x-y, y-z in this order, each from the last by x -> y -> z -> x
+# cube: the planar section in the planes z-x, x-y, y-z in this order, each from the last by x -> y
+# -> z -> x
 LAYOUTS: dict[str, Layout] = {
     "quad": _section(" ".join(_PLANAR.split()[:4]), "quad"),
     "planar": _section(_PLANAR, "planar"),

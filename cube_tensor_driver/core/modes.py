@@ -1,6 +1,7 @@
 """Modes: linear stress fields in equilibrium, the unknowns that a cube recovers.
 
-Mode m is the field sigma_ij(x) = S_ij + G_ijk x_k / d0, with amplitude in Pa. A name says what it is:
+Mode m is the field sigma_ij(x) = S_ij + G_ijk x_k / d0, with amplitude in Pa. A name says what it
+is:
 
     zz            uniform sigma_zz
     zz_x          sigma_zz growing along x: d0 d(sigma_zz)/dx
@@ -21,18 +22,22 @@ from .layout import AXES
 
 STRESS = ("xx", "yy", "zz", "yz", "zx", "xy")
 GRADIENT = tuple(f"{a}{a}_{b}" for a in AXES for b in AXES)
-COMPONENTS = STRESS + GRADIENT  # what is published: 6 stresses, then 9 normal gradients, rows xx yy zz
+COMPONENTS = (
+    STRESS + GRADIENT
+)  # what is published: 6 stresses, then 9 normal gradients, rows xx yy zz
 _PAIRS = tuple((AXES.index(n[0]), AXES.index(n[1])) for n in STRESS)
 
 
 def to_matrix(stress: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (..., 3, 3) from components (..., 6) in the order xx, yy, zz, yz, zx, xy."""
+    """Symmetric matrices (..., 3, 3) from components (..., 6) in the order xx, yy, zz, yz, zx,
+    xy."""
     s = np.asarray(stress)
     return s[..., [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
 
 
 def to_six(matrix: np.ndarray) -> np.ndarray:
-    """Components (..., 6) in the order xx, yy, zz, yz, zx, xy from symmetric matrices (..., 3, 3)."""
+    """Components (..., 6) in the order xx, yy, zz, yz, zx, xy from symmetric matrices (..., 3,
+    3)."""
     m = np.asarray(matrix)
     return np.stack([m[..., i, j] for i, j in _PAIRS], axis=-1)
 
@@ -78,12 +83,17 @@ class Modes:
     def state(self, stress: np.ndarray, gradient: np.ndarray | None = None) -> np.ndarray:
         """Amplitudes (N, M) in Pa of given fields.
 
-        stress: (N, 6) or (N, 3, 3) in Pa; gradient: (N, 3, 3, 3) d(sigma_ij)/dx_k times d0 in Pa, or None.
-        What the modes cannot express (a field out of equilibrium, out of the plane) is left out.
+        stress: (N, 6) or (N, 3, 3) in Pa; gradient: (N, 3, 3, 3) d(sigma_ij)/dx_k times d0 in Pa,
+        or None. What the modes cannot express (a field out of equilibrium, out of the plane) is
+        left out.
         """
         s = np.asarray(stress, dtype=float)
         s = (to_matrix(s) if s.shape[-1] == 6 else s).reshape(-1, 9)
-        g = np.zeros((len(s), 27)) if gradient is None else np.asarray(gradient, dtype=float).reshape(-1, 27)
+        g = (
+            np.zeros((len(s), 27))
+            if gradient is None
+            else np.asarray(gradient, dtype=float).reshape(-1, 27)
+        )
         return np.concatenate([s, g], axis=1) @ self.reading.T
 
     def field(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,8 +104,9 @@ class Modes:
     def action(self, rotation: np.ndarray) -> np.ndarray:
         """(M, M) matrix that turns states when the field is turned by a rotation or mirror (3, 3).
 
-        S'_ij = R_ia R_jb S_ab and G'_ijk = R_ia R_jb R_kc G_abc. SymmetryError when the turned modes
-        are no longer combinations of the modes, such as plane modes turned out of their plane.
+        S'_ij = R_ia R_jb S_ab and G'_ijk = R_ia R_jb R_kc G_abc. SymmetryError when the turned
+        modes are no longer combinations of the modes, such as plane modes turned out of their
+        plane.
         """
         r = np.asarray(rotation, dtype=float)
         turned = self.fields.copy()
@@ -103,7 +114,9 @@ class Modes:
         turned[9:] = np.kron(np.kron(r, r), r) @ turned[9:]
         action = self.reading @ turned
         if not np.allclose(self.fields @ action, turned, atol=1e-9):
-            raise SymmetryError(f"the modes {', '.join(self.names)} do not stay among themselves under {r.tolist()}")
+            raise SymmetryError(
+                f"the modes {', '.join(self.names)} do not stay among themselves under {r.tolist()}"
+            )
         return action
 
     def index(self, names: Sequence[str]) -> list[int]:
@@ -135,7 +148,9 @@ def _modes(names: Sequence[str], shears: str, symmetric: bool = True) -> Modes:
         stress = stress + np.where(stress == 0, stress.transpose(0, 2, 1), 0)
         gradient = gradient + np.where(gradient == 0, gradient.transpose(0, 2, 1, 3), 0)
     for g, name in zip(gradient, names, strict=True):
-        if name in GRADIENT and name[0] == name[3]:  # equilibrium: the shears' divergence cancels the normal one's
+        if (
+            name in GRADIENT and name[0] == name[3]
+        ):  # equilibrium: the shears' divergence cancels the normal one's
             i = AXES.index(name[0])
             for j in (AXES.index(a) for a in shears if a != name[0]):
                 g[i, j, j] = g[j, i, j] = -1 / (len(shears) - 1)
@@ -149,5 +164,8 @@ _PLANE_GRADIENT = ("zz_x", "zz_z", "xx_z", "xx_x")
 PLANE = _modes(("zz", "zx", "xx", *_PLANE_GRADIENT), "zx")
 # the paper's own eight, sigma_zx and sigma_xz apart: for comparison only
 PAPER = _modes(("zz", "zx", "xx", "xz", *_PLANE_GRADIENT), "zx", symmetric=False)
-# ii_i is balanced half by each of the two shears; the cube group acts as signed permutations on these 21
-SPACE = _modes((*STRESS, *GRADIENT, "yz_x", "zx_y", "xy_z", "xy_y-zx_z", "yz_z-xy_x", "zx_x-yz_y"), "xyz")
+# ii_i is balanced half by each of the two shears; the cube group acts as signed permutations on
+# these 21
+SPACE = _modes(
+    (*STRESS, *GRADIENT, "yz_x", "zx_y", "xy_z", "xy_y-zx_z", "yz_z-xy_x", "zx_x-yz_y"), "xyz"
+)

@@ -2,10 +2,10 @@
 
     r = f / f0,   strain d/d0 = r / (1 + beta (1 - r)),   v = E (d/d0 - 1)
 
-which with u = r - 1 is v = E (1 + beta) u / (1 - beta u). v: Pa, tension positive; f, f0: Hz; beta: parasitic
-over active capacitance at rest; E: modulus in Pa. Source: the paper's eq. 6, f = k d / (R (eps S + C' d)),
-solved for d against the rest state. Frequencies outside 0 < f < f0 (1 + beta) / beta belong to no thickness:
-they give NaN. All functions broadcast.
+which with u = r - 1 is v = E (1 + beta) u / (1 - beta u). v: Pa, tension positive; f, f0: Hz; beta:
+parasitic over active capacitance at rest; E: modulus in Pa. Source: the paper's eq. 6, f = k d / (R
+(eps S + C' d)), solved for d against the rest state. Frequencies outside 0 < f < f0 (1 + beta) /
+beta belong to no thickness: they give NaN. All functions broadcast.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from .errors import CalibrationError
 
 
 def pad_stress(frequency, rest_frequency, beta, modulus):
-    """Normal stress in Pa, tension positive, from frequencies in Hz; NaN outside the law's range."""
+    """Normal stress in Pa, tension positive, from frequencies in Hz; NaN outside the law's
+    range."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
         u = (f - f0) / f0
@@ -52,14 +53,16 @@ def highest_frequency(rest_frequency, beta):
 
 
 def linear_pad_stress(frequency, rest_frequency, beta, modulus):
-    """v = E (1 + beta) (f - f0) / f0: the paper's eq. 7 with R/k for k/R, tension positive. A check."""
+    """v = E (1 + beta) (f - f0) / f0: the paper's eq. 7 with R/k for k/R, tension positive. A
+    check."""
     f0 = np.asarray(rest_frequency)
     return modulus * (1 + beta) * (np.asarray(frequency) - f0) / f0
 
 
 @dataclass(frozen=True, eq=False)
 class TemperatureModel:
-    """f0(T) = f0 (1 + sum_d c_d (T - reference)^d), d = 1, 2 ...; f0 is the rest frequency at the reference.
+    """f0(T) = f0 (1 + sum_d c_d (T - reference)^d), d = 1, 2 ...; f0 is the rest frequency at the
+    reference.
 
     reference: degrees Celsius; coefficients: (P, D) per degree^d and pad
     """
@@ -69,7 +72,10 @@ class TemperatureModel:
 
     def __post_init__(self) -> None:
         try:
-            reference, coefficients = float(self.reference), np.array(self.coefficients, dtype=float)
+            reference, coefficients = (
+                float(self.reference),
+                np.array(self.coefficients, dtype=float),
+            )
         except (TypeError, ValueError):
             raise CalibrationError(
                 f"temperature: reference {self.reference!r} and coefficients {self.coefficients!r} must be numbers"
@@ -97,5 +103,7 @@ class TemperatureModel:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TemperatureModel:
         if not isinstance(data, Mapping) or set(data) != {"reference", "coefficients"}:
-            raise CalibrationError(f"temperature: found {data!r}; it is a table of reference and coefficients")
+            raise CalibrationError(
+                f"temperature: found {data!r}; it is a table of reference and coefficients"
+            )
         return cls(data["reference"], data["coefficients"])

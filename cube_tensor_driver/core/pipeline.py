@@ -1,10 +1,12 @@
-"""Pipeline: frequencies of many cubes in, stress and gradients out, without a loop over rows or cubes.
+"""Pipeline: frequencies of many cubes in, stress and gradients out, without a loop over rows or
+cubes.
 
-One table per calibration holds a stacked matrix: 15 rows that give the components, then the whitened
-null-space rows of the residual. Rows with all pads good are one pad law and one matrix product per calibration.
-Rows with bad pads are done again with the estimator of their mask, one product per distinct (calibration, mask).
-Nothing a row holds raises an error. A row's bits do not depend on how many batches are processed with it: products
-are made batch by batch, because the last bit of a matrix product may depend on its shape.
+One table per calibration holds a stacked matrix: 15 rows that give the components, then the
+whitened null-space rows of the residual. Rows with all pads good are one pad law and one matrix
+product per calibration. Rows with bad pads are done again with the estimator of their mask, one
+product per distinct (calibration, mask). Nothing a row holds raises an error. A row's bits do not
+depend on how many batches are processed with it: products are made batch by batch, because the last
+bit of a matrix product may depend on its shape.
 """
 
 from __future__ import annotations
@@ -25,9 +27,13 @@ from .status import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE
 
 N = len(COMPONENTS)
 MASKS_KEPT = 1024  # estimators of pad masks remembered at a time
-BETA_FLOOR = 1e-12  # so that every pad has a highest frequency; changes the law by 1e-12 of a strain
+BETA_FLOOR = (
+    1e-12  # so that every pad has a highest frequency; changes the law by 1e-12 of a strain
+)
 FLOOR_MARGIN = 1e-6  # some roundings of float32
-FEW_KINDS = 8  # up to so many calibrations: a product for each; more: one einsum for all of as many pads
+FEW_KINDS = (
+    8  # up to so many calibrations: a product for each; more: one einsum for all of as many pads
+)
 
 
 class StressRows(NamedTuple):
@@ -35,8 +41,10 @@ class StressRows(NamedTuple):
 
     stress: (N, 6) Pa, tension positive, order xx yy zz yz zx xy, in the cube's frame
     gradient: (N, 9) Pa/m, rows xx yy zz, columns d/dx d/dy d/dz
-    residual: (N,) sqrt(chi-square / degrees of freedom), about 1 for noise alone; NaN without redundancy
-    status: (N,) uint16 of the bits above; observed: (N,) uint16, bit i for component i of COMPONENTS
+    residual: (N,) sqrt(chi-square / degrees of freedom), about 1 for noise alone; NaN without
+    redundancy
+    status: (N,) uint16 of the bits above; observed: (N,) uint16, bit i for component i of
+    COMPONENTS
     """
 
     stress: np.ndarray
@@ -55,7 +63,8 @@ class _Table(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """Rows of a column that share a product. matrix: (pads, 15 + D), or (pads, seen, rows) of many calibrations."""
+    """Rows of a column that share a product. matrix: (pads, 15 + D), or (pads, seen, rows) of many
+    calibrations."""
 
     rows: slice | np.ndarray
     pads: int
@@ -77,7 +86,8 @@ class _Column(NamedTuple):
 
 
 class Pipeline:
-    """process() for cubes 0 .. len(calibrations) - 1; layouts may differ, columns fill up to the widest."""
+    """process() for cubes 0 .. len(calibrations) - 1; layouts may differ, columns fill up to the
+    widest."""
 
     def __init__(self, calibrations: Sequence[Calibration], dtype=np.float64) -> None:
         self.dtype = np.dtype(dtype)
@@ -92,7 +102,9 @@ class Pipeline:
         number = {key: i for i, key in enumerate(kinds)}
         self._kind = np.array([number[c.id] for c in self.calibrations])
         self._beta = self._per_pad([np.maximum(c.beta, BETA_FLOOR) for c in self._kinds], 1)
-        self._stiffness = self._per_pad([c.modulus for c in self._kinds], 0) * (1 + self._beta) / self._beta
+        self._stiffness = (
+            self._per_pad([c.modulus for c in self._kinds], 0) * (1 + self._beta) / self._beta
+        )
         self._exists = self._per_pad([np.ones(c.layout.n_pads) for c in self._kinds], 0) > 0
         self._thermal = np.array([c.temperature is not None for c in self._kinds])
         self._any_thermal = bool(self._thermal.any())
@@ -108,11 +120,14 @@ class Pipeline:
         self.rest_frequency = self._per_pad([c.rest_frequency for c in self.calibrations], np.nan)
 
     def _per_pad(self, values: Sequence[np.ndarray], missing: float) -> np.ndarray:
-        return np.array([np.pad(v, (0, self.n_pads - len(v)), constant_values=missing) for v in values])
+        return np.array(
+            [np.pad(v, (0, self.n_pads - len(v)), constant_values=missing) for v in values]
+        )
 
     @property
     def rest_frequency(self) -> np.ndarray:
-        """(cubes, P) in Hz at the reference temperature, NaN where a cube has no such pad; set by tare."""
+        """(cubes, P) in Hz at the reference temperature, NaN where a cube has no such pad; set by
+        tare."""
         return self._rest.copy()
 
     @rest_frequency.setter
@@ -120,9 +135,13 @@ class Pipeline:
         rest = np.array(value, dtype=float)
         exists = self._exists[self._kind]
         if rest.shape != exists.shape:
-            raise LayoutError(f"rest_frequency has shape {rest.shape}; this skin needs {exists.shape}")
+            raise LayoutError(
+                f"rest_frequency has shape {rest.shape}; this skin needs {exists.shape}"
+            )
         if not np.all(rest[exists] > 0) or not np.all(np.isfinite(rest[exists])):
-            raise CubeError(f"rest_frequency holds {rest[exists].min():g} Hz; every pad's must be finite and above 0")
+            raise CubeError(
+                f"rest_frequency holds {rest[exists].min():g} Hz; every pad's must be finite and above 0"
+            )
         self._rest = np.where(exists, rest, np.nan)
         self._columns.clear()
 
@@ -139,10 +158,12 @@ class Pipeline:
     ) -> StressRows:
         """Stress rows of samples.
 
-        cube: (N,) index; frequency: (N, P) Hz; pad_fault: (N,) bits of pads that the device reports broken
+        cube: (N,) index; frequency: (N, P) Hz; pad_fault: (N,) bits of pads that the device reports
+        broken
         temperature: (N,) degrees Celsius, NaN where unknown, or None
-        B batches of the same cubes at once: frequency (B, N, P) and so on give B * N rows, to the same bits.
-        Raises LayoutError for arrays of the wrong shape; all that a row can hold ends in its status.
+        B batches of the same cubes at once: frequency (B, N, P) and so on give B * N rows, to the
+        same bits. Raises LayoutError for arrays of the wrong shape; all that a row can hold ends in
+        its status.
         """
         with np.errstate(all="ignore", divide="raise"):
             column, v, mask, cold = self._law(cube, frequency, pad_fault, temperature)
@@ -151,25 +172,40 @@ class Pipeline:
             observed = column.observed.copy() if len(v) == 1 else np.tile(column.observed, len(v))
             if mask is not None:
                 limit = np.tile(column.limit, (len(v), 1))
-                flat, flat_limit, flat_v = out.reshape(-1, out.shape[2]), limit.reshape(-1), v.reshape(-1, self.n_pads)
+                flat, flat_limit, flat_v = (
+                    out.reshape(-1, out.shape[2]),
+                    limit.reshape(-1),
+                    v.reshape(-1, self.n_pads),
+                )
                 for kind, bits, chosen in _distinct(np.tile(column.kind, len(v)), mask.ravel()):
                     table = self._table(kind, bits)
-                    # Row by row: the last bit of one product for all may depend on how many there are, einsum's too.
+                    # Row by row: the last bit of one product for all may depend on how many there
+                    # are, einsum's too.
                     flat[chosen] = np.matmul(table.matrix, flat_v[chosen][:, :, None])[:, :, 0]
                     flat_limit[chosen], observed[chosen] = table.limit, table.observed
                 out[:, column.strange] = np.nan
                 observed.reshape(len(v), -1)[:, column.strange] = 0
             rest = out[:, :, N:]
-            residual = np.abs(rest[:, :, 0]) if self._depth == 1 else np.sqrt(np.einsum("bnd,bnd->bn", rest, rest))
+            residual = (
+                np.abs(rest[:, :, 0])
+                if self._depth == 1
+                else np.sqrt(np.einsum("bnd,bnd->bn", rest, rest))
+            )
             over = (residual > limit).ravel()
-            status = over * np.uint16(RESIDUAL) if np.count_nonzero(over) else np.zeros(len(over), np.uint16)
+            status = (
+                over * np.uint16(RESIDUAL)
+                if np.count_nonzero(over)
+                else np.zeros(len(over), np.uint16)
+            )
         if mask is not None:
             status[mask.ravel() != 0] |= PAD_FAULT
             status[observed == 0] |= INVALID
         if cold is not None:
             status[cold.ravel()] |= TEMPERATURE
         out = out.reshape(-1, out.shape[2])
-        return StressRows(out[:, : len(STRESS)], out[:, len(STRESS) : N], residual.ravel(), status, observed)
+        return StressRows(
+            out[:, : len(STRESS)], out[:, len(STRESS) : N], residual.ravel(), status, observed
+        )
 
     def _products(self, column: _Column, v: np.ndarray) -> np.ndarray:
         """(B, N, 15 + D) components and residual rows of v (B, N, P)."""
@@ -193,7 +229,8 @@ class Pipeline:
         pad_fault: np.ndarray | None = None,
         temperature: np.ndarray | None = None,
     ) -> np.ndarray:
-        """(N, P) pad stresses in Pa as the law gives them, before gains; NaN for bad and missing pads."""
+        """(N, P) pad stresses in Pa as the law gives them, before gains; NaN for bad and missing
+        pads."""
         kind, strange, pads, mask = self._pads(cube, frequency, pad_fault, temperature)
         bad = ~self._exists[kind] | strange[:, None] | _bits(mask, self.n_pads)
         return np.where(bad, np.nan, pads)
@@ -214,25 +251,33 @@ class Pipeline:
         return result & ~strange[:, None]
 
     def _pads(self, cube, frequency, pad_fault, temperature):
-        """Of each row: kind (N,), whether its cube is none of ours (N,), pad stresses (N, P) in Pa, bad pads (N,)."""
+        """Of each row: kind (N,), whether its cube is none of ours (N,), pad stresses (N, P) in Pa,
+        bad pads (N,)."""
         with np.errstate(all="ignore", divide="raise"):
             column, v, mask, _ = self._law(cube, frequency, pad_fault, temperature)
         kind, strange = np.tile(column.kind, len(v)), np.tile(column.strange, len(v))
         none = np.zeros(len(kind), dtype=np.int64)
-        return kind, strange, v.reshape(-1, self.n_pads) * self._stiffness[kind], none if mask is None else mask.ravel()
+        return (
+            kind,
+            strange,
+            v.reshape(-1, self.n_pads) * self._stiffness[kind],
+            none if mask is None else mask.ravel(),
+        )
 
     def covariance(self, cube: int, pad_fault: int = 0) -> np.ndarray:
-        """(15, 15) of one cube's components from its pads' noise, in Pa and Pa/m; NaN where unobserved."""
+        """(15, 15) of one cube's components from its pads' noise, in Pa and Pa/m; NaN where
+        unobserved."""
         kind = int(self._kind[cube])
         scale = self._scale(kind)
         mask = int(pad_fault) & int(_mask(self._exists[kind]))
         return self._estimator(kind, mask).covariance * np.outer(scale, scale)
 
     def _law(self, cube, frequency, pad_fault, temperature):
-        """The column, v / stiffness (B, N, P), and, or None, masks (B, N) of bad pads and rows without temperature.
+        """The column, v / stiffness (B, N, P), and, or None, masks (B, N) of bad pads and rows
+        without temperature.
 
-        Bad pads are 0; pads that a cube has not are NaN, or 0 where any pad is bad. A column of several turns becomes
-        as many batches.
+        Bad pads are 0; pads that a cube has not are NaN, or 0 where any pad is bad. A column of
+        several turns becomes as many batches.
         """
         f, cube = np.asarray(frequency, dtype=self.dtype), np.asarray(cube)
         if cube.ndim != 1 or f.shape[-2:] != (len(cube), self.n_pads):
@@ -243,7 +288,9 @@ class Pipeline:
         column = self._columns.of(cube)
         n = len(column.kind)
         count = f.size // (n * self.n_pads) if n else 1
-        f = f.reshape((n, self.n_pads) if count == 1 else (count, n, self.n_pads))  # numpy is faster with two axes
+        f = f.reshape(
+            (n, self.n_pads) if count == 1 else (count, n, self.n_pads)
+        )  # numpy is faster with two axes
         rest, top, cold = column.rest, column.top, None
         if self._any_thermal:
             known = np.full((count, n), np.nan)
@@ -258,7 +305,8 @@ class Pipeline:
         reported = pad_fault is not None and np.count_nonzero(pad_fault) > 0
         try:
             v /= below
-            # Falls with f down to 0 and is below -1 beyond top, so one comparison finds all that the law has not.
+            # Falls with f down to 0 and is below -1 beyond top, so one comparison finds all that
+            # the law has not.
             within = n > 0 and f.size == count * column.pads and v.min() > column.floor
         except FloatingPointError:  # f is top
             within = False
@@ -287,9 +335,16 @@ class Pipeline:
         pads = int(np.count_nonzero(self._exists[kind])) + int(strange.any())
         floor = float(np.nanmax(-rest / top, initial=-1.0)) * (1 - FLOOR_MARGIN)
         return _Column(
-            strange, kind, rest.astype(self.dtype), top.astype(self.dtype), floor, pads,
-            self._blocks(kind), self._limits[kind], self._observed[kind],
-        )  # fmt: skip
+            strange,
+            kind,
+            rest.astype(self.dtype),
+            top.astype(self.dtype),
+            floor,
+            pads,
+            self._blocks(kind),
+            self._limits[kind],
+            self._observed[kind],
+        )
 
     def _blocks(self, kind: np.ndarray) -> list[_Block]:
         few = len(self._kinds) <= FEW_KINDS
@@ -312,7 +367,9 @@ class Pipeline:
         for k, calibration in enumerate(self._kinds):
             if calibration.temperature is not None:
                 rows = (kind == k) & np.isfinite(temperature)
-                factor[rows, : calibration.layout.n_pads] = calibration.temperature.factor(temperature[rows])
+                factor[rows, : calibration.layout.n_pads] = calibration.temperature.factor(
+                    temperature[rows]
+                )
         return factor
 
     def _scale(self, kind: int) -> np.ndarray:
@@ -320,7 +377,9 @@ class Pipeline:
 
     def _make_estimator(self, kind: int, mask: int) -> Estimator:
         c = self._kinds[kind]
-        return make_estimator(c.response, c.noise, c.modes, np.flatnonzero(_bits(mask, c.layout.n_pads)), c.neglect)
+        return make_estimator(
+            c.response, c.noise, c.modes, np.flatnonzero(_bits(mask, c.layout.n_pads)), c.neglect
+        )
 
     def _make_table(self, kind: int, mask: int) -> _Table:
         e, c = self._estimator(kind, mask), self._kinds[kind]
@@ -328,7 +387,9 @@ class Pipeline:
         n = c.layout.n_pads
         matrix[:N, :n] = e.matrix * self._scale(kind)[:, None]
         matrix[N:, :n] = np.nan
-        null = e.null[: self._depth]  # a mask that lowers the rank by more than a pad could have more rows
+        null = e.null[
+            : self._depth
+        ]  # a mask that lowers the rank by more than a pad could have more rows
         dof = len(null)
         if dof:
             matrix[N:, :n] = 0

@@ -9,7 +9,8 @@ import numpy as np
 from .errors import CalibrationError, LayoutError
 from .symmetry import Structure, find_structure
 
-# Illustrative: neither computed nor measured; calibrations that are fitted or computed replace them.
+# Illustrative: neither computed nor measured; calibrations that are fitted or computed replace
+# them.
 ILLUSTRATIVE: dict[str, float] = {
     "a": 1.4,
     "b": 0.3,
@@ -20,8 +21,8 @@ ILLUSTRATIVE: dict[str, float] = {
     "h": 0.3,
 }
 
-# Entries of row V1 for the cube. Those across the pad's section (yy, yy_x, yy_z) and the two free shears are
-# illustrative too; the others make each section answer plane modes as ILLUSTRATIVE does.
+# Entries of row V1 for the cube. Those across the pad's section (yy, yy_x, yy_z) and the two free
+# shears are illustrative too; the others make each section answer plane modes as ILLUSTRATIVE does.
 _FREE_SHEAR_Z, _FREE_SHEAR_X = 0.4, 0.2
 ILLUSTRATIVE_CUBE: dict[str, float] = {
     "+z-x:zz": 1.4,
@@ -40,7 +41,8 @@ ILLUSTRATIVE_CUBE: dict[str, float] = {
 
 
 def illustrative_coefficients(structure: Structure) -> dict[str, float]:
-    """Illustrative coefficients of a built-in layout under any of its symmetries; LayoutError for others."""
+    """Illustrative coefficients of a built-in layout under any of its symmetries; LayoutError for
+    others."""
     letters = structure.layout.name in ("quad", "planar")
     if not letters and structure.layout.name != "cube":
         raise LayoutError(
@@ -48,13 +50,19 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
             "planar and cube: fit a calibration for yours"
         )
     if set(structure.names) in (set(ILLUSTRATIVE), set(ILLUSTRATIVE_CUBE)):
-        return {name: (ILLUSTRATIVE if letters else ILLUSTRATIVE_CUBE)[name] for name in structure.names}
+        return {
+            name: (ILLUSTRATIVE if letters else ILLUSTRATIVE_CUBE)[name] for name in structure.names
+        }
     return project(structure, _illustrative_response(structure))[0]
 
 
 def response(structure: Structure, coefficients: Mapping[str, float]) -> np.ndarray:
-    """A = sum_k c_k B_k, shape (P, M); CalibrationError names what is missing, unknown or not finite."""
-    missing, unknown = set(structure.names) - set(coefficients), set(coefficients) - set(structure.names)
+    """A = sum_k c_k B_k, shape (P, M); CalibrationError names what is missing, unknown or not
+    finite."""
+    missing, unknown = (
+        set(structure.names) - set(coefficients),
+        set(coefficients) - set(structure.names),
+    )
     if missing or unknown:
         raise CalibrationError(
             f"layout {structure.layout.name!r} with symmetry {structure.symmetry!r} has "
@@ -71,8 +79,8 @@ def response(structure: Structure, coefficients: Mapping[str, float]) -> np.ndar
 def project(structure: Structure, matrix: np.ndarray) -> tuple[dict[str, float], float]:
     """The nearest member of a structure to a response (P, M).
 
-    Returns its coefficients (means over each orbit, as averaging P(R)^-1 A M(R) over the group gives) and
-    the relative part left over, |A - A_sym| / |A|, 0 for a perfectly symmetric response.
+    Returns its coefficients (means over each orbit, as averaging P(R)^-1 A M(R) over the group
+    gives) and the relative part left over, |A - A_sym| / |A|, 0 for a perfectly symmetric response.
     """
     matrix = np.asarray(matrix, dtype=float)
     if matrix.shape != structure.basis.shape[1:]:
@@ -80,7 +88,9 @@ def project(structure: Structure, matrix: np.ndarray) -> tuple[dict[str, float],
             f"the response matrix has shape {matrix.shape}; layout {structure.layout.name!r} "
             f"with its modes needs {structure.basis.shape[1:]}"
         )
-    values = np.einsum("kpm,pm->k", structure.basis, matrix) / np.einsum("kpm,kpm->k", structure.basis, structure.basis)
+    values = np.einsum("kpm,pm->k", structure.basis, matrix) / np.einsum(
+        "kpm,kpm->k", structure.basis, structure.basis
+    )
     left = matrix - np.tensordot(values, structure.basis, axes=1)
     size = np.linalg.norm(matrix)
     unexplained = float(np.linalg.norm(left) / size) if size else 0.0
@@ -88,11 +98,12 @@ def project(structure: Structure, matrix: np.ndarray) -> tuple[dict[str, float],
 
 
 def prototype(shift: np.ndarray) -> np.ndarray:
-    """Readings (N, 3) of the paper's prototype, normal, shear, gradient, from frequency shifts (N, 4) of V1 .. V4.
+    """Readings (N, 3) of the paper's prototype, normal, shear, gradient, from frequency shifts (N,
+    4) of V1 .. V4.
 
-    The paper's eqs. 8 to 10 as they are, in the unit of the shifts and uncalibrated. In terms of eq. 1 they are
-    -4 (a zz - b xx), 4 (c + d) zx and -4 (e zz_x - h xx_x): the normal reading holds sigma_xx too, and the third
-    shows the true gradient only where that of sigma_xx is known.
+    The paper's eqs. 8 to 10 as they are, in the unit of the shifts and uncalibrated. In terms of
+    eq. 1 they are -4 (a zz - b xx), 4 (c + d) zx and -4 (e zz_x - h xx_x): the normal reading holds
+    sigma_xx too, and the third shows the true gradient only where that of sigma_xx is known.
     """
     return np.asarray(shift) @ np.array([[-1, -1, 1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1]])
 
@@ -105,4 +116,8 @@ def _illustrative_response(structure: Structure) -> np.ndarray:
 
 def _some(names) -> str:
     names = sorted(names)
-    return "none" if not names else ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    return (
+        "none"
+        if not names
+        else ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    )

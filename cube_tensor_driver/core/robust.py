@@ -1,4 +1,5 @@
-"""Least squares that forget outliers and say what the data leave open: the steps and weights of `fit`.
+"""Least squares that forget outliers and say what the data leave open: the steps and weights of
+`fit`.
 
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """
@@ -30,7 +31,8 @@ def weights_of(stage: str, r: np.ndarray) -> np.ndarray:
 
 
 def least_squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """x of a x = b for a (R, C) and b (R,), the smallest; directions that a does not determine stay put."""
+    """x of a x = b for a (R, C) and b (R,), the smallest; directions that a does not determine stay
+    put."""
     size = np.linalg.norm(a, axis=0)
     size[size == 0] = 1
     return np.linalg.lstsq(a / size, b, rcond=DIRECTION_TOLERANCE)[0] / size

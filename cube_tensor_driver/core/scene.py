@@ -1,7 +1,9 @@
-"""What a skin looks like: quantities, colours, arrows and crosses of its cubes as plain arrays, for every viewer alike.
+"""What a skin looks like: quantities, colours, arrows and crosses of its cubes as plain arrays, for
+every viewer alike.
 
-Values are (N, 15) in the order of COMPONENTS, Pa and Pa/m, in the cubes' frames, NaN where not observed; places and
-what is drawn are in the skin's parent frame, m. Colours are (..., 3) from 0 to 1.
+Values are (N, 15) in the order of COMPONENTS, Pa and Pa/m, in the cubes' frames, NaN where not
+observed; places and what is drawn are in the skin's parent frame, m. Colours are (..., 3) from 0 to
+1.
 """
 
 from __future__ import annotations
@@ -18,22 +20,28 @@ from .status import INVALID, RESIDUAL
 from .tensor import principal_stresses, quaternion_from_rotation
 from .window import WINDOW_S, still_strained
 
-# viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both read in grey.
+# viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both
+# read in grey.
 SEQUENTIAL = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 DIVERGING = "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f"
-GREY, RED, ORANGE, WHITE = (0.55, 0.55, 0.55), (0.85, 0.1, 0.1), (0.95, 0.55, 0.0), (0.95, 0.95, 0.95)
+GREY, RED, ORANGE, WHITE = (
+    (0.55, 0.55, 0.55),
+    (0.85, 0.1, 0.1),
+    (0.95, 0.55, 0.0),
+    (0.95, 0.95, 0.95),
+)
 
 FINE, DOUBTFUL, FAULTY, STALE = range(4)
 HEALTH = ("ok", "doubtful", "no tensor", "stale")
-"""Words of `Newest.health`. Doubtful: a status bit is set, RESIDUAL in many rows; no tensor: INVALID; stale: nothing
-came lately."""
+"""Words of `Newest.health`. Doubtful: a status bit is set, RESIDUAL in many rows; no tensor:
+INVALID; stale: nothing came lately."""
 MARK = np.array([GREY, ORANGE, RED, WHITE])
 """Colour of the cross over a cube by its health; a fine cube has none."""
 FALL = 0.98
 """What an automatic range keeps of its top from one picture to the next."""
 
 
-class Places(NamedTuple):
+class CubePoses(NamedTuple):
     """Where cubes are: position (N, 3) m, rotation (N, 3, 3) cube to parent, half_side (N,) m."""
 
     position: np.ndarray
@@ -42,7 +50,8 @@ class Places(NamedTuple):
 
     @property
     def pitch(self) -> float:
-        """Typical distance of neighbours in m, at least a cube's side: the measure of all that is drawn."""
+        """Typical distance of neighbours in m, at least a cube's side: the measure of all that is
+        drawn."""
         side = 2.0 * float(np.median(self.half_side))
         if len(self.position) < 2:
             return 3.0 * side
@@ -53,15 +62,16 @@ class Places(NamedTuple):
 
 
 def turns(rotation: np.ndarray) -> np.ndarray:
-    """(N, 4) quaternions w, x, y, z of rotations (N, 3, 3). A loop: for once per skin, not per picture."""
+    """(N, 4) quaternions w, x, y, z of rotations (N, 3, 3). A loop: for once per skin, not per
+    picture."""
     return np.array([np.roll(quaternion_from_rotation(matrix), 1) for matrix in rotation])
 
 
 class Newest:
     """The newest row of each of n cubes and when it came. Time is what the caller counts, in s.
 
-    strained: (n,) bool, many rows with a residual above its limit, as `Health` has it; noise alone is above it in one
-    row of a thousand, on a large skin in every picture.
+    strained: (n,) bool, many rows with a residual above its limit, as `Health` has it; noise alone
+    is above it in one row of a thousand, on a large skin in every picture.
     """
 
     def __init__(self, n: int) -> None:
@@ -75,11 +85,15 @@ class Newest:
         self._over = np.zeros(n, np.int64)  # rows of the window with RESIDUAL
 
     def update(self, cube: np.ndarray, rows: StressRows, now: float) -> None:
-        """Take rows; of several rows of a cube the last stays, rows of cubes that we do not have are left out."""
+        """Take rows; of several rows of a cube the last stays, rows of cubes that we do not have
+        are left out."""
         ours = cube < len(self.status)
         if not ours.all():
             cube, rows = cube[ours], StressRows(*(column[ours] for column in rows))
-        self.values[cube, : len(STRESS)], self.values[cube, len(STRESS) :] = rows.stress, rows.gradient
+        self.values[cube, : len(STRESS)], self.values[cube, len(STRESS) :] = (
+            rows.stress,
+            rows.gradient,
+        )
         self.residual[cube], self.status[cube], self.arrived[cube] = rows.residual, rows.status, now
         self._close_window(now)
         np.add.at(self.count, cube, 1)
@@ -109,7 +123,8 @@ class Newest:
 
 @dataclass(frozen=True)
 class Quantity:
-    """What can be shown as colour: name for people, unit and its size in SI, smallest top of an automatic range.
+    """What can be shown as colour: name for people, unit and its size in SI, smallest top of an
+    automatic range.
 
     signed: colours lie about zero. of: values (N, 15), residual (N,) -> (N,) in SI.
     """
@@ -139,16 +154,21 @@ def _length(*names: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 
 
 QUANTITIES = {
-    "pressure": Quantity("pressure −σzz", "kPa", 1e3, 500.0, False, lambda values, residual: -values[:, 2]),
+    "pressure": Quantity(
+        "pressure −σzz", "kPa", 1e3, 500.0, False, lambda values, residual: -values[:, 2]
+    ),
     "shear": Quantity("shear |σzx, σyz|", "kPa", 1e3, 500.0, False, _length("zx", "yz")),
-    "gradient": Quantity("gradient |∂σzz/∂x, ∂σzz/∂y|", "kPa/mm", 1e6, 1e5, False, _length("zz_x", "zz_y")),
+    "gradient": Quantity(
+        "gradient |∂σzz/∂x, ∂σzz/∂y|", "kPa/mm", 1e6, 1e5, False, _length("zz_x", "zz_y")
+    ),
     **{name: Quantity(f"σ{name}", "kPa", 1e3, 500.0, True, _component(name)) for name in STRESS},
     "residual": Quantity("residual", "σ", 1.0, 3.0, False, lambda values, residual: residual),
 }
 
 
 def automatic(quantity: Quantity, shown: np.ndarray, before: float = 0.0) -> float:
-    """Top of the range for what is shown: follows a rise at once, falls slowly from `before`, never below the least."""
+    """Top of the range for what is shown: follows a rise at once, falls slowly from `before`, never
+    below the least."""
     finite = np.abs(shown[np.isfinite(shown)])
     return max(quantity.least, FALL * before, float(finite.max(initial=0.0)))
 
@@ -160,18 +180,20 @@ def colours(quantity: Quantity, shown: np.ndarray, top: float) -> np.ndarray:
     at = np.clip(place / 2 + 0.5 if quantity.signed else place, 0, 1) * (len(table) - 1)
     low = np.minimum(at.astype(int), len(table) - 2)
     part = (at - low)[:, None]
-    return np.where(np.isfinite(shown)[:, None], (1 - part) * table[low] + part * table[low + 1], GREY)
+    return np.where(
+        np.isfinite(shown)[:, None], (1 - part) * table[low] + part * table[low + 1], GREY
+    )
 
 
 def _table(hexes: str) -> np.ndarray:
     return np.array([[int(text[i : i + 2], 16) / 255 for i in (0, 2, 4)] for text in hexes.split()])
 
 
-def traction_arrows(places: Places, values: np.ndarray, length: float) -> np.ndarray:
+def traction_arrows(places: CubePoses, values: np.ndarray, length: float) -> np.ndarray:
     """(N, 2, 3) from tail to tip: the traction σ·n on the faces +z, `length` metres per Pa.
 
-    It is how the load pushes: pressing points into the skin and ends on the face, pulling begins there. Unobserved
-    parts count as 0.
+    It is how the load pushes: pressing points into the skin and ends on the face, pulling begins
+    there. Unobserved parts count as 0.
     """
     t = np.nan_to_num(values[:, [4, 3, 2]]) * length
     arrow = np.einsum("nij,nj->ni", places.rotation, t)
@@ -180,27 +202,37 @@ def traction_arrows(places: Places, values: np.ndarray, length: float) -> np.nda
     return np.stack([tail, tail + arrow], axis=1)
 
 
-def gradient_arrows(places: Places, values: np.ndarray, length: float) -> np.ndarray:
-    """(N, 2, 3) on the faces +z: where pressure grows, `length` metres per Pa/m; unobserved parts count as 0."""
+def gradient_arrows(places: CubePoses, values: np.ndarray, length: float) -> np.ndarray:
+    """(N, 2, 3) on the faces +z: where pressure grows, `length` metres per Pa/m; unobserved parts
+    count as 0."""
     g = -np.nan_to_num(values[:, [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]]) * length
     arrow = np.einsum("nij,nj->ni", places.rotation[:, :, :2], g)
     tail = places.position + places.rotation[:, :, 2] * (1.15 * places.half_side[:, None])
     return np.stack([tail, tail + arrow], axis=1)
 
 
-def principal_crosses(places: Places, values: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lines (N, 3, 2, 3) along the principal stresses, `length` metres per Pa, and whether each pulls (N, 3).
+def principal_crosses(
+    places: CubePoses, values: np.ndarray, length: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lines (N, 3, 2, 3) along the principal stresses, `length` metres per Pa, and whether each
+    pulls (N, 3).
 
     Unobserved components count as 0: a planar cube shows its section's cross.
     """
     principal, directions = principal_stresses(np.nan_to_num(values[:, : len(STRESS)]))
-    half = np.einsum("nij,nkj->nki", places.rotation, directions) * (0.5 * length * np.abs(principal))[..., None]
-    centre = places.position[:, None] + places.rotation[:, None, :, 2] * places.half_side[:, None, None]
+    half = (
+        np.einsum("nij,nkj->nki", places.rotation, directions)
+        * (0.5 * length * np.abs(principal))[..., None]
+    )
+    centre = (
+        places.position[:, None] + places.rotation[:, None, :, 2] * places.half_side[:, None, None]
+    )
     return np.stack([centre - half, centre + half], axis=2), principal > 0
 
 
-def fault_crosses(places: Places, health: np.ndarray) -> np.ndarray:
-    """(N, 2, 2, 3) two lines across the face +z of each cube that is not fine; lines of length 0 where it is."""
+def fault_crosses(places: CubePoses, health: np.ndarray) -> np.ndarray:
+    """(N, 2, 2, 3) two lines across the face +z of each cube that is not fine; lines of length 0
+    where it is."""
     corner = np.array([[[-1, -1, 0.0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]) * 1.3
     corner = np.where((health != FINE)[:, None, None, None], corner, 0) + np.array([0, 0, 1.2])
     return places.position[:, None, None] + np.einsum(
@@ -209,10 +241,16 @@ def fault_crosses(places: Places, health: np.ndarray) -> np.ndarray:
 
 
 def heads(arrows: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(N, 3, 2, 3) an arrow (N, 2, 3) as shaft and two barbs, for viewers that only know lines; normal (N, 3)."""
+    """(N, 3, 2, 3) an arrow (N, 2, 3) as shaft and two barbs, for viewers that only know lines;
+    normal (N, 3)."""
     tail, tip = arrows[:, 0], arrows[:, 1]
     back = 0.25 * (tail - tip)
-    across = np.cross(back, normal + 1e-3 * np.roll(normal, 1, axis=1))  # the small part: arrows along the normal
+    across = np.cross(
+        back, normal + 1e-3 * np.roll(normal, 1, axis=1)
+    )  # the small part: arrows along the normal
     size = np.linalg.norm(across, axis=1, keepdims=True)
     across *= 0.5 * np.linalg.norm(back, axis=1, keepdims=True) / np.where(size > 0, size, 1)
-    return np.stack([arrows, np.stack([tip, tip + back + across], 1), np.stack([tip, tip + back - across], 1)], axis=1)
+    return np.stack(
+        [arrows, np.stack([tip, tip + back + across], 1), np.stack([tip, tip + back - across], 1)],
+        axis=1,
+    )

@@ -1,7 +1,8 @@
 """Symmetry: which response matrices a cube can have, given the group that its surroundings respect.
 
-Every element R of the group permutes the pads (P(R)) and turns the modes (M(R)). The response A obeys
-A M(R) = P(R) A for all R. Because both act as signed permutations, the entries of A fall into orbits of equal
+Every element R of the group permutes the pads (P(R)) and turns the modes (M(R)). The response A
+obeys A M(R) = P(R) A for all R. Because both act as signed permutations, the entries of A fall into
+orbits of equal
 magnitude: each orbit is one coefficient, and each coefficient is one entry of A.
 Source: the symmetry argument of the paper's section on eq. 1, for any layout.
 """
@@ -20,7 +21,10 @@ from .modes import PLANE, SPACE, Modes
 
 _TURN_Z = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
 _CYCLE = ((0, 0, 1), (1, 0, 0), (0, 1, 0))
-_MIRRORS = tuple(tuple(tuple(-1 if i == j == k else int(i == j) for j in range(3)) for i in range(3)) for k in range(3))
+_MIRRORS = tuple(
+    tuple(tuple(-1 if i == j == k else int(i == j) for j in range(3)) for i in range(3))
+    for k in range(3)
+)
 GENERATORS: dict[str, tuple] = {
     "full": (_TURN_Z, _CYCLE, *_MIRRORS),  # 48: the cube alone in a wide body
     "slab": (_TURN_Z, *_MIRRORS),  # 16: z differs from x and y, but up and down are alike
@@ -58,7 +62,8 @@ def closure(generators: Sequence) -> np.ndarray:
 
 @lru_cache
 def group(name: str) -> np.ndarray:
-    """Elements (G, 3, 3) of a named group, signed permutation matrices; SymmetryError when unknown."""
+    """Elements (G, 3, 3) of a named group, signed permutation matrices; SymmetryError when
+    unknown."""
     if name not in GENERATORS:
         raise SymmetryError(f"unknown symmetry {name!r}; known are {', '.join(GENERATORS)}")
     elements = closure(GENERATORS[name])
@@ -67,17 +72,21 @@ def group(name: str) -> np.ndarray:
 
 
 def layout_group(layout: Layout, name: str) -> np.ndarray:
-    """The elements of a group that concern a layout: for a planar one, those that keep the plane y = 0."""
+    """The elements of a group that concern a layout: for a planar one, those that keep the plane y
+    = 0."""
     elements = group(name)
     return elements[np.abs(elements[:, 1, 1]) == 1] if layout.planar else elements
 
 
 def pad_images(layout: Layout, rotation: np.ndarray) -> np.ndarray:
-    """(P,) the pad onto which a rotation or mirror carries each; SymmetryError names one without image."""
+    """(P,) the pad onto which a rotation or mirror carries each; SymmetryError names one without
+    image."""
     r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
     for pad, (x, n) in enumerate(zip(layout.positions @ r.T, layout.normals @ r.T, strict=True)):
-        same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(np.abs(layout.normals - n) < 1e-6, axis=1)
+        same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(
+            np.abs(layout.normals - n) < 1e-6, axis=1
+        )
         if not same.any():
             raise SymmetryError(
                 f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be carried "
@@ -89,7 +98,8 @@ def pad_images(layout: Layout, rotation: np.ndarray) -> np.ndarray:
 
 
 def pad_action(layout: Layout, rotation: np.ndarray) -> np.ndarray:
-    """(P, P) permutation matrix of the pads: the turned pad stresses are pad_action @ pad stresses."""
+    """(P, P) permutation matrix of the pads: the turned pad stresses are pad_action @ pad
+    stresses."""
     action = np.zeros((layout.n_pads, layout.n_pads))
     action[pad_images(layout, rotation), np.arange(layout.n_pads)] = 1
     return action
@@ -100,7 +110,8 @@ class Structure:
     """All response matrices that a symmetry allows: sum_k coefficient_k basis_k.
 
     names: (K,) of the coefficients; a name such as "+z-x:zz" is the entry of that pad and mode
-    basis: (K, P, M) with entries 0, 1, -1; every entry of a response belongs to at most one coefficient
+    basis: (K, P, M) with entries 0, 1, -1; every entry of a response belongs to at most one
+    coefficient
     """
 
     layout: Layout
@@ -116,8 +127,12 @@ class Structure:
     @property
     def pad_orbits(self) -> list[list[int]]:
         """Pads that the symmetry carries onto each other."""
-        images = np.array([pad_images(self.layout, r) for r in layout_group(self.layout, self.symmetry)])
-        return [list(orbit) for orbit in dict.fromkeys(tuple(np.unique(column)) for column in images.T)]
+        images = np.array(
+            [pad_images(self.layout, r) for r in layout_group(self.layout, self.symmetry)]
+        )
+        return [
+            list(orbit) for orbit in dict.fromkeys(tuple(np.unique(column)) for column in images.T)
+        ]
 
 
 def default_modes(layout: Layout) -> Modes:
@@ -126,7 +141,8 @@ def default_modes(layout: Layout) -> Modes:
 
 
 def find_structure(layout: Layout, symmetry: str = "full", modes: Modes | None = None) -> Structure:
-    """The structure of a layout under a group; SymmetryError when the layout does not have the symmetry."""
+    """The structure of a layout under a group; SymmetryError when the layout does not have the
+    symmetry."""
     return _structure(layout, symmetry, modes or default_modes(layout))
 
 
@@ -136,7 +152,9 @@ def _structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
     pads = np.array([pad_images(layout, r) for r in elements])
     actions = np.array([modes.action(r) for r in elements])
     images, signs = np.abs(actions).argmax(axis=1), np.sign(actions.sum(axis=1)).astype(int)
-    if not np.allclose(np.abs(actions).sum(axis=1), 1) or not np.allclose(np.abs(actions).max(axis=1), 1):
+    if not np.allclose(np.abs(actions).sum(axis=1), 1) or not np.allclose(
+        np.abs(actions).max(axis=1), 1
+    ):
         raise SymmetryError("the group does not act on these modes as signed permutations")
     n_pads, n_modes = layout.n_pads, modes.n_modes
     seen = np.zeros((n_pads, n_modes), dtype=bool)
@@ -152,13 +170,18 @@ def _structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
             seen[rows, columns] = True
             if np.any((rows == pad) & (columns == mode) & (sign < 0)):
                 continue  # an element that flips the mode but keeps the pad forbids this entry
-            name, flip = letters.get(modes.names[mode], (f"{layout.pads[pad]}:{modes.names[mode]}", 1))
+            name, flip = letters.get(
+                modes.names[mode], (f"{layout.pads[pad]}:{modes.names[mode]}", 1)
+            )
             member = np.zeros((n_pads, n_modes))
             member[rows, columns] = flip * sign
             names.append(name)
             basis.append(member)
     if letters:
-        names, basis = map(list, zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True))
+        names, basis = map(
+            list,
+            zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True),
+        )
     stacked = np.array(basis).reshape(-1, n_pads, n_modes)
     stacked.flags.writeable = False
     return Structure(layout, modes, symmetry, tuple(names), stacked)

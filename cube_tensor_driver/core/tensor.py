@@ -1,7 +1,7 @@
 """Tensor algebra over rows. Stress (..., 6) in the order xx, yy, zz, yz, zx, xy, tension positive.
 
-Gradients are (..., 3, 3, 3), G_ijk = d(sigma_ij)/dx_k. Any unit unless said. Source: textbook continuum
-mechanics; rotations by transforms3d, quaternions in ROS order x, y, z, w.
+Gradients are (..., 3, 3, 3), G_ijk = d(sigma_ij)/dx_k. Any unit unless said. Source: textbook
+continuum mechanics; rotations by transforms3d, quaternions in ROS order x, y, z, w.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from .modes import to_matrix, to_six
 
 
 def principal_stresses(stress: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal stresses (..., 3), largest first, and their directions (..., 3, 3), one unit vector per row.
+    """Principal stresses (..., 3), largest first, and their directions (..., 3, 3), one unit vector
+    per row.
 
     Rows with NaN give NaN. The sign of a direction is arbitrary.
     """
@@ -22,7 +23,9 @@ def principal_stresses(stress: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     finite = np.isfinite(m).all(axis=(-2, -1))
     values, vectors = np.linalg.eigh(np.where(finite[..., None, None], m, 0))
     values, directions = values[..., ::-1], np.swapaxes(vectors, -1, -2)[..., ::-1, :]
-    return np.where(finite[..., None], values, np.nan), np.where(finite[..., None, None], directions, np.nan)
+    return np.where(finite[..., None], values, np.nan), np.where(
+        finite[..., None, None], directions, np.nan
+    )
 
 
 def invariants(stress: np.ndarray) -> np.ndarray:
@@ -41,11 +44,14 @@ def von_mises(stress: np.ndarray) -> np.ndarray:
 
 
 def traction(stress: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(..., 3) sigma n on planes with normals (..., 3), made unit vectors; CubeError for a zero one."""
+    """(..., 3) sigma n on planes with normals (..., 3), made unit vectors; CubeError for a zero
+    one."""
     n = np.asarray(normal, dtype=float)
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     if not np.all(length > 0):
-        raise CubeError(f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal")
+        raise CubeError(
+            f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal"
+        )
     return np.einsum("...ij,...j->...i", to_matrix(stress), n / length)
 
 
@@ -58,14 +64,16 @@ def rotate_stress(stress: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def rotate_gradient(gradient: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """(..., 3, 3, 3) R_ia R_jb R_kc G_abc.
 
-    All 27 are needed: the nine normal gradients alone do not determine themselves in a turned frame.
+    All 27 are needed: the nine normal gradients alone do not determine themselves in a turned
+    frame.
     """
     r = np.asarray(rotation, dtype=float)
     return np.einsum("...ia,...jb,...kc,...abc->...ijk", r, r, r, np.asarray(gradient))
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll), rad, fixed axes as in URDF: cube coordinates to parent's."""
+    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll), rad, fixed axes as in URDF: cube coordinates to
+    parent's."""
     return euler.euler2mat(roll, pitch, yaw, "sxyz")
 
 
@@ -86,7 +94,9 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
     x, y, z, w = np.asarray(quaternion, dtype=float)
     size = np.sqrt(x * x + y * y + z * z + w * w)
     if not (np.isfinite(size) and size > 0):
-        raise CubeError(f"quaternion {[x, y, z, w]} has length {size}; it must be finite and above 0")
+        raise CubeError(
+            f"quaternion {[x, y, z, w]} has length {size}; it must be finite and above 0"
+        )
     return quaternions.quat2mat([w, x, y, z])
 
 
@@ -95,12 +105,15 @@ def rpy_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
     return np.array(euler.mat2euler(rotation_from_quaternion(quaternion), "sxyz"))
 
 
-def contact_wrench(stress: np.ndarray, gradient: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
+def contact_wrench(
+    stress: np.ndarray, gradient: np.ndarray, side: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Force (N, 3) in N and torque (N, 3) in N m on the square face +z of a reference side in m.
 
     stress: (N, 6) Pa; gradient: (N, 9) Pa/m of the normal stresses, as in StressRows
-    force = w^2 sigma n; torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0). The twist needs gradients of shear,
-    which pads of normal stress do not see, so it is 0. Components that are not observed count as 0.
+    force = w^2 sigma n; torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0). The twist needs gradients
+    of shear, which pads of normal stress do not see, so it is 0. Components that are not observed
+    count as 0.
     """
     s, g = np.nan_to_num(stress), np.nan_to_num(gradient)
     force = side**2 * s[..., [4, 3, 2]]

@@ -1,10 +1,13 @@
-"""Windows: statistics of pads over half a second, what they say of the pads, and what tare averages.
+"""Windows: statistics of pads over half a second, what they say of the pads, and what tare
+averages.
 
-    noise of a pad    sqrt(mean(w (f[n] - f[n-1] - r (f[n-1] - f[n-2]))²) / 6), r = (t[n] - t[n-1]) / (t[n-1] - t[n-2]),
-                      w = 6 / (1 + (1 + r)² + r²), each term bounded so that one jump is no noise; a load that moves
-                      slowly leaves nothing, also where rows are missing; r = 1 where it is within EVEN;
-                      w = 0 across a gap
-    roughness         sum w (…)² / sum (f[n] - f[n-1])²: 3 for noise, (2 pi F T)² for a load that moves with F Hz
+    noise of a pad    sqrt(mean(w (f[n] - f[n-1] - r (f[n-1] - f[n-2]))²) / 6), r = (t[n] - t[n-1])
+    / (t[n-1] - t[n-2]),
+                      w = 6 / (1 + (1 + r)² + r²), each term bounded so that one jump is no noise; a
+                      load that moves slowly leaves nothing, also where rows are missing; r = 1
+                      where it is within EVEN; w = 0 across a gap
+    roughness         sum w (…)² / sum (f[n] - f[n-1])²: 3 for noise, (2 pi F T)² for a load that
+    moves with F Hz
 
 All arrays are (cubes, pads); nothing loops over cubes.
 """
@@ -25,29 +28,37 @@ MIN_COUNT = 20
 NOISY_ENTER, NOISY_LEAVE = 10.0, 5.0
 """Times the calibration's noise and times the cube's other pads, to become noisy and to stay so."""
 ROUGH = 0.3
-"""Roughness below which it is a load that moves, and no pad becomes noisy: below 9 Hz at 100 rows a second."""
+"""Roughness below which it is a load that moves, and no pad becomes noisy: below 9 Hz at 100 rows a
+second."""
 JUMP = 60.0
-"""Times the usual noise, to which a second difference is bounded: two of them in 20 rows stay below NOISY_ENTER."""
+"""Times the usual noise, to which a second difference is bounded: two of them in 20 rows stay below
+NOISY_ENTER."""
 GAP_NS = 50_000_000
-"""What a load did across a longer gap is not known; MIN_COUNT rows in half a second come twice as often."""
+"""What a load did across a longer gap is not known; MIN_COUNT rows in half a second come twice as
+often."""
 EVEN = 1.5
-"""Times each other, up to which two intervals count as equal: stamps jitter, but a missing row makes it 2."""
+"""Times each other, up to which two intervals count as equal: stamps jitter, but a missing row
+makes it 2."""
 STUCK_MOVING = 5.0
-"""Times its noise that the cube's pads must have moved, before one that did not move at all is called stuck."""
+"""Times its noise that the cube's pads must have moved, before one that did not move at all is
+called stuck."""
 STILL = 8.0
-"""Times its noise, peak to peak, within which a pad stands still: noise alone spans 6 in 1000 rows."""
+"""Times its noise, peak to peak, within which a pad stands still: noise alone spans 6 in 1000
+rows."""
 RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
-"""Shares of a window's rows with a residual above its limit, for a cube to become strained and to stay so."""
+"""Shares of a window's rows with a residual above its limit, for a cube to become strained and to
+stay so."""
 WAITING = 8
-"""Scans whose rows wait and are then added one after the other: the sums are fetched from memory once for all of them,
-which takes several times as long as adding."""
+"""Scans whose rows wait and are then added one after the other: the sums are fetched from memory
+once for all of them, which takes several times as long as adding."""
 DRIFT_LIMIT = 2e-4
-"""Of the rest frequency: how far one pad wanders while all stand still, before it is called drifting."""
+"""Of the rest frequency: how far one pad wanders while all stand still, before it is called
+drifting."""
 
 
 class Window(NamedTuple):
-    """What is kept of a window: rows (cubes,) that came; (cubes, P) in Hz, NaN where nothing was measured; rough:
-    (cubes, P) bool, rougher than a load that moves."""
+    """What is kept of a window: rows (cubes,) that came; (cubes, P) in Hz, NaN where nothing was
+    measured; rough: (cubes, P) bool, rougher than a load that moves."""
 
     rows: np.ndarray
     mean: np.ndarray
@@ -66,14 +77,25 @@ class _Pace(NamedTuple):
 
 
 class Statistics:
-    """Of the window that is not over yet. bound: (cubes, P) Hz², to which a squared second difference is cut."""
+    """Of the window that is not over yet. bound: (cubes, P) Hz², to which a squared second
+    difference is cut."""
 
     def __init__(self, rest: np.ndarray, bound: np.ndarray) -> None:
         """rest: (cubes, P) Hz, NaN where there is no pad; float32 sums are of what is above it."""
         self._all = np.full((9, *rest.shape), np.nan, np.float32)
-        # step: the newest first difference; way, bend: sums of squared first and second differences.
-        (self._last, self._step, self._way, self._bend, self._sum, self._lowest, self._highest, self._base,
-         self.bound) = self._all  # fmt: skip
+        # step: the newest first difference; way, bend: sums of squared first and second
+        # differences.
+        (
+            self._last,
+            self._step,
+            self._way,
+            self._bend,
+            self._sum,
+            self._lowest,
+            self._highest,
+            self._base,
+            self.bound,
+        ) = self._all
         self._base[:] = np.nan_to_num(rest)
         self.bound[:] = bound
         self._count = np.zeros(len(rest), int)
@@ -96,7 +118,9 @@ class Statistics:
         self._way[:] = self._bend[:] = self._sum[:] = self._count[:] = 0
         self._lowest[:] = self._highest[:] = np.nan
 
-    def add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray) -> None:
+    def add(
+        self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray
+    ) -> None:
         """Rows (N, P) of different cubes, taken at one time or (N,) times."""
         kept = self._kept[len(self._waiting), : len(frequency)]
         kept[:] = frequency
@@ -109,7 +133,9 @@ class Statistics:
         for one in waiting:
             self._add(*one)
 
-    def _add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray) -> None:
+    def _add(
+        self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: int | np.ndarray
+    ) -> None:
         part = self._all[:, cubes]
         last, step, way, bend, total, lowest, highest, base, bound = part
         uneven = self._pace(cubes, stamp_ns)
@@ -133,8 +159,11 @@ class Statistics:
             self._all[:, cubes] = part
         self._count[cubes] += 1
 
-    def add_many(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
-        """`add` of (B, N, P) taken at (B,) times, one after the other, to the same bits: sums go batch by batch."""
+    def add_many(
+        self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray
+    ) -> None:
+        """`add` of (B, N, P) taken at (B,) times, one after the other, to the same bits: sums go
+        batch by batch."""
         self._settle()
         k = 0
         while k < len(frequency):
@@ -165,9 +194,12 @@ class Statistics:
             self._all[:, cubes] = part
         self._count[cubes] += len(frequency)
 
-    def _pace(self, cubes: slice | np.ndarray, stamp_ns: int | np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """r and w of the rows, (N, 1) each; None where all are even, which for the same cubes as before is known
-        without looking at each. Where an interval is unknown, not positive or a gap, w = 0."""
+    def _pace(
+        self, cubes: slice | np.ndarray, stamp_ns: int | np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """r and w of the rows, (N, 1) each; None where all are even, which for the same cubes as
+        before is known without looking at each. Where an interval is unknown, not positive or a
+        gap, w = 0."""
         one = self._together
         if one is not None and one.cubes is cubes and isinstance(stamp_ns, int):
             interval_ns = stamp_ns - one.time_ns
@@ -183,7 +215,9 @@ class Statistics:
         if isinstance(stamp_ns, int) and (interval == interval[0]).all():
             self._together = _Pace(cubes, stamp_ns, int(interval[0]))
         known = (interval > 0) & (before > 0) & (np.maximum(interval, before) < GAP_NS)
-        ratio = np.where(known & ~_even(interval, before), interval / np.where(known, before, 1), 1.0)
+        ratio = np.where(
+            known & ~_even(interval, before), interval / np.where(known, before, 1), 1.0
+        )
         weight = known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
         return ratio.astype(np.float32)[:, None], weight.astype(np.float32)[:, None]
 
@@ -206,13 +240,20 @@ class Statistics:
         with np.errstate(invalid="ignore"):
             mean = np.where(self._count[:, None] > 0, self._base + self._sum / count, np.nan)
         noise = np.sqrt(self._bend / count / 6)
-        return Window(self._count.copy(), mean, self._lowest.copy(), self._highest.copy(), noise,
-                      self._bend > ROUGH * self._way)  # fmt: skip
+        return Window(
+            self._count.copy(),
+            mean,
+            self._lowest.copy(),
+            self._highest.copy(),
+            noise,
+            self._bend > ROUGH * self._way,
+        )
 
 
 class Judge:
-    """What windows say of pads: stuck, noisy, drifting. still: (cubes,) bool, nothing moved in the last one; noise:
-    (cubes, P) Hz, by the calibration; bound: for the statistics of the next window."""
+    """What windows say of pads: stuck, noisy, drifting. still: (cubes,) bool, nothing moved in the
+    last one; noise: (cubes, P) Hz, by the calibration; bound: for the statistics of the next
+    window."""
 
     def __init__(self, exists: np.ndarray) -> None:
         self._exists = exists
@@ -260,8 +301,9 @@ class Judge:
 
 
 def still_strained(strained: np.ndarray, over: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(cubes,) bool after a window: strained (cubes,) bool before it; over (cubes,) of its rows (cubes,) had a residual
-    above its limit, as noise alone does to one in a thousand. Cubes without rows stay as they were."""
+    """(cubes,) bool after a window: strained (cubes,) bool before it; over (cubes,) of its rows
+    (cubes,) had a residual above its limit, as noise alone does to one in a thousand. Cubes without
+    rows stay as they were."""
     limit = np.where(strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
     return np.where(rows > 0, over > limit * rows, strained)
 

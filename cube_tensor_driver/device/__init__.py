@@ -1,1 +1,5 @@
-"""Hubs on the wire: protocol, links, the reader thread, device time. Bytes in, frames and host times out."""
+"""From the bytes of hubs to `FrequencyRows`: protocol, links, clocks, accounts, scans.
+
+The live source (`open_links`) puts them together. Nothing here knows ROS, and nothing looks at what
+a frequency means.
+"""

@@ -1,11 +1,12 @@
 """Device time to host time: the line below all (device time, arrival) points.
 
-Arrival is device time plus offset plus drift plus a delay, and delay only ever adds: buffers, USB polling,
-the scheduler. So the line that touches the points from below is the clock, and what lies above it is delay.
-Points are thinned to the earliest per bucket of one second; of their lower convex hull the edge over the
-middle is the line below all points that is nearest to them in the mean (Moon, Skelly, Towsley, "Estimation
-and removal of clock skew from network delay measurements", INFOCOM 1999). The part of the delay that is
-always there cannot be told from the offset: stamps are late by it.
+Arrival is device time plus offset plus drift plus a delay, and delay only ever adds: buffers, USB
+polling, the scheduler. So the line that touches the points from below is the clock, and what lies
+above it is delay. Points are thinned to the earliest per bucket of one second; of their lower
+convex hull the edge over the middle is the line below all points that is nearest to them in the
+mean (Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay measurements",
+INFOCOM 1999). The part of the delay that is always there cannot be told from the offset: stamps are
+late by it.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ RESTART_US = 1_000_000
 class ClockMap:
     """Maps one hub's clock to the host's. Bounded memory; amortised constant time per sample.
 
-    Read-only: offset_ns, host minus device time at the newest sample, 0 before the first; drift_ppm, positive
-    when host time runs faster than the hub's, 0 until known; jitter_ns, mean delay above the line (over the
-    last 64 calls or so); resets, how often the map began anew.
+    Read-only: offset_ns, host minus device time at the newest sample, 0 before the first;
+    drift_ppm, positive when host time runs faster than the hub's, 0 until known; jitter_ns, mean
+    delay above the line (over the last 64 calls or so); resets, how often the map began anew.
     """
 
     _fresh: bool
@@ -59,7 +60,8 @@ class ClockMap:
         self._begin()
 
     def reset(self) -> None:
-        """The hub restarted: fit anew. Drift is kept as a first guess; stamps still do not go backward."""
+        """The hub restarted: fit anew. Drift is kept as a first guess; stamps still do not go
+        backward."""
         self.resets += 1
         self._begin()
 
@@ -71,18 +73,24 @@ class ClockMap:
     def offset_ns(self) -> int:
         if self._fresh:
             return 0
-        return self._first_ns - 1000 * self._first_us + round(self._offset + self._drift * self._newest)
+        return (
+            self._first_ns
+            - 1000 * self._first_us
+            + round(self._offset + self._drift * self._newest)
+        )
 
     def update(self, device_us: Sequence[int], arrival_ns: int) -> list[int]:
         """Host times, ns, of samples taken at device_us, µs, that arrived together at arrival_ns.
 
-        Along device time stamps never go backward, and none is later than its arrival. Begins anew by itself
-        when device time falls back by over 1 s or either clock was set; only a host clock set back makes
-        stamps go backward.
+        Along device time stamps never go backward, and none is later than its arrival. Begins anew
+        by itself when device time falls back by over 1 s or either clock was set; only a host clock
+        set back makes stamps go backward.
         """
         for k in range(1, len(device_us)):
             if device_us[k] < device_us[k - 1] - RESTART_US:
-                return self.update(device_us[:k], arrival_ns) + self.update(device_us[k:], arrival_ns)
+                return self.update(device_us[:k], arrival_ns) + self.update(
+                    device_us[k:], arrival_ns
+                )
         return self._stamps(device_us, arrival_ns) if device_us else []
 
     def _stamps(self, times: Sequence[int], arrival_ns: int) -> list[int]:
@@ -102,7 +110,9 @@ class ClockMap:
         stamps = []
         for time in times:
             since = 1000 * (time - self._first_us)
-            stamp = min(self._first_ns + since + round(self._offset + self._drift * since), arrival_ns)
+            stamp = min(
+                self._first_ns + since + round(self._offset + self._drift * since), arrival_ns
+            )
             if since > self._newest:
                 stamp = max(stamp, self._last_stamp)
                 self._newest, self._last_stamp = since, stamp
@@ -120,8 +130,8 @@ class ClockMap:
         self._least = math.inf
 
     def _take(self, t: float, arrival_ns: int) -> None:
-        """One point, t ns of device time since the first: lower the line to it, close the bucket when
-        full."""
+        """One point, t ns of device time since the first: lower the line to it, close the bucket
+        when full."""
         delay = arrival_ns - self._first_ns - t
         above = delay - self._offset - self._drift * t
         if above < 0:
@@ -155,12 +165,13 @@ class ClockMap:
 
 
 def _middle_slope(points: list[tuple[float, float]]) -> float:
-    """Slope of the lower convex hull's edge over the mean abscissa; points (x, y) sorted, at least two."""
+    """Slope of the lower convex hull's edge over the mean abscissa; points (x, y) sorted, at least
+    two."""
     hull: list[tuple[float, float]] = []
     for x, y in points:
-        while len(hull) > 1 and (hull[-1][0] - hull[-2][0]) * (y - hull[-2][1]) <= (x - hull[-2][0]) * (
-            hull[-1][1] - hull[-2][1]
-        ):
+        while len(hull) > 1 and (hull[-1][0] - hull[-2][0]) * (y - hull[-2][1]) <= (
+            x - hull[-2][0]
+        ) * (hull[-1][1] - hull[-2][1]):
             hull.pop()
         hull.append((x, y))
     middle = sum(x for x, _ in points) / len(points)

@@ -1,7 +1,7 @@
 """From the bytes of a link to frames, whatever the bytes are.
 
-`Decoder.feed` never raises: every non-empty run of bytes closed by a zero becomes exactly one frame or is counted in
-exactly one counter of `Counters`.
+`Decoder.feed` never raises: every non-empty run of bytes closed by a zero becomes exactly one frame
+or is counted in exactly one counter of `Counters`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,20 @@ from .protocol import HEADER, MAX_FRAME, OVERHEAD, REQUEST, UNPACK, VERSION, Fra
 MAX_RUN = MAX_FRAME + (MAX_FRAME + 253) // 254
 """Longest run of bytes between two zeros that can be a frame: COBS adds at most one byte in 254."""
 MIN_RUN = OVERHEAD + REQUEST.size + 1
-"""Shortest run that can be a frame, of any version: to try shorter ones would let noise slow the decoder down."""
+"""Shortest run that can be a frame, of any version: to try shorter ones would let noise slow the
+decoder down."""
 SHORT_RUN, CROWD = 32, 32
-"""More runs in a feed than CROWD that are shorter than any SAMPLE are noise: see `Decoder._thinned`."""
-# CRC-32 over data followed by its own CRC is this constant: no slice, no second look at the frame's end.
+"""More runs in a feed than CROWD that are shorter than any SAMPLE are noise: see
+`Decoder._thinned`."""
+# CRC-32 over data followed by its own CRC is this constant: no slice, no second look at the frame's
+# end.
 _CRC_RESIDUE = 0x2144DF1C
 
 
 @dataclass(slots=True)
 class Counters:
-    """What became of the bytes fed to a `Decoder`. All but `bytes` count frames or runs between zeros."""
+    """What became of the bytes fed to a `Decoder`. All but `bytes` count frames or runs between
+    zeros."""
 
     bytes: int = 0
     frames: int = 0
@@ -45,7 +49,8 @@ class Decoder:
     """Bytes in, frames out. Holds at most MAX_RUN bytes between calls.
 
     counters: `Counters`, growing for the life of the decoder.
-    other_version: the last version other than ours that a sound frame named, None if there was none.
+    other_version: the last version other than ours that a sound frame named, None if there was
+    none.
     """
 
     def __init__(self) -> None:
@@ -58,7 +63,12 @@ class Decoder:
         """Frames that `data` completes, in order. Never raises, whatever the bytes are."""
         self.counters.bytes += len(data)
         last = len(data) - 1
-        if last > MIN_RUN and not data[0] and data.find(0, 1) == last and not (self._tail or self._discarding):
+        if (
+            last > MIN_RUN
+            and not data[0]
+            and data.find(0, 1) == last
+            and not (self._tail or self._discarding)
+        ):
             # One frame and nothing else, as it mostly comes.
             only = self._decode(data[1:last])
             return [] if only is None else [only]
@@ -93,25 +103,30 @@ class Decoder:
         self._discarding = False
 
     def _thinned(self, data: bytes) -> bytes:
-        """Data without the short runs that can be no frame, where they are a crowd: counted without a step each.
+        """Data without the short runs that can be no frame, where they are a crowd: counted without
+        a step each.
 
-        To decode each would take longer than good frames of the same size. A short frame with a sound checksum but type
-        or version 0, which no version has, counts as crc here.
+        To decode each would take longer than good frames of the same size. A short frame with a
+        sound checksum but type or version 0, which no version has, counts as crc here.
         """
-        code = np.frombuffer(data + b"\0", np.uint8)  # one more, where what leads beyond the data ends
+        code = np.frombuffer(
+            data + b"\0", np.uint8
+        )  # one more, where what leads beyond the data ends
         zeros = np.flatnonzero(code[:-1] == 0)
         length = np.diff(zeros) - 1
         tiny = np.count_nonzero(length < MIN_RUN) - np.count_nonzero(length == 0)
         kept = length >= MIN_RUN
         short = np.flatnonzero(kept & (length < SHORT_RUN))
         if len(short) > CROWD:
-            # Each code word says where the next one is; a run is COBS where that leads to its end, a zero, which stays.
+            # Each code word says where the next one is; a run is COBS where that leads to its end,
+            # a zero, which stays.
             at = np.minimum(np.arange(len(code)) + code, len(code) - 1)
             for _ in range((SHORT_RUN - 1).bit_length()):
                 at = at[at]
             first, end, size = zeros[short] + 1, zeros[short + 1], length[short]
             sound = at[first] == end
-            # The header's fourth byte, the high one of its length, is the only one of four that is 0.
+            # The header's fourth byte, the high one of its length, is the only one of four that is
+            # 0.
             hopeful = sound & (code[first] == 4) & (code[first + 3] == size - 1 - OVERHEAD)
             kept[short] = hopeful
             self.counters.framing += len(short) - int(np.count_nonzero(sound))
@@ -120,7 +135,10 @@ class Decoder:
             return data
         self.counters.length += tiny
         chosen = np.flatnonzero(kept)
-        runs = [data[i:j] for i, j in zip((zeros[chosen] + 1).tolist(), zeros[chosen + 1].tolist(), strict=True)]
+        runs = [
+            data[i:j]
+            for i, j in zip((zeros[chosen] + 1).tolist(), zeros[chosen + 1].tolist(), strict=True)
+        ]
         return b"\0".join([data[: zeros[0]], *runs, data[zeros[-1] + 1 :]])
 
     def _decode(self, run: bytes | bytearray) -> Frame | None:

@@ -1,8 +1,9 @@
 """One link: a byte stream from and to a hub over a serial port, a pseudo-terminal or TCP.
 
-Nothing here blocks or waits, keeps a thread or knows a frame; `reader` drives it. Serial ports are opened by
-pyserial (``serial_for_url``) and read with ``os.read``, which takes all there is in one call per 4 kB. What
-goes wrong is a `LinkError` whose `kind` is one word and whose text names the fix:
+Nothing here blocks or waits, keeps a thread or knows a frame; `reader` drives it. Serial ports are
+opened by pyserial (``serial_for_url``) and read with ``os.read``, which takes all there is in one
+call per 4 kB. What goes wrong is a `LinkError` whose `kind` is one word and whose text names the
+fix:
 
     no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
     refused  no_answer  unreachable  unresolved                       opening a TCP link
@@ -38,7 +39,9 @@ BACKOFF_S = (0.25, 5.0)
 BACKOFF_TCP_S = 1.5
 """Nothing announces that a TCP peer is back, so a longer pause would break "back within 2 s"."""
 
-_NO_PERMISSION = "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
+_NO_PERMISSION = (
+    "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
+)
 _OPEN_ERRORS = {
     errno.ENOENT: ("no_port", "plug the hub in or correct the port"),
     errno.ENXIO: ("no_port", "nothing is behind this port: plug the hub in or correct the port"),
@@ -56,8 +59,8 @@ _OPEN_ERRORS = {
 
 
 class LinkState(str, Enum):
-    """closed: not in use. waiting: not there yet, tried again with back-off. open: port open. silent: open,
-    but no sample for max(3 sample periods, 0.2 s) although samples were asked for."""
+    """closed: not in use. waiting: not there yet, tried again with back-off. open: port open.
+    silent: open, but no sample for max(3 sample periods, 0.2 s) although samples were asked for."""
 
     CLOSED = "closed"
     WAITING = "waiting"
@@ -69,9 +72,10 @@ class LinkState(str, Enum):
 class LinkConfig:
     """Where a hub is.
 
-    port: device path, which may be a pattern such as ``/dev/ttyACM*`` (each match is tried in turn, which
-    finds a hub that comes back under another name), or ``socket://host:port``, or another URL that pyserial
-    opens. baud: ignored by USB and TCP. hub_uid: the hub that must answer, None for any.
+    port: device path, which may be a pattern such as ``/dev/ttyACM*`` (each match is tried in turn,
+    which finds a hub that comes back under another name), or ``socket://host:port``, or another URL
+    that pyserial opens. baud: ignored by USB and TCP. hub_uid: the hub that must answer, None for
+    any.
     """
 
     name: str
@@ -81,8 +85,8 @@ class LinkConfig:
 
 
 class Link:
-    """One link. `state` and `error` are set by the reader; `decoder`, `hello` (the hub's last, or None) and
-    `counters` outlive reconnects."""
+    """One link. `state` and `error` are set by the reader; `decoder`, `hello` (the hub's last, or
+    None) and `counters` outlive reconnects."""
 
     def __init__(self, config: LinkConfig) -> None:
         """LinkError `bad_port`: no port at all, or a TCP address that is none."""
@@ -111,8 +115,8 @@ class Link:
 
     @property
     def counters(self) -> dict[str, int]:
-        """The decoder's counters and: opened, lost (while open), silences, before_hello (samples not
-        delivered because the hub had not said yet who it is), bytes_out."""
+        """The decoder's counters and: opened, lost (while open), silences, before_hello (samples
+        not delivered because the hub had not said yet who it is), bytes_out."""
         names = ("opened", "lost", "silences", "before_hello", "bytes_out")
         return {**self.decoder.counters.as_dict(), **{name: getattr(self, name) for name in names}}
 
@@ -129,7 +133,8 @@ class Link:
         return self._fd
 
     def open(self) -> bool:
-        """Take one step towards open; True when open, False while a TCP connection is under way (call again).
+        """Take one step towards open; True when open, False while a TCP connection is under way
+        (call again).
 
         LinkError when this attempt failed.
         """
@@ -144,10 +149,11 @@ class Link:
         return True
 
     def read(self) -> bytes:
-        """What one call gives, up to READ_CHUNK; b"" if nothing. LinkError `lost` when the other end is gone.
+        """What one call gives, up to READ_CHUNK; b"" if nothing. LinkError `lost` when the other
+        end is gone.
 
-        A tty gives 4 kB at a time. To ask again at once would make us wait until the kernel has moved up the next;
-        while the other links are read that happens by itself.
+        A tty gives 4 kB at a time. To ask again at once would make us wait until the kernel has
+        moved up the next; while the other links are read that happens by itself.
         """
         try:
             data = os.read(self._fd, READ_CHUNK)
@@ -196,8 +202,8 @@ class Link:
         return bool(self._out) or waiting > 0
 
     def close(self) -> None:
-        """Close at once, whatever the state; safe to call twice. A half-received frame is counted as
-        framing."""
+        """Close at once, whatever the state; safe to call twice. A half-received frame is counted
+        as framing."""
         if self._connecting is not None:
             self._connecting.close()
             self._connecting = None
@@ -228,7 +234,8 @@ class Link:
         self._turn += 1
 
     def fingerprint(self) -> tuple[object, ...]:
-        """What the port's path leads to now; a change means that trying again is worth it at once."""
+        """What the port's path leads to now; a change means that trying again is worth it at
+        once."""
         return () if self._tcp else tuple(_identity(path) for path in self._candidates())
 
     def _candidates(self) -> list[str]:
@@ -238,7 +245,9 @@ class Link:
 
     def _open_serial(self) -> None:
         paths = self._candidates()
-        error = LinkError(f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port")
+        error = LinkError(
+            f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port"
+        )
         for i in range(len(paths)):
             self.path = paths[(self._turn + i) % len(paths)]
             try:
@@ -263,7 +272,8 @@ class Link:
     def _lost(self, error: OSError) -> LinkError:
         reason = error.strerror or str(error)
         return LinkError(
-            f"{self.path}: connection lost ({reason}): replug the hub, it is taken up again by itself", "lost"
+            f"{self.path}: connection lost ({reason}): replug the hub, it is taken up again by itself",
+            "lost",
         )
 
 
@@ -282,19 +292,23 @@ def open_error(path: str, error: BaseException) -> LinkError:
 
 def _open_port(path: str, baud: int) -> serial.SerialBase:
     try:
-        # inter_byte_timeout=0 is VMIN=1: reading nothing is then EAGAIN, and b"" only ever means unplugged.
+        # inter_byte_timeout=0 is VMIN=1: reading nothing is then EAGAIN, and b"" only ever means
+        # unplugged.
         port = serial.serial_for_url(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
     except (OSError, termios.error) as error:
         raise open_error(path, error) from error
     except ValueError as error:
         kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"
-        raise LinkError(f"{path} at {baud} baud: {error}: correct the port or the baud rate", kind) from error
+        raise LinkError(
+            f"{path} at {baud} baud: {error}: correct the port or the baud rate", kind
+        ) from error
     try:
         port.fileno()
     except (AttributeError, OSError) as error:
         port.close()
         raise LinkError(
-            f"{path}: this kind of port cannot be waited on: use a device path or socket://", "bad_port"
+            f"{path}: this kind of port cannot be waited on: use a device path or socket://",
+            "bad_port",
         ) from error
     with contextlib.suppress(ValueError, AttributeError, NotImplementedError, OSError):
         port.set_low_latency_mode(True)

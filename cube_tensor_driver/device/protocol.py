@@ -1,13 +1,15 @@
 """Wire protocol, version 1: the frames, and their bytes, without any I/O.
 
-A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian, `length` counting the payload,
-`crc` the CRC-32 of IEEE 802.3 over all before it. It travels COBS-encoded between two zero bytes. Layouts and
-one annotated hex dump per frame type: docs/protocol.md. The driver and the simulated hubs share this file.
+A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian, `length` counting the
+payload, `crc` the CRC-32 of IEEE 802.3 over all before it. It travels COBS-encoded between two zero
+bytes. Layouts and
+one annotated hex dump per frame type: docs/protocol.md. The driver and the simulated hubs share
+this file.
 
 Contracts
-    `encode` takes a frame and returns bytes, or raises `ProtocolError`. Arrays to encode must have the dtype named in
-    the frame's docstring; nothing is converted behind the caller's back. Arrays of decoded frames are read-only, made
-    when first asked for. For the way back see decoder.py.
+    `encode` takes a frame and returns bytes, or raises `ProtocolError`. Arrays to encode must have
+    the dtype named in the frame's docstring; nothing is converted behind the caller's back. Arrays
+    of decoded frames are read-only, made when first asked for. For the way back see decoder.py.
 """
 
 from __future__ import annotations
@@ -67,8 +69,8 @@ class Result(IntEnum):
 class Hello:
     """Who the hub is. Sent at power-up, on request and then at 1 Hz.
 
-    hub_uid u64; firmware u32; n_pads per cube u8; flags u8 (0 in version 1); period_us sample period u32, µs;
-    cube_uids (n_cubes,) uint64.
+    hub_uid u64; firmware u32; n_pads per cube u8; flags u8 (0 in version 1); period_us sample
+    period u32, µs; cube_uids (n_cubes,) uint64.
     """
 
     hub_uid: int
@@ -85,7 +87,9 @@ class Hello:
     def _pack(self) -> bytes:
         uids = _array("cube_uids", self.cube_uids, _U64, (len(self.cube_uids),))
         return (
-            _HELLO.pack(self.hub_uid, self.firmware, len(uids), self.n_pads, self.flags, self.period_us)
+            _HELLO.pack(
+                self.hub_uid, self.firmware, len(uids), self.n_pads, self.flags, self.period_us
+            )
             + uids.tobytes()
         )
 
@@ -101,9 +105,11 @@ class Hello:
 
 
 class Sample:
-    """One reading of cubes first_cube .. first_cube + n_cubes − 1 of a hub, all at the same instant.
+    """One reading of cubes first_cube .. first_cube + n_cubes − 1 of a hub, all at the same
+    instant.
 
-    sequence: u32, given when the sample is taken, so that a sample dropped in the hub leaves a gap; wraps.
+    sequence: u32, given when the sample is taken, so that a sample dropped in the hub leaves a gap;
+    wraps.
     first_cube: index on the hub, u16. device_us: hub clock, µs, u64. shape: (n_cubes, n_pads).
     frequency: (n_cubes, n_pads) uint32, mHz, 0 not measured.
     pad_fault: (n_cubes,) uint32, bit p set = pad p reported faulty by the hub.
@@ -158,7 +164,9 @@ class Sample:
 
     def _pack(self) -> bytes:
         if len(self.shape) != 2:
-            raise ProtocolError(f"frequency has {len(self.shape)} dimensions, must have 2: (n_cubes, n_pads)")
+            raise ProtocolError(
+                f"frequency has {len(self.shape)} dimensions, must have 2: (n_cubes, n_pads)"
+            )
         n_cubes, n_pads = self.shape
         frequency = _array("frequency", self.frequency, _U32, (n_cubes, n_pads))
         pad_fault = _array("pad_fault", self.pad_fault, _U32, (n_cubes,))
@@ -171,7 +179,9 @@ class Sample:
         if size < _SAMPLE.size:
             return None
         sample = cls.__new__(cls)
-        sample.sequence, sample.first_cube, n_cubes, sample.device_us, n_pads = _SAMPLE.unpack_from(raw, 4)
+        sample.sequence, sample.first_cube, n_cubes, sample.device_us, n_pads = _SAMPLE.unpack_from(
+            raw, 4
+        )
         if size != _SAMPLE.size + n_cubes * (4 * n_pads + 6):
             return None
         sample.shape = n_cubes, n_pads
@@ -186,7 +196,8 @@ def _fields(n_cubes: int, n_pads: int) -> struct.Struct:
 
 
 def join(samples: Sequence[Sample]) -> _Arrays:
-    """frequency (N, P), pad_fault (N,) and temperature (N,) of all cubes of samples with P pads, one after the other.
+    """frequency (N, P), pad_fault (N,) and temperature (N,) of all cubes of samples with P pads,
+    one after the other.
 
     Decoded bytes become arrays once for all of them. Read-only where all were decoded.
     """
@@ -194,11 +205,15 @@ def join(samples: Sequence[Sample]) -> _Arrays:
     parts: list[bytes] = []
     for sample in samples:
         if not sample._raw:
-            frequency, pad_fault, temperature = zip(*(sample._made() for sample in samples), strict=True)
+            frequency, pad_fault, temperature = zip(
+                *(sample._made() for sample in samples), strict=True
+            )
             return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
         parts += _fields(*sample.shape).unpack(sample._raw)
     return (
-        np.frombuffer(b"".join(parts[::3]), _U32).reshape(sum(sample.n_cubes for sample in samples), width),
+        np.frombuffer(b"".join(parts[::3]), _U32).reshape(
+            sum(sample.n_cubes for sample in samples), width
+        ),
         np.frombuffer(b"".join(parts[1::3]), _U32),
         np.frombuffer(b"".join(parts[2::3]), _I16),
     )
@@ -206,8 +221,8 @@ def join(samples: Sequence[Sample]) -> _Arrays:
 
 @dataclass(frozen=True, slots=True)
 class Stats:
-    """The hub's own book: uptime_ms u64; samples taken u32 and dropped in the hub u32, since power-up,
-    wrapping; supply_mv u16, mV, 0 unknown."""
+    """The hub's own book: uptime_ms u64; samples taken u32 and dropped in the hub u32, since
+    power-up, wrapping; supply_mv u16, mV, 0 unknown."""
 
     uptime_ms: int
     taken: int
@@ -224,7 +239,8 @@ class Stats:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Host to hub: request u8 (a `Command`; other numbers pass, the hub answers UNKNOWN), argument u32."""
+    """Host to hub: request u8 (a `Command`; other numbers pass, the hub answers UNKNOWN), argument
+    u32."""
 
     request: int
     argument: int = 0
@@ -239,8 +255,8 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """Hub to host, one per REQUEST: its request u8, result u8 (a `Result`, 0 done), argument u32 now in
-    force."""
+    """Hub to host, one per REQUEST: its request u8, result u8 (a `Result`, 0 done), argument u32
+    now in force."""
 
     request: int
     result: int = 0
@@ -258,25 +274,30 @@ Frame = Hello | Sample | Stats | Request | Ack
 
 _TYPES: dict[int, type[Frame]] = {0x01: Hello, 0x02: Sample, 0x03: Stats, 0x10: Request, 0x11: Ack}
 _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
-UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {code: kind._unpack for code, kind in _TYPES.items()}
+UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
+    code: kind._unpack for code, kind in _TYPES.items()
+}
 
 
 def encode(frame: Frame, version: int = VERSION) -> bytes:
     """Bytes of one frame: a zero, the COBS code of header, payload and CRC-32, a zero.
 
-    The leading zero ends whatever half frame or garbage came before, which would otherwise swallow this
-    frame. version: another one than ours, to try the other end with. ProtocolError: a field out of its range,
-    an array of the wrong dtype or shape, a payload over 65535 bytes.
+    The leading zero ends whatever half frame or garbage came before, which would otherwise swallow
+    this frame. version: another one than ours, to try the other end with. ProtocolError: a field
+    out of its range, an array of the wrong dtype or shape, a payload over 65535 bytes.
     """
     code = _CODES.get(type(frame))
     if code is None:
         raise ProtocolError(
-            f"cannot encode {type(frame).__name__}; a frame is one of " + ", ".join(k.__name__ for k in _CODES)
+            f"cannot encode {type(frame).__name__}; a frame is one of "
+            + ", ".join(k.__name__ for k in _CODES)
         )
     try:
         payload = frame._pack()
     except struct.error as error:
-        raise ProtocolError(f"{type(frame).__name__}: {error}; see the field ranges in its docstring") from error
+        raise ProtocolError(
+            f"{type(frame).__name__}: {error}; see the field ranges in its docstring"
+        ) from error
     if len(payload) > MAX_PAYLOAD:
         raise ProtocolError(
             f"{type(frame).__name__} payload has {len(payload)} bytes, the limit is {MAX_PAYLOAD}: "
@@ -289,6 +310,12 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
 
 def _array(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != shape:
-        found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-        raise ProtocolError(f"{name} is {found}, must be an array of {dtype.name} {shape}; convert and round it first")
+        found = (
+            f"{value.dtype} {value.shape}"
+            if isinstance(value, np.ndarray)
+            else type(value).__name__
+        )
+        raise ProtocolError(
+            f"{name} is {found}, must be an array of {dtype.name} {shape}; convert and round it first"
+        )
     return value

@@ -1,9 +1,11 @@
-"""The one thread that reads all links: opens and reopens them, decodes, and calls back once per wake-up.
+"""The one thread that reads all links: opens and reopens them, decodes, and calls back once per
+wake-up.
 
-Each link is brought up the same way after every opening: ask for HELLO; on HELLO send what the hub should do
-(period, start or stop). A hub that restarts behind an open port falls silent, and its next HELLO brings it up
-again. No link waits for another: ports are read without blocking, a TCP connection is made without blocking,
-and what one link does not take stays in its own bounded buffer.
+Each link is brought up the same way after every opening: ask for HELLO; on HELLO send what the hub
+should do (period, start or stop). A hub that restarts behind an open port falls silent, and its
+next HELLO brings it up again. No link waits for another: ports are read without blocking, a TCP
+connection is made without blocking, and what one link does not take stays in its own bounded
+buffer.
 """
 
 from __future__ import annotations
@@ -31,10 +33,12 @@ REOPEN_S = 5.0
 LOOK_S = 0.25
 """How often a waiting link looks whether its port has come back."""
 GATHER = 0.2, 1e-3
-"""Hubs sample together, but their bytes come one by one. Who comes first waits so long for the others, as a share of
+"""Hubs sample together, but their bytes come one by one. Who comes first waits so long for the
+others, as a share of
 the sample period and in s at most: one message for all instead of several."""
 GATHER_STEP_S = 2e-4
-"""They are looked for at this interval, instead of a wake-up for each; arrival may look later by that."""
+"""They are looked for at this interval, instead of a wake-up for each; arrival may look later by
+that."""
 NO_WAIT_S = 5e-5
 """A wait for data shorter than this was none."""
 DRAIN_S = 0.05
@@ -44,7 +48,8 @@ CLOSE_S = 1.5
 Taken = list[tuple[int, int, bytes | LinkError]]
 """Link index, arrival in ns, and what one read of this link gave."""
 Arrivals = list[tuple[int, int, list[Frame]]]
-"""Link index, arrival in ns, and the frames that one read of this link completed; one or several of each link."""
+"""Link index, arrival in ns, and the frames that one read of this link completed; one or several of
+each link."""
 OnFrames = Callable[[Arrivals], None]
 OnState = Callable[[int, LinkState, LinkError | None], None]
 
@@ -52,7 +57,8 @@ _log = logging.getLogger(__name__)
 
 
 class _Session:
-    """What the reader remembers of one link between wake-ups; times are time.monotonic() seconds."""
+    """What the reader remembers of one link between wake-ups; times are time.monotonic()
+    seconds."""
 
     def __init__(self, period_us: int | None) -> None:
         self.period_us = period_us  # to ask for, None leaves the hub's own
@@ -71,11 +77,12 @@ class _Session:
 class Reader:
     """Reads all links in one thread.
 
-    on_frames: called once per wake-up with `Arrivals`, in order of arrival per link. on_state: called with (link index,
-    LinkState, LinkError or None) when a link's state, or why it waits, changes. Both run in the reader's thread and
-    must return soon; an exception in them is logged and the reader goes on. clock_ns: the clock of arrival times, read
-    after the bytes, so that arrival is never earlier than true. period_us: sample period to set on every hub, None
-    leaves the hub's own.
+    on_frames: called once per wake-up with `Arrivals`, in order of arrival per link. on_state:
+    called with (link index, LinkState, LinkError or None) when a link's state, or why it waits,
+    changes. Both run in the reader's thread and must return soon; an exception in them is logged
+    and the reader goes on. clock_ns: the clock of arrival times, read after the bytes, so that
+    arrival is never earlier than true. period_us: sample period to set on every hub, None leaves
+    the hub's own.
 
     failure: what ended the thread though nobody asked it to end, None while all is well.
     """
@@ -101,23 +108,29 @@ class Reader:
         self._wake_write = -1
 
     def start(self) -> None:
-        """Begin. A reader runs once; make a new one to start again. LinkError `closed` otherwise."""
+        """Begin. A reader runs once; make a new one to start again. LinkError `closed`
+        otherwise."""
         if self._thread is not None:
             raise LinkError("a reader starts once: make a new Reader", "closed")
         wake_read, self._wake_write = os.pipe()
         os.set_blocking(wake_read, False)
         os.set_blocking(self._wake_write, False)
-        self._thread = threading.Thread(target=self._run, args=(wake_read,), name="cube reader", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, args=(wake_read,), name="cube reader", daemon=True
+        )
         self._thread.start()
 
     def send(self, link: int, request: Request) -> None:
-        """Send a request, from any thread. Start, stop and set period are remembered and sent again after
-        each reopening; so they may be given while the link is down. LinkError `closed`: any other request
-        then."""
+        """Send a request, from any thread. Start, stop and set period are remembered and sent again
+        after each reopening; so they may be given while the link is down. LinkError `closed`: any
+        other request then."""
         target = self.links[link]
         remembered = request.request in (Command.START, Command.STOP, Command.SET_PERIOD)
         if not remembered and not target.is_open:
-            raise LinkError(f"link {target.config.name!r} is {target.state.value}: wait until it opens", "closed")
+            raise LinkError(
+                f"link {target.config.name!r} is {target.state.value}: wait until it opens",
+                "closed",
+            )
         self._requests.append((link, request))
         self._wake()
 
@@ -130,7 +143,9 @@ class Reader:
         if thread is not None and thread is not threading.current_thread():
             thread.join(CLOSE_S)
             if thread.is_alive():
-                _log.error("the reader did not end within %.1f s: a port hangs in the kernel", CLOSE_S)
+                _log.error(
+                    "the reader did not end within %.1f s: a port hangs in the kernel", CLOSE_S
+                )
 
     def _wake(self) -> None:
         # The lock keeps a late send from writing to a number that the closed pipe has given back.
@@ -174,7 +189,10 @@ class Reader:
             self._shut(selector, wake_read)
 
     def _take(
-        self, selector: selectors.BaseSelector, ready: list[tuple[selectors.SelectorKey, int]], wake_read: int
+        self,
+        selector: selectors.BaseSelector,
+        ready: list[tuple[selectors.SelectorKey, int]],
+        wake_read: int,
     ) -> Taken:
         """All there is of the links that are ready."""
         taken: list[tuple[int, bytes | LinkError]] = []
@@ -196,8 +214,11 @@ class Reader:
         arrival_ns = self._clock_ns() if taken else 0
         return [(i, arrival_ns, data) for i, data in taken]
 
-    def _decode(self, selector: selectors.BaseSelector, taken: Taken) -> tuple[Arrivals, dict[int, LinkError]]:
-        """Look at what was taken, all at once: after each wait Python's code and data are far from the processor.
+    def _decode(
+        self, selector: selectors.BaseSelector, taken: Taken
+    ) -> tuple[Arrivals, dict[int, LinkError]]:
+        """Look at what was taken, all at once: after each wait Python's code and data are far from
+        the processor.
 
         Returns the frames, and the links to close with the reason of each.
         """
@@ -234,13 +255,17 @@ class Reader:
         late = [
             session.actual_us
             for i, (link, session) in enumerate(zip(self.links, self._sessions, strict=True))
-            if i not in came and link.state is LinkState.OPEN and session.greeted and session.started
+            if i not in came
+            and link.state is LinkState.OPEN
+            and session.greeted
+            and session.started
         ]
         share, most = GATHER
         return min(1e-6 * share * min(late), most) if late else 0.0
 
     def _note(self, i: int, frame: Frame) -> bool:
-        """What a frame means for the link itself; whether to deliver it. LinkError: close the link."""
+        """What a frame means for the link itself; whether to deliver it. LinkError: close the
+        link."""
         link, session = self.links[i], self._sessions[i]
         if isinstance(frame, Sample):
             session.last_sample = session.last_byte
@@ -265,7 +290,11 @@ class Reader:
             if not session.greeted or link.state is LinkState.SILENT or other_period:
                 session.greeted = True
                 self._configure(i)
-        elif isinstance(frame, Ack) and frame.request == Command.SET_PERIOD and frame.result == Result.DONE:
+        elif (
+            isinstance(frame, Ack)
+            and frame.request == Command.SET_PERIOD
+            and frame.result == Result.DONE
+        ):
             session.actual_us = frame.argument
         return True
 
@@ -300,10 +329,18 @@ class Reader:
             if not link.is_open:
                 self._try_open(selector, i, now)
                 return
-            if session.started and link.state is LinkState.OPEN and now - session.last_sample > session.silent_after():
+            if (
+                session.started
+                and link.state is LinkState.OPEN
+                and now - session.last_sample > session.silent_after()
+            ):
                 link.silences += 1
                 session.hello_at = now
-                period = f"sample period {session.actual_us} µs" if session.actual_us else "sample period not known yet"
+                period = (
+                    f"sample period {session.actual_us} µs"
+                    if session.actual_us
+                    else "sample period not known yet"
+                )
                 self._set_state(
                     i,
                     LinkState.SILENT,
@@ -373,7 +410,9 @@ class Reader:
         link, session = self.links[i], self._sessions[i]
         if link.unsent != session.watching_writes:
             session.watching_writes = link.unsent
-            selector.modify(link, selectors.EVENT_READ | (selectors.EVENT_WRITE if link.unsent else 0), i)
+            selector.modify(
+                link, selectors.EVENT_READ | (selectors.EVENT_WRITE if link.unsent else 0), i
+            )
 
     def _set_state(self, i: int, state: LinkState, error: LinkError | None) -> None:
         link = self.links[i]

@@ -1,4 +1,5 @@
-"""Accounting of one hub's samples: which are new, which came twice or late, how many are missing and why."""
+"""Accounting of one hub's samples: which are new, which came twice or late, how many are missing
+and why."""
 
 from __future__ import annotations
 
@@ -9,16 +10,18 @@ from enum import Enum
 from .protocol import Sample, Stats
 
 MEMORY = 64
-"""Samples remembered; what arrives later than that after its turn belongs to a hub that restarted."""
+"""Samples remembered; what arrives later than that after its turn belongs to a hub that
+restarted."""
 MAX_GAP = 1 << 20
 """A longer gap (17 minutes at 1 kHz) is a hub that restarted, not loss."""
 RESTART_US = 1_000_000
-"""A sample from before the first seen is late if its time is no further back than this, else of a new run."""
+"""A sample from before the first seen is late if its time is no further back than this, else of a
+new run."""
 
 
 class Verdict(str, Enum):
-    """new: next in turn, or after a gap. late: out of order, had been counted missing. duplicate: do not
-    deliver. reset: the hub restarted and this is the first sample of its new count."""
+    """new: next in turn, or after a gap. late: out of order, had been counted missing. duplicate:
+    do not deliver. reset: the hub restarted and this is the first sample of its new count."""
 
     NEW = "new"
     LATE = "late"
@@ -28,9 +31,10 @@ class Verdict(str, Enum):
 
 @dataclass(slots=True)
 class SequenceCounters:
-    """Samples. At any time taken by the hub since the first seen = delivered + missing; received = delivered
-    + duplicate. `out_of_order` are among the delivered. Of what a restart lost, the samples since power-up are
-    among the missing; those that the hub took last before it restarted nobody can know."""
+    """Samples. At any time taken by the hub since the first seen = delivered + missing; received =
+    delivered + duplicate. `out_of_order` are among the delivered. Of what a restart lost, the
+    samples since power-up are among the missing; those that the hub took last before it restarted
+    nobody can know."""
 
     delivered: int = 0
     missing: int = 0
@@ -52,8 +56,11 @@ class SequenceTracker:
         self._newest_us = 0
 
     def update(self, sequence: int, device_us: int) -> Verdict:
-        """Judge one SAMPLE by its sequence number (u32) and device time (µs), and count it. Constant time."""
-        if sequence == self._next % 0x1_0000_0000 and device_us >= self._newest_us:  # as it mostly is
+        """Judge one SAMPLE by its sequence number (u32) and device time (µs), and count it.
+        Constant time."""
+        if (
+            sequence == self._next % 0x1_0000_0000 and device_us >= self._newest_us
+        ):  # as it mostly is
             self._next, self._newest_us = self._next + 1, device_us
             return self._deliver(self._next - 1, device_us, Verdict.NEW)
         if not self._seen:
@@ -92,12 +99,15 @@ class SequenceTracker:
         return self._first
 
     def _fits(self, number: int, device_us: int) -> bool:
-        """Whether a sample from before the newest is of the same run: its time lies where its number does."""
+        """Whether a sample from before the newest is of the same run: its time lies where its
+        number does."""
         if any(other == number for other, _ in self._seen):
             return False
         if number < self._first:
             return 0 <= self._newest_us - device_us < RESTART_US
-        return all((us <= device_us) if other < number else (us >= device_us) for other, us in self._seen)
+        return all(
+            (us <= device_us) if other < number else (us >= device_us) for other, us in self._seen
+        )
 
     def _restart(self, sequence: int, device_us: int) -> Verdict:
         self.counters.resets += 1
@@ -120,9 +130,11 @@ class SequenceTracker:
 
 
 class Account:
-    """The book of one link: every sample the hub took is delivered, dropped in the hub, or lost on the way.
+    """The book of one link: every sample the hub took is delivered, dropped in the hub, or lost on
+    the way.
 
-    A hub with many cubes spreads a sample over several frames; each counts here, for itself, as a sample.
+    A hub with many cubes spreads a sample over several frames; each counts here, for itself, as a
+    sample.
     """
 
     def __init__(self) -> None:
@@ -144,11 +156,15 @@ class Account:
         """Compare with the hub's own book."""
         last, self.stats_frame = self.stats_frame, frame
         if last is None and all(tracker.first for tracker in self._trackers.values()):
-            self._dropped_before = frame.dropped  # we joined late: what was dropped before is not ours to count
+            self._dropped_before = (
+                frame.dropped
+            )  # we joined late: what was dropped before is not ours to count
         elif last is not None and frame.uptime_ms < last.uptime_ms:
             self._dropped_before = 0  # it restarted, perhaps before any sample of the new run came
             return
-        self._dropped += (frame.dropped - self._dropped_before) % 0x1_0000_0000 * len(self._trackers)
+        self._dropped += (
+            (frame.dropped - self._dropped_before) % 0x1_0000_0000 * len(self._trackers)
+        )
         self._dropped_before = frame.dropped
         for tracker in self._trackers.values():
             tracker.book(frame.taken)
@@ -158,13 +174,21 @@ class Account:
         return sum(tracker.counters.resets for tracker in self._trackers.values())
 
     def counters(self) -> dict[str, int]:
-        """taken = delivered + dropped_in_hub + lost_on_the_way; received = delivered + duplicate."""
+        """taken = delivered + dropped_in_hub + lost_on_the_way; received = delivered +
+        duplicate."""
         parts = [tracker.counters for tracker in list(self._trackers.values())]
-        total = {name: sum(getattr(part, name) for part in parts) for name in SequenceCounters().as_dict()}
+        total = {
+            name: sum(getattr(part, name) for part in parts)
+            for name in SequenceCounters().as_dict()
+        }
         missing = total.pop("missing")
         # Until the next STATS a drop looks like loss, never the other way round.
         dropped = min(self._dropped, missing)
-        book = {"taken": total["delivered"] + missing, "dropped_in_hub": dropped, "lost_on_the_way": missing - dropped}
+        book = {
+            "taken": total["delivered"] + missing,
+            "dropped_in_hub": dropped,
+            "lost_on_the_way": missing - dropped,
+        }
         return {**book, **total}
 
     def contradictions(self) -> list[str]:

@@ -1,7 +1,7 @@
 """A TCP connection made without ever blocking the caller.
 
-pyserial's own ``socket://`` blocks up to 5 s in connect and in name look-up, which would hold up every other
-link of the reader thread; a plain non-blocking socket does not.
+pyserial's own ``socket://`` blocks up to 5 s in connect and in name look-up, which would hold up
+every other link of the reader thread; a plain non-blocking socket does not.
 """
 
 from __future__ import annotations
@@ -22,23 +22,26 @@ CONNECT_TIMEOUT_S = 2.0
 
 
 def parse_url(url: str) -> tuple[str, int]:
-    """Host and port of ``socket://host:port`` (IPv6 hosts in brackets). LinkError `bad_port` if it is
-    none."""
+    """Host and port of ``socket://host:port`` (IPv6 hosts in brackets). LinkError `bad_port` if it
+    is none."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
         host, port = None, None
     if not host or not port:
-        raise LinkError(f"{url!r} is no TCP address: write socket://host:port with a port from 1 to 65535", "bad_port")
+        raise LinkError(
+            f"{url!r} is no TCP address: write socket://host:port with a port from 1 to 65535",
+            "bad_port",
+        )
     return host, port
 
 
 class Connecting:
     """One attempt to connect; call `poll` until it gives the socket.
 
-    Numeric hosts are taken at once. A name is looked up in a thread of its own that ends with the look-up,
-    because the system's resolver can block for half a minute and cannot be cancelled.
+    Numeric hosts are taken at once. A name is looked up in a thread of its own that ends with the
+    look-up, because the system's resolver can block for half a minute and cannot be cancelled.
     """
 
     def __init__(self, url: str) -> None:
@@ -51,10 +54,13 @@ class Connecting:
         try:
             self._addresses = self._look_up(socket.AI_NUMERICHOST)
         except socket.gaierror:
-            threading.Thread(target=self._resolve, name=f"resolve {self._host}", daemon=True).start()
+            threading.Thread(
+                target=self._resolve, name=f"resolve {self._host}", daemon=True
+            ).start()
 
     def poll(self) -> socket.socket | None:
-        """The connected, non-blocking socket, None while under way. LinkError when no address answers."""
+        """The connected, non-blocking socket, None while under way. LinkError when no address
+        answers."""
         if self._addresses is None:
             if self._error:
                 raise self._error
@@ -62,7 +68,9 @@ class Connecting:
         while True:
             if self._socket is None:
                 if not self._addresses:
-                    raise self._error or LinkError(f"{self._url}: {self._host} has no address", "unresolved")
+                    raise self._error or LinkError(
+                        f"{self._url}: {self._host} has no address", "unresolved"
+                    )
                 self._start(self._addresses.pop(0))
             if self._socket is not None:
                 code = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
@@ -84,7 +92,9 @@ class Connecting:
             self._socket = None
 
     def _look_up(self, flags: int) -> list[Any]:
-        return list(socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=flags))
+        return list(
+            socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=flags)
+        )
 
     def _resolve(self) -> None:
         try:

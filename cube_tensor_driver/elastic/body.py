@@ -14,9 +14,15 @@ from ..core.errors import ElasticError
 from ..core.layout import Layout
 from .mesh import block, section
 
-_SPACE_MESHES = ((0.5, 0.2, 3.0), (0.25, 0.2, 2.0), (0.25, 0.1, 1.5))  # brick on a face, at an edge, growth
+_SPACE_MESHES = (
+    (0.5, 0.2, 3.0),
+    (0.25, 0.2, 2.0),
+    (0.25, 0.1, 1.5),
+)  # brick on a face, at an edge, growth
 _FINEST = 1e-3  # distance of two pad edges, d0
-_FIRST_BYTES = 3e8  # of memory, whatever the mesh: SuperLU hangs where less of it can be had, measured
+_FIRST_BYTES = (
+    3e8  # of memory, whatever the mesh: SuperLU hangs where less of it can be had, measured
+)
 _BYTES = {2: 3e5, 3: 8e5}  # of memory per corner of an element at the peak, measured
 
 
@@ -25,7 +31,8 @@ class Body:
     """A box of elastomer with a cube bonded in its middle; lengths in m, moduli in Pa.
 
     width, depth, height: along x, y and z (depth in 3-D only); side: of the cube
-    young, poisson: of the body; cube_young, cube_poisson: of the cube, cube_young = inf makes it rigid
+    young, poisson: of the body; cube_young, cube_poisson: of the cube, cube_young = inf makes it
+    rigid
     plane: "strain" or "stress", for layouts in a plane
     Raises ElasticError when no such body can be computed.
     """
@@ -63,14 +70,18 @@ class Body:
 
 
 def strip_layout(layout: Layout, width: float, centre: float = 0.5) -> Layout:
-    """The same layout with pads of another width and distance from the middle of the face, in units of d0.
+    """The same layout with pads of another width and distance from the middle of the face, in units
+    of d0.
 
-    The halves of each face are width = 1, centre = 0.5. Raises LayoutError when a pad leaves its face.
+    The halves of each face are width = 1, centre = 0.5. Raises LayoutError when a pad leaves its
+    face.
     """
     normals = layout.normals
     across = layout.positions - normals
     length = np.linalg.norm(across, axis=1, keepdims=True)
-    return Layout(layout.name, normals + centre * across / np.where(length > 0, length, 1.0), normals, width)
+    return Layout(
+        layout.name, normals + centre * across / np.where(length > 0, length, 1.0), normals, width
+    )
 
 
 def field_axes(layout: Layout) -> tuple[int, ...]:
@@ -78,11 +89,14 @@ def field_axes(layout: Layout) -> tuple[int, ...]:
 
 
 def check_pads(body: Body, layout: Layout) -> None:
-    """Pads of one face must not share area: square ones overlap when both distances are below their side."""
+    """Pads of one face must not share area: square ones overlap when both distances are below their
+    side."""
     mm = 1e3 * body.side / 2
     for i, j in itertools.combinations(range(layout.n_pads), 2):
         gap = np.abs(layout.positions[i] - layout.positions[j]).max()
-        if np.array_equal(layout.normals[i], layout.normals[j]) and gap < layout.pad_size * (1 - 1e-9):
+        if np.array_equal(layout.normals[i], layout.normals[j]) and gap < layout.pad_size * (
+            1 - 1e-9
+        ):
             raise ElasticError(
                 f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {mm * layout.pad_size:g} mm wide, "
                 f"{mm * gap:g} mm apart; make them narrower or move them apart"
@@ -90,7 +104,8 @@ def check_pads(body: Body, layout: Layout) -> None:
 
 
 def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
-    """Mesh of the body: level 0 is the coarsest, 2 the finest. ElasticError when the pads are too fine for it."""
+    """Mesh of the body: level 0 is the coarsest, 2 the finest. ElasticError when the pads are too
+    fine for it."""
     axes = field_axes(layout)
     half = [(body.width, body.depth, body.height)[k] / body.side for k in axes]
     edges = [
@@ -108,15 +123,21 @@ def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
             f"pad edges are {mm * steps.min():.2g} mm apart and the mesh resolves {mm * _FINEST:g} mm; "
             "make the pads wider, or move their edges together or apart"
         )
-    return section(half, stops, level) if layout.planar else block(half, stops, *_SPACE_MESHES[level])
+    return (
+        section(half, stops, level) if layout.planar else block(half, stops, *_SPACE_MESHES[level])
+    )
 
 
 def check_memory(grid: skfem.Mesh, per_corner: float | None = None) -> None:
-    """ElasticError, before any work: too little memory. per_corner: bytes, by default of the response's solver.
+    """ElasticError, before any work: too little memory. per_corner: bytes, by default of the
+    response's solver.
 
     SuperLU must not run into a limit: it may look for memory for ever.
     """
-    need, have = _FIRST_BYTES + grid.nvertices * (per_corner or _BYTES[int(grid.dim())]), available_memory()
+    need, have = (
+        _FIRST_BYTES + grid.nvertices * (per_corner or _BYTES[int(grid.dim())]),
+        available_memory(),
+    )
     if have is not None and need > have:
         raise ElasticError(
             f"this needs about {need / 1e9:.2g} GB of memory and {max(have, 0.0) / 1e9:.2g} GB are available; "
@@ -125,14 +146,19 @@ def check_memory(grid: skfem.Mesh, per_corner: float | None = None) -> None:
 
 
 def available_memory() -> float | None:
-    """Bytes that this process may still take: of the machine, and of its own limit. None: nothing is known."""
+    """Bytes that this process may still take: of the machine, and of its own limit. None: nothing
+    is known."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        free = next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+        free = next(
+            1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable")
+        )
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return free
-        taken = resource.getpagesize() * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        taken = resource.getpagesize() * int(
+            Path("/proc/self/statm").read_text(encoding="ascii").split()[0]
+        )
         return min(free, float(limit - taken))
     except (OSError, StopIteration):
         return None  # not Linux: nothing is known, so nothing is refused

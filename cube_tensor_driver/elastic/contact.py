@@ -1,20 +1,21 @@
 """Stress and stress gradient in a half space under contact loads on its surface.
 
-The skin is the half space z <= 0 in the cube frame: z points out of the skin, its surface is z = 0 and a
-cube sits at z = -depth. A force acts *on* the skin, so pressing has a negative z component.
+The skin is the half space z <= 0 in the cube frame: z points out of the skin, its surface is z = 0
+and a cube sits at z = -depth. A force acts *on* the skin, so pressing has a negative z component.
 
-With d = point - source, R = |d|, Z = -d_z and the harmonic potential chi = Z ln(R + Z) - R, the solutions
-of Boussinesq (normal force) and Cerruti (tangential force) are one expression::
+With d = point - source, R = |d|, Z = -d_z and the harmonic potential chi = Z ln(R + Z) - R, the
+solutions of Boussinesq (normal force) and Cerruti (tangential force) are one expression::
 
     sigma_ij = -3 / (2 pi) d_i d_j (F . d) / R^5  +  (1 - 2 nu) / (2 pi) C_ij
     C_xx = g_yy,  C_yy = g_xx,  C_xy = -g_xy,  C_zi = 0,   g = F_x chi_x + F_y chi_y - F_z chi_Z
 
-The first term is the whole answer in an incompressible body; the second is a plane stress field with the
-Airy function g, so it balances by itself and leaves every plane z = const free of traction.
+The first term is the whole answer in an incompressible body; the second is a plane stress field
+with the Airy function g, so it balances by itself and leaves every plane z = const free of
+traction.
 
-Source: K. L. Johnson, Contact Mechanics (1985), 3.2 (normal) and 3.6 (tangential); A. E. H. Love, Phil.
-Trans. R. Soc. A 228 (1929) 377. They print the components; the form with g is ours, and the tests hold it
-to their components.
+Source: K. L. Johnson, Contact Mechanics (1985), 3.2 (normal) and 3.6 (tangential); A. E. H. Love,
+Phil. Trans. R. Soc. A 228 (1929) 377. They print the components; the form with g is ours, and the
+tests hold it to their components.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ Array = NDArray[np.float64]
 _PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # xx, yy, zz, yz, zx, xy
 
 
-def field(points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: float) -> tuple[Array, Array]:
+def field(
+    points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: float
+) -> tuple[Array, Array]:
     """Stress and its gradient at points under point forces on the surface.
 
     points   (..., N, 3) m, z <= 0
@@ -38,8 +41,8 @@ def field(points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: flo
     poisson  Poisson's ratio, -1 < nu <= 0.5; Young's modulus does not enter
 
     Returns stress (..., N, 6) in Pa, order xx yy zz yz zx xy, tension positive, and its gradient
-    (..., N, 6, 3) in Pa/m: the last axis is the direction of the derivative. Leading axes broadcast (time,
-    say); memory is about 500 bytes per pair of point and force.
+    (..., N, 6, 3) in Pa/m: the last axis is the direction of the derivative. Leading axes broadcast
+    (time, say); memory is about 500 bytes per pair of point and force.
 
     Raises ElasticError for a point above the surface or on a source, a source off the surface, or a
     Poisson's ratio out of range.
@@ -50,7 +53,9 @@ def field(points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: flo
     f = f[..., None, :, :]
     radius = np.sqrt(np.einsum("...i,...i->...", d, d))
     if not np.all(radius > 0.0):
-        raise ElasticError("a point lies on a point force, where the stress is infinite; move it below the surface")
+        raise ElasticError(
+            "a point lies on a point force, where the stress is infinite; move it below the surface"
+        )
     stress, gradient = _radial(d, f, radius)
     if poisson != 0.5:
         airy_stress, airy_gradient = _airy(d, f, radius)
@@ -60,17 +65,22 @@ def field(points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: flo
     return stress, gradient
 
 
-def disc(radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6) -> tuple[Array, Array]:
-    """Uniform traction on a disc as point forces: (sources (L, 3) m, forces (L, 3) N), L = 4 order^2.
+def disc(
+    radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6
+) -> tuple[Array, Array]:
+    """Uniform traction on a disc as point forces: (sources (L, 3) m, forces (L, 3) N), L = 4
+    order^2.
 
-    Gauss points in r^2 and equally spaced angles: the error falls exponentially with `order` at points
-    deeper than the spacing. Raises ElasticError unless radius > 0 and order >= 1.
+    Gauss points in r^2 and equally spaced angles: the error falls exponentially with `order` at
+    points deeper than the spacing. Raises ElasticError unless radius > 0 and order >= 1.
     """
     t, weight = _gauss(order)
     return _rings(radius, np.sqrt(t), weight, force, centre)
 
 
-def hertz(radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6) -> tuple[Array, Array]:
+def hertz(
+    radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6
+) -> tuple[Array, Array]:
     """Traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2) on a disc: a sphere that presses or slides.
 
     Same result and errors as `disc`; Johnson 4.2 (normal) and 7.1 (sliding).
@@ -82,7 +92,8 @@ def hertz(radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order
 def rectangle(
     sides: ArrayLike, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 8
 ) -> tuple[Array, Array]:
-    """Uniform traction on a rectangle of sides (x, y) m as point forces, L = order^2; see `disc`."""
+    """Uniform traction on a rectangle of sides (x, y) m as point forces, L = order^2; see
+    `disc`."""
     length = np.asarray(sides, dtype=np.float64)
     if length.shape != (2,) or not np.all(length > 0.0):
         raise ElasticError(f"rectangle sides are {sides!r}; give two positive lengths in m")
@@ -94,19 +105,26 @@ def rectangle(
 def _check(points: Array, sources: Array, forces: Array, poisson: float) -> None:
     for name, a in (("points", points), ("sources", sources), ("forces", forces)):
         if a.ndim < 2 or a.shape[-1] != 3 or not np.all(np.isfinite(a)):
-            raise ElasticError(f"{name} have shape {a.shape}; give finite numbers of shape (..., n, 3)")
+            raise ElasticError(
+                f"{name} have shape {a.shape}; give finite numbers of shape (..., n, 3)"
+            )
     if sources.shape[-2] != forces.shape[-2]:
-        raise ElasticError(f"{sources.shape[-2]} sources but {forces.shape[-2]} forces; give one force per source")
+        raise ElasticError(
+            f"{sources.shape[-2]} sources but {forces.shape[-2]} forces; give one force per source"
+        )
     if not -1.0 < poisson <= 0.5:
         raise ElasticError(f"Poisson's ratio is {poisson}; it must lie in (-1, 0.5]")
     if np.any(points[..., 2] > 0.0):
-        raise ElasticError(f"a point is at z = {points[..., 2].max():g} m; the skin is z <= 0, depths are negative z")
+        raise ElasticError(
+            f"a point is at z = {points[..., 2].max():g} m; the skin is z <= 0, depths are negative z"
+        )
     if np.any(sources[..., 2] != 0.0):
         raise ElasticError("a force acts off the surface; sources must have z = 0")
 
 
 def _radial(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
-    """The first term, all there is in an incompressible body, and its gradient; summed over forces."""
+    """The first term, all there is in an incompressible body, and its gradient; summed over
+    forces."""
     k = -3.0 / (2.0 * np.pi)
     pair = np.stack([d[..., i] * d[..., j] for i, j in _PAIRS], axis=-2)  # (..., N, 6, L)
     weight = k * np.einsum("...i,...i->...", d, f) / radius**5
@@ -123,8 +141,9 @@ def _radial(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
 def _airy(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
     """The field C_ij of the module head and its gradient, summed over forces.
 
-    In a plane Z = const a function of r has the derivatives h_ab = delta_ab h1 + d_a d_b h2 and so on, where
-    h1 = h'/r, h2 = h1'/r, ...; below they are those of chi, chi_Z = ln(R + Z) and chi_ZZ = 1/R.
+    In a plane Z = const a function of r has the derivatives h_ab = delta_ab h1 + d_a d_b h2 and so
+    on, where h1 = h'/r, h2 = h1'/r, ...; below they are those of chi, chi_Z = ln(R + Z) and chi_ZZ
+    = 1/R.
     """
     x, y, z = np.moveaxis(d, -1, 0)
     fx, fy, fz = np.moveaxis(np.broadcast_to(f, d.shape), -1, 0)
@@ -151,7 +170,14 @@ def _airy(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
     gxyy = _sum(chi2 * fx + a * x + chi3 * y * (y * fx + 2 * x * fy) + b * x * y * y)
     zero = np.zeros_like(gxx)
     stress = np.stack([gyy, gxx, zero, zero, zero, -gxy], axis=-1)
-    rows = [[gxyy, gyyy, gyyz], [gxxx, gxxy, gxxz], [zero] * 3, [zero] * 3, [zero] * 3, [-gxxy, -gxyy, -gxyz]]
+    rows = [
+        [gxyy, gyyy, gyyz],
+        [gxxx, gxxy, gxxz],
+        [zero] * 3,
+        [zero] * 3,
+        [zero] * 3,
+        [-gxxy, -gxyy, -gxyz],
+    ]
     return stress, np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
@@ -167,7 +193,9 @@ def _gauss(order: int) -> tuple[Array, Array]:
     return (t + 1.0) / 2.0, weight / 2.0
 
 
-def _rings(radius: float, r: Array, weight: Array, force: ArrayLike, centre: ArrayLike) -> tuple[Array, Array]:
+def _rings(
+    radius: float, r: Array, weight: Array, force: ArrayLike, centre: ArrayLike
+) -> tuple[Array, Array]:
     if not radius > 0.0:
         raise ElasticError(f"patch radius is {radius} m; it must be positive")
     n = 4 * len(r)
@@ -176,7 +204,9 @@ def _rings(radius: float, r: Array, weight: Array, force: ArrayLike, centre: Arr
     return _patch(radius * x.ravel(), radius * y.ravel(), np.repeat(weight / n, n), force, centre)
 
 
-def _patch(x: Array, y: Array, share: Array, force: ArrayLike, centre: ArrayLike) -> tuple[Array, Array]:
+def _patch(
+    x: Array, y: Array, share: Array, force: ArrayLike, centre: ArrayLike
+) -> tuple[Array, Array]:
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
     sources = np.stack([cx + x, cy + y, np.zeros_like(x)], axis=-1)
     return sources, share[:, None] * np.asarray(force, dtype=np.float64)

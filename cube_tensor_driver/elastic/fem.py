@@ -1,7 +1,8 @@
-"""The response matrix of a cube in a body, computed: the mean normal stress of every pad under every mode.
+"""The response matrix of a cube in a body, computed: the mean normal stress of every pad under
+every mode.
 
-The body is a box with the cube bonded in its middle, loaded on its outer faces by the tractions of each mode;
-that is the field which would be everywhere in the body if the cube were not there.
+The body is a box with the cube bonded in its middle, loaded on its outer faces by the tractions of
+each mode; that is the field which would be everywhere in the body if the cube were not there.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ class Response:
     """A computed response matrix.
 
     matrix: (pads, modes), Pa per Pa, tension positive, gradients times d0
-    coefficients, structure_residual: its projection on the matrices that `symmetry` allows, and the relative
-    part that is left; mode_residual: that part for each mode
-    rank: number of independent states the pads see; unobservable: modes that cannot be told, by name
-    convergence: one row per mesh: unknowns, seconds, coefficients, and `change`, the largest change of an
-    entry to the next finer mesh relative to the largest entry (None for the last)
+    coefficients, structure_residual: its projection on the matrices that `symmetry` allows, and the
+    relative part that is left; mode_residual: that part for each mode
+    rank: number of independent states the pads see; unobservable: modes that cannot be told, by
+    name
+    convergence: one row per mesh: unknowns, seconds, coefficients, and `change`, the largest change
+    of an entry to the next finer mesh relative to the largest entry (None for the last)
     """
 
     body: Body
@@ -68,17 +70,25 @@ class Response:
             "mode_residual": self.mode_residual,
             "rank": self.rank,
             "unobservable": list(self.unobservable),
-            "body": {name: None if value == np.inf else value for name, value in vars(self.body).items()},
+            "body": {
+                name: None if value == np.inf else value for name, value in vars(self.body).items()
+            },
         }
 
 
 def compute_response(
-    body: Body, layout: Layout, symmetry: str = "full", meshes: int = 3, progress: Progress | None = None
+    body: Body,
+    layout: Layout,
+    symmetry: str = "full",
+    meshes: int = 3,
+    progress: Progress | None = None,
 ) -> Response:
-    """Response of a layout in a body on `meshes` meshes, 1 to 3; the last, finest one is the result.
+    """Response of a layout in a body on `meshes` meshes, 1 to 3; the last, finest one is the
+    result.
 
-    progress(done, total, what) is called before every solve and at the end. Raises ElasticError when pads
-    overlap or the mesh would not fit into memory, SymmetryError when the layout does not have the symmetry.
+    progress(done, total, what) is called before every solve and at the end. Raises ElasticError
+    when pads overlap or the mesh would not fit into memory, SymmetryError when the layout does not
+    have the symmetry.
     """
     start = time.perf_counter()
     structure = find_structure(layout, symmetry)
@@ -92,7 +102,9 @@ def compute_response(
 
     def report(what: str) -> None:
         if progress is not None:
-            progress(next(done), total, f"mesh {len(matrices) + 1}, {what}" if what != "done" else what)
+            progress(
+                next(done), total, f"mesh {len(matrices) + 1}, {what}" if what != "done" else what
+            )
 
     rows: list[dict[str, Any]] = []
     for grid in grids:
@@ -150,10 +162,13 @@ def calibration_from_fem(
     neglect: tuple[str, ...] = (),
     source: str = "",
 ) -> Calibration:
-    """Calibration of a cube with the computed response: its symmetric coefficients, or the whole matrix.
+    """Calibration of a cube with the computed response: its symmetric coefficients, or the whole
+    matrix.
 
-    rest_frequency Hz, beta and modulus Pa (of the pads' foam) are not computed: measure them, or tare.
-    noise: standard deviation of a pad's stress in Pa; by default that of counting 1 ms of periods, 8 ppm.
+    rest_frequency Hz, beta and modulus Pa (of the pads' foam) are not computed: measure them, or
+    tare.
+    noise: standard deviation of a pad's stress in Pa; by default that of counting 1 ms of periods,
+    8 ppm.
     neglect: modes stated to be zero, so that few pads can tell the others.
     """
     content: dict[str, Any] = {"coefficients": result.coefficients}
@@ -174,13 +189,20 @@ def calibration_from_fem(
 
 
 def make_solid(body: Body, layout: Layout, grid: Any = None) -> Solid:
-    """The meshed body; `grid` is a mesh from elastic.mesh, by default the finest that compute_response uses."""
+    """The meshed body; `grid` is a mesh from elastic.mesh, by default the finest that
+    compute_response uses."""
     plane = body.plane if layout.planar else "strain"
-    cube = None if np.isinf(body.cube_young) else lame(body.cube_young / body.young, body.cube_poisson, plane)
+    cube = (
+        None
+        if np.isinf(body.cube_young)
+        else lame(body.cube_young / body.young, body.cube_poisson, plane)
+    )
     return Solid(grid or make_mesh(body, layout, 2), lame(1.0, body.poisson, plane), cube)
 
 
-def linear_response(solid: Solid, layout: Layout, report: Callable[[str], None] = lambda _: None) -> Array:
+def linear_response(
+    solid: Solid, layout: Layout, report: Callable[[str], None] = lambda _: None
+) -> Array:
     """Response matrix (pads, modes) on one mesh; report(what) is called before every solve."""
     axes, modes = field_axes(layout), default_modes(layout)
     every = range(modes.n_modes)
@@ -190,7 +212,9 @@ def linear_response(solid: Solid, layout: Layout, report: Callable[[str], None] 
     def forces(parity: Parity) -> Array:
         parts = zip(_part(stress, parity), _part(gradient, parity), strict=True)
         zero = np.zeros(solid.basis.N)
-        return np.stack([solid.linear_forces(s, g) if s.any() or g.any() else zero for s, g in parts], axis=1)
+        return np.stack(
+            [solid.linear_forces(s, g) if s.any() or g.any() else zero for s, g in parts], axis=1
+        )
 
     return pad_stresses(solid, layout, forces, report)
 
@@ -201,7 +225,8 @@ def pad_stresses(
     forces: Callable[[Parity], Array],
     report: Callable[[str], None] = lambda _: None,
 ) -> Array:
-    """Mean normal stress (pads, n) under n loads; forces(parity) are their nodal forces (dofs, n) of a parity."""
+    """Mean normal stress (pads, n) under n loads; forces(parity) are their nodal forces (dofs, n)
+    of a parity."""
     stresses: Array | float = 0.0
     parities = itertools.product((1, -1), repeat=solid.dim)
     for parity in sorted(parities, key=lambda parity: solid.alike(parity)[0], reverse=True):
@@ -219,14 +244,16 @@ def pad_stresses(
 
 
 def _part(field: Array, parity: Parity) -> Array:
-    """The components of a tensor field (modes, dim, ..., dim) of one parity: each index k flips axis k."""
+    """The components of a tensor field (modes, dim, ..., dim) of one parity: each index k flips
+    axis k."""
     indices = np.indices(field.shape[1:])
     odd = np.stack([np.sum(indices == k, axis=0) % 2 == 1 for k in range(len(parity))], axis=-1)
     return field * np.all(odd == (np.array(parity) < 0), axis=-1)
 
 
 def _sees(layout: Layout, pad: int, parity: Parity) -> bool:
-    """False for a pad in the middle of its face along an axis in which the field is odd: its mean is zero."""
+    """False for a pad in the middle of its face along an axis in which the field is odd: its mean
+    is zero."""
     axes = list(field_axes(layout))
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
     return bool(np.all((np.array(parity) > 0) | (np.abs(centre) > 1e-9) | (normal != 0)))
@@ -236,7 +263,9 @@ def _pad_stress(solid: Solid, reactions: Array, parity: Parity, layout: Layout, 
     axes, half = list(field_axes(layout)), layout.pad_size / 2
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
     axis = int(np.argmax(np.abs(normal)))
-    intervals = [(max(c - half, -1.0), min(c + half, 1.0)) for k, c in enumerate(centre) if k != axis]
+    intervals = [
+        (max(c - half, -1.0), min(c + half, 1.0)) for k, c in enumerate(centre) if k != axis
+    ]
     sign = parity[axis] if normal[axis] < 0 else 1
     return sign * solid.mean_stress(reactions, parity, axis, intervals)
 
@@ -246,4 +275,6 @@ def _observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[str, 
     _, singular, rows = np.linalg.svd(matrix)
     rank = int(np.sum(singular > RANK_TOLERANCE * singular[0]))
     part = np.linalg.norm(rows[rank:], axis=0)
-    return rank, tuple(name for name, size in zip(names, part, strict=True) if size > LEAK_TOLERANCE)
+    return rank, tuple(
+        name for name, size in zip(names, part, strict=True) if size > LEAK_TOLERANCE
+    )

@@ -1,16 +1,17 @@
 """Mean stress on a pad from the nodal reactions of a finite element solution.
 
-A bonded interface transmits to node i the reaction r_i = int phi_i t ds, with the nodal function phi_i and
-the traction t. Finite elements give r as well as they give the energy, while t = sigma n read off at the
-interface is poor, worst at the corner of the cube where it is infinite. Here t is recovered from r:
+A bonded interface transmits to node i the reaction r_i = int phi_i t ds, with the nodal function
+phi_i and the traction t. Finite elements give r as well as they give the energy, while t = sigma n
+read off at the interface is poor, worst at the corner of the cube where it is infinite. Here t is
+recovered from r:
 
     find t in T with  int phi_i t ds = r_i  for every node i but the corner's,
 
-T being the element's own polynomials, continued in the last element to the corner (whose reaction also holds
-the neighbour face's shear). The integral of t over a pad is then w . r with weights w that depend on the
-nodes alone. On a face with two tangential directions the weights are products of those along each.
-Linear tractions are returned exactly. Source: M. F. Wheeler, Comp. Meth. Appl. Mech. Eng. 2 (1973) 123
-(consistent fluxes); the treatment of the corner is ours.
+T being the element's own polynomials, continued in the last element to the corner (whose reaction
+also holds the neighbour face's shear). The integral of t over a pad is then w . r with weights w
+that depend on the nodes alone. On a face with two tangential directions the weights are products of
+those along each. Linear tractions are returned exactly. Source: M. F. Wheeler, Comp. Meth. Appl.
+Mech. Eng. 2 (1973) 123 (consistent fluxes); the treatment of the corner is ours.
 """
 
 from __future__ import annotations
@@ -22,22 +23,25 @@ Array = NDArray[np.float64]
 
 
 def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: float) -> Array:
-    """Weights w (n,) with w . r = integral of the traction from start to stop, -1 <= start < stop <= 1.
+    """Weights w (n,) with w . r = integral of the traction from start to stop, -1 <= start < stop
+    <= 1.
 
-    nodes   (n,) positions on half a face, from the middle 0 to the corner 1; elements of `order` equal steps
-    parity  +1 when the traction is even about the middle, -1 when it is odd (so zero there)
-    Pad edges must be ends of elements.
+    nodes   (n,) positions on half a face, from the middle 0 to the corner 1; elements of `order`
+    equal steps parity  +1 when the traction is even about the middle, -1 when it is odd (so zero
+    there) Pad edges must be ends of elements.
     """
 
     def signed(s: float) -> Array:
-        """Weights of the integral from the middle to s; on the other side its sign is that of the parity."""
+        """Weights of the integral from the middle to s; on the other side its sign is that of the
+        parity."""
         return _from_middle(nodes, order, parity, abs(s)) * (1 if s >= 0 else -parity)
 
     return signed(stop) - signed(start)
 
 
 def face_integral(nodes: Array, forces: Array, order: int, start: float, stop: float) -> float:
-    """Integral of the traction from start to stop from nodal forces (n,) along a whole face, split by parity.
+    """Integral of the traction from start to stop from nodal forces (n,) along a whole face, split
+    by parity.
 
     nodes: (n,) positions from corner to corner, -1 to 1, symmetric about the middle
     """
@@ -71,7 +75,8 @@ def _from_middle(nodes: Array, order: int, parity: int, stop: float) -> Array:
 
 
 def _line_element(order: int) -> tuple[Array, Array]:
-    """Mass matrix and integrals of the nodal polynomials on the unit interval with order + 1 equal nodes."""
+    """Mass matrix and integrals of the nodal polynomials on the unit interval with order + 1 equal
+    nodes."""
     s, weight = np.polynomial.legendre.leggauss(order + 1)
     s, weight = (s + 1) / 2, weight / 2
     to_nodal = np.linalg.inv(np.vander(np.arange(order + 1) / order, increasing=True))

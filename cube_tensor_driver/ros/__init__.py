@@ -1,1 +1,4 @@
-"""ROS 2: nodes and message conversions, thin; what they carry is made in the layers below."""
+"""Nodes and messages: the only folder that publishes, subscribes or offers services.
+
+Nodes are thin: parameters, topics and services here, the work in `core`, `device` and `bags`.
+"""

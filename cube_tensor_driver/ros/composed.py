@@ -1,4 +1,5 @@
-"""Driver and reconstruction in one process: tensors without the hop over DDS. `frequencies` is sent to who listens."""
+"""Driver and reconstruction in one process: tensors without the hop over DDS. `frequencies` is sent
+to who listens."""
 
 from __future__ import annotations
 

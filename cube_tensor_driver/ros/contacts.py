@@ -8,30 +8,35 @@ from numpy.typing import NDArray
 from cube_tensor_driver.msg import SkinContacts
 
 from ..elastic.surface import Contact, Surface
-from .follow import FollowerNode
 from .node import run
+from .skin_subscriber import SkinSubscriberNode
 
 
-class Contacts(FollowerNode):
-    """Publishes `contacts` for the newest `stress`, at most `rate` times a second; empty arrays: nothing presses."""
+class Contacts(SkinSubscriberNode):
+    """Publishes `contacts` for the newest `stress`, at most `rate` times a second; empty arrays:
+    nothing presses."""
 
     def __init__(self) -> None:
         super().__init__("contacts", SkinContacts, 10)
-        self.declare("depth", 0.004, "From the cubes' centres to the skin's surface, m.", (1e-5, 1.0))
-        self.declare("least", 300.0, "Pressure at the cubes that counts as contact, Pa.", (0.0, 1e9))
+        self.declare(
+            "depth", 0.004, "From the cubes' centres to the skin's surface, m.", (1e-5, 1.0)
+        )
+        self.declare(
+            "least", 300.0, "Pressure at the cubes that counts as contact, Pa.", (0.0, 1e9)
+        )
 
     def new_skin(self) -> None:
-        self._surface, self._said = Surface(self.follower.places, self.value("depth")), None
+        self._surface, self._said = Surface(self.subscriber.places, self.value("depth")), None
 
     def message(self) -> SkinContacts | None:
-        stamp = self.follower.stamp
+        stamp = self.subscriber.stamp
         if stamp is self._said:
             return None
         self._said = stamp
-        values = self.follower.newest.believed(self.follower.health())
+        values = self.subscriber.newest.believed(self.subscriber.health())
         message = contacts_message(self._surface.contacts(values, self.value("least")))
         message.header.stamp = stamp
-        message.header.frame_id = self.follower.info.header.frame_id
+        message.header.frame_id = self.subscriber.info.header.frame_id
         return message
 
 

@@ -1,4 +1,5 @@
-"""Health of the cubes in words: diagnostics of the cubes that are not fine, a line in the log when that changes."""
+"""Health of the cubes in words: diagnostics of the cubes that are not fine, a line in the log when
+that changes."""
 
 from __future__ import annotations
 
@@ -7,14 +8,15 @@ from collections.abc import Mapping
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from ..config.skin import Skin
 from ..core.health import Health
 from ..core.pipeline import Pipeline
 from ..core.status import LEFT_OUT, WORDS
-from ..files.skin import Skin
 from .diagnostics import make_status
 
 MAX_STATUSES = 64
-"""In one message: on a skin whose hubs are all gone, a status for each of 1000 cubes helps nobody."""
+"""In one message: on a skin whose hubs are all gone, a status for each of 1000 cubes helps
+nobody."""
 
 
 class CubeHealth:
@@ -25,8 +27,11 @@ class CubeHealth:
         self._came = np.zeros(len(skin.cubes), bool)
         self._words: dict[int, str] = {}
 
-    def statuses(self, uids: Mapping[int, int]) -> tuple[list[DiagnosticStatus], list[tuple[str, bool]]]:
-        """Statuses of cubes that are not fine or were not the last time; of what changed a line, and if it is bad."""
+    def statuses(
+        self, uids: Mapping[int, int]
+    ) -> tuple[list[DiagnosticStatus], list[tuple[str, bool]]]:
+        """Statuses of cubes that are not fine or were not the last time; of what changed a line,
+        and if it is bad."""
         bits, strained, rows = self._health.collect()
         self._came |= rows > 0
         levels = np.zeros(len(rows), int)
@@ -35,7 +40,9 @@ class CubeHealth:
         levels[rows == 0] = 3
         suspects = self._suspects(strained)
         words = {
-            int(cube): self._describe(int(cube), bits[cube], bool(strained[cube]), bool(rows[cube]), suspects)
+            int(cube): self._describe(
+                int(cube), bits[cube], bool(strained[cube]), bool(rows[cube]), suspects
+            )
             for cube in np.flatnonzero(levels)[:MAX_STATUSES]
         }
         statuses, lines = [], []
@@ -47,19 +54,37 @@ class CubeHealth:
                 lines.append((f"cube {name}: {text}", level > 0))
             uid = self._skin.cubes[cube].uid or uids.get(cube, 0)
             values = {"rows since the last": int(rows[cube])}
-            statuses.append(make_status(f"cube {name}", f"{uid:#x}" if uid else "", bytes([level]), text, values))
+            statuses.append(
+                make_status(
+                    f"cube {name}", f"{uid:#x}" if uid else "", bytes([level]), text, values
+                )
+            )
         self._words = words
         return statuses, lines
 
     def summary(self) -> dict[str, int]:
         """How many pads and cubes are how, now; only what there is."""
-        counts = {f"pads {word}": int(np.count_nonzero(self._health.state & bit)) for bit, word in WORDS.items()}
+        counts = {
+            f"pads {word}": int(np.count_nonzero(self._health.state & bit))
+            for bit, word in WORDS.items()
+        }
         counts["cubes with a residual"] = int(np.count_nonzero(self._health.strained))
         return {name: count for name, count in counts.items() if count}
 
-    def _describe(self, cube: int, bits: np.ndarray, strained: bool, came: bool, suspects: dict[int, list[str]]) -> str:
+    def _describe(
+        self,
+        cube: int,
+        bits: np.ndarray,
+        strained: bool,
+        came: bool,
+        suspects: dict[int, list[str]],
+    ) -> str:
         if not came:
-            return "stale: no rows any more, see its link" if self._came[cube] else "missing: no row yet, see its link"
+            return (
+                "stale: no rows any more, see its link"
+                if self._came[cube]
+                else "missing: no row yet, see its link"
+            )
         pads = self._skin.cubes[cube].calibration.layout.pads
         texts = [
             f"pad {pads[pad]} {' and '.join(word for bit, word in WORDS.items() if bits[pad] & bit)}"
@@ -69,7 +94,11 @@ class CubeHealth:
             named = suspects.get(cube)
             texts.append(
                 "residual above its level: "
-                + (f"pad {' or '.join(named)} may be bad" if named else "a pad is bad or the load is none it can tell")
+                + (
+                    f"pad {' or '.join(named)} may be bad"
+                    if named
+                    else "a pad is bad or the load is none it can tell"
+                )
             )
         return "; ".join(texts)
 
@@ -79,8 +108,12 @@ class CubeHealth:
         if not len(cubes):
             return {}
         health = self._health
-        found = self._pipeline.suspects(cubes, health.last[cubes], health.mask[cubes], health.temperature[cubes])
+        found = self._pipeline.suspects(
+            cubes, health.last[cubes], health.mask[cubes], health.temperature[cubes]
+        )
         return {
-            cube: [self._skin.cubes[cube].calibration.layout.pads[pad] for pad in np.flatnonzero(row)]
+            cube: [
+                self._skin.cubes[cube].calibration.layout.pads[pad] for pad in np.flatnonzero(row)
+            ]
             for cube, row in zip(cubes.tolist(), found, strict=True)
         }

@@ -1,4 +1,5 @@
-"""The topics of single cubes, `cubes/<name>/stress` and `cubes/<name>/wrench`: sent only while somebody listens."""
+"""The topics of single cubes, `cubes/<name>/stress` and `cubes/<name>/wrench`: sent only while
+somebody listens."""
 
 from __future__ import annotations
 
@@ -12,23 +13,27 @@ from std_msgs.msg import Header
 
 from cube_tensor_driver.msg import StressTensorStamped
 
+from ..config.skin import Skin
 from ..core.pipeline import Pipeline, StressRows
 from ..core.status import INVALID
 from ..core.tensor import contact_wrench
 from ..device.scan import Rows
-from ..files.skin import Skin
 from .messages import tensor_message, to_time, wrench_message
 
 ALL_AT_ONCE = 64
-"""Skins up to so many cubes announce all their topics; in larger ones a topic is announced once somebody asks."""
+"""Skins up to so many cubes announce all their topics; in larger ones a topic is announced once
+somebody asks."""
 COVARIANCES_KEPT = 4096
 DEPTH = 10
 
 
 class CubeTopics:
-    """Publishers of single cubes. side: of the face that wrenches refer to, m, None for each cube's own."""
+    """Publishers of single cubes. side: of the face that wrenches refer to, m, None for each cube's
+    own."""
 
-    def __init__(self, node: LifecycleNode, skin: Skin, pipeline: Pipeline, side: float | None) -> None:
+    def __init__(
+        self, node: LifecycleNode, skin: Skin, pipeline: Pipeline, side: float | None
+    ) -> None:
         self._node, self._skin, self._pipeline = node, skin, pipeline
         self._sides = np.array([side or 2 * cube.calibration.half_side for cube in skin.cubes])
         self._covariances: dict[tuple[int, int], NDArray[np.float64]] = {}
@@ -49,7 +54,9 @@ class CubeTopics:
     def find_listeners(self) -> None:
         """Look up, from time to time, which topics anybody listens to."""
         if self._wanted:
-            self._announce({name for name, _ in self._node.get_topic_names_and_types()} & self._wanted.keys())
+            self._announce(
+                {name for name, _ in self._node.get_topic_names_and_types()} & self._wanted.keys()
+            )
         self._listened = (_heard(self._tensors), _heard(self._wrenches))
 
     def publish(self, times: Rows, rows: StressRows, pad_fault: NDArray[np.uint32]) -> None:
@@ -58,9 +65,15 @@ class CubeTopics:
         if wrenches:
             chosen = np.flatnonzero(np.isin(times.cube, wrenches) & (rows.status & INVALID == 0))
             cubes = times.cube[chosen].tolist()
-            forces, torques = contact_wrench(rows.stress[chosen], rows.gradient[chosen], self._sides[cubes][:, None])
-            for row, cube, force, torque in zip(chosen.tolist(), cubes, forces, torques, strict=True):
-                self._wrenches[cube].publish(wrench_message(self._header(times, row, cube), force, torque))
+            forces, torques = contact_wrench(
+                rows.stress[chosen], rows.gradient[chosen], self._sides[cubes][:, None]
+            )
+            for row, cube, force, torque in zip(
+                chosen.tolist(), cubes, forces, torques, strict=True
+            ):
+                self._wrenches[cube].publish(
+                    wrench_message(self._header(times, row, cube), force, torque)
+                )
         if tensors:
             for row in np.flatnonzero(np.isin(times.cube, tensors)).tolist():
                 cube = int(times.cube[row])
@@ -91,4 +104,6 @@ class CubeTopics:
 
 
 def _heard(publishers: dict[int, Any]) -> list[int]:
-    return [number for number, publisher in publishers.items() if publisher.get_subscription_count()]
+    return [
+        number for number, publisher in publishers.items() if publisher.get_subscription_count()
+    ]

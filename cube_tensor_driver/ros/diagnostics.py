@@ -1,4 +1,5 @@
-"""Diagnostics at 1 Hz: by diagnostic_updater where it is installed, else by what stands in for it here."""
+"""Diagnostics at 1 Hz: by diagnostic_updater where it is installed, else by what stands in for it
+here."""
 
 from __future__ import annotations
 
@@ -32,12 +33,14 @@ except ModuleNotFoundError:
 
 
 class Diagnostics(Updater):  # type: ignore[misc]
-    """Publishes what `statuses` says, if anything, under the node's full name; for as long as the node lives."""
+    """Publishes what `statuses` says, if anything, under the node's full name; for as long as the
+    node lives."""
 
     def __init__(self, node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
         super().__init__(node)
         self._statuses = statuses
-        # The updater knows the bare name only, or doubles the slash; one skin may run in several namespaces.
+        # The updater knows the bare name only, or doubles the slash; one skin may run in several
+        # namespaces.
         self.node_name = node.get_fully_qualified_name()
 
     def update(self) -> None:
@@ -47,17 +50,22 @@ class Diagnostics(Updater):  # type: ignore[misc]
             self.publish(statuses)
 
 
-def make_status(name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]) -> DiagnosticStatus:
+def make_status(
+    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]
+) -> DiagnosticStatus:
     """A status of a part of the node."""
     pairs = [_pair(name, key, str(value)) for key, value in values.items()]
-    return DiagnosticStatus(name=name, hardware_id=hardware_id, level=level, message=text, values=pairs)
+    return DiagnosticStatus(
+        name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
+    )
 
 
 _newest: dict[tuple[str, str], KeyValue] = {}
 
 
 def _pair(name: str, key: str, value: str) -> KeyValue:
-    """Most values stay as they are from one second to the next, and rclpy takes 2 us to make a pair."""
+    """Most values stay as they are from one second to the next, and rclpy takes 2 us to make a
+    pair."""
     pair = _newest.get((name, key))
     if pair is None or pair.value != value:
         pair = _newest[name, key] = KeyValue(key=key, value=value)

@@ -15,19 +15,19 @@ from rclpy.event_handler import PublisherEventCallbacks
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
+from ..bags.message_codec import frequencies_buffer
+from ..config.skin import Skin, read_skin
 from ..core.errors import ConfigError, LinkError
 from ..core.pipeline import Pipeline
 from ..device.clock import ClockMap
 from ..device.link import LinkConfig, LinkState
 from ..device.protocol import VERSION, Command, Hello, Request, Sample, Stats
 from ..device.reader import Arrivals, Reader
-from ..device.scan import Place, Rows, Scan
+from ..device.scan import CubeAddress, Rows, Scan
 from ..device.sequence import Account, Verdict
-from ..files.cdr import blank_frequencies
-from ..files.skin import Skin, read_skin
 from .diagnostics import Diagnostics, make_status
 from .messages import info_message
-from .node import BLANKS_KEPT, LATCHED, CubeNode, queue, run, scans_per_message
+from .node import BUFFERS_KEPT, LATCHED, CubeNode, queue, run, scans_per_message
 
 LEVELS = {
     LinkState.OPEN: DiagnosticStatus.OK,
@@ -38,24 +38,52 @@ LEVELS = {
 
 
 MAX_SCANS = 4
-"""Scans in one message at most, or as many as make a batch: DDS keeps the largest one of each place of a queue."""
+"""Scans in one message at most, or as many as make a batch: DDS keeps the largest one of each place
+of a queue."""
 
 
 class Driver(CubeNode):
-    """Publishes `frequencies`, `info` and diagnostics. The reader's thread publishes; the main thread spins."""
+    """Publishes `frequencies`, `info` and diagnostics. The reader's thread publishes; the main
+    thread spins."""
 
     def __init__(self, take: Callable[[Rows, int, bytes], None] | None = None) -> None:
-        """take: called in the reader's thread with what each message holds: a reconstruction in the same process."""
+        """take: called in the reader's thread with what each message holds: a reconstruction in the
+        same process."""
         super().__init__("driver")
         self._take = take
-        self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
+        self.declare(
+            "autostart",
+            True,
+            "Configure and activate at once; false waits for lifecycle transitions.",
+        )
         self.declare("config", "", "Skin file (YAML).")
-        self.declare("port", "", "Port instead of the one in the skin file, for a skin with one link.")
-        self.declare("port_directory", "", "Folder with the links' ports under the links' names: simulated hubs.")
-        self.declare("rate", 0.0, "Samples per second to ask of the hubs; 0: as the skin file says.", (0.0, 10_000.0),
-                     live=True)  # fmt: skip
-        self.declare("publish_period", 0.0, "Time that one message covers, s; 0: a message for each scan.", (0.0, 1.0))
-        self.declare("qos_reliability", "reliable", "Reliability of the batch topics.", choices="reliable, best_effort")
+        self.declare(
+            "port", "", "Port instead of the one in the skin file, for a skin with one link."
+        )
+        self.declare(
+            "port_directory",
+            "",
+            "Folder with the links' ports under the links' names: simulated hubs.",
+        )
+        self.declare(
+            "rate",
+            0.0,
+            "Samples per second to ask of the hubs; 0: as the skin file says.",
+            (0.0, 10_000.0),
+            live=True,
+        )
+        self.declare(
+            "publish_period",
+            0.0,
+            "Time that one message covers, s; 0: a message for each scan.",
+            (0.0, 1.0),
+        )
+        self.declare(
+            "qos_reliability",
+            "reliable",
+            "Reliability of the batch topics.",
+            choices="reliable, best_effort",
+        )
         self._reader: Reader | None = None
         self._diagnostics = Diagnostics(self, self._statuses)
 
@@ -70,10 +98,15 @@ class Driver(CubeNode):
         self._links = self._link_configs(skin)
         names = [link.name for link in skin.links]
         places = [
-            Place(cube.name, None if cube.link is None else names.index(cube.link), cube.index, cube.uid,
-                  cube.calibration.layout.n_pads)
+            CubeAddress(
+                cube.name,
+                None if cube.link is None else names.index(cube.link),
+                cube.index,
+                cube.uid,
+                cube.calibration.layout.n_pads,
+            )
             for cube in skin.cubes
-        ]  # fmt: skip
+        ]
         self._scan = Scan(len(names), places)
         self._accounts = [Account() for _ in names]
         self._clocks = [ClockMap() for _ in names]
@@ -85,7 +118,7 @@ class Driver(CubeNode):
         self._published = self._published_before = 0
         self._turns = scans_per_message(self.value("publish_period"), self._rate)
         self._frame_id = skin.parent_frame.encode() + b"\0"
-        self._blank = lru_cache(maxsize=BLANKS_KEPT)(partial(blank_frequencies, self._frame_id))
+        self._blank = lru_cache(maxsize=BUFFERS_KEPT)(partial(frequencies_buffer, self._frame_id))
         rate = None if self._rate is None else self._rate / self._turns
         quality = queue(rate, self.value("qos_reliability"), self._turns * len(skin.cubes))
         self._listened_to = False
@@ -131,7 +164,10 @@ class Driver(CubeNode):
             )
         return [
             LinkConfig(
-                link.name, port or (str(Path(folder) / link.name) if folder else link.port), link.baud, link.hub_uid
+                link.name,
+                port or (str(Path(folder) / link.name) if folder else link.port),
+                link.baud,
+                link.hub_uid,
             )
             for link in skin.links
         ]
@@ -141,7 +177,8 @@ class Driver(CubeNode):
         self._simulated_time = isinstance(clock, ROSClock) and clock.ros_time_is_active
 
     def _now_ns(self) -> int:
-        """The node's clock. Without simulated time that is the system's, asked for itself in a tenth of the time."""
+        """The node's clock. Without simulated time that is the system's, asked for itself in a
+        tenth of the time."""
         return int(self.get_clock().now().nanoseconds) if self._simulated_time else time.time_ns()
 
     def _on_frames(self, batch: Arrivals) -> None:
@@ -161,14 +198,21 @@ class Driver(CubeNode):
                 elif isinstance(frame, Stats):
                     account.stats(frame)
             if samples:
-                self._scan.add(link, samples, clock.update([sample.device_us for sample in samples], arrival_ns))
+                self._scan.add(
+                    link,
+                    samples,
+                    clock.update([sample.device_us for sample in samples], arrival_ns),
+                )
         self._publish()
         self._unaccounted_rows = self._scan.unaccounted()
 
     def _publish(self) -> None:
         """What is complete."""
         most = max(MAX_SCANS, self._turns + 1)
-        while self._scan.complete(self._turns) and (rows := self._scan.take(self._room, most)) is not None:
+        while (
+            self._scan.complete(self._turns)
+            and (rows := self._scan.take(self._room, most)) is not None
+        ):
             first_ns = int(rows.stamp_ns.min())
             if self._take is None or self._listened_to:
                 self._message.field["time_offset"][:] = rows.stamp_ns - first_ns
@@ -185,8 +229,14 @@ class Driver(CubeNode):
         """The fields of a message: what the scan writes there is not copied any more."""
         self._message = self._blank(rows, n_pads)
         field = self._message.field
-        return Rows(field["cube"], field["sequence"], np.empty(rows, np.int64),
-                    field["frequency"], field["temperature"], field["pad_fault"])  # fmt: skip
+        return Rows(
+            field["cube"],
+            field["sequence"],
+            np.empty(rows, np.int64),
+            field["frequency"],
+            field["temperature"],
+            field["pad_fault"],
+        )
 
     def _learn(self, link: int, frame: Hello) -> None:
         problems = self._scan.hello(link, frame)
@@ -194,7 +244,9 @@ class Driver(CubeNode):
             return
         self._problems[link] = problems
         name = self._links[link].name
-        self.get_logger().info(f"link {name}: hub {frame.hub_uid:#x} with {frame.n_cubes} cubes of {frame.n_pads} pads")
+        self.get_logger().info(
+            f"link {name}: hub {frame.hub_uid:#x} with {frame.n_cubes} cubes of {frame.n_pads} pads"
+        )
         for problem in problems:
             self.get_logger().error(f"link {name}: {problem}")
 
@@ -216,7 +268,8 @@ class Driver(CubeNode):
         self._info.publish(info_message(self._skin, self._pipeline, now_ns, self._uids, "driver"))
 
     def _statuses(self) -> list[DiagnosticStatus]:
-        """For diagnostics, of the whole and of each link; what happened since the last time is in them."""
+        """For diagnostics, of the whole and of each link; what happened since the last time is in
+        them."""
         if not self.configured:
             return []
         self._look_at_clock()
@@ -231,7 +284,9 @@ class Driver(CubeNode):
             "rows with another number of pads": self._scan.wrong_pads,
             "rows unaccounted": self._unaccounted_rows,
         }
-        wrong = f"{self._unaccounted_rows} rows are lost in the driver: please report it" * bool(self._unaccounted_rows)
+        wrong = f"{self._unaccounted_rows} rows are lost in the driver: please report it" * bool(
+            self._unaccounted_rows
+        )
         level = DiagnosticStatus.ERROR if wrong else DiagnosticStatus.OK
         statuses = [make_status("rows", self._skin.name, level, wrong, totals)]
         reader = self._reader
@@ -265,7 +320,10 @@ class Driver(CubeNode):
             }
             stats = account.stats_frame
             if stats is not None:
-                values |= {"hub uptime s": stats.uptime_ms / 1000, "hub supply mV": stats.supply_mv or "unknown"}
+                values |= {
+                    "hub uptime s": stats.uptime_ms / 1000,
+                    "hub supply mV": stats.supply_mv or "unknown",
+                }
             uid = "" if link.hello is None else f"{link.hello.hub_uid:#x}"
             text = "; ".join(notes) or link.state.value
             statuses.append(make_status(f"link {link.config.name}", uid, level, text, values))

@@ -1,7 +1,8 @@
-"""The floor of the benchmark: bare rclpy publishing, and echoing, messages of a skin's sizes. No work inside.
+"""The floor of the benchmark: bare rclpy publishing, and echoing, messages of a skin's sizes. No
+work inside.
 
-`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress; the same executor, the same
-quality of service, the same flat arrays as the real nodes.
+`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress; the same
+executor, the same quality of service, the same flat arrays as the real nodes.
 """
 
 from __future__ import annotations
@@ -32,11 +33,17 @@ class Source(CubeNode):
 
     def configure(self) -> None:
         n, rate = int(self.value("cubes")), float(self.value("rate"))
-        self._publisher = self.create_lifecycle_publisher(SkinFrequencies, "frequencies", queue(rate))
+        self._publisher = self.create_lifecycle_publisher(
+            SkinFrequencies, "frequencies", queue(rate)
+        )
         self._rows = Rows(
-            np.arange(n, dtype=np.uint16), np.zeros(n, np.uint32), np.full(n, time.time_ns()),
-            np.full((n, PADS), 1e5, np.float32), np.full(n, np.nan, np.float32), np.zeros(n, np.uint32),
-        )  # fmt: skip
+            np.arange(n, dtype=np.uint16),
+            np.zeros(n, np.uint32),
+            np.full(n, time.time_ns()),
+            np.full((n, PADS), 1e5, np.float32),
+            np.full(n, np.nan, np.float32),
+            np.zeros(n, np.uint32),
+        )
         self._timer = self.create_timer(1.0 / rate, self._publish)
 
     def _publish(self) -> None:
@@ -56,10 +63,15 @@ class Echo(CubeNode):
         n, quality = int(self.value("cubes")), queue(float(self.value("rate")))
         self._publisher = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._rows = StressRows(
-            np.zeros((n, 6), np.float32), np.zeros((n, 9), np.float32), np.zeros(n, np.float32),
-            np.zeros(n, np.uint16), np.zeros(n, np.uint16),
-        )  # fmt: skip
-        self._subscription = self.create_subscription(SkinFrequencies, "frequencies", self._answer, quality)
+            np.zeros((n, 6), np.float32),
+            np.zeros((n, 9), np.float32),
+            np.zeros(n, np.float32),
+            np.zeros(n, np.uint16),
+            np.zeros(n, np.uint16),
+        )
+        self._subscription = self.create_subscription(
+            SkinFrequencies, "frequencies", self._answer, quality
+        )
 
     def _answer(self, message: SkinFrequencies) -> None:
         times = read_frequencies(message)[0]

@@ -1,4 +1,5 @@
-"""The processes of a skin as launch actions. Imports launch, which every ROS 2 machine has and the wheels lack."""
+"""The processes of a skin as launch actions. Imports launch, which every ROS 2 machine has and the
+wheels lack."""
 
 from __future__ import annotations
 
@@ -12,25 +13,30 @@ from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from ..config.load_script import read_script
+from ..config.package_data import package_data
+from ..config.skin import Skin, read_skin
+from ..config.urdf import skin_urdf
 from ..core.errors import ConfigError
-from ..files.script import read_script
-from ..files.share import share
-from ..files.skin import Skin, read_skin
-from ..files.urdf import skin_urdf
-from .start import Process, record_command, skin_processes
+from ..processes.skin_processes import Process, record_command, skin_processes
 
 
 def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
     """A launch argument that is true or false."""
-    return DeclareLaunchArgument(name, default_value=default, choices=["true", "false"], description=description)
+    return DeclareLaunchArgument(
+        name, default_value=default, choices=["true", "false"], description=description
+    )
 
 
-def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list[LaunchDescriptionEntity]:
-    """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask for.
+def start_skin(
+    context: LaunchContext, **arguments: LaunchConfiguration
+) -> list[LaunchDescriptionEntity]:
+    """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask
+    for.
 
-    arguments: config and namespace; port, rate, publish_period, simulate, load, composed, autostart, markers, contacts,
-    record, rviz, state_publisher if the launch file has them. ConfigError: skin file, load script or an argument is
-    wrong.
+    arguments: config and namespace; port, rate, publish_period, simulate, load, composed,
+    autostart, markers, contacts, record, rviz, state_publisher if the launch file has them.
+    ConfigError: skin file, load script or an argument is wrong.
     """
     given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
     path = Path(given["config"]).expanduser().resolve()
@@ -60,10 +66,16 @@ def start_skin(context: LaunchContext, **arguments: LaunchConfiguration) -> list
         markers=wanted("markers") or wanted("rviz"),
         contacts=wanted("contacts"),
         load=load,
-        simulated_ports=Path(tempfile.mkdtemp(prefix="cube_ports_")) if wanted("simulate") else None,
+        simulated_ports=Path(tempfile.mkdtemp(prefix="cube_ports_"))
+        if wanted("simulate")
+        else None,
     )
-    # Nodes first: where one cannot be started launch gives up, and leaves what it has started already.
-    actions = [_action(process, namespace) for process in sorted(processes, key=lambda process: not process.node)]
+    # Nodes first: where one cannot be started launch gives up, and leaves what it has started
+    # already.
+    actions = [
+        _action(process, namespace)
+        for process in sorted(processes, key=lambda process: not process.node)
+    ]
     if wanted("state_publisher") or wanted("rviz"):
         actions.append(_state_publisher(skin, namespace))
     if wanted("record"):
@@ -87,7 +99,9 @@ def _action(process: Process, namespace: str) -> LaunchDescriptionEntity:
             emulate_tty=True,
         )
     return ExecuteProcess(
-        cmd=[sys.executable, "-m", process.module, *process.arguments], name=process.executable, output="screen"
+        cmd=[sys.executable, "-m", process.module, *process.arguments],
+        name=process.executable,
+        output="screen",
     )
 
 
@@ -97,7 +111,9 @@ def _installed(package: str, action: LaunchDescriptionEntity) -> LaunchDescripti
         get_package_prefix(package)
     except PackageNotFoundError:
         name = package.replace("_", "-")
-        return LogInfo(msg=f"{package} is not installed: left out (sudo apt install ros-$ROS_DISTRO-{name})")
+        return LogInfo(
+            msg=f"{package} is not installed: left out (sudo apt install ros-$ROS_DISTRO-{name})"
+        )
     return action
 
 
@@ -105,10 +121,19 @@ def _state_publisher(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
     package = "robot_state_publisher"
     parameters = [{"robot_description": skin_urdf(skin)}]
     return _installed(
-        package, Node(package=package, executable=package, namespace=namespace, parameters=parameters, output="screen")
+        package,
+        Node(
+            package=package,
+            executable=package,
+            namespace=namespace,
+            parameters=parameters,
+            output="screen",
+        ),
     )
 
 
 def _rviz(namespace: str) -> LaunchDescriptionEntity:
-    arguments = ["-d", str(share() / "rviz" / "skin.rviz")]
-    return _installed("rviz2", Node(package="rviz2", executable="rviz2", namespace=namespace, arguments=arguments))
+    arguments = ["-d", str(package_data() / "rviz" / "skin.rviz")]
+    return _installed(
+        "rviz2", Node(package="rviz2", executable="rviz2", namespace=namespace, arguments=arguments)
+    )

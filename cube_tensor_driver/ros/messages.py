@@ -22,20 +22,21 @@ from cube_tensor_driver.msg import (
     StressTensorStamped,
 )
 
+from ..config.calibration import calibration_text
+from ..config.skin import Skin
 from ..core.errors import MessageError
 from ..core.modes import COMPONENTS, STRESS
 from ..core.pipeline import Pipeline, StressRows
 from ..core.tensor import quaternion_from_rpy
 from ..device.scan import Rows
-from ..files.calibration import calibration_text
-from ..files.skin import Skin
 
 SECOND = 1_000_000_000
 N_STRESS, N_GRADIENT = len(STRESS), len(COMPONENTS) - len(STRESS)
 
 
 class Times(NamedTuple):
-    """When and of which cube rows are: header as it came, cube (N,), sequence (N,), time_offset (N,) ns."""
+    """When and of which cube rows are: header as it came, cube (N,), sequence (N,), time_offset
+    (N,) ns."""
 
     header: Header
     cube: NDArray[np.uint16]
@@ -58,7 +59,8 @@ def to_ns(stamp: Time) -> int:
 
 
 def packed(code: str, values: NDArray[Any]) -> array[Any]:
-    """A message's array field of the values, row-major; code is the field's type as `array` spells it."""
+    """A message's array field of the values, row-major; code is the field's type as `array` spells
+    it."""
     field = array(code)
     field.frombytes(np.ascontiguousarray(values, dtype=code).tobytes())
     return field
@@ -81,7 +83,8 @@ def frequencies_message(rows: Rows, frame_id: str) -> SkinFrequencies:
 def read_frequencies(
     message: SkinFrequencies,
 ) -> tuple[Times, NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32]]:
-    """Times, frequency (N, n_pads), pad_fault (N,), temperature (N,): views. MessageError: lengths that do not fit."""
+    """Times, frequency (N, n_pads), pad_fault (N,), temperature (N,): views. MessageError: lengths
+    that do not fit."""
     rows = len(message.cube)
     width = message.n_pads
     times = _times(message)
@@ -89,7 +92,12 @@ def read_frequencies(
     for name, per_row in fields.items():
         _check_length(message, name, rows * per_row)
     frequency = np.frombuffer(message.frequency, np.float32).reshape(rows, width)
-    return times, frequency, np.frombuffer(message.pad_fault, np.uint32), np.frombuffer(message.temperature, np.float32)
+    return (
+        times,
+        frequency,
+        np.frombuffer(message.pad_fault, np.uint32),
+        np.frombuffer(message.temperature, np.float32),
+    )
 
 
 def stress_message(times: Times, rows: StressRows) -> SkinStress:
@@ -112,8 +120,14 @@ def read_stress(message: SkinStress) -> tuple[Times, StressRows]:
     """Times and rows, views. MessageError: lengths that do not fit."""
     rows = len(message.cube)
     times = _times(message)
-    fields = {"stress": N_STRESS, "gradient": N_GRADIENT, "residual": 1, "status": 1, "observed": 1,
-              "left_out": 1}  # fmt: skip
+    fields = {
+        "stress": N_STRESS,
+        "gradient": N_GRADIENT,
+        "residual": 1,
+        "status": 1,
+        "observed": 1,
+        "left_out": 1,
+    }
     for name, per_row in fields.items():
         _check_length(message, name, rows * per_row)
     return times, StressRows(
@@ -125,7 +139,9 @@ def read_stress(message: SkinStress) -> tuple[Times, StressRows]:
     )
 
 
-def tensor_message(header: Header, rows: StressRows, row: int, covariance: NDArray[np.float64]) -> StressTensorStamped:
+def tensor_message(
+    header: Header, rows: StressRows, row: int, covariance: NDArray[np.float64]
+) -> StressTensorStamped:
     """One row as a message of its own; covariance (15, 15)."""
     xx, yy, zz, yz, zx, xy = rows.stress[row].tolist()
     tensor = StressTensor(
@@ -140,7 +156,9 @@ def tensor_message(header: Header, rows: StressRows, row: int, covariance: NDArr
     return StressTensorStamped(header=header, tensor=tensor)
 
 
-def wrench_message(header: Header, force_n: NDArray[np.float64], torque_nm: NDArray[np.float64]) -> WrenchStamped:
+def wrench_message(
+    header: Header, force_n: NDArray[np.float64], torque_nm: NDArray[np.float64]
+) -> WrenchStamped:
     """Force (3,) in N and torque (3,) in N m."""
     message = WrenchStamped(header=header)
     force, torque = message.wrench.force, message.wrench.torque
@@ -158,8 +176,8 @@ def info_message(
 ) -> SkinInfo:
     """What is fixed about a skin, with the rest frequencies that the pipeline uses now.
 
-    uids: of cubes by their index in the skin, as their hubs say, where the skin file does not. sender: driver or
-    reconstruction.
+    uids: of cubes by their index in the skin, as their hubs say, where the skin file does not.
+    sender: driver or reconstruction.
     """
     message = SkinInfo(version=SkinInfo.VERSION, name=skin.name, sender=sender)
     message.header = Header(stamp=to_time(stamp_ns), frame_id=skin.parent_frame)
@@ -169,7 +187,8 @@ def info_message(
         calibration = cube.calibration
         x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
         pose = Pose(
-            position=Point(x=cube.xyz[0], y=cube.xyz[1], z=cube.xyz[2]), orientation=Quaternion(x=x, y=y, z=z, w=w)
+            position=Point(x=cube.xyz[0], y=cube.xyz[1], z=cube.xyz[2]),
+            orientation=Quaternion(x=x, y=y, z=z, w=w),
         )
         message.cubes.append(
             CubeInfo(

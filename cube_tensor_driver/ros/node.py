@@ -1,4 +1,5 @@
-"""What both nodes share: parameters with descriptions, qualities of service, how a node is started, spun and ended."""
+"""What both nodes share: parameters with descriptions, qualities of service, how a node is started,
+spun and ended."""
 
 from __future__ import annotations
 
@@ -24,38 +25,53 @@ from ..core.errors import ConfigError, CubeError
 PAUSE_S = 2.0
 """The longest pause of a reader that no message is lost in: queue depths are rate times this."""
 QUEUE_BYTES = 64_000_000
-"""What a queue may hold of the largest skins, so that no process grows beyond 200 MB: there the pause is shorter."""
+"""What a queue may hold of the largest skins, so that no process grows beyond 200 MB: there the
+pause is shorter."""
 ROW_BYTES = 78
 UNKNOWN_RATE = 1000.0
-BLANKS_KEPT = 4
+BUFFERS_KEPT = 4
 """Shapes of messages whose bytes are kept to be filled again."""
 SPIN_S = 0.2
 SWITCH_S = 1e-3
-"""A reader gives up Python's lock at each read; while the main thread computes it would wait 5 ms each time."""
+"""A reader gives up Python's lock at each read; while the main thread computes it would wait 5 ms
+each time."""
 COLLECT = 20_000, 20, 20
-"""When Python looks for garbage. A scan leaves none, but at 700 objects it looked every scan or two."""
+"""When Python looks for garbage. A scan leaves none, but at 700 objects it looked every scan or
+two."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def queue(rate: float | None, reliability: str = "reliable", rows: int = 1) -> QoSProfile:
-    """Quality of service of the batch topics at `rate` messages of so many rows per second, None: not known.
+    """Quality of service of the batch topics at `rate` messages of so many rows per second, None:
+    not known.
 
     ConfigError: no such reliability.
     """
-    depth = max(10, math.ceil(min((rate or UNKNOWN_RATE) * PAUSE_S, QUEUE_BYTES / (rows * ROW_BYTES))))
-    policies = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
+    depth = max(
+        10, math.ceil(min((rate or UNKNOWN_RATE) * PAUSE_S, QUEUE_BYTES / (rows * ROW_BYTES)))
+    )
+    policies = {
+        "reliable": ReliabilityPolicy.RELIABLE,
+        "best_effort": ReliabilityPolicy.BEST_EFFORT,
+    }
     if reliability not in policies:
-        raise ConfigError(f"parameter qos_reliability is {reliability!r}, allowed: {', '.join(policies)}")
-    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=policies[reliability])
+        raise ConfigError(
+            f"parameter qos_reliability is {reliability!r}, allowed: {', '.join(policies)}"
+        )
+    return QoSProfile(
+        depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=policies[reliability]
+    )
 
 
 def scans_per_message(publish_period: float, rate: float | None) -> int:
-    """How many samples of each cube a message holds; at `rate` samples per second, None: not known."""
+    """How many samples of each cube a message holds; at `rate` samples per second, None: not
+    known."""
     return max(1, round(publish_period * (rate or UNKNOWN_RATE)))
 
 
 class CubeNode(LifecycleNode):
-    """A lifecycle node whose errors are one line in the log and a transition that fails, never a traceback."""
+    """A lifecycle node whose errors are one line in the log and a transition that fails, never a
+    traceback."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -86,7 +102,9 @@ class CubeNode(LifecycleNode):
         )
         descriptor.read_only = False
         if span is not None:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)]
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)
+            ]
         self.declare_parameter(name, default, descriptor)
 
     def config(self) -> Path:
@@ -174,7 +192,8 @@ class CubeNode(LifecycleNode):
 
 
 def run(make: Callable[[], Sequence[CubeNode]]) -> None:
-    """Run nodes, started in order, until SIGINT or SIGTERM, then end them in reverse; exit code 1: one cannot start."""
+    """Run nodes, started in order, until SIGINT or SIGTERM, then end them in reverse; exit code 1:
+    one cannot start."""
     stopping = False
 
     def stop(*_: object) -> None:
@@ -192,7 +211,9 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
         executor = make_executor()
         for node in nodes:
             executor.add_node(node)
-            for transition in (node.trigger_configure, node.trigger_activate) if node.value("autostart") else ():
+            for transition in (
+                (node.trigger_configure, node.trigger_activate) if node.value("autostart") else ()
+            ):
                 if not stopping and transition() != TransitionCallbackReturn.SUCCESS:
                     stopping, code = True, 1
         # What is there by now stays: no collection has to look at it, which would take 20 ms.
@@ -200,7 +221,8 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
         gc.freeze()
         gc.set_threshold(*COLLECT)
         while not stopping:
-            # EventsExecutor.spin() can burn a core and does not return on a signal; spin_once in the main thread does.
+            # EventsExecutor.spin() can burn a core and does not return on a signal; spin_once in
+            # the main thread does.
             with contextlib.suppress(ExternalShutdownException):
                 executor.spin_once(timeout_sec=SPIN_S)
             for node in nodes:

@@ -1,4 +1,5 @@
-"""A bag onto its topics again, bytes as they were recorded, in its own rhythm, with its own clock if asked for."""
+"""A bag onto its topics again, bytes as they were recorded, in its own rhythm, with its own clock
+if asked for."""
 
 from __future__ import annotations
 
@@ -11,22 +12,29 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
+from ..bags.message_codec import stress_of_today
+from ..bags.read import PACKAGE, STRESS, Bag, Entry
 from ..core.errors import BagError
-from ..files.bags import PACKAGE, STRESS, Bag, Entry
-from ..files.cdr import stress_of_today
 from .messages import SECOND
 from .recorder import DEPTH, message_class
 
 CLOCK_S = 0.01
 """Of real time, at least so often the clock is sent; and before every message."""
 DISCOVERY_S, NOBODY_S, LOOK_S = 1.0, 3.0, 0.1
-"""Before the first message: no further subscriber has found the publishers for so long; or none of frequencies at all.
+"""Before the first message: no further subscriber has found the publishers for so long; or none of
+frequencies at all.
 
-Each topic is discovered in its own time: that somebody hears of `info` says nothing of `frequencies` yet.
+Each topic is discovered in its own time: that somebody hears of `info` says nothing of
+`frequencies` yet.
 """
 SHOWN_NS = 100_000_000
-"""So much of the bag is published after a jump, though the player is paused: enough for every link to deliver."""
-MADE = (f"{PACKAGE}/msg/SkinStress", f"{PACKAGE}/msg/StressTensorStamped", "geometry_msgs/msg/WrenchStamped")
+"""So much of the bag is published after a jump, though the player is paused: enough for every link
+to deliver."""
+MADE = (
+    f"{PACKAGE}/msg/SkinStress",
+    f"{PACKAGE}/msg/StressTensorStamped",
+    "geometry_msgs/msg/WrenchStamped",
+)
 """Types that a reconstruction makes, of topics that are left out unless stress is asked for."""
 
 
@@ -49,16 +57,24 @@ class Player:
         self._node, self._bag, self._rate = node, bag, rate
         self._publishers: dict[str, Any] = {}
         self._latched: set[str] = set()
-        skins = [topic.removesuffix("frequencies") for topic in bag.topics(f"{PACKAGE}/msg/SkinFrequencies")]
+        skins = [
+            topic.removesuffix("frequencies")
+            for topic in bag.topics(f"{PACKAGE}/msg/SkinFrequencies")
+        ]
         for connection in bag.connections:
             topic = connection.topic
             made = connection.msgtype in MADE and (
-                connection.msgtype.startswith(PACKAGE) or any(topic.startswith(f"{skin}cubes/") for skin in skins)
+                connection.msgtype.startswith(PACKAGE)
+                or any(topic.startswith(f"{skin}cubes/") for skin in skins)
             )
             if topic not in self._publishers and topic != "/clock" and (stress or not made):
                 self._add(topic, connection)
         if not self._publishers:
-            there = "but what a reconstruction makes; --stress publishes that too" if bag.connections else "in it"
+            there = (
+                "but what a reconstruction makes; --stress publishes that too"
+                if bag.connections
+                else "in it"
+            )
             raise BagError(f"{bag.path}: nothing to publish {there}")
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._clock = node.create_publisher(Clock, "/clock", best_effort) if clock else None
@@ -80,7 +96,8 @@ class Player:
             self._wake.notify()
 
     def jump(self, position: float, paused: bool) -> None:
-        """Go on from there, or hold there once what stands there has been published. BagError: not in the bag."""
+        """Go on from there, or hold there once what stands there has been published. BagError: not
+        in the bag."""
         to_ns = max(self._bag.start_ns, min(self._at(position), self._bag.end_ns - SHOWN_NS))
         with self._wake:
             self._jump_ns, self._paused, self._steps = to_ns, paused, 0
@@ -93,7 +110,8 @@ class Player:
             self._wake.notify()
 
     def run(self, start: float, loop: bool, hold: bool = False) -> None:
-        """Publish from `start` to the end of the bag, over and over with `loop`; with `hold` wait there to be steered.
+        """Publish from `start` to the end of the bag, over and over with `loop`; with `hold` wait
+        there to be steered.
 
         BagError: damaged, or start is not in the bag.
         """
@@ -105,7 +123,9 @@ class Player:
             with self._wake:
                 if hold and not loop and self._jump_ns is None:
                     self._paused = True
-                    self._wake.wait_for(lambda: self.stop.is_set() or self._jump_ns is not None or not self._paused)
+                    self._wake.wait_for(
+                        lambda: self.stop.is_set() or self._jump_ns is not None or not self._paused
+                    )
                 next_ns, self._shown_ns = begin_ns if loop or hold else None, 0
                 if self._jump_ns is not None:
                     next_ns, self._jump_ns = self._jump_ns, None
@@ -114,7 +134,11 @@ class Player:
     def _await_subscribers(self) -> None:
         """Until those who listen have found the publishers."""
         publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
-        raw = [publisher for topic, publisher in self._publishers.items() if topic.endswith("frequencies")]
+        raw = [
+            publisher
+            for topic, publisher in self._publishers.items()
+            if topic.endswith("frequencies")
+        ]
         found, since, enough = 0, time.monotonic(), NOBODY_S
         while time.monotonic() - since < enough and not self.stop.wait(LOOK_S):
             now = sum(publisher.get_subscription_count() for publisher in publishers)
@@ -125,19 +149,29 @@ class Player:
 
     def _at(self, position: float) -> int:
         if not 0 <= position <= self.length:
-            raise BagError(f"{self._bag.path}: {position:g} s is not in the bag, which is {self.length:.3f} s long")
+            raise BagError(
+                f"{self._bag.path}: {position:g} s is not in the bag, which is {self.length:.3f} s long"
+            )
         return self._bag.start_ns + round(position * SECOND)
 
     def _add(self, topic: str, connection: Any) -> None:
         offered = connection.ext.offered_qos_profiles
-        latched = bool(offered) and all(one.durability.value == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)
-        best_effort = bool(offered) and any(one.reliability.value == ReliabilityPolicy.BEST_EFFORT for one in offered)
+        latched = bool(offered) and all(
+            one.durability.value == DurabilityPolicy.TRANSIENT_LOCAL for one in offered
+        )
+        best_effort = bool(offered) and any(
+            one.reliability.value == ReliabilityPolicy.BEST_EFFORT for one in offered
+        )
         profile = QoSProfile(
             depth=DEPTH,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-            reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+            reliability=ReliabilityPolicy.BEST_EFFORT
+            if best_effort
+            else ReliabilityPolicy.RELIABLE,
         )
-        self._publishers[topic] = self._node.create_publisher(message_class(topic, connection.msgtype), topic, profile)
+        self._publishers[topic] = self._node.create_publisher(
+            message_class(topic, connection.msgtype), topic, profile
+        )
         if latched:
             self._latched.add(topic)
 
@@ -171,7 +205,9 @@ class Player:
                     self._wake.wait()
                     self._anchor(bag_ns)
                     continue
-                left = self._begun + (bag_ns - self._bag_ns) / SECOND / self._rate - time.monotonic()
+                left = (
+                    self._begun + (bag_ns - self._bag_ns) / SECOND / self._rate - time.monotonic()
+                )
                 if left <= 0:
                     return True
                 if self._clock is not None:

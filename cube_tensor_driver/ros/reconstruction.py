@@ -13,23 +13,29 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 
+from ..bags.message_codec import (
+    Shape,
+    frequencies_shape,
+    read_frequencies,
+    same_shape,
+    stress_buffer,
+)
+from ..config.skin import read_skin
 from ..core.errors import CubeError
 from ..core.health import Health
 from ..core.pipeline import Pipeline
 from ..core.status import INVALID
 from ..core.tare import DriftTracker
 from ..device.scan import Rows
-from ..files.cdr import Shape, blank_stress, frequencies_shape, read_frequencies, same_shape
-from ..files.skin import read_skin
 from .cube_health import CubeHealth
 from .cube_topics import CubeTopics
 from .diagnostics import Diagnostics, make_status
 from .messages import info_message
-from .node import BLANKS_KEPT, LATCHED, CubeNode, queue, run, scans_per_message
+from .node import BUFFERS_KEPT, LATCHED, CubeNode, queue, run, scans_per_message
 from .taring import Taring, tare_folder
 
 if TYPE_CHECKING:
-    from ..files.recorded import RecordedHealth
+    from ..bags.recorded_health import RecordedHealth
 
 BAGS = (".mcap", ".db3")
 LISTENERS_S = 0.5
@@ -37,24 +43,60 @@ LISTENERS_S = 0.5
 
 
 class Reconstruction(CubeNode):
-    """Publishes `stress`, `info`, diagnostics, and per cube `cubes/<name>/stress` and `cubes/<name>/wrench`."""
+    """Publishes `stress`, `info`, diagnostics, and per cube `cubes/<name>/stress` and
+    `cubes/<name>/wrench`."""
 
     def __init__(self, subscribes: bool = True) -> None:
         """subscribes: False when `take` is called by a driver in the same process."""
         super().__init__("reconstruction")
         self._subscribes = subscribes
-        self.declare("autostart", True, "Configure and activate at once; false waits for lifecycle transitions.")
-        self.declare("config", "", "Skin file (YAML), or a bag: then replayed frequencies give the recorded stress.")
-        self.declare("wrench_side", 0.0, "Side of the face that wrenches refer to, m; 0: the cube's own.", (0.0, 10.0))
-        self.declare("publish_period", 0.0, "The driver's, for how long queues must be, s.", (0.0, 1.0))
-        self.declare("qos_reliability", "reliable", "Reliability of the batch topics.", choices="reliable, best_effort")
-        self.declare("tare_duration", 1.0, "What ~/tare averages over unless it is told, s.", (0.5, 10.0), live=True)
-        self.declare("tare_folder", "", "Where tare is kept, by uid; empty: ~/.ros/cube_tensor_driver/tare.")
-        self.declare("drift_time", 0.0, "Time constant with which rest frequencies follow slow drift while nothing "
-                     "touches a cube, s; 0: never.", (0.0, 1e6), live=True)  # fmt: skip
+        self.declare(
+            "autostart",
+            True,
+            "Configure and activate at once; false waits for lifecycle transitions.",
+        )
+        self.declare(
+            "config",
+            "",
+            "Skin file (YAML), or a bag: then replayed frequencies give the recorded stress.",
+        )
+        self.declare(
+            "wrench_side",
+            0.0,
+            "Side of the face that wrenches refer to, m; 0: the cube's own.",
+            (0.0, 10.0),
+        )
+        self.declare(
+            "publish_period", 0.0, "The driver's, for how long queues must be, s.", (0.0, 1.0)
+        )
+        self.declare(
+            "qos_reliability",
+            "reliable",
+            "Reliability of the batch topics.",
+            choices="reliable, best_effort",
+        )
+        self.declare(
+            "tare_duration",
+            1.0,
+            "What ~/tare averages over unless it is told, s.",
+            (0.5, 10.0),
+            live=True,
+        )
+        self.declare(
+            "tare_folder", "", "Where tare is kept, by uid; empty: ~/.ros/cube_tensor_driver/tare."
+        )
+        self.declare(
+            "drift_time",
+            0.0,
+            "Time constant with which rest frequencies follow slow drift while nothing "
+            "touches a cube, s; 0: never.",
+            (0.0, 1e6),
+            live=True,
+        )
         self._active = False
         self._recorded: RecordedHealth | None = None
-        # In one process with the driver its thread calls `take`, while services run in the main thread.
+        # In one process with the driver its thread calls `take`, while services run in the main
+        # thread.
         self._lock = threading.Lock()
         self._diagnostics = Diagnostics(self, self._statuses)
 
@@ -63,7 +105,9 @@ class Reconstruction(CubeNode):
         recorded = self._recorded = _recorded(path)
         skin = self._skin = recorded.skin if recorded else read_skin(path)
         self._pipeline = (
-            recorded.pipeline if recorded else Pipeline([cube.calibration for cube in skin.cubes], np.float32)
+            recorded.pipeline
+            if recorded
+            else Pipeline([cube.calibration for cube in skin.cubes], np.float32)
         )
         self._health = recorded or Health(self._pipeline)
         self._rows = self._rows_before = self._invalid = self._bad_messages = 0
@@ -71,7 +115,7 @@ class Reconstruction(CubeNode):
         turns = scans_per_message(self.value("publish_period"), skin.rate)
         rate = None if skin.rate is None else skin.rate / turns
         quality = queue(rate, self.value("qos_reliability"), turns * len(skin.cubes))
-        self._blank = lru_cache(maxsize=BLANKS_KEPT)(blank_stress)
+        self._blank = lru_cache(maxsize=BUFFERS_KEPT)(stress_buffer)
         self._shape: tuple[bytes, Shape] | None = None
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
@@ -79,8 +123,16 @@ class Reconstruction(CubeNode):
         self._drift = DriftTracker(self._pipeline, self._health)
         self._drift_time = float(self.value("drift_time"))
         self._words = CubeHealth(skin, self._pipeline, self._health)
-        self._taring = Taring(self, skin, self._pipeline, self._health, None if recorded else folder,
-                              lambda: float(self.value("tare_duration")), self._publish_info, self._lock)  # fmt: skip
+        self._taring = Taring(
+            self,
+            skin,
+            self._pipeline,
+            self._health,
+            None if recorded else folder,
+            lambda: float(self.value("tare_duration")),
+            self._publish_info,
+            self._lock,
+        )
         self._listening = self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
         if self._subscribes:
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
@@ -123,8 +175,14 @@ class Reconstruction(CubeNode):
             self._refuse(error)
             return
         field = batch.field[0]
-        given = Rows(field["cube"], field["sequence"], batch.times_ns[0], field["frequency"], field["temperature"],
-                     field["pad_fault"])  # fmt: skip
+        given = Rows(
+            field["cube"],
+            field["sequence"],
+            batch.times_ns[0],
+            field["frequency"],
+            field["temperature"],
+            field["pad_fault"],
+        )
         self.take_rows(given, int(batch.stamp_ns[0]), bytes(field["frame_id"]))
 
     def take_rows(self, given: Rows, stamp_ns: int, frame_id: bytes) -> None:
@@ -141,7 +199,11 @@ class Reconstruction(CubeNode):
                 rows = self._pipeline.process(cube, given.frequency, pad_fault, given.temperature)
                 self._health.residual(cube, rows.status)
                 rows.status[:] |= status
-                if self._drift_time and self._health.closed != windows and self._drift.step(self._drift_time):
+                if (
+                    self._drift_time
+                    and self._health.closed != windows
+                    and self._drift.step(self._drift_time)
+                ):
                     self._publish_info()
         except CubeError as error:
             self._refuse(error)
@@ -158,16 +220,23 @@ class Reconstruction(CubeNode):
         self.get_logger().error(f"frequencies: {error}", throttle_duration_sec=5.0)
 
     def _publish_info(self) -> None:
-        # Just behind the last row that was made without it: so a bag says from which row on it holds.
-        since_ns = self._health.newest_ns + 1 if self._health.newest_ns else self.get_clock().now().nanoseconds
+        # Just behind the last row that was made without it: so a bag says from which row on it
+        # holds.
+        since_ns = (
+            self._health.newest_ns + 1
+            if self._health.newest_ns
+            else self.get_clock().now().nanoseconds
+        )
         self._info.publish(info_message(self._skin, self._pipeline, since_ns, self._taring.uids))
 
     def _on_lost(self, event: Any) -> None:
-        """DDS says that messages are gone for good: the network or this node was away for longer than queues hold."""
+        """DDS says that messages are gone for good: the network or this node was away for longer
+        than queues hold."""
         self._lost_messages = event.total_count
 
     def _statuses(self) -> list[DiagnosticStatus]:
-        """For diagnostics, of the whole and of cubes that are not fine; what was found since the last time."""
+        """For diagnostics, of the whole and of cubes that are not fine; what was found since the
+        last time."""
         if not self.configured:
             return []
         with self._lock:
@@ -199,7 +268,7 @@ def _recorded(path: Path) -> RecordedHealth | None:
     if not path.is_dir() and path.suffix not in BAGS:
         return None
     # Here, because it loads much that a node does not need otherwise.
-    from ..files.recorded import RecordedHealth
+    from ..bags.recorded_health import RecordedHealth
 
     return RecordedHealth(path)
 

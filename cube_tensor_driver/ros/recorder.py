@@ -1,4 +1,5 @@
-"""Topics into a bag, bytes as they come: the main thread takes messages, a thread of its own writes them."""
+"""Topics into a bag, bytes as they come: the main thread takes messages, a thread of its own writes
+them."""
 
 from __future__ import annotations
 
@@ -13,12 +14,13 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from ..bags.write import BagWriter, quality
 from ..core.errors import BagError
-from ..files.bag_writer import BagWriter, quality
 
 DEPTH = 2000
 WRITE_S = 0.05
-"""How often the writing thread looks what there is: seldom, so that it does not contend for the interpreter."""
+"""How often the writing thread looks what there is: seldom, so that it does not contend for the
+interpreter."""
 FLUSH_S = 0.25
 """How often all that was written is handed to the system: what a kill -9 can cost, twice over."""
 WAITING_BYTES = 256 << 20
@@ -28,7 +30,8 @@ WAITING_BYTES = 256 << 20
 class Recorder:
     """Records `topics` of a node's graph into a bag from now until `close`.
 
-    Topics that appear later are taken up by `find_topics`, to be called now and then. received, dropped: messages.
+    Topics that appear later are taken up by `find_topics`, to be called now and then. received,
+    dropped: messages.
     """
 
     def __init__(self, node: Node, topics: Sequence[str], bag: BagWriter) -> None:
@@ -49,7 +52,11 @@ class Recorder:
     @property
     def missing(self) -> list[str]:
         """Topics that nobody offers yet."""
-        return [topic for topic in self._wanted if topic not in self.counts and topic not in self.refused]
+        return [
+            topic
+            for topic in self._wanted
+            if topic not in self.counts and topic not in self.refused
+        ]
 
     def find_topics(self) -> None:
         """Subscribe to the wanted topics that have a publisher by now. Main thread only."""
@@ -74,17 +81,24 @@ class Recorder:
     def _subscribe(self, topic: str, offers: list[TopicEndpointInfo]) -> None:
         msgtype = offers[0].topic_type
         profiles = [offer.qos_profile for offer in offers]
-        latched = all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles)
+        latched = all(
+            profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles
+        )
         reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles)
         with self._lock:
-            self._bag.add_topic(topic, msgtype, [quality(latched=latched, reliable=reliable, depth=DEPTH)])
+            self._bag.add_topic(
+                topic, msgtype, [quality(latched=latched, reliable=reliable, depth=DEPTH)]
+            )
         clock = self._node.get_clock()
         self.counts[topic] = 0
 
         def take(data: bytes) -> None:
             self.received += 1
             self.counts[topic] += 1
-            if self._taken_bytes - self._written_bytes + len(data) > WAITING_BYTES or self.error is not None:
+            if (
+                self._taken_bytes - self._written_bytes + len(data) > WAITING_BYTES
+                or self.error is not None
+            ):
                 self.dropped += 1
                 return
             # Each of the two counts has one thread that changes it; the deque is safe for both.
@@ -98,7 +112,9 @@ class Recorder:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         self._subscriptions.append(
-            self._node.create_subscription(message_class(topic, msgtype), topic, take, profile, raw=True)
+            self._node.create_subscription(
+                message_class(topic, msgtype), topic, take, profile, raw=True
+            )
         )
 
     def _write(self) -> None:

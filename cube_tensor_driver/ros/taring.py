@@ -1,4 +1,5 @@
-"""Tare as services: ~/tare and ~/clear_tare, kept on disk by uid, restored when the driver says who the cubes are."""
+"""Tare as services: ~/tare and ~/clear_tare, kept on disk by uid, restored when the driver says who
+the cubes are."""
 
 from __future__ import annotations
 
@@ -16,12 +17,12 @@ from std_srvs.srv import Trigger
 from cube_tensor_driver.msg import SkinInfo
 from cube_tensor_driver.srv import Tare
 
+from ..config.skin import Skin
+from ..config.tare import read_tare, remove_tare, write_tare
 from ..core.errors import ConfigError, CubeError, TareError
 from ..core.health import Health
 from ..core.pipeline import Pipeline
 from ..core.tare import measure_rest
-from ..files.skin import Skin
-from ..files.tare import read_tare, remove_tare, write_tare
 
 STALE_S = 1.0
 """Data older than this is not the present load."""
@@ -35,7 +36,8 @@ def tare_folder(parameter: str) -> Path:
 
 
 class Taring:
-    """The services of one reconstruction. changed: called when rest frequencies have changed; lock: held meanwhile.
+    """The services of one reconstruction. changed: called when rest frequencies have changed; lock:
+    held meanwhile.
 
     folder: None keeps and restores nothing."""
 
@@ -67,7 +69,8 @@ class Taring:
             self._node.destroy_service(service)
 
     def on_info(self, message: SkinInfo) -> None:
-        """The driver's `info`: uids of cubes that the skin file does not name. Our own says nothing new."""
+        """The driver's `info`: uids of cubes that the skin file does not name. Our own says nothing
+        new."""
         if message.name == self._skin.name and len(message.cubes) == len(self._names):
             self._learn({number: cube.uid for number, cube in enumerate(message.cubes) if cube.uid})
 
@@ -79,7 +82,8 @@ class Taring:
         return {"cubes tared": str(len(self.created)), "oldest tare s": f"{oldest:.0f}"}
 
     def _learn(self, uids: Mapping[int, int]) -> None:
-        """Cubes are known now: restore what is kept of them; a cube that was exchanged starts as calibrated."""
+        """Cubes are known now: restore what is kept of them; a cube that was exchanged starts as
+        calibrated."""
         fresh = {number: uid for number, uid in uids.items() if self.uids.get(number) != uid}
         rest = self._pipeline.rest_frequency
         before = rest.copy()
@@ -91,12 +95,16 @@ class Taring:
             try:
                 stored = read_tare(self._folder, uid, calibration) if self._folder else None
             except ConfigError as error:
-                self._node.get_logger().warning(f"cube {self._names[number]}: tare not restored: {error}")
+                self._node.get_logger().warning(
+                    f"cube {self._names[number]}: tare not restored: {error}"
+                )
                 continue
             if stored is not None:
                 rest[number, : calibration.layout.n_pads] = stored.rest_frequency
                 self.created[number] = stored.created
-                self._node.get_logger().info(f"cube {self._names[number]}: tare of {stored.created} restored")
+                self._node.get_logger().info(
+                    f"cube {self._names[number]}: tare of {stored.created} restored"
+                )
         if not np.array_equal(before, rest, equal_nan=True):
             self._set(rest)
 
@@ -108,11 +116,17 @@ class Taring:
                 if now_ns - self._health.newest_ns > 1e9 * STALE_S:
                     raise TareError("no data now: see the diagnostics of the links")
                 rest = measure_rest(
-                    self._pipeline, self._health, cubes, request.duration or self._duration(), self._names
+                    self._pipeline,
+                    self._health,
+                    cubes,
+                    request.duration or self._duration(),
+                    self._names,
                 )
                 moved = np.nanmax(np.abs(rest / self._pipeline.rest_frequency - 1)[cubes])
             self._set(rest)
-            response.message = f"{len(cubes)} cubes, rest frequencies moved by up to {1e6 * moved:.0f} ppm"
+            response.message = (
+                f"{len(cubes)} cubes, rest frequencies moved by up to {1e6 * moved:.0f} ppm"
+            )
             response.message += self._keep(cubes, rest)
             response.success = True
         except CubeError as error:
@@ -138,8 +152,12 @@ class Taring:
     def _find(self, names: list[str]) -> list[int]:
         unknown = [name for name in names if name not in self._names]
         if unknown:
-            raise TareError(f"no cube {', '.join(map(repr, unknown))} in the skin; its cubes: {', '.join(self._names)}")
-        return [self._names.index(name) for name in names] if names else list(range(len(self._names)))
+            raise TareError(
+                f"no cube {', '.join(map(repr, unknown))} in the skin; its cubes: {', '.join(self._names)}"
+            )
+        return (
+            [self._names.index(name) for name in names] if names else list(range(len(self._names)))
+        )
 
     def _keep(self, cubes: list[int], rest: np.ndarray) -> str:
         """Write files; returns what the answer should say about it."""
@@ -155,11 +173,19 @@ class Taring:
             calibration = self._skin.cubes[number].calibration
             try:
                 write_tare(
-                    self._folder, self.uids[number], calibration, rest[number, : calibration.layout.n_pads], created
+                    self._folder,
+                    self.uids[number],
+                    calibration,
+                    rest[number, : calibration.layout.n_pads],
+                    created,
                 )
             except ConfigError as error:
                 return f"; in force, but not kept: {error}"
-        return f"; not kept, since their uid is not known: {', '.join(nameless)}" if nameless else "; kept on disk"
+        return (
+            f"; not kept, since their uid is not known: {', '.join(nameless)}"
+            if nameless
+            else "; kept on disk"
+        )
 
     def _forget(self, number: int, rest: np.ndarray) -> None:
         rest[number] = self._calibrated[number]

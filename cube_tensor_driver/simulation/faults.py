@@ -1,7 +1,9 @@
-"""Faults of simulated hubs, by schedule or live: what happens to which hub, when, and the book of it.
+"""Faults of simulated hubs, by schedule or live: what happens to which hub, when, and the book of
+it.
 
-A fault is a table with `kind` and, where it needs them: `at` (s of simulated time, now if left out), `link` (all if
-left out), `seconds` (how long), `count` (samples harmed), `cube` and `pad` (on the hub), `value`.
+A fault is a table with `kind` and, where it needs them: `at` (s of simulated time, now if left
+out), `link` (all if left out), `seconds` (how long), `count` (samples harmed), `cube` and `pad` (on
+the hub), `value`.
 """
 
 from __future__ import annotations
@@ -66,17 +68,29 @@ class Fault:
     def parse(cls, data: Any, place: str) -> Fault:
         """From plain values. ConfigError names key, what was found and what is allowed."""
         if not isinstance(data, dict) or "kind" not in data:
-            raise ConfigError(f"{place}: found {str(data)[:60]!r}, allowed: a table with the key kind, {{kind: drop}}")
+            raise ConfigError(
+                f"{place}: found {str(data)[:60]!r}, allowed: a table with the key kind, {{kind: drop}}"
+            )
         known: dict[str, Any] = {field.name: type(field.default) for field in fields(cls)}
         known["kind"] = str
         for key, value in data.items():
             if key not in known:
                 raise ConfigError(f"{place}: unknown key {key!r}, allowed: {', '.join(known)}")
             kind = known[key]
-            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-            fine = (number and (kind is float or value == int(value))) if kind is not str else isinstance(value, str)
+            number = (
+                isinstance(value, (int, float))
+                and not isinstance(value, bool)
+                and math.isfinite(value)
+            )
+            fine = (
+                (number and (kind is float or value == int(value)))
+                if kind is not str
+                else isinstance(value, str)
+            )
             if not fine or (key not in ("value", "kind", "link") and value < 0):
-                raise ConfigError(f"{place}: {key}: found {value!r}, allowed: a {kind.__name__} from 0 up")
+                raise ConfigError(
+                    f"{place}: {key}: found {value!r}, allowed: a {kind.__name__} from 0 up"
+                )
         if data["kind"] not in KINDS:
             raise ConfigError(f"{place}: kind: found {data['kind']!r}, allowed: {', '.join(KINDS)}")
         return cls(**{key: known[key](value) for key, value in data.items()})
@@ -110,25 +124,32 @@ class Injector:
         self.book: list[tuple[int, int, str, dict[str, Any]]] = []
         self._frames: dict[str, list[str]] = {name: [] for name in self._benches}
         self._held: dict[str, bytes] = {}
-        self._pads: dict[str, list[tuple[Fault, NDArray[np.uint32] | None]]] = {name: [] for name in self._benches}
+        self._pads: dict[str, list[tuple[Fault, NDArray[np.uint32] | None]]] = {
+            name: [] for name in self._benches
+        }
         self._warm: dict[str, tuple[int, float, float]] = {}
         for fault in faults:
             self.add(fault, round(1e6 * fault.at))
 
     def add(self, fault: Fault, at_us: int) -> None:
-        """Carry out a fault at a simulated time. ConfigError: of a link, cube or pad that there is not."""
+        """Carry out a fault at a simulated time. ConfigError: of a link, cube or pad that there is
+        not."""
         names = [fault.link] if fault.link else list(self._benches)
         for name in names:
             bench = self._benches.get(name)
             if bench is None:
-                raise ConfigError(f"fault {fault.kind}: link {name!r}, allowed: {', '.join(self._benches)}")
+                raise ConfigError(
+                    f"fault {fault.kind}: link {name!r}, allowed: {', '.join(self._benches)}"
+                )
             cubes, pads = len(bench.hub.cube_uids), bench.hub.n_pads
             if fault.kind in PAD and not (fault.cube < cubes and fault.pad < pads):
                 raise ConfigError(
                     f"fault {fault.kind}: found cube {fault.cube}, pad {fault.pad}; allowed: below {cubes}, {pads}"
                 )
             self._number += 1
-            heapq.heappush(self._coming, (at_us, self._number, Fault(**{**asdict(fault), "link": name})))
+            heapq.heappush(
+                self._coming, (at_us, self._number, Fault(**{**asdict(fault), "link": name}))
+            )
 
     def due_us(self) -> int | None:
         """When `step` has to be called next."""
@@ -144,7 +165,9 @@ class Injector:
             _, _, fault = heapq.heappop(self._coming)
             self._begin(self._benches[fault.link], fault, now_us)
 
-    def values(self, bench: Bench, frequency: NDArray[np.uint32], now_us: int) -> NDArray[np.uint32]:
+    def values(
+        self, bench: Bench, frequency: NDArray[np.uint32], now_us: int
+    ) -> NDArray[np.uint32]:
         """What the hub measures, (cubes, pads) in mHz, of what the pads would do."""
         pads, warm = self._pads[bench.name], self._warm.get(bench.name)
         extra = bench.hub.extra_pads
@@ -163,7 +186,9 @@ class Injector:
                 # Only the parasitic capacitance is left: above all that the law of β = 0.3 knows.
                 frequency[at] = min(8 * int(frequency[at]), 0xFFFFFFFF)
             elif fault.kind == "noisy":
-                frequency[at] = round(float(frequency[at]) * (1 + fault.value * self._random.standard_normal()))
+                frequency[at] = round(
+                    float(frequency[at]) * (1 + fault.value * self._random.standard_normal())
+                )
             else:
                 if kept is None:
                     kept = frequency[at].copy()
@@ -238,9 +263,15 @@ class Injector:
     def _end(self, bench: Bench, fault: Fault, now_us: int) -> None:
         hub, line = bench.hub, bench.line
         if fault.kind in PAD:
-            self._pads[bench.name] = [pair for pair in self._pads[bench.name] if pair[0] is not fault]
+            self._pads[bench.name] = [
+                pair for pair in self._pads[bench.name] if pair[0] is not fault
+            ]
         elif fault.kind in ("unplug", "rename") and not line.plugged:
-            renamed = line.port.with_name(f"{bench.name}_{len(self.book)}") if fault.kind == "rename" else None
+            renamed = (
+                line.port.with_name(f"{bench.name}_{len(self.book)}")
+                if fault.kind == "rename"
+                else None
+            )
             line.plug(renamed)
             hub.reset(now_us, 0)
             line.send(hub.hello(), now_us)

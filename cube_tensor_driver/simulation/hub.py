@@ -1,4 +1,5 @@
-"""A simulated hub: answers requests, takes samples, keeps its book. No I/O and no clock, as on the wire so here."""
+"""A simulated hub: answers requests, takes samples, keeps its book. No I/O and no clock, as on the
+wire so here."""
 
 from __future__ import annotations
 
@@ -9,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device.decoder import Decoder
-from ..device.prepared import Prepared
 from ..device.protocol import (
     TEMPERATURE_UNKNOWN,
     VERSION,
@@ -22,6 +22,7 @@ from ..device.protocol import (
     Stats,
     encode,
 )
+from .prepared_frames import Prepared
 
 FIRMWARE = 0x00010000
 PERIOD_LIMITS_US = (100, 10_000_000)
@@ -29,7 +30,8 @@ PERIOD_LIMITS_US = (100, 10_000_000)
 
 @dataclass
 class Run:
-    """Samples first … last (from power-up) were taken at start_us, start_us + period_us, … of simulated time.
+    """Samples first … last (from power-up) were taken at start_us, start_us + period_us, … of
+    simulated time.
 
     boot: how often the hub had restarted by then.
     """
@@ -45,9 +47,10 @@ class Run:
 class SimulatedHub:
     """The device side of the protocol.
 
-    boot_us: what the hub's clock shows at simulated time 0; period_us: sample period; next_us: simulated time of the
-    next sample; runs: the book of what was sampled; dropped: samples taken that found no room on the line, since
-    power-up; boots: restarts. For faults: drift_ppm, version, false_uid, extra_pads, celsius (0.01 °C).
+    boot_us: what the hub's clock shows at simulated time 0; period_us: sample period; next_us:
+    simulated time of the next sample; runs: the book of what was sampled; dropped: samples taken
+    that found no room on the line, since power-up; boots: restarts. For faults: drift_ppm, version,
+    false_uid, extra_pads, celsius (0.01 °C).
     """
 
     uid: int
@@ -84,7 +87,9 @@ class SimulatedHub:
 
     def device_us(self, now_us: int) -> int:
         """What the hub's clock shows at simulated time now_us."""
-        return self.boot_us + now_us + round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
+        return (
+            self.boot_us + now_us + round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
+        )
 
     def set_clock(self, now_us: int, step_us: int = 0, drift_ppm: float | None = None) -> None:
         """Set the clock forward, or give it another rate from now on."""
@@ -106,17 +111,24 @@ class SimulatedHub:
 
     def receive(self, data: bytes, now_us: int) -> bytes:
         """What the hub answers to bytes that the host sends at simulated time now_us."""
-        answers = [self._answer(frame, now_us) for frame in self.decoder.feed(data) if isinstance(frame, Request)]
+        answers = [
+            self._answer(frame, now_us)
+            for frame in self.decoder.feed(data)
+            if isinstance(frame, Request)
+        ]
         return b"".join(answers)
 
     def prepare(self, frequency: NDArray[np.uint32]) -> None:
         """Encode now what will be the same in every SAMPLE of these very frequencies."""
         n = len(frequency)
-        plain = Sample(0, 0, 0, frequency, np.zeros(n, "<u4"), np.full(n, TEMPERATURE_UNKNOWN, "<i2"))
+        plain = Sample(
+            0, 0, 0, frequency, np.zeros(n, "<u4"), np.full(n, TEMPERATURE_UNKNOWN, "<i2")
+        )
         self._prepared[id(frequency)] = frequency, Prepared(plain)
 
     def sample(self, frequency: NDArray[np.uint32]) -> bytes:
-        """Take the sample of next_us: bytes of its SAMPLE frame. frequency: (cubes, pads) in mHz."""
+        """Take the sample of next_us: bytes of its SAMPLE frame. frequency: (cubes, pads) in
+        mHz."""
         run = self.runs[-1] if self.runs else None
         if (
             run
@@ -126,7 +138,9 @@ class SimulatedHub:
         ):
             run.last = self.sequence
         else:
-            self.runs.append(Run(self.sequence, self.sequence, self.next_us, self.period_us, self.boots))
+            self.runs.append(
+                Run(self.sequence, self.sequence, self.next_us, self.period_us, self.boots)
+            )
         sequence, device_us = self.sequence & 0xFFFFFFFF, max(0, self.device_us(self.next_us))
         self.sequence += 1
         self.next_us += self.period_us
@@ -135,7 +149,9 @@ class SimulatedHub:
             return prepared.encode(sequence, device_us)
         n = len(frequency)
         temperature = np.full(n, self.celsius, "<i2")
-        return encode(Sample(sequence, 0, device_us, frequency, np.zeros(n, "<u4"), temperature), self.version)
+        return encode(
+            Sample(sequence, 0, device_us, frequency, np.zeros(n, "<u4"), temperature), self.version
+        )
 
     def skip(self, now_us: int) -> None:
         """Take the next sample after now_us; those before are never taken."""

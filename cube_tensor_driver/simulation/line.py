@@ -1,4 +1,5 @@
-"""The line of a simulated hub: a pseudo-terminal or TCP, that can be unplugged, held up, and taken in bursts."""
+"""The line of a simulated hub: a pseudo-terminal or TCP, that can be unplugged, held up, and taken
+in bursts."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from ..core.errors import ConfigError
 from ..device.tcp import parse_url
 
 OUT_LIMIT = 1 << 16
-"""Bytes that wait for the line at most: what is sampled beyond is dropped in the hub, and counted there."""
+"""Bytes that wait for the line at most: what is sampled beyond is dropped in the hub, and counted
+there."""
 BURST_US = 16_000
 """The latency timer of common USB serial chips."""
 
@@ -20,7 +22,8 @@ BURST_US = 16_000
 class Line:
     """One pseudo-terminal, whose near end appears as the link `port`.
 
-    held_until_us, burst_until_us: until when (simulated time) nothing, or every BURST_US all, goes out.
+    held_until_us, burst_until_us: until when (simulated time) nothing, or every BURST_US all, goes
+    out.
     """
 
     def __init__(self, port: Path) -> None:
@@ -55,7 +58,8 @@ class Line:
         self._out.clear()
 
     def send(self, data: bytes, now_us: int) -> bool:
-        """Queue bytes for the line and write what it takes; False when there was no room for them."""
+        """Queue bytes for the line and write what it takes; False when there was no room for
+        them."""
         room = self.plugged and len(self._out) + len(data) <= OUT_LIMIT
         if room:
             self._out += data
@@ -94,7 +98,8 @@ class Line:
 
 
 class TcpLine(Line):
-    """The same behind a bridge that listens at `url`: what is unplugged is the bridge, and it has no other name."""
+    """The same behind a bridge that listens at `url`: what is unplugged is the bridge, and it has
+    no other name."""
 
     def __init__(self, url: str) -> None:
         """LinkError: no address; ConfigError: it cannot be listened at."""
@@ -109,7 +114,9 @@ class TcpLine(Line):
             self._listener = socket.create_server(self._address, backlog=1)
         except OSError as error:
             host, number = self._address
-            raise ConfigError(f"{host}:{number}: {error.strerror}; name an address that is free here") from None
+            raise ConfigError(
+                f"{host}:{number}: {error.strerror}; name an address that is free here"
+            ) from None
         self._listener.setblocking(False)
         self.fd = self._listener.fileno()
 

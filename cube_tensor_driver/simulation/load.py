@@ -10,32 +10,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from ..config.load_script import Action, Indenter, Script, between, read_script
+from ..config.package_data import package_data
+from ..config.skin import Skin
 from ..core.errors import ConfigError
-from ..core.scene import Places
+from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..elastic import contact
-from ..files.script import Action, Indenter, Script, between, read_script
-from ..files.share import share
-from ..files.skin import Skin
 
 Array = NDArray[np.float64]
 SLOW = 1e-3
-"""Speed at which friction has reached 0.7 of its full size, m/s: it turns round smoothly where a slide does."""
+"""Speed at which friction has reached 0.7 of its full size, m/s: it turns round smoothly where a
+slide does."""
 WIDEST = 12
-"""Contact's radius over the cubes' depth at most: wider ones take more points than anybody can wait for."""
+"""Contact's radius over the cubes' depth at most: wider ones take more points than anybody can wait
+for."""
 _STEPS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
 """Orders of quadrature in use: few different ones, so that cubes are computed together."""
 
 
 def default_script() -> Script:
     """The script of those who name none: something wanders over the whole skin."""
-    return read_script(share() / "config" / "load_demo.yaml")
+    return read_script(package_data() / "config" / "load_demo.yaml")
 
 
 class Press(NamedTuple):
     """What one indenter does at one time, in the skin's parent frame.
 
-    place (3,) m, normal (3,) out of the skin there, force (3,) N on the skin, radius of the contact in m.
+    place (3,) m, normal (3,) out of the skin there, force (3,) N on the skin, radius of the contact
+    in m.
     """
 
     shape: str
@@ -48,24 +51,30 @@ class Press(NamedTuple):
 class Load:
     """A script on a skin: the same at the same time in every process.
 
-    Each cube sees the half space whose surface lies `script.depth` above it, across its own z axis, with the load at
-    the foot of its perpendicular; a cube that is turned away from the load by an angle sees the angle's cosine of it,
-    beyond a right angle nothing. A sphere's contact is Hertz's: a³ = 3 F R (1 − ν²) / (4 E). The tangential force of
-    a slide is friction × normal force along its velocity v, times v / √(v² + SLOW²).
+    Each cube sees the half space whose surface lies `script.depth` above it, across its own z axis,
+    with the load at the foot of its perpendicular; a cube that is turned away from the load by an
+    angle sees the angle's cosine of it, beyond a right angle nothing. A sphere's contact is
+    Hertz's: a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a slide is friction × normal force
+    along its velocity v, times v / √(v² + SLOW²).
 
-    Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz), 7.1 (sliding), 8.1 (rolling with traction).
+    Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz), 7.1 (sliding), 8.1 (rolling with
+    traction).
     """
 
     def __init__(self, skin: Skin, script: Script) -> None:
-        """ConfigError: a sphere sinks in deeper than Hertz's contact holds, or a disc is too wide for its depth."""
+        """ConfigError: a sphere sinks in deeper than Hertz's contact holds, or a disc is too wide
+        for its depth."""
         self.script = script
         self.period = script.period or script.end
         self._position = np.array([cube.xyz for cube in skin.cubes])
         self._turn = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
         half = np.array([cube.calibration.half_side for cube in skin.cubes])
-        low, high = (self._position - half[:, None]).min(axis=0), (self._position + half[:, None]).max(axis=0)
+        low, high = (
+            (self._position - half[:, None]).min(axis=0),
+            (self._position + half[:, None]).max(axis=0),
+        )
         self._centre, self._span = (low + high) / 2, (high - low) / 2
-        self.places = Places(self._position, self._turn, half)
+        self.places = CubePoses(self._position, self._turn, half)
         self._pitch = self.places.pitch
         self._paths = {id(a): self._path(a) for i in script.indenters for a in i.actions}
         for indenter in script.indenters:
@@ -82,7 +91,8 @@ class Load:
                 )
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in the cubes' frames."""
+        """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
+        the cubes' frames."""
         stress, gradient = np.zeros((len(self._turn), 6)), np.zeros((len(self._turn), 6, 3))
         for press in self.presses(seconds):
             local = np.einsum("nij,ni->nj", self._turn, press.place - self._position)
@@ -95,7 +105,9 @@ class Load:
                 points, share_of = _points(press.shape, order)
                 sources = local[rows, None, :] * (1.0, 1.0, 0.0) + press.radius * points
                 below = np.array([[0.0, 0.0, -self.script.depth]])
-                found = contact.field(below, sources, force[rows, None, :] * share_of, self.script.poisson)
+                found = contact.field(
+                    below, sources, force[rows, None, :] * share_of, self.script.poisson
+                )
                 stress[rows] += found[0][:, 0]
                 gradient[rows] += found[1][:, 0]
         return stress, gradient
@@ -113,7 +125,8 @@ class Load:
         return found
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """Sum (3,) of all forces on the skin in N, their centre of pressure (3,) in m and the mean normal (3,) there.
+        """Sum (3,) of all forces on the skin in N, their centre of pressure (3,) in m and the mean
+        normal (3,) there.
 
         Without load centre and normal are NaN.
         """
@@ -123,7 +136,11 @@ class Load:
             return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
         centre = weight @ np.array([press.place for press in presses]) / weight.sum()
         normal = weight @ np.array([press.normal for press in presses])
-        return np.sum([press.force for press in presses], axis=0), centre, normal / np.linalg.norm(normal)
+        return (
+            np.sum([press.force for press in presses], axis=0),
+            centre,
+            normal / np.linalg.norm(normal),
+        )
 
     def _press(self, indenter: Indenter, action: Action, seconds: float) -> Press:
         when = (seconds - action.start) / (action.end - action.start)
@@ -134,12 +151,23 @@ class Load:
         if path and action.kind == "slide":
             velocity = path(when, 1) / (action.end - action.start)
             velocity -= normal * (velocity @ normal)
-            shear = indenter.friction * size * velocity / math.hypot(float(np.linalg.norm(velocity)), SLOW)
+            shear = (
+                indenter.friction
+                * size
+                * velocity
+                / math.hypot(float(np.linalg.norm(velocity)), SLOW)
+            )
         else:
             steady = len(action.shear) == 1
-            shear = action.shear[0] * size / action.force.max() if steady else between(action.shear, when)
+            shear = (
+                action.shear[0] * size / action.force.max()
+                if steady
+                else between(action.shear, when)
+            )
             shear = shear - normal * (shear @ normal)
-        return Press(indenter.shape, place, normal, shear - size * normal, self._radius(indenter, size))
+        return Press(
+            indenter.shape, place, normal, shear - size * normal, self._radius(indenter, size)
+        )
 
     def _radius(self, indenter: Indenter, force: float) -> float:
         if indenter.shape == "disc":
@@ -156,7 +184,9 @@ class Load:
             return None
         closed = len(action.path) > 2 and np.array_equal(action.path[0], action.path[-1])
         when = np.linspace(0, 1, len(action.path))
-        return CubicSpline(when, self._place(action.path), bc_type="periodic" if closed else "clamped")
+        return CubicSpline(
+            when, self._place(action.path), bc_type="periodic" if closed else "clamped"
+        )
 
     def _normal(self, place: Array) -> Array:
         """(3,) out of the skin: the mean of the cubes' z axes, near ones first."""
@@ -168,9 +198,11 @@ class Load:
 
 
 def _orders(shape: str, radius: float, depth: float, away: Array) -> NDArray[np.int64]:
-    """Order of quadrature for each cube, `away` m from the contact's axis: few points for those who see it from afar.
+    """Order of quadrature for each cube, `away` m from the contact's axis: few points for those who
+    see it from afar.
 
-    Stress and gradient are within 1e-3 of their greatest value; what point forces make is in balance in any case.
+    Stress and gradient are within 1e-3 of their greatest value; what point forces make is in
+    balance in any case.
     """
     near = radius / np.hypot(depth, np.maximum(away - radius, 0.0))
     wanted = 5 * near + 1 if shape == "sphere" else 3.3 * near + 0.5
@@ -183,6 +215,9 @@ def _points(shape: str, order: int) -> tuple[Array, Array]:
     if shape == "sphere" and order > 1:
         points, share_of = contact.hertz(1.0, (0.0, 0.0, 1.0), order=order)
     else:
-        # Seen from afar a sphere's contact is a disc with the same second moment: 2/5 a² against 1/2 a².
-        points, share_of = contact.disc(math.sqrt(0.8) if shape == "sphere" else 1.0, (0.0, 0.0, 1.0), order=order)
+        # Seen from afar a sphere's contact is a disc with the same second moment: 2/5 a² against
+        # 1/2 a².
+        points, share_of = contact.disc(
+            math.sqrt(0.8) if shape == "sphere" else 1.0, (0.0, 0.0, 1.0), order=order
+        )
     return points, share_of[:, 2:]

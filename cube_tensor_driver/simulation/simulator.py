@@ -1,4 +1,5 @@
-"""Plays all hubs of a skin in one process, on pseudo-terminals or TCP, under a load, and keeps the book of it."""
+"""Plays all hubs of a skin in one process, on pseudo-terminals or TCP, under a load, and keeps the
+book of it."""
 
 from __future__ import annotations
 
@@ -15,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..config.skin import Skin
+from ..config.yaml import parse_yaml
 from ..core.errors import ConfigError
-from ..files.skin import Skin
-from ..files.yaml import parse_yaml
 from .cubes import SimulatedCubes
 from .faults import Fault, Injector
 from .hub import SimulatedHub
@@ -35,7 +36,8 @@ CONTROL = ".faults"
 
 @dataclasses.dataclass
 class Bench:
-    """A hub on its line. members: (hub cubes,) index in the skin of each cube of the hub, ABSENT where it has none."""
+    """A hub on its line. members: (hub cubes,) index in the skin of each cube of the hub, ABSENT
+    where it has none."""
 
     name: str
     hub: SimulatedHub
@@ -60,11 +62,13 @@ class Simulator:
         seed: int = 0,
         tcp: bool = False,
     ) -> None:
-        """instants: compute the load at so many instants of its script beforehand and go round them, one a sample.
+        """instants: compute the load at so many instants of its script beforehand and go round
+        them, one a sample.
 
-        faults: to carry out; seed: of what is random in them; tcp: play links whose port is socket://host:port there.
-        ConfigError: cubes of one hub have different numbers of pads, the folder for the ports or a TCP address cannot
-        be used, or a fault is of what there is not.
+        faults: to carry out; seed: of what is random in them; tcp: play links whose port is
+        socket://host:port there.
+        ConfigError: cubes of one hub have different numbers of pads, the folder for the ports or a
+        TCP address cannot be used, or a fault is of what there is not.
         """
         self._load = load
         self._ports = ports
@@ -84,12 +88,24 @@ class Simulator:
                     raise ConfigError(
                         f"link {link.name}: its cubes have {sorted(widths)} pads; a hub carries one kind only"
                     )
-                uids = [skin.cubes[m].uid or FIRST_UID + int(m) if m != ABSENT else FIRST_UID + 0xFFFF - i
-                        for i, m in enumerate(members)]  # fmt: skip
+                uids = [
+                    skin.cubes[m].uid or FIRST_UID + int(m)
+                    if m != ABSENT
+                    else FIRST_UID + 0xFFFF - i
+                    for i, m in enumerate(members)
+                ]
                 # Clocks that started at different times, as those of real hubs.
-                hub = SimulatedHub(link.hub_uid or number + 1, uids, widths.pop(), boot_us=1_000_003 * (number + 1))
-                simulated = SimulatedCubes([cube.calibration for cube in cubes], noise, drift, seed=number)
-                line = TcpLine(link.port) if tcp and link.port.startswith("socket://") else Line(ports / link.name)
+                hub = SimulatedHub(
+                    link.hub_uid or number + 1, uids, widths.pop(), boot_us=1_000_003 * (number + 1)
+                )
+                simulated = SimulatedCubes(
+                    [cube.calibration for cube in cubes], noise, drift, seed=number
+                )
+                line = (
+                    TcpLine(link.port)
+                    if tcp and link.port.startswith("socket://")
+                    else Line(ports / link.name)
+                )
                 self.benches.append(Bench(link.name, hub, line, members, simulated))
             control = ports / CONTROL
             control.unlink(missing_ok=True)
@@ -131,15 +147,21 @@ class Simulator:
                         key.data()
                 now = self.now_us()
                 for bench in self.benches:
-                    if bench.hub.started and not bench.prepared and now - bench.hub.next_us > LATE_US:
+                    if (
+                        bench.hub.started
+                        and not bench.prepared
+                        and now - bench.hub.next_us > LATE_US
+                    ):
                         bench.hub.skip(now)
                 behind = True
                 while behind and not stop.requested:
-                    # One of each hub in turn: where this loop comes late no hub falls silent behind the others.
+                    # One of each hub in turn: where this loop comes late no hub falls silent behind
+                    # the others.
                     behind = False
                     for bench in self.benches:
                         if bench.hub.started and bench.hub.next_us <= now:
-                            # Faults fall between the samples where they belong, however late this loop comes.
+                            # Faults fall between the samples where they belong, however late this
+                            # loop comes.
                             self._injector.step(bench.hub.next_us)
                             if bench.hub.started:
                                 self._sample(bench, now)
@@ -147,7 +169,9 @@ class Simulator:
                 for bench in self.benches:
                     bench.line.flush(now)
                     if bench.hub.started and not bench.prepared:
-                        self._field_at(bench.hub.next_us)  # before it is due: a hub does not compute its load
+                        self._field_at(
+                            bench.hub.next_us
+                        )  # before it is due: a hub does not compute its load
                 self._injector.step(now)
                 if now >= second_us:
                     second_us += 1_000_000
@@ -163,7 +187,9 @@ class Simulator:
         times += [bench.line.due_us(now) for bench in self.benches]
         return min(time for time in times if time is not None)
 
-    def _watch(self, selector: selectors.BaseSelector, watched: dict[str, int], bench: Bench) -> None:
+    def _watch(
+        self, selector: selectors.BaseSelector, watched: dict[str, int], bench: Bench
+    ) -> None:
         """Listen to the line as it is plugged now."""
         fd = bench.line.fd
         if watched.get(bench.name, -1) != fd:
@@ -208,7 +234,9 @@ class Simulator:
             self._fields[time_us] = stress, gradient
         return self._fields[time_us]
 
-    def _frequency(self, bench: Bench, stress: np.ndarray, gradient: np.ndarray, seconds: float) -> np.ndarray:
+    def _frequency(
+        self, bench: Bench, stress: np.ndarray, gradient: np.ndarray, seconds: float
+    ) -> np.ndarray:
         there = bench.members != ABSENT
         frequency = np.zeros((len(there), bench.hub.n_pads), "<u4")
         cubes = bench.members[there]
@@ -216,7 +244,8 @@ class Simulator:
         return frequency
 
     def book(self) -> dict[str, object]:
-        """What was sampled: start_time_ns (wall clock at simulated time 0), per link runs, dropped, members; faults."""
+        """What was sampled: start_time_ns (wall clock at simulated time 0), per link runs, dropped,
+        members; faults."""
         links = {
             bench.name: {
                 "runs": [dataclasses.asdict(run) for run in bench.hub.runs],
@@ -253,15 +282,23 @@ class Stop:
 
 
 def hub_members(skin: Skin, link: str) -> np.ndarray:
-    """(hub cubes,) index in the skin of each cube that a simulated hub on this link carries, ABSENT for none.
+    """(hub cubes,) index in the skin of each cube that a simulated hub on this link carries, ABSENT
+    for none.
 
-    Cubes that are known by uid alone take the free places; without a link they sit on the first one.
+    Cubes that are known by uid alone take the free places; without a link they sit on the first
+    one.
     """
     fixed = {
-        cube.index: number for number, cube in enumerate(skin.cubes) if cube.link == link and cube.index is not None
+        cube.index: number
+        for number, cube in enumerate(skin.cubes)
+        if cube.link == link and cube.index is not None
     }
     first = skin.links[0].name
-    loose = [number for number, cube in enumerate(skin.cubes) if cube.index is None and (cube.link or first) == link]
+    loose = [
+        number
+        for number, cube in enumerate(skin.cubes)
+        if cube.index is None and (cube.link or first) == link
+    ]
     size = max([len(fixed) + len(loose), *(index + 1 for index in fixed)], default=0)
     members = np.full(size, ABSENT)
     members[list(fixed)] = list(fixed.values())

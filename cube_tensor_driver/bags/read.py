@@ -1,0 +1,291 @@
+"""Bags (rosbag2 folders, or one .mcap or .db3 file) read without ROS. All that is wrong with one is
+a `BagError`."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag2 import ReaderError
+from rosbags.rosbag2.storage_mcap import zstd
+from rosbags.rosbag2.storage_sqlite3 import apsw
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from ..config.package_data import package_data
+from ..config.yaml import parse_yaml
+from ..core.calibration import Calibration
+from ..core.errors import BagError, CalibrationError, ConfigError, CubeError, MessageError
+from ..core.pipeline import Pipeline
+from . import message_codec
+from .mcap import BagReader
+
+PACKAGE = "cube_tensor_driver"
+FREQUENCIES, STRESS, INFO = (
+    f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo")
+)
+VERSIONS = (1, 2)
+"""Of SkinInfo that this package reads. An older one that is not among them has to be converted
+here."""
+BATCH, BATCH_BYTES = 64, 1 << 19
+"""Messages at a time: what numpy costs per call no longer counts, and they fit the cache."""
+# What rosbags and the libraries below it let through where bytes are not what they should be.
+DAMAGE = (
+    ReaderError,
+    SerdeError,
+    TypesysError,
+    apsw.Error,
+    zstd.ZstdError,
+    struct.error,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+    ArithmeticError,
+    MemoryError,
+    EOFError,
+    RuntimeError,
+)
+
+
+@contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """What goes wrong inside with the bag `path` is a BagError; errors of our own pass."""
+    try:
+        yield
+    except CubeError:
+        raise
+    except FileNotFoundError as error:
+        if path.is_dir() and not (path / "metadata.yaml").exists():
+            raise BagError(
+                f"{path}: no metadata.yaml: no bag, or a recording that was cut off; "
+                f"./cube bag repair {path} makes the latter readable"
+            ) from None
+        raise BagError(
+            f"{path}: {error.strerror or 'no such file or folder'}; name a bag"
+        ) from None
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
+    except DAMAGE as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise BagError(
+            f"{path}: damaged, or no bag ({text[:200]}); ./cube bag repair may help if it was cut off"
+        ) from None
+
+
+@lru_cache
+def typestore() -> Typestore:
+    """The message types of ROS 2 Jazzy and of this package, as they are today."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for path in sorted((package_data() / "msg").glob("*.msg")):
+        types |= get_types_from_msg(path.read_text(), f"{PACKAGE}/msg/{path.stem}")
+    store.register(types)
+    return store
+
+
+class Entry(NamedTuple):
+    """A message of a bag: topic, type, when it was recorded in ns, serialised bytes."""
+
+    topic: str
+    msgtype: str
+    time_ns: int
+    data: bytes
+
+
+class Bag:
+    """A bag open for reading; a context. Types are read as the bag itself defines them."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with damage(path):
+            self._reader = BagReader(path)
+
+    def __enter__(self) -> Bag:
+        with damage(self.path):
+            self._reader.open()
+            self._types = self._own_types()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()
+
+    @property
+    def connections(self) -> list[Connection]:
+        return self._reader.connections
+
+    @property
+    def start_ns(self) -> int:
+        """When the earliest message was recorded."""
+        return self._reader.start_time
+
+    @property
+    def end_ns(self) -> int:
+        """When the latest message was recorded."""
+        return self._reader.end_time - 1
+
+    def topics(self, msgtype: str) -> list[str]:
+        """Topics of a type."""
+        return sorted(
+            {connection.topic for connection in self.connections if connection.msgtype == msgtype}
+        )
+
+    def skin(self) -> str:
+        """What its topics begin with, ending in /. BagError: no skin, or several."""
+        found = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
+        if len(found) != 1:
+            raise BagError(
+                f"{self.path}: {len(found)} topics of {FREQUENCIES} ({', '.join(found) or 'none'}); needed is one"
+            )
+        return found[0]
+
+    def entries(
+        self,
+        topics: set[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[Entry]:
+        """Messages from start_ns until before stop_ns, of some topics or all, in the order of
+        recording."""
+        for connection, time_ns, data in self._messages(topics, start_ns, stop_ns):
+            yield Entry(connection.topic, connection.msgtype, time_ns, data)
+
+    def _messages(
+        self, topics: set[str] | None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        wanted = [c for c in self.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        count = 0
+        with damage(self.path):
+            for message in self._reader.messages(wanted, start_ns, stop_ns):
+                count += 1
+                yield message
+        # A name damaged in one place only makes rosbags leave messages out without a word.
+        promised = sum(connection.msgcount for connection in wanted)
+        if start_ns is None and stop_ns is None and count != promised:
+            names = ", ".join(sorted({connection.topic for connection in wanted}))
+            raise BagError(
+                f"{self.path}: damaged: {count} messages on {names}, the bag says {promised}; "
+                "./cube bag repair may help"
+            )
+
+    @property
+    def version(self) -> int:
+        """Of this package's messages, as the bag defines them."""
+        _, fields = self._types.fielddefs.get(STRESS, ((), ()))
+        return 1 if fields and all(name != "left_out" for name, _ in fields) else max(VERSIONS)
+
+    def decode(self, entry: Entry) -> Any:
+        """The message. BagError: its bytes do not fit its type."""
+        with damage(self.path):
+            return self._types.deserialize_cdr(entry.data, entry.msgtype)
+
+    def infos(self, topic: str) -> list[Any]:
+        """The SkinInfo messages of a topic. BagError: none, or a version that cannot be read."""
+        infos = [self.decode(entry) for entry in self.entries({topic})]
+        if not infos:
+            raise BagError(
+                f"{self.path}: no message on {topic}: the bag does not say what its frequencies mean; "
+                f"record {topic} too"
+            )
+        for info in infos:
+            if info.version not in VERSIONS:
+                older = "older than" if info.version < min(VERSIONS) else "newer than"
+                raise BagError(
+                    f"{self.path}: {topic} has version {info.version}, {older} what this package "
+                    f"reads ({', '.join(map(str, VERSIONS))}); use the package it was recorded with, or "
+                    "a newer one"
+                )
+        return infos
+
+    def batches(self, topic: str) -> Iterator[tuple[message_codec.Batch, NDArray[np.int64]]]:
+        """Frequencies or stress, in order, and when they were recorded in ns, (B,).
+
+        As many messages of one shape at a time as follow each other, at most BATCH. BagError: one
+        contradicts itself.
+        """
+        find, read = message_codec.frequencies_shape, message_codec.read_frequencies
+        if topic in self.topics(STRESS):
+            find, read = (
+                partial(message_codec.stress_shape, version=self.version),
+                partial(message_codec.read_stress, version=self.version),
+            )
+        waiting: list[bytes] = []
+        times_ns: list[int] = []
+        shape, most = message_codec.Shape(0, 0, 0), 0
+        try:
+            for _, time_ns, data in self._messages({topic}):
+                if len(waiting) >= most or not message_codec.same_shape(data, waiting[0], shape):
+                    if waiting:
+                        yield read(waiting, shape), np.array(times_ns)
+                    waiting, times_ns, most = [], [], max(1, min(BATCH, BATCH_BYTES // len(data)))
+                    shape = find(data)
+                waiting.append(data)
+                times_ns.append(time_ns)
+            if waiting:
+                yield read(waiting, shape), np.array(times_ns)
+        except MessageError as error:
+            raise BagError(f"{self.path}: {topic}: {error}") from None
+
+    def _own_types(self) -> Typestore:
+        types: dict[str, Any] = {}
+        for connection in self.connections:
+            if (
+                connection.msgdef.format == MessageDefinitionFormat.MSG
+                and connection.msgtype.startswith(PACKAGE)
+            ):
+                types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
+        if not types:
+            return typestore()
+        store = get_typestore(Stores.ROS2_JAZZY)
+        store.register({name: types[name] for name in types if name.startswith(PACKAGE)})
+        return store
+
+
+def calibrations(info: Any) -> list[Calibration]:
+    """The calibration of each cube of a SkinInfo, of rclpy or of a bag. BagError: missing, or
+    damaged."""
+    texts = dict(zip(info.calibration_ids, info.calibrations, strict=False))
+    known: dict[str, Calibration] = {}
+    try:
+        for name in {cube.calibration_id for cube in info.cubes}:
+            known[name] = Calibration.from_dict(parse_yaml(texts[name], f"calibration {name}"))
+    except (CalibrationError, ConfigError) as error:
+        raise BagError(f"info of the skin {info.name}: {error}") from None
+    except KeyError as error:
+        raise BagError(
+            f"info of the skin {info.name}: no calibration {error}, which a cube uses"
+        ) from None
+    return [known[cube.calibration_id] for cube in info.cubes]
+
+
+def pipeline(info: Any) -> Pipeline:
+    """The pipeline that made the stress under a SkinInfo, rest frequencies as they were after
+    tare."""
+    made = Pipeline(calibrations(info), np.float32)
+    made.rest_frequency = rest_frequency(info, made)
+    return made
+
+
+def rest_frequency(info: Any, of: Pipeline) -> np.ndarray:
+    """(cubes, P) in Hz of a SkinInfo. BagError: not one per pad."""
+    rest = of.rest_frequency
+    for row, cube, calibration in zip(rest, info.cubes, of.calibrations, strict=True):
+        if len(cube.rest_frequency) != calibration.layout.n_pads:
+            raise BagError(
+                f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} rest "
+                f"frequencies, its layout {calibration.layout.name} has {calibration.layout.n_pads} "
+                "pads"
+            )
+        row[: len(cube.rest_frequency)] = cube.rest_frequency
+    return rest

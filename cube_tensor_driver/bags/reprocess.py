@@ -1,0 +1,339 @@
+"""Recorded frequencies to stress again, by the pipeline of the reconstruction node and to the same
+bits."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config.calibration import calibration_text
+from ..config.skin import Skin
+from ..core.calibration import Calibration
+from ..core.errors import BagError, CalibrationError, CubeError
+from ..core.health import Health
+from ..core.pipeline import Pipeline, StressRows
+from . import message_codec
+from .mcap import HEAD
+from .read import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, damage, pipeline, typestore
+from .recorded_verdicts import RecordedVerdicts
+from .tables import TableWriter
+from .write import BagWriter, quality
+
+PARTIAL = ".partial"
+"""Folder beside the results for what is not complete; a restart begins those anew."""
+
+BATCHES_BYTES = 30 << 20
+
+
+@dataclass(frozen=True)
+class Change:
+    """What to do differently from the recording. None: as it was.
+
+    calibration: for all cubes; skin: the calibrations of its cubes, by name; tare: from and to in s
+    after the start of the bag, between which the cubes were without load.
+    """
+
+    calibration: Calibration | None = None
+    skin: Skin | None = None
+    tare: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """One bag to reprocess: where to, as what (bag, parquet, csv)."""
+
+    bag: Path
+    output: Path
+    form: str
+    change: Change
+
+
+class Done(NamedTuple):
+    """What a job did: messages and rows of stress, how much time they cover in s."""
+
+    messages: int
+    rows: int
+    seconds: float
+
+
+class Recording:
+    """The frequencies of a bag as a stream of stress; `topic` of frequencies. infos, pipelines: by
+    time.
+
+    BagError: no info in the bag, or the change does not fit its cubes.
+    """
+
+    def __init__(self, bag: Bag, topic: str, change: Change | None = None) -> None:
+        change = change or Change()
+        self.bag, self.topic = bag, topic
+        infos = bag.infos(topic.removesuffix("frequencies") + "info")
+        # The driver knows of no tare: what it says counts only where no reconstruction ran.
+        infos = [info for info in infos if info.sender == "reconstruction"] or infos
+        infos.sort(key=lambda info: _stamp_ns(info))
+        self.infos = infos
+        self._now: tuple[int, Pipeline, Health] | None = None
+        self._since = np.array([_stamp_ns(info) for info in infos])
+        with damage(bag.path):
+            self.pipelines = [self._changed(info, change) for info in infos]
+        if change.tare is not None:
+            self._tare(*change.tare)
+        # What was found bad under other rest frequencies need not be so under these.
+        self.found = RecordedVerdicts(bag, topic, change == Change())
+
+    def batches(
+        self,
+    ) -> Iterator[tuple[message_codec.Batch, NDArray[np.int64], StressRows, NDArray[np.uint32]]]:
+        """Frequencies, when they were recorded, the stress of all their rows in order, the pads
+        left out of each."""
+        for batch, recorded_ns in self.bag.batches(self.topic):
+            field = batch.field
+            # An info holds for what was sampled from its stamp on: the node stamps it just behind
+            # the last row before.
+            which = np.maximum(np.searchsorted(self._since, batch.newest_ns, side="right") - 1, 0)
+            known, left_out, bits = self.found.of(batch.stamp_ns, field["cube"])
+            changed = (field["cube"][1:] != field["cube"][:-1]).any(axis=1) | (
+                np.diff(2 * which + known) != 0
+            )
+            ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(field)]
+            for run in map(slice, ends[:-1], ends[1:]):
+                part = message_codec.Batch(batch.shape, batch.stamp_ns[run], field[run])
+                found = (left_out[run], bits[run]) if known[run.start] else None
+                rows, without = self._process(int(which[run.start]), part, found)
+                yield part, recorded_ns[run], rows, without
+
+    def number(self, newest_ns: int) -> int:
+        """Which info holds for a message whose newest row was sampled then."""
+        return max(int(np.searchsorted(self._since, newest_ns, side="right")) - 1, 0)
+
+    def info_messages(self) -> list[bytes]:
+        """The SkinInfo messages that go with the stress, serialised."""
+        return [_info(info, made) for info, made in zip(self.infos, self.pipelines, strict=True)]
+
+    def _process(
+        self,
+        number: int,
+        batch: message_codec.Batch,
+        found: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None,
+    ) -> tuple[StressRows, NDArray[np.uint32]]:
+        """Stress of all rows of a batch of the same cubes, as the node makes it message by message;
+        pads left out.
+
+        found: pads left out and status bits as the node found them, None to find them anew.
+        """
+        of, health = self._use(number)
+        field = batch.field
+        cube, frequency, temperature = field["cube"][0], field["frequency"], field["temperature"]
+        try:
+            left_out, bits = found or health.update_many(
+                cube, frequency, field["pad_fault"], batch.times_ns, temperature
+            )
+            rows = of.process(cube, frequency, left_out, temperature)
+        except CubeError as error:
+            raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
+        rows.status[:] |= bits.ravel()
+        return rows, left_out.ravel()
+
+    def _use(self, number: int) -> tuple[Pipeline, Health]:
+        """The pipeline under an info, and the health that goes with it: a tare changes rest
+        frequencies only."""
+        if self._now is None or [c.id for c in self._now[1].calibrations] != [
+            c.id for c in self.pipelines[number].calibrations
+        ]:
+            made = Pipeline(self.pipelines[number].calibrations, np.float32)
+            made.rest_frequency = self.pipelines[number].rest_frequency
+            self._now = number, made, Health(made)
+        elif self._now[0] != number:
+            _, made, health = self._now
+            made.rest_frequency = self.pipelines[number].rest_frequency
+            health.refresh()
+            self._now = number, made, health
+        return self._now[1:]
+
+    def _changed(self, info: Any, change: Change) -> Pipeline:
+        recorded = pipeline(info)
+        if change.skin is not None:
+            by_name = {cube.name: cube.calibration for cube in change.skin.cubes}
+            missing = [cube.name for cube in info.cubes if cube.name not in by_name]
+            if missing:
+                raise BagError(
+                    f"{self.bag.path}: the skin file {change.skin.name} has no cubes "
+                    f"{', '.join(missing[:5])}; the bag has"
+                )
+            new = [by_name[cube.name] for cube in info.cubes]
+        elif change.calibration is not None:
+            new = [change.calibration] * len(info.cubes)
+        else:
+            return recorded
+        rest = []
+        for cube, old, made, was in zip(
+            info.cubes, recorded.calibrations, new, recorded.rest_frequency, strict=True
+        ):
+            try:
+                made.check(old.layout, cube.uid or None)
+            except CalibrationError as error:
+                raise BagError(f"{self.bag.path}: cube {cube.name}: {error}") from None
+            # A tare is a measurement and stays; without one the calibration says what no load is.
+            n = old.layout.n_pads
+            tared = was[:n] != old.rest_frequency
+            rest.append(
+                np.pad(
+                    np.where(tared, was[:n], made.rest_frequency),
+                    (0, len(was) - n),
+                    constant_values=np.nan,
+                )
+            )
+        result = Pipeline(new, np.float32)
+        result.rest_frequency = np.array(rest)
+        return result
+
+    def _tare(self, begin_s: float, end_s: float) -> None:
+        """Mean frequencies of all pads between two times, temperature taken out, become the rest
+        frequencies."""
+        of = self.pipelines[-1]
+        total, count = np.zeros_like(of.rest_frequency), np.zeros(of.rest_frequency.shape)
+        begin_ns, end_ns = (self.bag.start_ns + round(time * 1e9) for time in (begin_s, end_s))
+        for batch, _ in self.bag.batches(self.topic):
+            chosen = (batch.times_ns >= begin_ns) & (batch.times_ns < end_ns)
+            cube = batch.field["cube"][chosen]
+            if not len(cube):
+                continue
+            known = cube < len(of.calibrations)
+            cube = cube[known]
+            frequency = batch.field["frequency"][chosen][known].astype(float)
+            frequency = frequency / of.temperature_factor(
+                cube, batch.field["temperature"][chosen][known]
+            )
+            bad = (
+                batch.field["pad_fault"][chosen][known][:, None] >> np.arange(frequency.shape[1])
+                & 1
+                > 0
+            )
+            good = np.isfinite(frequency) & (frequency > 0) & ~bad
+            np.add.at(total, cube, np.where(good, frequency, 0))
+            np.add.at(count, cube, good)
+        exists = np.isfinite(of.rest_frequency)
+        without = (exists & (count == 0)).any(axis=1)
+        if without.any():
+            names = ", ".join(
+                self.infos[-1].cubes[cube].name for cube in np.flatnonzero(without)[:5]
+            )
+            seconds = (self.bag.end_ns - self.bag.start_ns) * 1e-9
+            raise BagError(
+                f"{self.bag.path}: --tare-from {begin_s:g} {end_s:g}: not every pad of {names} was "
+                f"measured in that time; the bag lasts from 0 to {seconds:.3f} s"
+            )
+        rest = np.where(exists, total / np.maximum(count, 1), np.nan)
+        for made in self.pipelines:
+            made.rest_frequency = rest
+
+
+def reprocess(job: Job) -> Done:
+    """Do one job; its output appears when it is complete. BagError: what is wrong with bag or
+    output."""
+    # malloc gives back what is free above twice the largest block that it ever gave back: not the
+    # batches' memory.
+    np.empty(BATCHES_BYTES, np.uint8)
+    partial = job.output.parent / PARTIAL / job.output.name
+    try:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+        with Bag(job.bag) as bag:
+            topics = bag.topics(FREQUENCIES)
+            if not topics:
+                raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
+            if job.form == "bag":
+                done = _to_bag(bag, topics, job.change, partial)
+            elif len(topics) > 1:
+                raise BagError(
+                    f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
+                )
+            else:
+                done = _to_table(bag, topics[0], job.change, partial)
+        partial.replace(job.output)
+        with suppress(OSError):  # other jobs are at work in there
+            partial.parent.rmdir()
+    except OSError as error:
+        raise BagError(
+            f"{job.output}: {error.strerror}; name a folder that can be written"
+        ) from None
+    return done
+
+
+def _to_bag(bag: Bag, topics: list[str], change: Change, output: Path) -> Done:
+    messages = rows = 0
+    with BagWriter(output) as writer:
+        for topic in topics:
+            skin = topic.removesuffix("frequencies")
+            recording = Recording(bag, topic, change)
+            writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
+            writer.add_topic(f"{skin}stress", STRESS, [quality()])
+            for info, data in zip(recording.infos, recording.info_messages(), strict=True):
+                writer.write(
+                    f"{skin}info", max(bag.start_ns, min(bag.end_ns, _stamp_ns(info))), data
+                )
+            for batch, recorded_ns, stress, left_out in recording.batches():
+                made = message_codec.stress_messages(batch, (*stress, left_out), HEAD)
+                writer.write_many(f"{skin}stress", recorded_ns, made)
+                messages += len(recorded_ns)
+                rows += len(stress.status)
+    return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
+
+
+def _to_table(bag: Bag, topic: str, change: Change, output: Path) -> Done:
+    messages = rows = 0
+    recording = Recording(bag, topic, change)
+    with TableWriter(
+        output, [cube.name for cube in recording.infos[-1].cubes] + ["unknown"]
+    ) as table:
+        for batch, recorded_ns, stress, left_out in recording.batches():
+            field = batch.field
+            table.write(
+                batch.times_ns.ravel(),
+                field["cube"].ravel(),
+                field["sequence"].ravel(),
+                stress,
+                left_out,
+            )
+            messages += len(recorded_ns)
+            rows += len(stress.status)
+    return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
+
+
+def _stamp_ns(info: Any) -> int:
+    return int(info.header.stamp.sec) * message_codec.SECOND + int(info.header.stamp.nanosec)
+
+
+def _info(info: Any, made: Pipeline) -> bytes:
+    """The recorded info with the calibrations and rest frequencies of the pipeline, serialised."""
+    distinct = {
+        calibration.id: number
+        for number, calibration in reversed(list(enumerate(made.calibrations)))
+    }
+    cubes = [
+        replace(
+            cube,
+            calibration_id=calibration.id,
+            half_side=calibration.half_side,
+            rest_frequency=rest[: calibration.layout.n_pads],
+        )
+        for cube, calibration, rest in zip(
+            info.cubes, made.calibrations, made.rest_frequency, strict=True
+        )
+    ]
+    changed = replace(
+        info,
+        version=max(VERSIONS),
+        sender="reconstruction",
+        cubes=cubes,
+        calibration_ids=list(distinct),
+        calibrations=[calibration_text(made.calibrations[number]) for number in distinct.values()],
+        covariance=np.array([made.covariance(number) for number in distinct.values()]).ravel(),
+    )
+    return bytes(typestore().serialize_cdr(changed, INFO))

@@ -1,0 +1,1 @@
+"""The page that `./cube view` serves: viser and nothing else draws here."""

@@ -1,0 +1,99 @@
+"""What the program hands on from step to step: rows of frequencies, and rows of stress.
+
+One row is one sample: all pads of one cube at one instant. Rows of one scan come together, and so
+do the rows of several scans: then all rows of the first, all of the second, and so on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class _Rows:
+    """What both kinds have: their number, and a choice of them. All fields are arrays (N, ...)."""
+
+    __slots__ = ()
+    cube: NDArray[np.uint16]
+
+    def __len__(self) -> int:
+        return len(self.cube)
+
+    def select(self: _Kind, chosen: Any) -> _Kind:
+        """The rows that an index, a slice or a mask chooses, as numpy indexes arrays."""
+        return type(self)(*(getattr(self, field.name)[chosen] for field in fields(self)))  # type: ignore[arg-type]
+
+
+_Kind = TypeVar("_Kind", bound=_Rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrequencyRows(_Rows):
+    """What the pads measured: N rows of P pads.
+
+    cube: (N,) index of the cube in the skin
+    sequence: (N,) number that the hub gave the sample; it wraps
+    stamp_ns: (N,) when the pads were read, ns, in the clock of the source
+    frequency: (N, P) Hz; NaN where nothing was measured and where the cube has no such pad
+    temperature: (N,) °C; NaN where it is unknown
+    pad_fault: (N,) bit p: the device reports that pad p is broken
+    """
+
+    cube: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    stamp_ns: NDArray[np.int64]
+    frequency: NDArray[np.float32]
+    temperature: NDArray[np.float32]
+    pad_fault: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StressRows(_Rows):
+    """What was reconstructed: N rows, in the frame of each cube, tension positive.
+
+    cube, sequence, stamp_ns: (N,) of the frequencies that each row was made from
+    stress: (N, 6) Pa, order xx yy zz yz zx xy; NaN where a component is not observed
+    gradient: (N, 9) Pa/m, rows xx yy zz, columns d/dx d/dy d/dz; NaN where it is not observed
+    residual: (N,) sqrt(chi-square / degrees of freedom), about 1 for noise alone; NaN where there
+        is no redundancy
+    status: (N,) bits of `status.py`
+    observed: (N,) bit i: component i of `modes.COMPONENTS` was recovered
+    left_out: (N,) bit p: pad p was not used
+    """
+
+    cube: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    stamp_ns: NDArray[np.int64]
+    stress: NDArray[np.floating]
+    gradient: NDArray[np.floating]
+    residual: NDArray[np.floating]
+    status: NDArray[np.uint16]
+    observed: NDArray[np.uint16]
+    left_out: NDArray[np.uint32]
+
+
+class Source(Protocol):
+    """Where frequencies come from: live links, a bag, a simulated skin. A context manager.
+
+    skin: which cubes `FrequencyRows.cube` counts. is_live: whether rows come as they are measured,
+    so that waiting for the next one takes time.
+    """
+
+    @property
+    def skin(self) -> Any: ...
+
+    @property
+    def is_live(self) -> bool: ...
+
+    def statistics(self) -> dict[str, object]:
+        """What was delivered and what was not, by name."""
+
+    def __iter__(self) -> Iterator[FrequencyRows]: ...
+
+    def __enter__(self) -> Source: ...
+
+    def __exit__(self, *error: object) -> None: ...

@@ -1,1 +1,0 @@
-"""Files: skin and calibration files in YAML."""

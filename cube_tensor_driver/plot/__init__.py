@@ -1,0 +1,1 @@
+"""Pictures as files: matplotlib and nothing else draws here."""

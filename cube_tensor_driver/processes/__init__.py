@@ -1,0 +1,1 @@
+"""Which processes a skin needs, and how they are started, watched and ended. ROS is not imported."""

@@ -1,1 +1,0 @@
-"""What people look at: the live table, plots, the browser view."""
