@@ -354,9 +354,13 @@ def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(bag, tmp_pat
     before, after = stress(bag), stress(tmp_path / "out" / "bag")
     factor = np.where(np.arange(16) == 3, 2, 1)[:, None]
     for stamp, record in after.items():
-        np.testing.assert_allclose(
-            record["stress"], factor * before[stamp]["stress"], rtol=1e-5
-        )  # float32
+        expected = factor * before[stamp]["stress"]
+        # A component is a sum over pads in float32: it rounds in proportion to the cube's largest
+        # stress, and in another order where a skin has two calibrations.
+        rounding = 1e-5 * np.nanmax(np.abs(expected), axis=1, keepdims=True)
+        unseen = np.isnan(expected)
+        assert np.array_equal(np.isnan(record["stress"]), unseen)
+        assert np.all((np.abs(record["stress"] - expected) <= rounding) | unseen)
     with Bag(tmp_path / "out" / "bag") as made:
         ids = [cube.calibration_id for cube in made.infos("/info")[0].cubes]
     assert len(set(ids)) == 2 and ids.count(ids[3]) == 1

@@ -143,6 +143,10 @@ def paper(options: argparse.Namespace) -> int:
 
 
 def bench(options: argparse.Namespace) -> int:
+    if options.what == "decode":
+        from ..trials.bench_decode import bench_decode
+
+        return bench_decode(options.json)
     from ..trials import bench
 
     if options.what == "pipeline":

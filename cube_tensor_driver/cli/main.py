@@ -308,6 +308,7 @@ def parser() -> argparse.ArgumentParser:
     )
     for name, text in (
         ("pipeline", "the core against the same law and matrix product in bare numpy"),
+        ("decode", "the decoder on all kinds of noise, beside clean frames"),
         ("echo", "bare rclpy: publish, echo, receive messages of a skin's sizes"),
         ("skin", "simulated hubs to received tensors, beside the echo"),
         ("scale", "skin for growing numbers of cubes, with a picture"),
@@ -327,11 +328,11 @@ def parser() -> argparse.ArgumentParser:
             sub.add_argument(
                 "--figure", type=Path, default=Path("scale.png"), metavar="FILE", help="(scale.png)"
             )
-        else:
+        elif name != "decode":
             sub.add_argument(
                 "--cubes", type=int, default=1260 if name == "pipeline" else 64, metavar="N"
             )
-        if name != "pipeline":
+        if name not in ("pipeline", "decode"):
             sub.add_argument(
                 "--rate",
                 type=positive,

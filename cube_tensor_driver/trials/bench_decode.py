@@ -1,0 +1,98 @@
+"""./cube bench decode: what noise costs the decoder, beside clean frames in the same run."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ..device.decoder import Decoder
+from ..device.protocol import Sample, encode
+from ..terminal.output import write_json
+
+BYTES = 500_000
+READ = 4096
+"""Bytes that one call of the decoder is given, as a busy link gives them."""
+ROUNDS = 5
+
+
+def clean_frames(size: int) -> bytes:
+    """At least `size` bytes of sound SAMPLE frames of 8 cubes with 8 pads."""
+    random = np.random.default_rng(1)
+    frames: list[bytes] = []
+    length = 0
+    while length < size:
+        number = len(frames)
+        frequency = random.integers(90_000_000, 110_000_000, (8, 8)).astype("<u4")
+        no_fault, no_temperature = np.zeros(8, "<u4"), np.zeros(8, "<i2")
+        frame = encode(Sample(number, 0, 1000 * number, frequency, no_fault, no_temperature))
+        frames.append(frame)
+        length += len(frame)
+    return b"".join(frames)
+
+
+def harmed_frames(size: int) -> bytes:
+    """Frames in which one byte in a hundred was replaced by a random one."""
+    random = np.random.default_rng(2)
+    data = np.frombuffer(clean_frames(size), np.uint8).copy()
+    where = random.integers(0, len(data), len(data) // 100)
+    data[where] = random.integers(0, 256, len(where))
+    return data.tobytes()
+
+
+def random_bytes(size: int) -> bytes:
+    return np.random.default_rng(3).bytes(size)
+
+
+def random_zeros_and_ones(size: int) -> bytes:
+    return np.random.default_rng(4).integers(0, 2, size).astype(np.uint8).tobytes()
+
+
+# The shortest run that could be a frame, and fails in its last byte.
+FAILS_LATE = b"\1" * 14 + b"\2\0"
+SOUND_COBS = b"\2\7" * 7 + b"\1\0"
+NOISE: dict[str, Callable[[int], bytes]] = {
+    "random": random_bytes,
+    "mostly zeros and ones": random_zeros_and_ones,
+    "harmed frames": harmed_frames,
+    "no zero at all": lambda size: b"\x55" * size,
+    "late failures": lambda size: FAILS_LATE * (size // 16),
+    "late failures, sound ones between": lambda size: (FAILS_LATE + SOUND_COBS) * (size // 32),
+    "zeros and ones in turn": lambda size: b"\0\1" * (size // 2),
+}
+"""Bytes that are no frames, or few, each made for a size in bytes."""
+
+
+def bench_decode(json_path: Path | None) -> int:
+    """Time clean frames and each noise in turn; the best of some rounds, in ns per byte.
+
+    Other processes only ever add to a time, so the best is nearest to the work itself.
+    """
+    good = clean_frames(BYTES)
+    result: dict[str, object] = {"bytes": BYTES}
+    for name, make in NOISE.items():
+        bad = make(BYTES)
+        rounds = [(_ns_per_byte(good), _ns_per_byte(bad)) for _ in range(ROUNDS)]
+        clean_ns = min(clean for clean, _ in rounds)
+        noise_ns = min(noise for _, noise in rounds)
+        result[name] = {
+            "noise_ns": round(noise_ns, 2),
+            "clean_ns": round(clean_ns, 2),
+            "ratio": round(noise_ns / clean_ns, 2),
+        }
+    print(json.dumps(result, indent=2))
+    if json_path is not None:
+        write_json(json_path, result)
+    return 0
+
+
+def _ns_per_byte(data: bytes) -> float:
+    """Processor time of a fresh decoder."""
+    decoder = Decoder()
+    start = time.process_time_ns()
+    for at in range(0, len(data), READ):
+        decoder.feed(data[at : at + READ])
+    return (time.process_time_ns() - start) / len(data)
