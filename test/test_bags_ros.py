@@ -30,7 +30,12 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import Process, record_command, skin_processes
+from cube_tensor_driver.processes.skin_processes import (
+    Process,
+    SimulatedHubs,
+    record_command,
+    skin_processes,
+)
 from cube_tensor_driver.ros.messages import read_stress, to_ns
 from cube_tensor_driver.ros.node import queue
 from cube_tensor_driver.simulation.inject import inject
@@ -94,7 +99,7 @@ def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
 def running(ros, tmp_path):
     """A simulated skin of sixteen cubes, and a tester that listens."""
     with Children(tmp_path) as children:
-        for process in skin_processes(SKIN, simulated_ports=tmp_path / "ports"):
+        for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
             children.start(process)
         ros.heard = ros.listen(SkinStress, "stress", 1000)
         ros.wait(lambda: ros.heard)

@@ -36,7 +36,7 @@ from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.protocol import Hello, Request, Sample, encode
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
 from cube_tensor_driver.processes.children import Children, ros_arguments
-from cube_tensor_driver.processes.skin_processes import skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.messages import read_frequencies, read_stress
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
@@ -133,7 +133,7 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     wrenches = ros.listen(WrenchStamped, "cubes/c05/wrench")
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     with Children(tmp_path) as children:
-        for process in skin_processes(SKIN, simulated_ports=tmp_path / "ports"):
+        for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
             if process.node and scans > 1:
                 process.parameters["publish_period"] = scans / skin.rate
             children.start(process)
@@ -231,7 +231,9 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
 def test_driver_waits_for_a_port_that_is_not_there_yet(ros, tmp_path):
     frequencies = ros.listen(SkinFrequencies, "frequencies")
     ports = tmp_path / "ports"
-    simulator, _, driver = (skin_processes(SINGLE, simulated_ports=ports)[i] for i in (0, 1, 2))
+    simulator, _, driver = (
+        skin_processes(SINGLE, simulated=SimulatedHubs(ports))[i] for i in (0, 1, 2)
+    )
     with Children(tmp_path) as children:
         children.start(driver)
         ros.wait(lambda: "No such file" in children.log("driver"))
@@ -294,7 +296,7 @@ def sequences(frequencies: list) -> list[int]:
 
 
 def start_single(children: Children, tmp_path: Path) -> None:
-    for process in skin_processes(SINGLE, simulated_ports=tmp_path / "ports")[1:]:
+    for process in skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path / "ports"))[1:]:
         children.start(process)
 
 
@@ -393,7 +395,9 @@ def test_one_process_sends_frequencies_to_who_listens(ros, hub, tmp_path):
         return True
 
     with Children(tmp_path) as children:
-        children.start(skin_processes(SINGLE, composed=True, simulated_ports=tmp_path / "ports")[1])
+        children.start(
+            skin_processes(SINGLE, composed=True, simulated=SimulatedHubs(tmp_path / "ports"))[1]
+        )
         ros.wait(lambda: 1 in hub.listen())
         hub.send(greet())
         ros.wait(lambda: 2 in hub.listen())
@@ -510,7 +514,7 @@ def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, paramete
 def test_lifecycle_by_hand(ros, tmp_path):
     frequencies = ros.listen(SkinFrequencies, "frequencies")
     ports = tmp_path / "ports"
-    simulator, _, driver = skin_processes(SINGLE, simulated_ports=ports)
+    simulator, _, driver = skin_processes(SINGLE, simulated=SimulatedHubs(ports))
     driver.parameters["autostart"] = False
 
     def change(number: int) -> None:

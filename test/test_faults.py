@@ -264,7 +264,7 @@ def skin(tmp_path_factory):
     from cube_tensor_driver.config.grid import grid
 
     path = tmp_path_factory.mktemp("skin") / "skin.yaml"
-    write_yaml(path, grid("skin", 4, 1, 0.012, 2, "planar", "planar", 500.0, "/dev/null{}"))
+    write_yaml(path, grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0, port="/dev/null{}"))
     return read_skin(path)
 
 

@@ -16,7 +16,7 @@ from cube_tensor_driver.config.skin import check_skin, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError
 
-GOOD = grid("skin", 3, 2, 0.012, 2, "planar", "planar", 100.0, "/dev/ttyACM{}")
+GOOD = grid(nx=3, ny=2, pitch=0.012, links=2, rate=100.0)
 
 
 def read(tmp_path: Path, data: object):
@@ -42,7 +42,7 @@ def test_shipped_calibrations_have_their_id():
 def test_grid_deals_every_cube_once():
     # 7 cubes on 3 links: 3, 2, 2, indices from 0 on each link, positions centred and one pitch
     # apart
-    data = grid("skin", 7, 1, 0.5, 3, "planar", "planar", 10.0, "p{}")
+    data = grid(nx=7, ny=1, pitch=0.5, links=3, rate=10.0, port="p{}")
     assert [(cube["link"], cube["index"]) for cube in data["cubes"]] == [
         ("hub0", 0),
         ("hub0", 1),

@@ -15,7 +15,11 @@ import pytest
 from conftest import ROOT
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.yaml import read_yaml
-from cube_tensor_driver.processes.skin_processes import record_command, skin_processes
+from cube_tensor_driver.processes.skin_processes import (
+    SimulatedHubs,
+    record_command,
+    skin_processes,
+)
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 
@@ -23,7 +27,9 @@ SKIN = package_data() / "config" / "skin_demo.yaml"
 def test_one_list_serves_launch_and_demo():
     names = [
         process.executable
-        for process in skin_processes(SKIN, simulated_ports=Path("p"), markers=True, contacts=True)
+        for process in skin_processes(
+            SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True
+        )
     ]
     assert names == ["simulator", "reconstruction", "driver", "markers", "contacts"]
     assert [process.executable for process in skin_processes(SKIN, composed=True)] == ["composed"]
@@ -33,7 +39,7 @@ def test_one_list_serves_launch_and_demo():
 def test_every_executable_of_the_list_is_a_script_and_a_module():
     cmake = (ROOT / "CMakeLists.txt").read_text()
     every = skin_processes(
-        SKIN, simulated_ports=Path("p"), markers=True, contacts=True
+        SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True
     ) + skin_processes(SKIN, composed=True)
     for process in every:
         script = ROOT / "scripts" / process.executable

@@ -26,7 +26,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from cube_tensor_driver.bags.read import STRESS, Bag
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.processes.children import ros_arguments
-from cube_tensor_driver.processes.skin_processes import Process, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 CUBES, RATE = 16, 100
@@ -183,7 +183,9 @@ def sampled(book: dict) -> dict[tuple[int, int], int]:
 
 def test_a_cut_cable_costs_what_queues_do_not_hold_and_that_is_counted(hosts, tmp_path):
     bag, book = tmp_path / "bag", tmp_path / "book.json"
-    for process in skin_processes(SKIN, simulated_ports=tmp_path / "ports", book=book, instants=16):
+    for process in skin_processes(
+        SKIN, simulated=SimulatedHubs(tmp_path / "ports", sample_log=book, instants=16)
+    ):
         hosts.start("desk" if process.executable == "reconstruction" else "robot", process)
     recording = ("record", "-o", str(bag), "--topics", "stress", "/diagnostics")
     hosts.start("desk", Process("recorder", "cube_tensor_driver.cli", False, arguments=recording))

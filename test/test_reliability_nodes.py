@@ -34,7 +34,7 @@ from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.device.protocol import Hello, Sample, encode
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children, ros_arguments
-from cube_tensor_driver.processes.skin_processes import Process, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.messages import read_stress
 from cube_tensor_driver.srv import Tare
 
@@ -60,7 +60,7 @@ class Scene3D:
     def start(self):
         self.hub.listen()
         self.hub.requests.clear()
-        for process in skin_processes(SINGLE, simulated_ports=self.folder / "ports")[1:]:
+        for process in skin_processes(SINGLE, simulated=SimulatedHubs(self.folder / "ports"))[1:]:
             if process.executable == "reconstruction":
                 process.parameters["tare_folder"] = str(self.folder / "tare")
             self.children.start(process)
@@ -284,7 +284,7 @@ def test_the_security_policy_allows_what_the_nodes_do(stage):
 @pytest.mark.parametrize("executable", ["driver", "reconstruction"])
 def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
     """Beside the other node, which goes on: what comes in meanwhile must not leak either."""
-    processes = skin_processes(SINGLE, simulated_ports=tmp_path / "ports")
+    processes = skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path / "ports"))
     next(process for process in processes if process.executable == executable).parameters[
         "autostart"
     ] = False
@@ -325,7 +325,7 @@ def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
 
 
 def test_lifecycle_in_the_middle_of_a_reconnect(ros, tmp_path, deaf):
-    _, _, driver = skin_processes(SINGLE, simulated_ports=tmp_path)
+    _, _, driver = skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path))
     driver.parameters.update(autostart=False, port_directory="", port=deaf)
     kind = Transition
     with Children(tmp_path) as children:

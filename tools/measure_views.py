@@ -110,7 +110,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
             nx += 1
         write_yaml(
             folder / "skin.yaml",
-            grid("skin", nx, cubes // nx, 0.012, 1, "planar", "planar", RATE, "/dev/null"),
+            grid(nx=nx, ny=cubes // nx, pitch=0.012, links=1, rate=RATE, port="/dev/null"),
         )
         skin = read_skin(folder / "skin.yaml")
         load = Load(skin, default_script())

@@ -39,14 +39,14 @@ def config_grid(options: argparse.Namespace) -> int:
 
     skin = grid(
         options.name,
-        options.nx,
-        options.ny,
-        options.pitch,
-        options.links,
-        options.calibration,
-        options.layout,
-        options.rate,
-        options.port,
+        nx=options.nx,
+        ny=options.ny,
+        pitch=options.pitch,
+        links=options.links,
+        calibration=options.calibration,
+        layout=options.layout,
+        rate=options.rate,
+        port=options.port,
     )
     text = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart, on {options.links} links"
     write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")

@@ -21,7 +21,7 @@ from ..core.errors import ConfigError, CubeError
 from ..plot.documentation import draw_field, draw_markers, draw_prototype, draw_study, tables_text
 from ..plot.plots import save
 from ..processes.children import Children
-from ..processes.skin_processes import Process, skin_processes
+from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..research.field_study import field_study
 from ..research.paper import experiments
 from ..ros.node import make_executor
@@ -78,7 +78,8 @@ def _demo_skin() -> Iterator[Children]:
         tempfile.TemporaryDirectory(prefix="cube_pictures_") as name,
         Children(Path(name)) as children,
     ):
-        for process in skin_processes(skin, markers=True, simulated_ports=Path(name) / "ports"):
+        hubs = SimulatedHubs(Path(name) / "ports")
+        for process in skin_processes(skin, markers=True, simulated=hubs):
             children.start(process)
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         yield children

@@ -1,4 +1,4 @@
-"""Skin files of flat grids of cubes, as plain values for `write_yaml`."""
+"""Skin files for flat grids of cubes, as plain values for `write_yaml`."""
 
 from __future__ import annotations
 
@@ -8,40 +8,45 @@ from ..core.errors import ConfigError
 
 
 def grid(
-    name: str,
+    name: str = "skin",
+    *,
     nx: int,
     ny: int,
     pitch: float,
-    links: int,
-    calibration: str,
-    layout: str,
     rate: float,
-    port: str,
+    links: int = 1,
+    calibration: str = "planar",
+    layout: str = "planar",
+    port: str = "/dev/ttyACM{}",
 ) -> dict[str, Any]:
-    """A skin of nx × ny cubes in the parent frame's x-y plane, centred on it, pitch in m, x running
-    fastest.
+    """The content of a skin file with nx × ny cubes in the x-y plane of the parent frame.
 
-    The cubes are dealt to the links in order, as evenly as possible. port: pattern of the links'
-    ports, {} the link's number. ConfigError: a number that is not positive, or more links than
-    cubes.
+    The grid is centred on the frame's origin; x runs fastest. pitch: distance of neighbours, m.
+    rate: samples per second. The links carry equally many cubes, or one more, in order. port: the
+    port of each link, where {} stands for the number of the link.
+
+    Raises ConfigError if a number is not greater than 0, or if there are more links than cubes.
     """
-    for what, value in {"nx": nx, "ny": ny, "pitch": pitch, "links": links, "rate": rate}.items():
+    numbers = {"nx": nx, "ny": ny, "pitch": pitch, "links": links, "rate": rate}
+    for what, value in numbers.items():
         if value <= 0:
             raise ConfigError(f"grid: {what} is {value}, must be greater than 0")
     count = nx * ny
     if links > count:
         raise ConfigError(f"grid: {links} links for {count} cubes; use at most one link per cube")
+
     digits = len(str(count - 1))
     cubes = []
     for number in range(count):
         link = number * links // count
-        first = -(-link * count // links)
-        x, y = ((number % nx) - (nx - 1) / 2) * pitch, ((number // nx) - (ny - 1) / 2) * pitch
+        first_of_link = -(-link * count // links)
+        x = (number % nx - (nx - 1) / 2) * pitch
+        y = (number // nx - (ny - 1) / 2) * pitch
         cubes.append(
             {
                 "name": f"c{number:0{digits}d}",
                 "link": f"hub{link}",
-                "index": number - first,
+                "index": number - first_of_link,
                 "pose": {"xyz": [round(x, 9), round(y, 9), 0.0], "rpy": [0.0, 0.0, 0.0]},
                 "layout": layout,
                 "calibration": calibration,

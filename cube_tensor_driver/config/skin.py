@@ -111,6 +111,16 @@ class Skin:
     cubes: tuple[SkinCube, ...]
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The name of each cube."""
+        return tuple(cube.name for cube in self.cubes)
+
+    @property
+    def calibrations(self) -> tuple[Calibration, ...]:
+        """The calibration of each cube; cubes of one file share one object."""
+        return tuple(cube.calibration for cube in self.cubes)
+
+    @property
     def n_pads(self) -> int:
         """Pads of the widest cube: the width of a row."""
         return max(cube.calibration.layout.n_pads for cube in self.cubes)

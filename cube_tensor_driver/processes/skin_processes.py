@@ -1,5 +1,4 @@
-"""What to start for a skin: the one list that the launch files and ./cube demo both take. Does not
-import ROS."""
+"""What to start for a skin: one list that the launch files and `./cube demo` share."""
 
 from __future__ import annotations
 
@@ -13,16 +12,16 @@ from ..config.yaml import read_yaml, write_yaml
 
 Value = str | float | bool
 RECORDED = ("frequencies", "stress", "info")
-"""What a recording needs: `frequencies` and `info` make everything again, `stress` is what was
-seen."""
+"""The topics of a recording. `frequencies` and `info` are enough to reconstruct everything again;
+`stress` is what was published at the time."""
 
 
 @dataclass(frozen=True)
 class Process:
     """One process of a running skin.
 
-    executable: its name in the package; module: what `python -m` runs. node: whether it is a ROS
-    node and takes parameters; otherwise it takes arguments.
+    executable: its name in the package. module: what `python -m` runs. node: whether it is a ROS
+    node, which takes parameters; other processes take arguments.
     """
 
     executable: str
@@ -30,6 +29,33 @@ class Process:
     node: bool = True
     parameters: dict[str, Value] = field(default_factory=dict)
     arguments: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SimulatedHubs:
+    """The simulator that takes the place of the real hubs.
+
+    ports: folder for its pseudo-terminals. load: its load script; None: the one in the package.
+    sample_log: file for a record of every sample it sends; None: none. instants: how many instants
+    of the load it computes in advance, see `simulation.simulator.Simulator`; None: its default.
+    """
+
+    ports: Path
+    load: Path | None = None
+    sample_log: Path | None = None
+    instants: int | None = None
+
+    def process(self, config: Path) -> Process:
+        """The simulator of the skin file `config`."""
+        arguments = ["--config", str(config), "--ports", str(self.ports)]
+        if self.load is not None:
+            arguments += ["--load", str(self.load)]
+        if self.sample_log is not None:
+            arguments += ["--book", str(self.sample_log)]
+        if self.instants is not None:
+            arguments += ["--instants", str(self.instants)]
+        module = "cube_tensor_driver.simulation.main"
+        return Process("simulator", module, node=False, arguments=tuple(arguments))
 
 
 def skin_processes(
@@ -42,78 +68,63 @@ def skin_processes(
     autostart: bool = True,
     markers: bool = False,
     contacts: bool = False,
-    simulated_ports: Path | None = None,
-    book: Path | None = None,
-    instants: int | None = None,
-    load: Path | None = None,
+    simulated: SimulatedHubs | None = None,
 ) -> list[Process]:
-    """Driver and reconstruction of a skin file; with a folder for simulated ports the simulator
-    too.
+    """The processes of a skin file, in the order in which they start.
 
-    port: instead of the one in the file, for a skin with one link. rate: samples per second instead
-    of the file's, 0 for the file's. publish_period: time that one message covers, s; 0: a message
-    for each scan. composed: driver and reconstruction in one process. autostart: False leaves nodes
-    to be configured and activated by lifecycle transitions. markers, contacts: those nodes, too.
-    book: where the simulator writes what it sampled; instants: see `simulation.main.Simulator`;
-    load: its load script, None for the shipped one.
+    These are the driver and the reconstruction, or one process with both if `composed`; before them
+    the simulator, if hubs are `simulated`; after them the nodes `markers` and `contacts` if wanted.
+
+    port: replaces the port in the file, for a skin with one link. rate: samples per second, 0: as
+    the file says. publish_period: time that one message covers, s, 0: one message per scan.
+    autostart: False leaves it to others to configure and activate the nodes.
     """
     start: dict[str, Value] = {} if autostart else {"autostart": False}
-    skin: dict[str, Value] = {"config": str(config), "publish_period": publish_period, **start}
-    driver: dict[str, Value] = {
-        **skin,
-        "port": port,
-        "rate": rate,
-        "port_directory": str(simulated_ports or ""),
-    }
+    common: dict[str, Value] = {"config": str(config), "publish_period": publish_period, **start}
+    port_directory = str(simulated.ports) if simulated else ""
+    driver = {**common, "port": port, "rate": rate, "port_directory": port_directory}
+
+    processes = [simulated.process(config)] if simulated else []
     if composed:
-        processes = [Process("composed", "cube_tensor_driver.ros.composed", parameters=driver)]
+        processes.append(_node("composed", driver))
     else:
-        processes = [
-            Process("reconstruction", "cube_tensor_driver.ros.reconstruction", parameters=skin),
-            Process("driver", "cube_tensor_driver.ros.driver", parameters=driver),
-        ]
-    for name, wanted in {"markers": markers, "contacts": contacts}.items():
-        if wanted:
-            processes.append(Process(name, f"cube_tensor_driver.ros.{name}", parameters=start))
-    if simulated_ports is not None:
-        arguments = ["--config", str(config), "--ports", str(simulated_ports)]
-        if load is not None:
-            arguments += ["--load", str(load)]
-        if book is not None:
-            arguments += ["--book", str(book)]
-        if instants is not None:
-            arguments += ["--instants", str(instants)]
-        processes.insert(
-            0,
-            Process(
-                "simulator", "cube_tensor_driver.simulation.main", False, arguments=tuple(arguments)
-            ),
-        )
+        processes += [_node("reconstruction", common), _node("driver", driver)]
+    if markers:
+        processes.append(_node("markers", start))
+    if contacts:
+        processes.append(_node("contacts", start))
     return processes
 
 
+def _node(name: str, parameters: dict[str, Value]) -> Process:
+    return Process(name, f"cube_tensor_driver.ros.{name}", parameters=dict(parameters))
+
+
 def record_command(skin: str, namespace: str = "") -> list[str]:
-    """ros2 bag record of a running skin, into a new folder where it is started:
-    [namespace_]skin_date-time."""
+    """The command of `ros2 bag record` for a running skin.
+
+    It writes into a new folder below the current one, named [namespace_]skin_date-time.
+    """
     parts = [part for part in namespace.split("/") if part]
     prefix = "".join(f"/{part}" for part in parts)
     folder = "_".join([*parts, skin, f"{datetime.now():%Y_%m_%d-%H_%M_%S}"])
-    overrides = package_data() / "config" / "record_qos.yaml"
-    if prefix:
-        # The file names topics without a namespace.
-        profiles = {prefix + topic: profile for topic, profile in read_yaml(overrides).items()}
-        overrides = Path(tempfile.mkdtemp(prefix="cube_record_")) / overrides.name
-        write_yaml(overrides, profiles)
+    topics = [f"{prefix}/{topic}" for topic in RECORDED]
+    overrides = _qos_overrides(prefix)
     return [
-        "ros2",
-        "bag",
-        "record",
-        "--storage",
-        "mcap",
-        "-o",
-        folder,
-        "--qos-profile-overrides-path",
-        str(overrides),
-        "--topics",
-        *(f"{prefix}/{topic}" for topic in RECORDED),
+        *("ros2", "bag", "record"),
+        *("--storage", "mcap"),
+        *("-o", folder),
+        *("--qos-profile-overrides-path", str(overrides)),
+        *("--topics", *topics),
     ]
+
+
+def _qos_overrides(prefix: str) -> Path:
+    """The file of QoS profiles by topic; one of our own where topics have a namespace."""
+    path = package_data() / "config" / "record_qos.yaml"
+    if not prefix:
+        return path
+    profiles = {prefix + topic: profile for topic, profile in read_yaml(path).items()}
+    own = Path(tempfile.mkdtemp(prefix="cube_record_")) / path.name
+    write_yaml(own, profiles)
+    return own

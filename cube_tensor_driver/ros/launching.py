@@ -18,7 +18,7 @@ from ..config.package_data import package_data
 from ..config.skin import Skin, read_skin
 from ..config.urdf import skin_urdf
 from ..core.errors import ConfigError
-from ..processes.skin_processes import Process, record_command, skin_processes
+from ..processes.skin_processes import Process, SimulatedHubs, record_command, skin_processes
 
 
 def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
@@ -65,10 +65,7 @@ def start_skin(
         autostart=given.get("autostart") != "false",
         markers=wanted("markers") or wanted("rviz"),
         contacts=wanted("contacts"),
-        load=load,
-        simulated_ports=Path(tempfile.mkdtemp(prefix="cube_ports_"))
-        if wanted("simulate")
-        else None,
+        simulated=SimulatedHubs(_port_folder(), load) if wanted("simulate") else None,
     )
     # Nodes first: where one cannot be started launch gives up, and leaves what it has started
     # already.
@@ -84,6 +81,10 @@ def start_skin(
     if wanted("rviz"):
         actions.append(_rviz(namespace))
     return actions
+
+
+def _port_folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="cube_ports_"))
 
 
 def _action(process: Process, namespace: str) -> LaunchDescriptionEntity:

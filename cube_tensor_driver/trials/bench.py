@@ -31,7 +31,7 @@ from ..core.oscillator import pad_frequency
 from ..core.pipeline import Pipeline
 from ..plot.plots import draw_scale, save
 from ..processes.children import Children
-from ..processes.skin_processes import Process, skin_processes
+from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import make_executor, queue
 from ..simulation.arrival_count import Tally
 from ..terminal.output import write_json
@@ -159,16 +159,23 @@ def _skin(
         path = folder / "skin.yaml"
         hubs = math.ceil(cubes / CUBES_PER_HUB)
         write_yaml(
-            path, grid("skin", cubes, 1, PITCH, hubs, CALIBRATION, LAYOUT, rate, "/dev/ttyACM{}")
+            path,
+            grid(
+                nx=cubes,
+                ny=1,
+                pitch=PITCH,
+                links=hubs,
+                calibration=CALIBRATION,
+                layout=LAYOUT,
+                rate=rate,
+            ),
         )
         book = folder / "book.json"
         processes = skin_processes(
             path,
             publish_period=publish_period,
             composed=composed,
-            simulated_ports=folder / "ports",
-            book=book,
-            instants=INSTANTS,
+            simulated=SimulatedHubs(folder / "ports", sample_log=book, instants=INSTANTS),
         )
         tally = Tally(read_skin(path))
         with Children(folder) as children:

@@ -30,7 +30,7 @@ from ..config.yaml import write_yaml
 from ..core.errors import ConfigError, CubeError, MessageError
 from ..plot.plots import draw_forces, save
 from ..processes.children import Children
-from ..processes.skin_processes import Process, skin_processes
+from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.messages import read_stress
 from ..ros.node import make_executor, queue
 from ..simulation.load import Load, default_script
@@ -74,14 +74,14 @@ def demo_skin(options: Options, folder: Path) -> Path:
     nx = math.ceil(math.sqrt(options.cubes))
     skin = grid(
         "skin",
-        nx,
-        math.ceil(options.cubes / nx),
-        PITCH,
-        math.ceil(options.cubes / CUBES_PER_HUB),
-        CALIBRATION,
-        LAYOUT,
-        options.rate or RATE,
-        "/dev/ttyACM{}",
+        nx=nx,
+        ny=math.ceil(options.cubes / nx),
+        pitch=PITCH,
+        links=math.ceil(options.cubes / CUBES_PER_HUB),
+        calibration=CALIBRATION,
+        layout=LAYOUT,
+        rate=options.rate or RATE,
+        port="/dev/ttyACM{}",
     )
     skin["cubes"] = skin["cubes"][: options.cubes]
     used = {cube["link"] for cube in skin["cubes"]}
@@ -119,7 +119,9 @@ def _run(
     judge = Judge(skin, load)
     with LiveTable(skin, show=not options.headless) as table, Children(folder) as children:
         for process in skin_processes(
-            path, rate=rate, simulated_ports=folder / "ports", book=book, load=options.load
+            path,
+            rate=rate,
+            simulated=SimulatedHubs(folder / "ports", load=options.load, sample_log=book),
         ):
             children.start(process)
         if options.view:

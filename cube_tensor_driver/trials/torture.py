@@ -32,7 +32,7 @@ from ..config.yaml import to_yaml, write_yaml
 from ..core.errors import CubeError
 from ..core.pipeline import StressRows
 from ..processes.children import Children
-from ..processes.skin_processes import skin_processes
+from ..processes.skin_processes import SimulatedHubs, skin_processes
 from ..ros.messages import to_ns
 from ..ros.node import make_executor, queue
 from ..simulation.faults import FRAME, PAD
@@ -165,7 +165,7 @@ def failures(result: dict[str, Any]) -> list[str]:
 def _run(options: Options, folder: Path, interrupted: threading.Event) -> dict[str, Any]:
     ports, path, book = folder / "ports", folder / "skin.yaml", folder / "book.json"
     # Every link may be behind every port: which hub it is only its uid says.
-    data = grid("skin", NX, NY, 0.012, HUBS, "planar", "planar", RATE, str(ports / "*"))
+    data = grid(nx=NX, ny=NY, pitch=0.012, links=HUBS, rate=RATE, port=str(ports / "*"))
     for number, link in enumerate(data["links"]):
         link["hub_uid"] = number + 1
     # The last hub is behind a bridge: the same faults over TCP.
@@ -176,7 +176,9 @@ def _run(options: Options, folder: Path, interrupted: threading.Event) -> dict[s
     reckoning = TortureVerification(skin, INSTANTS)
     with Children(folder) as children:
         for process in skin_processes(
-            path, rate=RATE, simulated_ports=ports, book=book, instants=INSTANTS
+            path,
+            rate=RATE,
+            simulated=SimulatedHubs(ports, sample_log=book, instants=INSTANTS),
         ):
             if process.executable == "driver":
                 process.parameters.update({"autostart": False, "port_directory": ""})
