@@ -294,7 +294,7 @@ GOOD = {
         ),
         (
             lambda d: d["indenters"][1].update(name="a"),
-            ["indenters[1] (a): the name is there twice"],
+            ["indenters[1] (a): the name appears twice"],
         ),
         (lambda d: d.update(period=3.5), ["tap from 3 to 4 s is not over", "period is 3.5 s"]),
         (lambda d: d.update(poisson=0.6), ["poisson: found 0.6", "<= 0.5"]),

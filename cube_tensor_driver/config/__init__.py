@@ -1,4 +1,5 @@
 """Files that people write and the program checks: skins, calibrations, tares, load scripts, tables.
 
-Reading never starts anything; all mistakes of a file are reported at once, each with file and key.
+A file is checked completely before anything starts, and each mistake is named with file and key.
+Recordings are not here but in bags/.
 """

@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all: written beside their place, then moved onto it."""
+"""Files that appear complete or not at all: they are written under another name, then renamed."""
 
 from __future__ import annotations
 
@@ -11,25 +11,31 @@ from ..core.errors import ConfigError
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """What to write in place of `path`, whose place it takes at the end; after an error neither is
-    left behind.
+    """Give a temporary file to write to, which replaces `path` when the block ends.
 
-    ConfigError: cannot be written, or `path` is a folder or a device.
+    If the block fails, the temporary file is removed and `path` stays as it was.
+
+    Raises ConfigError if the file cannot be written, or if `path` is a folder or a device.
     """
-    with _beside(path) as partial:
-        yield partial
-        partial.replace(path)
+    with _temporary(path) as temporary:
+        yield temporary
+        temporary.replace(path)
 
 
 def check_writable(path: Path) -> None:
-    """ConfigError, before any work: `whole` could not write this. Permissions say little to root or
-    in /proc."""
-    with _beside(path) as partial:
-        partial.touch()
+    """Raise ConfigError, before any work is done, if `atomic_write` could not write this file.
+
+    It tries to write: permissions alone do not tell this to root, or below /proc.
+    """
+    with _temporary(path) as temporary:
+        temporary.touch()
 
 
 def check_outputs(paths: dict[str, Path | None]) -> None:
-    """ConfigError, before any work: a file that cannot be written, or one for two outputs."""
+    """Check the output files of a command, by the option that names each, before any work is done.
+
+    Raises ConfigError if a file cannot be written, or if two options name the same file.
+    """
     given = {option: path for option, path in paths.items() if path is not None}
     for option, path in given.items():
         for other in given:
@@ -42,16 +48,16 @@ def check_outputs(paths: dict[str, Path | None]) -> None:
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """A name beside `path`, where nothing is left in the end; its errors as ConfigError."""
-    partial = path.parent / f"{path.name}.part"
+def _temporary(path: Path) -> Iterator[Path]:
+    """A name in the folder of `path`; no file of that name is left at the end."""
+    temporary = path.parent / f"{path.name}.part"
     try:
         if path.exists() and not path.is_file():
             raise OSError(0, "is no file")
-        yield partial
+        yield temporary
     except OSError as error:
         what = error.strerror or str(error)
         raise ConfigError(f"{path}: {what}; name a file in a folder that can be written") from None
     finally:
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Calibration files: YAML of what `core.calibration.Calibration` holds."""
+"""Calibration files: a `core.calibration.Calibration` as YAML."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from .yaml import read_yaml, to_yaml, write_yaml
 
 
 def find_calibration(name: str, folder: Path) -> Path:
-    """The file that a skin means by `name`: a path, relative to the skin file's folder, or the name
-    of a shipped one.
+    """The calibration file that `name` means.
 
-    ConfigError: no such file, with the names of the shipped ones.
+    That is a path relative to `folder` (where the skin file is), or else the name of one of the
+    calibrations in the package. Raises ConfigError if there is neither, and lists these names.
     """
     shipped = package_data() / "config" / "calibration"
     for path in (folder / name, shipped / f"{name}.yaml"):
@@ -27,8 +27,10 @@ def find_calibration(name: str, folder: Path) -> Path:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read and check a calibration file. ConfigError: cannot be read, or what
-    `Calibration.from_dict` refuses."""
+    """Read and check a calibration file.
+
+    Raises ConfigError if it cannot be read, or if `Calibration.from_dict` refuses its content.
+    """
     try:
         return Calibration.from_dict(read_yaml(path))
     except CalibrationError as error:
@@ -36,10 +38,13 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def write_calibration(path: Path, calibration: Calibration, header: str = "") -> None:
-    """Write a calibration file, whole or not at all. ConfigError: cannot be written."""
+    """Write a calibration file, completely or not at all. Raises ConfigError if it cannot.
+
+    header: comment lines at the top of the file.
+    """
     write_yaml(path, calibration.to_dict(), header)
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """The text of a calibration's file."""
+    """The content of the calibration's file."""
     return to_yaml(calibration.to_dict())

@@ -1,4 +1,4 @@
-"""Tables of known loads and measured frequencies (CSV), the input of a fit."""
+"""Tables (CSV) of known loads and the frequencies measured under them: the input of a fit."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import FitError
 from ..core.fit import traction_loads
 from ..core.layout import Layout
+from ..core.modes import Modes
 from ..core.symmetry import default_modes
 from .yaml import MAX_BYTES
 
@@ -21,7 +22,10 @@ TEMPERATURE = "temperature"
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """state (N, M) in Pa; frequency (N, P) in Hz; temperature (N,) in °C or None."""
+    """N loads of a cube with P pads and M modes.
+
+    state: (N, M) Pa. frequency: (N, P) Hz. temperature: (N,) °C, or None if it is unknown.
+    """
 
     state: NDArray[np.float64]
     frequency: NDArray[np.float64]
@@ -29,69 +33,70 @@ class Loads:
 
 
 def read_loads(path: Path, layout: Layout, area: float | None = None) -> Loads:
-    """Read a table with one load per row and a line of column names.
+    """Read a table with a line of column names, then one load per line.
 
-    Columns: each pad's name (`+z-x` …), frequency in Hz; the load either as amplitudes of modes
-    (`zz`, `zz_x` …, Pa, gradients times the half side; modes without a column are 0), or as the
-    force `fx`, `fy`, `fz` in N of a reference sensor on the face +z, over `area` in m²;
-    `temperature` in °C if it is known.
+    The columns are:
 
-    FitError: cannot be read, columns missing, unknown or twice, a cell that is no number, forces
-    without area.
+    - the frequency of each pad in Hz, named as the pad (`+z-x` …);
+    - the load, either as amplitudes of modes in Pa (`zz`, `zz_x` …; gradients times the half side;
+      a mode without a column is 0), or as the force `fx`, `fy`, `fz` in N of a reference sensor on
+      the face +z, which acts on `area` in m²;
+    - `temperature` in °C, if it is known.
+
+    Raises FitError if the file cannot be read, a column is missing, unknown or there twice, a cell
+    is no number, or forces are given without an area.
     """
-    header, cells = _read(path)
+    header, cells = _read_cells(path)
     modes = default_modes(layout)
+    _check_columns(path, header, layout, modes)
+    column = {name: cells[:, number] for number, name in enumerate(header)}
+    frequency = np.stack([column[pad] for pad in layout.pads], axis=1)
+    return Loads(_states(path, column, modes, area), frequency, column.get(TEMPERATURE))
+
+
+def _check_columns(path: Path, header: list[str], layout: Layout, modes: Modes) -> None:
     allowed = {*layout.pads, *modes.names, *FORCE, TEMPERATURE}
-    for what, names in (
-        ("unknown", [name for name in header if name not in allowed]),
-        ("twice", sorted({name for name in header if header.count(name) > 1})),
-        ("missing", [pad for pad in layout.pads if pad not in header]),
-    ):
+    wrong = {
+        "unknown": [name for name in header if name not in allowed],
+        "twice": sorted({name for name in header if header.count(name) > 1}),
+        "missing": [pad for pad in layout.pads if pad not in header],
+    }
+    for what, names in wrong.items():
         if names:
             raise FitError(
-                f"{path}: columns {what}: {', '.join(map(repr, names))}; needed are the pads {', '.join(layout.pads)} "
+                f"{path}: columns {what}: {', '.join(map(repr, names))}; "
+                f"needed are the pads {', '.join(layout.pads)} "
                 f"and modes ({', '.join(modes.names)}) or forces ({', '.join(FORCE)})"
             )
-    column = {name: cells[:, header.index(name)] for name in header}
-    by_force = [name for name in FORCE if name in header]
-    by_mode = [name for name in modes.names if name in header]
-    if bool(by_force) == bool(by_mode):
-        found = "both" if by_mode else "neither"
+
+
+def _states(
+    path: Path, column: dict[str, NDArray[np.float64]], modes: Modes, area: float | None
+) -> NDArray[np.float64]:
+    """(N, M) Pa, from the columns of modes or of forces."""
+    forces = [name for name in FORCE if name in column]
+    amplitudes = [name for name in modes.names if name in column]
+    if bool(forces) == bool(amplitudes):
+        found = "both" if amplitudes else "neither"
         raise FitError(
-            f"{path}: found {found} columns of modes and of forces; give the load in one of the two ways"
+            f"{path}: found {found} columns of modes and of forces; "
+            "give the load in one of the two ways"
         )
-    if by_mode:
-        zero = np.zeros(len(cells))
-        state = np.stack([column.get(name, zero) for name in modes.names], axis=1)
-    else:
-        if area is None:
-            raise FitError(
-                f"{path}: the loads are forces; give the area they act on in m² (--area)"
-            )
-        if len(by_force) < 3:
-            raise FitError(
-                f"{path}: found forces {', '.join(by_force)}; all of {', '.join(FORCE)} are needed"
-            )
-        state = traction_loads(modes, np.stack([column[name] for name in FORCE], axis=1), area)
-    return Loads(
-        state, np.stack([column[pad] for pad in layout.pads], axis=1), column.get(TEMPERATURE)
-    )
+    if amplitudes:
+        zero = np.zeros(len(column[amplitudes[0]]))
+        return np.stack([column.get(name, zero) for name in modes.names], axis=1)
+    if area is None:
+        raise FitError(f"{path}: the loads are forces; give the area they act on in m² (--area)")
+    if len(forces) < len(FORCE):
+        raise FitError(
+            f"{path}: found forces {', '.join(forces)}; all of {', '.join(FORCE)} are needed"
+        )
+    return traction_loads(modes, np.stack([column[name] for name in FORCE], axis=1), area)
 
 
-def _read(path: Path) -> tuple[list[str], NDArray[np.float64]]:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise FitError(f"{path}: larger than {MAX_BYTES} bytes: this is no table of loads")
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [
-                [cell.strip() for cell in line]
-                for line in csv.reader(file)
-                if any(cell.strip() for cell in line)
-            ]
-    except OSError as error:
-        raise FitError(f"{path}: {error.strerror}; name a CSV file that can be read") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FitError(f"{path}: not a CSV file ({error})") from None
+def _read_cells(path: Path) -> tuple[list[str], NDArray[np.float64]]:
+    """The column names, and the numbers (lines, columns) below them."""
+    lines = _read_lines(path)
     if len(lines) < 2:
         raise FitError(
             f"{path}: found {len(lines)} lines; needed are one with column names and one per load"
@@ -103,18 +108,34 @@ def _read(path: Path) -> tuple[list[str], NDArray[np.float64]]:
             raise FitError(
                 f"{path}: load {number + 1} has {len(row)} cells, the first line has {len(header)}"
             )
-        for place, cell in enumerate(row):
+        for column, cell in enumerate(row):
             try:
-                values[number, place] = float(cell)
+                values[number, column] = float(cell)
             except ValueError:
                 raise FitError(
-                    f"{path}: load {number + 1}, column {header[place]}: {cell!r} is no number"
+                    f"{path}: load {number + 1}, column {header[column]}: {cell!r} is no number"
                 ) from None
     return header, values
 
 
+def _read_lines(path: Path) -> list[list[str]]:
+    """The cells of each line, without spaces around them; empty lines are left out."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise FitError(f"{path}: larger than {MAX_BYTES} bytes: this is no table of loads")
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = [[cell.strip() for cell in line] for line in csv.reader(file)]
+    except OSError as error:
+        raise FitError(f"{path}: {error.strerror}; name a CSV file that can be read") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FitError(f"{path}: not a CSV file ({error})") from None
+    return [line for line in lines if any(line)]
+
+
 def unloaded(loads: Loads) -> NDArray[np.float64] | None:
-    """Mean frequencies (P,) in Hz of the rows without load, None if there are none."""
-    rest = ~loads.state.any(axis=1)
-    mean: NDArray[np.float64] = loads.frequency[rest].mean(axis=0)
-    return mean if rest.any() else None
+    """(P,) Hz: mean frequencies of the rows without load; None if there are no such rows."""
+    at_rest = ~loads.state.any(axis=1)
+    if not at_rest.any():
+        return None
+    mean: NDArray[np.float64] = loads.frequency[at_rest].mean(axis=0)
+    return mean

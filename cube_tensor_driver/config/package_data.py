@@ -1,4 +1,4 @@
-"""Where the package's own data files are, in a checkout as in an install space."""
+"""Where the files are that the package brings along: shipped skins, calibrations, launch files."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ _NAME = "cube_tensor_driver"
 
 
 def package_data() -> Path:
-    """The folder with config/ and launch/: the checkout, or share/cube_tensor_driver of the install
-    space.
+    """The folder that holds config/ and launch/.
 
-    ConfigError: neither is there, the installation is broken.
+    In a checkout it is the checkout itself, after an installation share/cube_tensor_driver.
+
+    Raises ConfigError if there is neither, which means that the installation is broken.
     """
     for parent in Path(__file__).parents:
         for folder in (parent, parent / "share" / _NAME):
             if (folder / "package.xml").is_file() and (folder / "config").is_dir():
                 return folder
     raise ConfigError(
-        f"the data files of {_NAME} are not beside {Path(__file__).parent}: install the package again (colcon build)"
+        f"the data files of {_NAME} are not beside {Path(__file__).parent}: "
+        "install the package again (colcon build)"
     )

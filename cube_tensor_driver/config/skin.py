@@ -1,9 +1,5 @@
-"""Skin files: which links there are, which cubes they carry, where the cubes sit, how they are
-calibrated.
-
-docs/config.md describes the keys. A file is checked whole before anything starts: every mistake is
-one line with file, key, what was found and what is allowed.
-"""
+"""Skin files: which links there are, which cubes they carry, where these sit and how they are
+calibrated. docs/config.md describes the keys."""
 
 from __future__ import annotations
 
@@ -16,15 +12,17 @@ from typing import Any
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError, CubeError
 from .calibration import find_calibration, read_calibration
-from .schema import NAME, TEXT, TRIPLE, Schema, real, several, table
+from .schema import NAME, TEXT, TRIPLE, Schema, list_of, mapping, real
 from .yaml import read_yaml
+
+BAUD = 921_600
 
 _FRAME = {
     "type": "string",
     "pattern": r"^[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z",
     "description": "a frame id of letters, digits, _ and /, a letter first",
 }
-# An integer, or a text such as 0x1f because uids are hexadecimal on labels.
+# Labels on cubes give uids in hexadecimal, so a text such as 0x1f is allowed.
 _UID = {
     "anyOf": [
         {"type": "integer", "minimum": 1, "maximum": 2**64 - 1},
@@ -44,28 +42,28 @@ _BAUD = {
     "maximum": 20_000_000,
     "description": "1200 to 20000000",
 }
-_LINK = table(("name", "port"), {"name": NAME, "port": TEXT, "baud": _BAUD, "hub_uid": _UID})
-_CUBE = table(
+_LINK = mapping(("name", "port"), {"name": NAME, "port": TEXT, "baud": _BAUD, "hub_uid": _UID})
+_CUBE = mapping(
     ("name", "pose", "layout", "calibration"),
     {
         "name": NAME,
         "link": NAME,
         "index": _INDEX,
         "uid": _UID,
-        "pose": table(("xyz", "rpy"), {"xyz": TRIPLE, "rpy": TRIPLE}),
+        "pose": mapping(("xyz", "rpy"), {"xyz": TRIPLE, "rpy": TRIPLE}),
         "layout": TEXT,
         "calibration": TEXT,
     },
 )
 _SCHEMA = Schema(
-    table(
+    mapping(
         ("name", "parent_frame", "links", "cubes"),
         {
             "name": NAME,
             "parent_frame": _FRAME,
             "rate": real("samples per second, 0.1 to 10000", minimum=0.1, maximum=10_000),
-            "links": several(_LINK, "links"),
-            "cubes": several(_CUBE, "cubes"),
+            "links": list_of(_LINK, "links"),
+            "cubes": list_of(_CUBE, "cubes"),
         },
     )
 )
@@ -73,8 +71,11 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class SkinLink:
-    """A link of a skin: name, port (device path, pattern or socket://host:port), baud, uid of the
-    hub or None."""
+    """A link of a skin.
+
+    port: device path, pattern of device paths, or socket://host:port. hub_uid: uid of the hub that
+    must answer there; None: any hub may.
+    """
 
     name: str
     port: str
@@ -86,8 +87,9 @@ class SkinLink:
 class SkinCube:
     """A cube of a skin.
 
-    RecordedVerdicts on the wire by uid, or by link and index. xyz in m and rpy in rad (fixed axes
-    x, y, z: REP 103) are its pose in the skin's parent frame.
+    It is recognised by its uid, or by its link and its index in the hub; what is not used is None.
+    xyz, m, and rpy, rad, are its pose in the parent frame of the skin; rpy are rotations about the
+    fixed axes x, y, z (REP 103).
     """
 
     name: str
@@ -101,8 +103,11 @@ class SkinCube:
 
 @dataclass(frozen=True)
 class Skin:
-    """All cubes of one configuration file. rate: samples per second to ask of the hubs, None to
-    leave it to them."""
+    """All cubes of one configuration file, in the order of the file.
+
+    This order is what `cube` in rows and messages counts. parent_frame: the frame that poses refer
+    to. rate: samples per second to ask of the hubs; None leaves it to them.
+    """
 
     name: str
     parent_frame: str
@@ -117,137 +122,190 @@ class Skin:
 
     @property
     def calibrations(self) -> tuple[Calibration, ...]:
-        """The calibration of each cube; cubes of one file share one object."""
+        """The calibration of each cube; cubes with the same file share one object."""
         return tuple(cube.calibration for cube in self.cubes)
 
     @property
     def n_pads(self) -> int:
-        """Pads of the widest cube: the width of a row."""
-        return max(cube.calibration.layout.n_pads for cube in self.cubes)
+        """The width of a row: the number of pads of the cube that has most."""
+        return max(calibration.layout.n_pads for calibration in self.calibrations)
 
     def frame(self, cube: SkinCube) -> str:
-        """Frame id of a cube."""
+        """The frame id of a cube."""
         return f"{self.name}_{cube.name}"
 
 
-def read_skin(path: Path) -> Skin:
-    """Read and check a skin file.
+def read_skin(path: str | Path) -> Skin:
+    """Read a skin file (YAML) with the calibrations it names, and check both.
 
-    ConfigError: the first mistake (file, key, what was found, what is allowed) and how many more
-    there are.
+    docs/config.md describes the keys. Nothing is opened and nothing is started: ports are only
+    names here.
+
+    path: the skin file. Calibration files are looked up relative to its folder, then among those
+    of the package.
+
+    Returns the skin: links and cubes in the order of the file, poses in m and rad, the rate in
+    samples per second.
+
+    Raises ConfigError if the file cannot be read or has mistakes. The text names the file, the key
+    of the first mistake, what was found and what is allowed, and how many more mistakes there are;
+    `check_skin` gives them all.
     """
+    path = Path(path)
     skin, mistakes = check_skin(path)
     if skin is None:
-        more = (
-            f" (and {len(mistakes) - 1} more: ./cube config check {path})"
-            if len(mistakes) > 1
-            else ""
-        )
+        others = len(mistakes) - 1
+        more = f" (and {others} more: ./cube config check {path})" if others else ""
         raise ConfigError(f"{path}: {mistakes[0]}{more}")
     return skin
 
 
 def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
-    """The skin of a file and no mistakes, or None and every mistake, one line each. ConfigError: it
-    cannot be read."""
+    """The skin of a file and no mistakes; or None and all mistakes, one line each.
+
+    Entries beside a malformed one are checked as well. Raises ConfigError if the file cannot be
+    read or is not YAML.
+    """
     data = read_yaml(path)
     found = _SCHEMA.mistakes(data)
     mistakes = [line for _, line in found]
-    if not isinstance(data, dict) or not all(
-        isinstance(data.get(key), list) for key in ("links", "cubes")
-    ):
+    if not isinstance(data, dict):
         return None, mistakes
-    # Where an entry is malformed the others are looked at all the same.
-    wrong = {where[:2] for where, _ in found}
+    if not isinstance(data.get("links"), list) or not isinstance(data.get("cubes"), list):
+        return None, mistakes
+    # ("cubes", 3) for a mistake anywhere in cubes[3].
+    malformed = {where[:2] for where, _ in found}
+
     links = tuple(
-        SkinLink(link["name"], link["port"], link.get("baud", 921_600), _uid(link.get("hub_uid")))
-        for number, link in enumerate(data["links"])
-        if ("links", number) not in wrong
+        SkinLink(item["name"], item["port"], item.get("baud", BAUD), _uid(item.get("hub_uid")))
+        for number, item in enumerate(data["links"])
+        if ("links", number) not in malformed
     )
-    mistakes += _twice("links", "name", [repr(link.name) for link in links])
-    mistakes += _twice(
-        "links", "hub_uid", [hex(link.hub_uid) for link in links if link.hub_uid is not None]
-    )
-    names = {link.name for link in links}
-    whole = len(names) == len(data["links"])
-    calibrations: dict[str, Calibration | CubeError] = {}
-    cubes = []
+    mistakes += _link_mistakes(links)
+
+    # Where a link is malformed its name is unknown, so no cube can be blamed for naming it.
+    all_links_known = len({link.name for link in links}) == len(data["links"])
+    reader = _CubeReader(path.parent, [link.name for link in links] if all_links_known else None)
     for number, item in enumerate(data["cubes"]):
-        if ("cubes", number) in wrong:
-            continue
-        name = item["calibration"]
-        if name not in calibrations:
-            try:
-                calibrations[name] = read_calibration(find_calibration(name, path.parent))
-            except CubeError as error:
-                calibrations[name] = error
-                mistakes.append(f"cubes[{number}].calibration: {error}")
-        calibration, uid = calibrations[name], _uid(item.get("uid"))
-        if isinstance(calibration, CubeError):
-            continue
-        mistakes += [
-            f"cubes[{number}]{line}"
-            for line in _contradictions(item, uid, calibration, names if whole else None)
-        ]
-        xyz, rpy = (tuple(float(value) for value in item["pose"][part]) for part in ("xyz", "rpy"))
-        cubes.append(
-            SkinCube(item["name"], item.get("link"), item.get("index"), uid, xyz, rpy, calibration)  # type: ignore[arg-type]
+        if ("cubes", number) not in malformed:
+            reader.read(number, item)
+    cubes = tuple(reader.cubes)
+    mistakes += reader.mistakes
+    mistakes += _cube_mistakes(cubes)
+    mistakes += _pad_mistakes(links, cubes)
+    if mistakes:
+        return None, mistakes
+    rate = None if data.get("rate") is None else float(data["rate"])
+    return Skin(data["name"], data["parent_frame"], rate, links, cubes), []
+
+
+class _CubeReader:
+    """Makes cubes of the entries of a file, and reads each calibration once.
+
+    links: the names of the links; None: not all of them are known.
+    """
+
+    def __init__(self, folder: Path, links: list[str] | None) -> None:
+        self.cubes: list[SkinCube] = []
+        self.mistakes: list[str] = []
+        self._folder = folder
+        self._links = links
+        self._calibrations: dict[str, Calibration | None] = {}
+
+    def read(self, number: int, item: dict[str, Any]) -> None:
+        calibration = self._calibration(number, item["calibration"])
+        if calibration is None:
+            return
+        uid = _uid(item.get("uid"))
+        for line in self._contradictions(item, uid, calibration):
+            self.mistakes.append(f"cubes[{number}]{line}")
+        self.cubes.append(
+            SkinCube(
+                name=item["name"],
+                link=item.get("link"),
+                index=item.get("index"),
+                uid=uid,
+                xyz=_triple(item["pose"]["xyz"]),
+                rpy=_triple(item["pose"]["rpy"]),
+                calibration=calibration,
+            )
         )
-    mistakes += _twice("cubes", "name", [repr(cube.name) for cube in cubes])
-    mistakes += _twice("cubes", "uid", [hex(cube.uid) for cube in cubes if cube.uid is not None])
-    mistakes += _twice(
-        "cubes",
-        "link and index",
-        [f"{cube.link!r}, {cube.index}" for cube in cubes if cube.index is not None],
-    )
+
+    def _calibration(self, number: int, name: str) -> Calibration | None:
+        """None after an error, which is reported once, with the first cube that names it."""
+        if name not in self._calibrations:
+            try:
+                self._calibrations[name] = read_calibration(find_calibration(name, self._folder))
+            except CubeError as error:
+                self._calibrations[name] = None
+                self.mistakes.append(f"cubes[{number}].calibration: {error}")
+        return self._calibrations[name]
+
+    def _contradictions(
+        self, item: dict[str, Any], uid: int | None, calibration: Calibration
+    ) -> Iterator[str]:
+        """Keys of one cube that contradict each other or the rest of the file."""
+        link, index = item.get("link"), item.get("index")
+        if link is not None and self._links is not None and link not in self._links:
+            allowed = ", ".join(sorted(self._links))
+            yield f".link: found {link!r}, allowed: one of the links {allowed}"
+        if uid is None and (link is None or index is None):
+            yield (
+                ": found neither uid nor both link and index, which say where the cube is; "
+                "add one of them"
+            )
+        if uid is not None and index is not None:
+            yield ": found both uid and index; keep one, they might contradict each other"
+        if item["layout"] != calibration.layout.name:
+            yield (
+                f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
+                f"is for the layout {calibration.layout.name!r}"
+            )
+        if calibration.uid is not None and uid != calibration.uid:
+            found = "not given" if uid is None else hex(uid)
+            yield (
+                f".calibration: {item['calibration']!r} was made for the cube with uid "
+                f"{calibration.uid:#x}, this cube's uid is {found}"
+            )
+
+
+def _link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
+    yield from _repeated("links", "name", [repr(link.name) for link in links])
+    hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
+    yield from _repeated("links", "hub_uid", hub_uids)
+
+
+def _cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:
+    yield from _repeated("cubes", "name", [repr(cube.name) for cube in cubes])
+    uids = [hex(cube.uid) for cube in cubes if cube.uid is not None]
+    yield from _repeated("cubes", "uid", uids)
+    positions = [f"{cube.link!r}, {cube.index}" for cube in cubes if cube.index is not None]
+    yield from _repeated("cubes", "link and index", positions)
+
+
+def _pad_mistakes(links: tuple[SkinLink, ...], cubes: tuple[SkinCube, ...]) -> Iterator[str]:
+    """A frame of a hub has the same number of pads for each of its cubes."""
     for link in links:
         pads = {cube.calibration.layout.n_pads for cube in cubes if cube.link == link.name}
         if len(pads) > 1:
-            both = " and ".join(map(str, sorted(pads)))
-            mistakes.append(
-                f"cubes: those on the link {link.name!r} have {both} pads; a hub reads one number of pads"
+            numbers = " and ".join(map(str, sorted(pads)))
+            yield (
+                f"cubes: those on the link {link.name!r} have {numbers} pads; "
+                "a hub reads one number of pads"
             )
-    if mistakes:
-        return None, mistakes
-    rate = data.get("rate")
-    return Skin(
-        data["name"],
-        data["parent_frame"],
-        None if rate is None else float(rate),
-        links,
-        tuple(cubes),
-    ), []
 
 
-def _contradictions(
-    item: dict[str, Any], uid: int | None, calibration: Calibration, names: set[str] | None
-) -> Iterator[str]:
-    """What the keys of a cube say against each other; names: of the links, None if not all are
-    known."""
-    link, index = item.get("link"), item.get("index")
-    if link is not None and names is not None and link not in names:
-        yield f".link: found {link!r}, allowed: one of the links {', '.join(sorted(names))}"
-    if uid is None and (link is None or index is None):
-        yield ": found neither uid nor both link and index, which say where the cube is; add one of them"
-    if uid is not None and index is not None:
-        yield ": found both uid and index; keep one, they might contradict each other"
-    if item["layout"] != calibration.layout.name:
-        yield (
-            f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
-            f"is for the layout {calibration.layout.name!r}"
-        )
-    if calibration.uid is not None and uid != calibration.uid:
-        yield (
-            f".calibration: {item['calibration']!r} was made for the cube with uid {calibration.uid:#x}, "
-            f"this cube's uid is {'not given' if uid is None else hex(uid)}"
-        )
+def _repeated(where: str, what: str, values: list[str]) -> Iterator[str]:
+    for value, count in Counter(values).items():
+        if count > 1:
+            times = "twice" if count == 2 else f"{count} times"
+            yield f"{where}: the {what} {value} appears {times}; keep one"
 
 
 def _uid(value: int | str | None) -> int | None:
     return int(value, 16) if isinstance(value, str) else value
 
 
-def _twice(where: str, what: str, values: list[str]) -> Iterator[str]:
-    for value, count in Counter(values).items():
-        if count > 1:
-            yield f"{where}: the {what} {value} is there {'twice' * (count == 2) or f'{count} times'}; keep one"
+def _triple(values: list[float]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

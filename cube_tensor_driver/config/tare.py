@@ -1,5 +1,4 @@
-"""Tare files: the rest frequencies of one cube, by its uid, with the calibration they were measured
-under."""
+"""Tare files: the rest frequencies of one cube, named by its uid, with the calibration in use."""
 
 from __future__ import annotations
 
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
@@ -16,24 +16,32 @@ from .yaml import read_yaml, write_yaml
 
 SCHEMA = 1
 _KEYS = {"schema", "uid", "calibration_id", "created", "rest_frequency"}
+_HEADER = "Rest frequencies in Hz that ~/tare measured; ~/clear_tare removes it."
 
 
 class StoredTare(NamedTuple):
-    """rest_frequency: (P,) Hz; created: when, with its time zone."""
+    """rest_frequency: (P,) Hz. created: when it was measured, with time zone."""
 
-    rest_frequency: np.ndarray
+    rest_frequency: NDArray[np.float64]
     created: datetime
 
 
 def tare_path(folder: Path, uid: int) -> Path:
-    """The file of a cube."""
+    """The file of the cube with this uid."""
     return folder / f"{uid:016x}.yaml"
 
 
 def write_tare(
-    folder: Path, uid: int, calibration: Calibration, rest_frequency: np.ndarray, created: datetime
+    folder: Path,
+    uid: int,
+    calibration: Calibration,
+    rest_frequency: NDArray[np.floating],
+    created: datetime,
 ) -> None:
-    """Write a cube's tare, whole or not at all. ConfigError: the folder cannot be written."""
+    """Write the tare of a cube, completely or not at all, and make the folder if it is missing.
+
+    Raises ConfigError if the folder cannot be written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -47,27 +55,22 @@ def write_tare(
         "created": created.isoformat(timespec="seconds"),
         "rest_frequency": [float(value) for value in rest_frequency],
     }
-    write_yaml(
-        tare_path(folder, uid),
-        content,
-        "Rest frequencies in Hz that ~/tare measured; ~/clear_tare removes it.",
-    )
+    write_yaml(tare_path(folder, uid), content, _HEADER)
 
 
 def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | None:
-    """A cube's tare, None if there is none.
+    """The tare of a cube; None if it has none.
 
-    ConfigError: damaged, of another cube, or measured under another calibration; the text says
-    which, and what to do.
+    Raises ConfigError if the file is damaged, belongs to another cube, or was measured under
+    another calibration. The text says which of these it is, and what to do.
     """
     path = tare_path(folder, uid)
     if not path.exists():
         return None
     data = read_yaml(path)
     if not isinstance(data, dict) or set(data) != _KEYS:
-        raise ConfigError(
-            f"{path}: no tare file: its keys must be {', '.join(sorted(_KEYS))}; tare again"
-        )
+        keys = ", ".join(sorted(_KEYS))
+        raise ConfigError(f"{path}: no tare file: its keys must be {keys}; tare again")
     if data["schema"] != SCHEMA:
         raise ConfigError(
             f"{path}: schema is {data['schema']!r}, this version reads {SCHEMA}; tare again"
@@ -78,17 +81,15 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
         )
     if data["calibration_id"] != calibration.id:
         raise ConfigError(
-            f"{path}: measured under calibration {data['calibration_id']!r}, the cube now has {calibration.id!r}; "
-            "tare again"
+            f"{path}: measured under calibration {data['calibration_id']!r}, "
+            f"the cube now has {calibration.id!r}; tare again"
         )
-    return StoredTare(
-        _rest(path, data["rest_frequency"], calibration.layout.n_pads),
-        _created(path, data["created"]),
-    )
+    rest = _rest_frequency(path, data["rest_frequency"], calibration.layout.n_pads)
+    return StoredTare(rest, _created(path, data["created"]))
 
 
 def remove_tare(folder: Path, uid: int) -> None:
-    """Remove a cube's tare, if there is one. ConfigError: it cannot be removed."""
+    """Remove the tare of a cube if it has one. Raises ConfigError if it cannot be removed."""
     path = tare_path(folder, uid)
     try:
         path.unlink(missing_ok=True)
@@ -97,16 +98,18 @@ def remove_tare(folder: Path, uid: int) -> None:
 
 
 def _uid(value: Any) -> int | None:
-    known = isinstance(value, str) and re.fullmatch("0x[0-9a-f]{1,16}", value)
-    return int(value, 16) if known else None
+    if isinstance(value, str) and re.fullmatch("0x[0-9a-f]{1,16}", value):
+        return int(value, 16)
+    return None
 
 
-def _rest(path: Path, value: Any, n_pads: int) -> np.ndarray:
-    numbers = isinstance(value, list) and all(type(item) in (int, float) for item in value)
-    rest = np.array(value, float) if numbers else np.empty(0)
+def _rest_frequency(path: Path, value: Any, n_pads: int) -> NDArray[np.float64]:
+    are_numbers = isinstance(value, list) and all(type(item) in (int, float) for item in value)
+    rest = np.array(value, float) if are_numbers else np.empty(0)
     if rest.shape != (n_pads,) or not (np.isfinite(rest) & (rest > 0)).all():
         raise ConfigError(
-            f"{path}: rest_frequency is {str(value)[:60]}, it must be {n_pads} numbers above 0; tare again"
+            f"{path}: rest_frequency is {str(value)[:60]}, "
+            f"it must be {n_pads} numbers above 0; tare again"
         )
     return rest
 

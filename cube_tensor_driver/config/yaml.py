@@ -1,5 +1,4 @@
-"""YAML files read safely: bounded in size, no Python objects, no key twice. What goes wrong is a
-`ConfigError`."""
+"""YAML files, read safely: limited in size, plain values only, no key twice in a mapping."""
 
 from __future__ import annotations
 
@@ -12,22 +11,27 @@ from ..core.errors import ConfigError
 from .atomic_write import atomic_write
 
 MAX_BYTES = 64 << 20
-"""No skin or calibration comes near; a wrong path to a bag or a disk image does."""
+"""Far more than any skin or calibration file has; a bag or a disk image named by mistake has
+more."""
+_MERGE_TAG = "tag:yaml.org,2002:merge"
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The safe loader, in C where there is one, that refuses a key written twice instead of taking
-    the last."""
+    """The safe loader, in C where it is installed, which refuses a key that appears twice.
+
+    PyYAML would silently take the last one.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+        # Keys that come from a merge (<<) may be overridden.
+        own_keys = [key for key, _ in node.value if key.tag != _MERGE_TAG]
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         seen: set[Any] = set()
-        for key in own:
+        for key in own_keys:
             name = self.construct_object(key, deep=True)
             if name in seen:
                 raise yaml.MarkedYAMLError(
-                    problem=f"the key {name!r} is there twice; keep one",
+                    problem=f"the key {name!r} appears twice; keep one",
                     problem_mark=key.start_mark,
                 )
             seen.add(name)
@@ -35,26 +39,28 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 def parse_yaml(text: str | bytes, origin: str) -> Any:
-    """The plain Python value of a YAML text; `origin` names it in errors.
+    """The plain Python value of a YAML text; `origin` names the text in error messages.
 
-    ConfigError: not YAML, a key twice, a tag that is not plain data, with the line.
+    Raises ConfigError, with the line, if it is not YAML, if a key appears twice or if a tag stands
+    for something else than plain data.
     """
     try:
         return yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        place = f"{origin}, line {mark.line + 1}, column {mark.column + 1}" if mark else origin
-        raise ConfigError(f"{place}: {error.problem or 'not YAML'}") from None
+        where = f"{origin}, line {mark.line + 1}, column {mark.column + 1}" if mark else origin
+        raise ConfigError(f"{where}: {error.problem or 'not YAML'}") from None
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise ConfigError(
-            f"{origin}: not YAML: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        ) from None
+        lines = str(error).splitlines()
+        reason = lines[0] if lines else type(error).__name__
+        raise ConfigError(f"{origin}: not YAML: {reason}") from None
 
 
 def read_yaml(path: Path) -> Any:
     """The plain Python value of a YAML file.
 
-    ConfigError: no such file, not readable, larger than 64 MB, or as `parse_yaml`.
+    Raises ConfigError if the file does not exist, cannot be read or is larger than 64 MB, and in
+    the cases of `parse_yaml`.
     """
     try:
         size = path.stat().st_size
@@ -76,11 +82,11 @@ def to_yaml(value: Any) -> str:
 
 
 def write_yaml(path: Path, value: Any, header: str = "") -> None:
-    """Write plain values as YAML, whole or not at all; `header` becomes comment lines at the top.
+    """Write plain values as a YAML file, completely or not at all.
 
-    ConfigError: it cannot be written.
+    header: comment lines at the top. Raises ConfigError if the file cannot be written.
     """
-    lines = "".join(f"# {line}".rstrip() + "\n" for line in header.splitlines())
-    text = lines + to_yaml(value)
-    with atomic_write(path) as partial:
-        partial.write_text(text)
+    comment = "".join(f"# {line}".rstrip() + "\n" for line in header.splitlines())
+    text = comment + to_yaml(value)
+    with atomic_write(path) as temporary:
+        temporary.write_text(text)

@@ -106,15 +106,15 @@ def change(*path, to=None, remove=False):
         ),
         (change("cubes", 1, "index", to=-1), ["cubes[1].index", "found -1", "0 to 65535"]),
         (change("cubes", 2, "name", to="c 2"), ["cubes[2].name", "'c 2'", "letters, digits"]),
-        (change("cubes", 2, "name", to="c1"), ["cubes", "name 'c1' is there twice"]),
+        (change("cubes", 2, "name", to="c1"), ["cubes", "name 'c1' appears twice"]),
         (change("cubes", 2, "name", to="c2\n"), ["cubes[2].name", "letters, digits"]),
         (change("cubes", 2, "name", to="c" * 65), ["cubes[2].name", "at most 64"]),
         (change("cubes", 2, "name", to="2c"), ["cubes[2].name", "a letter first"]),
         (change("name", to="haut_ß"), ["name: found 'haut_ß'", "letters, digits"]),
         (change("parent_frame", to="/base"), ["parent_frame", "'/base'", "a letter first"]),
-        (change("links", 1, "name", to="hub0"), ["links", "name 'hub0' is there twice"]),
+        (change("links", 1, "name", to="hub0"), ["links", "name 'hub0' appears twice"]),
         (change("cubes", 2, "link", to="hub9"), ["cubes[2].link", "'hub9'", "hub0, hub1"]),
-        (change("cubes", 2, "index", to=1), ["link and index 'hub0', 1 is there twice"]),
+        (change("cubes", 2, "index", to=1), ["link and index 'hub0', 1 appears twice"]),
         (change("cubes", 2, "uid", to=5), ["cubes[2]", "both uid and index"]),
         (
             change("cubes", 2, "index", remove=True),
@@ -155,13 +155,13 @@ def test_uids_once_in_any_spelling(tmp_path):
     for link in data["links"]:
         link["hub_uid"] = 7
     with pytest.raises(
-        ConfigError, match=r"hub_uid 0x7 is there twice; .* \(and 1 more: ./cube config check"
+        ConfigError, match=r"hub_uid 0x7 appears twice; .* \(and 1 more: ./cube config check"
     ):
         read(tmp_path, data)
     path = tmp_path / "skin.yaml"
     assert check_skin(path)[1] == [
-        "links: the hub_uid 0x7 is there twice; keep one",
-        "cubes: the uid 0x1f is there twice; keep one",
+        "links: the hub_uid 0x7 appears twice; keep one",
+        "cubes: the uid 0x1f appears twice; keep one",
     ]
 
 
@@ -204,7 +204,7 @@ def test_every_mistake_is_told_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("a: 1\nb: 2\na: 3\n", ["line 3", "'a' is there twice"]),
+        ("a: 1\nb: 2\na: 3\n", ["line 3", "'a' appears twice"]),
         ("a: [1, 2", ["line", "expected"]),
         ("!!python/object/apply:os.system ['true']", ["line 1"]),
         ("", ["top level", "found None"]),
