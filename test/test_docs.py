@@ -204,3 +204,19 @@ def test_programs_of_a_page_run(name):
     assert programs
     for program in programs:
         exec(program, there)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_and_links_of_a_page_exist(page):
+    """Links, and files that a sentence names by their path in the checkout or in the package; a
+    path may leave out the suffix."""
+    text = page.read_text()
+    links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
+    missing = [link for link in links if not (page.parent / link).exists()]
+    rooms = "|".join(folder.name for folder in (ROOT / "cube_tensor_driver").iterdir())
+    pattern = rf"`((?:{rooms}|docs|launch|msg|rviz|scripts|srv|test|tools)/[\w./]+)(?:::\w+)?`"
+    for name in re.findall(pattern, text):
+        here, package = ROOT.glob(f"{name}*"), ROOT.glob(f"cube_tensor_driver/{name}*")
+        if "NAME" not in name and not [*here, *package]:
+            missing.append(name)
+    assert not missing
