@@ -4,7 +4,9 @@ pinned."""
 from __future__ import annotations
 
 import ast
+import os
 import re
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -45,6 +47,21 @@ HOMES = {
     "launch": {"ros"},
     "viser": {"browser"},
 }
+
+
+def python(script: str, folder: Path = ROOT, **environment: str) -> str:
+    """What a Python of its own prints, run in that folder."""
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env={**os.environ, **environment},
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def imports(path: Path) -> set[str]:
@@ -93,18 +110,17 @@ def test_heavy_libraries_stay_at_home():
 
 
 def test_core_needs_numpy_and_nothing_else():
-    script = (
-        "import sys, pkgutil, importlib, cube_tensor_driver.core as core\n"
-        "import numpy, numpy.random, transforms3d.euler\n"
-        "before = set(sys.modules)\n"
-        "for module in pkgutil.iter_modules(core.__path__): importlib.import_module(f'{core.__name__}.{module.name}')\n"
-        "tops = {name.split('.')[0] for name in set(sys.modules) - before}\n"
-        "print(*sorted(t for t in tops if t not in sys.stdlib_module_names))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
-    )
-    assert set(done.stdout.split()) <= {"cube_tensor_driver", "numpy", "transforms3d"}
+    """transforms3d, which is numpy only too, for rotations."""
+    script = """
+import importlib, pkgutil, sys
+import numpy, transforms3d.euler, cube_tensor_driver.core as core
+before = set(sys.modules)
+for module in pkgutil.iter_modules(core.__path__):
+    importlib.import_module(f"{core.__name__}.{module.name}")
+tops = {name.split(".")[0] for name in set(sys.modules) - before}
+print(*tops - sys.stdlib_module_names)
+"""
+    assert set(python(script).split()) <= {"cube_tensor_driver", "numpy", "transforms3d"}
 
 
 def test_no_exit_assert_or_bare_except_in_the_package():
@@ -116,45 +132,44 @@ def test_no_exit_assert_or_bare_except_in_the_package():
                 assert node.type is not None, f"{place}: bare except"
 
 
+# Module -> wheel -> rosdep key, where the names differ. rosdep has no key for the last ones: the
+# commands that need them say so where they are missing.
+WHEELS = {
+    "serial": "pyserial",
+    "yaml": "pyyaml",
+    "skfem": "scikit-fem",
+    "mpl_toolkits": "matplotlib",
+}
+KEYS = {
+    "cobs": "python-cobs-pip",
+    "pyserial": "python3-serial",
+    "pyyaml": "python3-yaml",
+    "rosbags": "python3-rosbags-pip",
+} | dict.fromkeys(("scikit-fem", "pyarrow", "viser", "distributed", "dask", "mcap"))
+
+
 def test_every_dependency_is_declared_and_pinned():
-    keys = {
-        "numpy": "python3-numpy",
-        "serial": "python3-serial",
-        "cobs": "python-cobs-pip",
-        "yaml": "python3-yaml",
-        "transforms3d": "python3-transforms3d",
-        "jsonschema": "python3-jsonschema",
-        "rich": "python3-rich",
-        "scipy": "python3-scipy",
-        "matplotlib": "python3-matplotlib",
-        "psutil": "python3-psutil",
-        "rosbags": "python3-rosbags-pip",
-    }
-    # rosdep has no key for these; the commands that need them say so where they are missing.
-    without_key = {"skfem", "pyarrow", "viser", "distributed", "dask"}
-    wheels = {"serial": "pyserial", "yaml": "pyyaml", "skfem": "scikit-fem"}
-    # Parts of wheels that are named already.
-    parts = {"mpl_toolkits": "matplotlib"}
-    declared = {
+    """What comes from ROS in package.xml, wheels there, in pyproject.toml and in the lock."""
+    tomllib = pytest.importorskip("tomllib", reason="needs tomllib of Python 3.11")
+    of_ros = {
         element.text
         for element in ElementTree.parse(ROOT / "package.xml").iter()
         if "depend" in element.tag
     }
-    locked = set(
-        re.findall(r"^([a-z0-9-]+)==", (ROOT / "tools/requirements.lock").read_text(), re.MULTILINE)
-    )
+    lock = (ROOT / "tools/requirements.lock").read_text()
+    locked = set(re.findall(r"^([a-z0-9-]+)==", lock, re.MULTILINE))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    by_pip = list(project["dependencies"])
+    for extra in project["optional-dependencies"].values():
+        by_pip += extra
+    of_pip = {re.match(r"[a-z0-9-]+", requirement)[0] for requirement in by_pip}
     used = {module.split(".")[0] for path in PACKAGE.rglob("*.py") for module in imports(path)}
-    for name in (
-        {parts.get(name, name) for name in used} - sys.stdlib_module_names - {"cube_tensor_driver"}
-    ):
-        if name not in without_key:
-            assert keys.get(name, name) in declared, (
-                f"{name} is imported but package.xml does not name it"
-            )
-        if name in keys or name in without_key:
-            assert wheels.get(name, name) in locked, (
-                f"{name} is imported but requirements.lock does not pin it"
-            )
+    for module in used - sys.stdlib_module_names - {"cube_tensor_driver"} - of_ros:
+        wheel = WHEELS.get(module, module)
+        key = KEYS.get(wheel, f"python3-{wheel}")
+        assert key is None or key in of_ros, f"package.xml does not name {key}"
+        assert wheel in locked, f"requirements.lock does not pin {wheel}"
+        assert wheel in of_pip, f"pyproject.toml does not name {wheel}"
 
 
 def test_every_locked_wheel_has_a_hash():
@@ -163,34 +178,91 @@ def test_every_locked_wheel_has_a_hash():
         assert "--hash=sha256:" in block, block.splitlines()[0]
 
 
-def test_installed_package_has_module_and_messages(tmp_path):
+USES_ITS_DATA = """
+import cube_tensor_driver, cube_tensor_driver.core.pipeline
+from cube_tensor_driver.config.calibration import read_calibration
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+print(cube_tensor_driver.__file__)
+print(package_data())
+print(len(read_skin(package_data() / "config" / "skin_demo.yaml").cubes))
+"""
+
+
+def test_installed_by_colcon_it_has_module_and_messages(tmp_path):
     """From the install space alone, without the checkout on the path."""
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    import os
-
     elsewhere = [
         path for path in sys.path if path and Path(path).resolve() not in (ROOT, ROOT / "test")
     ]
     script = (
-        "import cube_tensor_driver, cube_tensor_driver.core.pipeline, cube_tensor_driver.ros.driver\n"
+        "import cube_tensor_driver.ros.driver\n"
         "from cube_tensor_driver.msg import SkinStress, StressTensorStamped\n"
         "from cube_tensor_driver.srv import Tare\n"
-        "from cube_tensor_driver.config.skin import read_skin\n"
-        "from cube_tensor_driver.config.package_data import package_data\n"
-        "print(len(read_skin(package_data() / 'config' / 'skin_demo.yaml').cubes), cube_tensor_driver.__file__)"
     )
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(elsewhere)}
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env=env,
-        check=False,
+    said = python(script + USES_ITS_DATA, tmp_path, PYTHONPATH=os.pathsep.join(elsewhere))
+    file, _, cubes = said.splitlines()
+    assert cubes == "16" and not Path(file).is_relative_to(PACKAGE)
+
+
+def test_installed_by_pip_it_finds_its_data(tmp_path):
+    """All of config/, launch/, msg/, rviz/ and srv/ is there, and found where it was installed."""
+    source, prefix = tmp_path / "source", tmp_path / "prefix"
+    source.mkdir()
+    for name in ("pyproject.toml", "package.xml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    data = ("config", "launch", "msg", "rviz", "srv")
+    for name in (PACKAGE.name, *data):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-index",
+        "--no-deps",
+        "--no-compile",
+    ]
+    pip += ["--no-build-isolation", "--disable-pip-version-check"]
+    environment = {**os.environ, "PYTHONPATH": "", "PIP_ROOT_USER_ACTION": "ignore"}
+    subprocess.run(
+        [*pip, "--ignore-installed", "--prefix", prefix, source], check=True, env=environment
     )
-    assert done.returncode == 0, done.stderr
-    count, file = done.stdout.split()
-    assert count == "16" and not Path(file).is_relative_to(PACKAGE)
+    (site,) = prefix.glob("**/cube_tensor_driver/core")
+    said = python(USES_ITS_DATA, tmp_path, PYTHONPATH=str(site.parents[1]))
+    file, found, cubes = said.splitlines()
+    assert Path(file).is_relative_to(prefix) and cubes == "16"
+    assert Path(found) == prefix / "share" / PACKAGE.name
+    for name in data:
+        assert listing(Path(found, name)) == listing(source / name)
+
+
+def listing(folder: Path) -> list[Path]:
+    return sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+
+
+def test_version_stands_in_both_files_alike():
+    tree = ElementTree.parse(ROOT / "package.xml")
+    project = re.search(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert project and project[1] == tree.findtext("version")
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    """So that it takes hardly longer than numpy; python -X importtime tells what takes how long."""
+    heavy = {
+        "rclpy",
+        "scipy",
+        "matplotlib",
+        "rosbags",
+        "pyarrow",
+        "viser",
+        "rich",
+        "skfem",
+        "psutil",
+    }
+    loaded = python("import sys, cube_tensor_driver; print(*sys.modules)").split()
+    assert not heavy & set(loaded)
 
 
 def test_messages_say_unit_and_unknown():

@@ -22,5 +22,5 @@ def package_data() -> Path:
                 return folder
     raise ConfigError(
         f"the data files of {_NAME} are not beside {Path(__file__).parent}: "
-        "install the package again (colcon build)"
+        "install the package again (colcon build, or pip install .)"
     )
