@@ -80,6 +80,16 @@ def deaf() -> Iterator[str]:
         yield f"socket://127.0.0.1:{server.getsockname()[1]}"
 
 
+def decoded(message: object) -> object:
+    """`Decoded` rows of a SkinFrequencies or SkinStress as rclpy gives it."""
+    from rclpy.serialization import serialize_message
+
+    from cube_tensor_driver.bags import message_codec
+
+    name = "frequency" if hasattr(message, "frequency") else "stress"
+    return getattr(message_codec, f"{name}_codec").decode(serialize_message(message))
+
+
 class Ros:
     """Subscriptions whose messages are kept, and waiting for what should happen."""
 

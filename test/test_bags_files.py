@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
 from cube_tensor_driver.bags.mcap import HEAD, BagReader
-from cube_tensor_driver.bags.message_codec import stress_of_today
+from cube_tensor_driver.bags.message_codec import upgrade_stress
 from cube_tensor_driver.bags.read import FREQUENCIES, INFO, STRESS, Bag, typestore
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess import Change, Job, Recording, reprocess
@@ -35,6 +35,7 @@ from cube_tensor_driver.config.yaml import parse_yaml, read_yaml, write_yaml
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import PAD_FAULT, Pipeline
+from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import STUCK
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
@@ -51,37 +52,32 @@ def copy(bag, tmp_path):
     return Path(shutil.copytree(bag, tmp_path / "bag"))
 
 
-def stress(path: Path) -> dict[int, np.ndarray]:
-    """Records by stamp."""
+def stress(path: Path) -> dict[int, StressRows]:
+    """The rows of each message by its stamp."""
+    by_stamp = {}
     with Bag(path) as bag:
-        return {
-            int(stamp): one
-            for batch, _ in bag.batches("/stress")
-            for stamp, one in zip(batch.stamp_ns, batch.field, strict=True)
-        }
+        for messages, _ in bag.stress("/stress"):
+            n = len(messages.rows) // len(messages)
+            for k, stamp_ns in enumerate(messages.stamp_ns.tolist()):
+                by_stamp[stamp_ns] = messages.rows.select(slice(k * n, (k + 1) * n))
+    return by_stamp
 
 
-def differing_bits(one: dict[int, np.ndarray], other: dict[int, np.ndarray]) -> int:
-    assert one.keys() == other.keys()
-    names = (
-        "cube",
-        "sequence",
-        "time_offset",
-        "stress",
-        "gradient",
-        "residual",
-        "status",
-        "observed",
-        "left_out",
-    )
+def differing_bits(one: StressRows, other: StressRows) -> int:
+    """Between rows of the same cubes."""
     count = 0
-    for stamp, record in one.items():
-        for name in names:
-            a, b = (
-                np.ascontiguousarray(each[name]).view(np.uint8) for each in (record, other[stamp])
-            )
-            count += int(np.unpackbits(a ^ b).sum())
+    for field in dataclasses.fields(one):
+        a, b = (
+            np.ascontiguousarray(getattr(rows, field.name)).view(np.uint8) for rows in (one, other)
+        )
+        count += int(np.unpackbits(a ^ b).sum())
     return count
+
+
+def all_differing_bits(one: dict[int, StressRows], other: dict[int, StressRows]) -> int:
+    """Between messages by their stamps."""
+    assert one.keys() == other.keys()
+    return sum(differing_bits(rows, other[stamp]) for stamp, rows in one.items())
 
 
 @pytest.mark.parametrize(
@@ -200,7 +196,7 @@ def test_reprocessed_is_recorded_to_the_bit(tmp_path, storage):
     path = make_bag(tmp_path / "bag", SKIN, storage=storage)
     done = reprocess(Job(path, tmp_path / "out", "bag", Change()))
     assert done.messages == 300 and done.rows == 300 * 16
-    assert differing_bits(stress(path), stress(tmp_path / "out")) == 0
+    assert all_differing_bits(stress(path), stress(tmp_path / "out")) == 0
     with Bag(path) as one, Bag(tmp_path / "out") as other:
         assert other.infos("/info")[0].calibrations == one.infos("/info")[0].calibrations
 
@@ -245,8 +241,8 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
     reprocess(Job(tmp_path / "bag", tmp_path / "out", "bag", Change()))
     for k, record in enumerate(stress(tmp_path / "out").values()):
         of = pipeline if k < 50 else tared
-        expected = of.process(record["cube"], loads(pipeline, 0.01 * k).astype(np.float32))
-        np.testing.assert_array_equal(record["stress"], expected.stress, err_msg=str(k))
+        expected = of.process(record.cube, loads(pipeline, 0.01 * k).astype(np.float32))
+        np.testing.assert_array_equal(record.stress, expected.stress, err_msg=str(k))
 
 
 def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
@@ -260,18 +256,16 @@ def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
     )
     reprocess(Job(path, tmp_path / "out", "bag", Change()))
     recorded = stress(path)
-    assert differing_bits(recorded, stress(tmp_path / "out")) == 0
-    assert [int(one["left_out"][3]) for one in recorded.values()] == [4] * 80 + [0] * 70
-    assert recorded[START_NS]["status"][3] == PAD_FAULT | STUCK
+    assert all_differing_bits(recorded, stress(tmp_path / "out")) == 0
+    assert [int(one.left_out[3]) for one in recorded.values()] == [4] * 80 + [0] * 70
+    assert recorded[START_NS].status[3] == PAD_FAULT | STUCK
     reprocess(Job(path, tmp_path / "bag.parquet", "parquet", Change()))
     table = pyarrow.parquet.read_table(tmp_path / "bag.parquet")
     assert table["left_out"].to_numpy()[:16].tolist() == [0, 0, 0, 4] + [0] * 12
     # another tare judges anew, and does not find it
     with Bag(path) as bag:
-        ((_, _, rows, left_out), *_) = Recording(
-            bag, "/frequencies", Change(tare=(0.0, 0.1))
-        ).batches()
-    assert not left_out.any() and (rows.status & STUCK == 0).all()
+        ((_, _, rows), *_) = Recording(bag, "/frequencies", Change(tare=(0.0, 0.1))).batches()
+    assert not rows.left_out.any() and (rows.status & STUCK == 0).all()
 
 
 def test_stress_of_version_1_is_made_one_of_today():
@@ -280,7 +274,7 @@ def test_stress_of_version_1_is_made_one_of_today():
         entry = next(bag.entries({"/stress"}))
         old, new = (
             bag.decode(entry),
-            typestore().deserialize_cdr(stress_of_today(entry.data), STRESS),
+            typestore().deserialize_cdr(upgrade_stress(entry.data), STRESS),
         )
     np.testing.assert_array_equal(old.stress, new.stress)
     np.testing.assert_array_equal(old.observed, new.observed)
@@ -295,12 +289,12 @@ def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
     assert parquet.column_names == csv.column_names
     assert {"stamp_ns", "stress_zz_Pa", "gradient_zz_x_Pa_per_m"} <= set(parquet.column_names)
     records = list(stress(bag).values())
-    zz = np.concatenate([record["stress"][:, 2] for record in records])
+    zz = np.concatenate([record.stress[:, 2] for record in records])
     np.testing.assert_array_equal(parquet["stress_zz_Pa"].to_numpy(), zz)
     np.testing.assert_array_equal(csv["stress_zz_Pa"].to_numpy().astype(np.float32), zz)
     for name in ("residual", "status", "observed", "sequence"):
         np.testing.assert_array_equal(
-            parquet[name].to_numpy(), np.concatenate([record[name] for record in records])
+            parquet[name].to_numpy(), np.concatenate([getattr(record, name) for record in records])
         )
     assert parquet["cube"].to_pylist()[:17] == [f"c{k:02}" for k in range(16)] + ["c00"]
     assert parquet["stamp_ns"].to_pylist()[1] == START_NS + 100
@@ -317,9 +311,7 @@ def test_another_calibration_and_tare(bag, tmp_path, capsys):
     assert main([*common, "--calibration", str(tmp_path / "stiff.yaml")]) == 0
     before, after = stress(bag), stress(tmp_path / "stiff" / "bag")
     for stamp, record in after.items():
-        np.testing.assert_allclose(
-            record["stress"], 2 * before[stamp]["stress"], rtol=1e-5
-        )  # float32
+        np.testing.assert_allclose(record.stress, 2 * before[stamp].stress, rtol=1e-5)  # float32
     assert (
         main(
             ["reprocess", str(bag), "-o", str(tmp_path / "tared"), "--tare-from", "0.999", "1.001"]
@@ -331,8 +323,8 @@ def test_another_calibration_and_tare(bag, tmp_path, capsys):
     record = stress(tmp_path / "tared" / "bag")[START_NS + 1_000_000_000]
     # rest is float64, the frequency float32: 6e-8 of it, as strain, times the modulus of 0.3 MPa
     # and the inversion
-    assert np.nanmax(np.abs(record["stress"])) < 1
-    assert np.nanmax(np.abs(before[START_NS + 1_000_000_000]["stress"])) > 100
+    assert np.nanmax(np.abs(record.stress)) < 1
+    assert np.nanmax(np.abs(before[START_NS + 1_000_000_000].stress)) > 100
     assert (
         main(["reprocess", str(bag), "-o", str(tmp_path / "late"), "--tare-from", "50", "51"]) == 1
     )
@@ -354,13 +346,13 @@ def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(bag, tmp_pat
     before, after = stress(bag), stress(tmp_path / "out" / "bag")
     factor = np.where(np.arange(16) == 3, 2, 1)[:, None]
     for stamp, record in after.items():
-        expected = factor * before[stamp]["stress"]
+        expected = factor * before[stamp].stress
         # A component is a sum over pads in float32: it rounds in proportion to the cube's largest
         # stress, and in another order where a skin has two calibrations.
         rounding = 1e-5 * np.nanmax(np.abs(expected), axis=1, keepdims=True)
         unseen = np.isnan(expected)
-        assert np.array_equal(np.isnan(record["stress"]), unseen)
-        assert np.all((np.abs(record["stress"] - expected) <= rounding) | unseen)
+        assert np.array_equal(np.isnan(record.stress), unseen)
+        assert np.all((np.abs(record.stress - expected) <= rounding) | unseen)
     with Bag(tmp_path / "out" / "bag") as made:
         ids = [cube.calibration_id for cube in made.infos("/info")[0].cubes]
     assert len(set(ids)) == 2 and ids.count(ids[3]) == 1
@@ -378,7 +370,7 @@ def test_reprocess_goes_on_where_it_ended(bag, tmp_path, capsys):
     stamp = (out / "bag" / "metadata.yaml").stat().st_mtime_ns
     assert main(["reprocess", str(bag), str(other), "-o", str(out), "--jobs", "2"]) == 0
     assert (out / "bag" / "metadata.yaml").stat().st_mtime_ns == stamp
-    assert differing_bits(stress(bag), stress(out / "other")) == 0
+    assert all_differing_bits(stress(bag), stress(out / "other")) == 0
     assert not (out / ".partial").exists()
     assert main(["reprocess", str(bag), "-o", str(out), "--tare-from", "0", "1"]) == 1
     assert "other options" in capsys.readouterr().err
@@ -394,7 +386,7 @@ def test_reprocess_on_a_dask_cluster(bag, tmp_path):
         assert (
             main(["reprocess", str(bag), "-o", str(tmp_path / "out"), "--scheduler", address]) == 0
         )
-    assert differing_bits(stress(bag), stress(tmp_path / "out" / "bag")) == 0
+    assert all_differing_bits(stress(bag), stress(tmp_path / "out" / "bag")) == 0
 
 
 def test_cut_off_anywhere_is_repaired(bag, tmp_path):
@@ -486,7 +478,7 @@ def test_random_damage_is_one_message_or_no_harm(tmp_path):
         outcomes["harmless"] += 1
         again = stress(tmp_path / f"out{number}")
         if source == mcap:  # sqlite has no checksums: a flipped bit of a number stays a number
-            assert differing_bits(again, good[source]) == 0
+            assert all_differing_bits(again, good[source]) == 0
     assert outcomes["refused"] > 40
 
 
@@ -532,13 +524,10 @@ def test_the_kept_bag_of_each_version_can_be_read(tmp_path, version):
     assert len(common) > 100
     for stamp in common:
         # not to the bit: another processor may round otherwise
-        np.testing.assert_allclose(
-            again[stamp]["stress"], recorded[stamp]["stress"], rtol=1e-4, atol=0.1
-        )
-        np.testing.assert_array_equal(again[stamp]["status"], recorded[stamp]["status"])
+        np.testing.assert_allclose(again[stamp].stress, recorded[stamp].stress, rtol=1e-4, atol=0.1)
+        np.testing.assert_array_equal(again[stamp].status, recorded[stamp].status)
         assert (
-            again[stamp]["left_out"]
-            == np.where((version == 2) & (again[stamp]["cube"] == 1), 1 << 2, 0)
+            again[stamp].left_out == np.where((version == 2) & (again[stamp].cube == 1), 1 << 2, 0)
         ).all()
     with Bag(kept) as bag, Bag(tmp_path / "out") as made:
         assert bag.version == bag.infos("/info")[0].version == version

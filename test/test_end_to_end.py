@@ -26,7 +26,7 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from conftest import ROOT
+from conftest import ROOT, decoded
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
@@ -37,7 +37,6 @@ from cube_tensor_driver.device.protocol import Hello, Request, Sample, encode
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
 from cube_tensor_driver.processes.children import Children, ros_arguments
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
-from cube_tensor_driver.ros.messages import read_frequencies, read_stress
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 SINGLE = package_data() / "config" / "cube.yaml"
@@ -165,8 +164,8 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     counts = np.bincount(np.concatenate([message.cube for message in batches]), minlength=16)
     assert counts.min() > 0.5 * counts.max()
     assert np.median([len(message.cube) for message in batches]) == 16 * scans
-    times, rows = read_stress(batches[-1])
-    assert times.header.frame_id == "skin_base"
+    rows = decoded(batches[-1]).rows
+    assert batches[-1].header.frame_id == "skin_base"
     assert (rows.status == 0).all()
     names = ("xx", "yy", "zz", "yz", "zx", "xy")
     seen = [name for k, name in enumerate(names) if rows.observed[0] >> k & 1]
@@ -178,9 +177,9 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     # what the batch says of a cube, its own topic says too, with the covariance of the core
     by_time = {}
     for message in batches:
-        times, rows = read_stress(message)
-        for row in np.flatnonzero(times.cube == 5):
-            by_time[int(times.stamp_ns[row])] = rows.stress[row], rows.gradient[row]
+        rows = decoded(message).rows
+        for row in np.flatnonzero(rows.cube == 5):
+            by_time[int(rows.stamp_ns[row])] = rows.stress[row], rows.gradient[row]
     tensor = tensors[-1]
     stamp = tensor.header.stamp.sec * 10**9 + tensor.header.stamp.nanosec
     stress, gradient = by_time[stamp]
@@ -217,13 +216,13 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
         Calibration.from_dict(parse_yaml(texts[cube.calibration_id], "info")) for cube in info.cubes
     ]
     replay = Pipeline(calibrations, np.float32)
-    stored = {tuple(read_stress(m)[0].sequence): read_stress(m)[1] for m in batches}
+    stored = {tuple(rows.sequence): rows for rows in (decoded(one).rows for one in batches)}
     compared = 0
     for message in raw:
-        times, frequency, pad_fault, temperature = read_frequencies(message)
-        if tuple(times.sequence) in stored:
-            again = replay.process(times.cube, frequency, pad_fault, temperature)
-            np.testing.assert_array_equal(again.stress, stored[tuple(times.sequence)].stress)
+        rows = decoded(message).rows
+        if tuple(rows.sequence) in stored:
+            again = replay.process(rows.cube, rows.frequency, rows.pad_fault, rows.temperature)
+            np.testing.assert_array_equal(again.stress, stored[tuple(rows.sequence)].stress)
             compared += 1
     assert compared > 40
 
@@ -377,7 +376,7 @@ def test_beyond_the_law_is_a_fault_and_no_number(ros, hub, tmp_path):
             return bool(batches)
 
         ros.wait(arrived)
-        _, rows = read_stress(batches[0])
+        rows = decoded(batches[0]).rows
         assert rows.status[0] & SkinStress.PAD_FAULT
         # six pads cannot tell seven unknowns apart: something is missing, and what is there is at
         # rest

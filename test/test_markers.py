@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.core import scene
-from cube_tensor_driver.core.pipeline import StressRows
+from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.scene import QUANTITIES, CubePoses, Newest
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL
 from cube_tensor_driver.core.tensor import rotation_from_quaternion, rotation_from_rpy
@@ -25,11 +25,15 @@ def places(n: int = 3, turn: np.ndarray | None = None) -> CubePoses:
 def rows(values: np.ndarray, status: object = 0) -> StressRows:
     n = len(values)
     return StressRows(
-        values[:, :6],
-        values[:, 6:],
-        np.ones(n),
-        np.full(n, status, np.uint16),
-        np.zeros(n, np.uint16),
+        cube=np.arange(n, dtype=np.uint16),
+        sequence=np.zeros(n, np.uint32),
+        stamp_ns=np.zeros(n, np.int64),
+        stress=values[:, :6],
+        gradient=values[:, 6:],
+        residual=np.ones(n),
+        status=np.full(n, status, np.uint16),
+        observed=np.zeros(n, np.uint16),
+        left_out=np.zeros(n, np.uint32),
     )
 
 
@@ -132,9 +136,9 @@ def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
 
 def test_markers_node_draws_what_comes(ros, tmp_path):
     from rclpy.qos import DurabilityPolicy, QoSProfile
-    from std_msgs.msg import Header
     from visualization_msgs.msg import Marker, MarkerArray
 
+    from cube_tensor_driver.bags.message_codec import stress_codec
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.pipeline import Pipeline
@@ -142,7 +146,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from cube_tensor_driver.plot.documentation import draw_markers
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process
-    from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
+    from cube_tensor_driver.ros.messages import info_message
 
     skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     n, pressed, silent = len(skin.cubes), 6, 15
@@ -158,10 +162,10 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     values[pressed, [2, 4]] = -20e3, 4e3
 
     def sent() -> None:
-        cubes = np.delete(np.arange(n, dtype=np.uint16), silent)
-        none = np.zeros(len(cubes))
-        times = Times(Header(stamp=to_time(time.time_ns())), cubes, none, none)
-        publisher.publish(stress_message(times, rows(values[cubes].astype(np.float32))))
+        made = rows(values)
+        made.stamp_ns[:] = time.time_ns()
+        chosen = made.select(np.arange(n) != silent)
+        publisher.publish(stress_codec.encode(chosen, b"skin_base\0"))
 
     def drawn() -> bool:
         sent()

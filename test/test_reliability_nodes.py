@@ -28,6 +28,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 from test_end_to_end import SINGLE, Hub
 
+from conftest import decoded
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
@@ -35,7 +36,6 @@ from cube_tensor_driver.device.protocol import Hello, Sample, encode
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children, ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
-from cube_tensor_driver.ros.messages import read_stress
 from cube_tensor_driver.srv import Tare
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -110,7 +110,7 @@ class Scene3D:
     def zz(self):
         count = len(self.stress)
         self.wait(lambda: len(self.stress) > count + 5)
-        return float(read_stress(self.stress[-1])[1].stress[0, 2])
+        return float(decoded(self.stress[-1]).rows.stress[0, 2])
 
     def says(self, text):
         return any(text in status.message for array in self.diagnostics for status in array.status)
@@ -176,7 +176,7 @@ def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
     pad = CALIBRATION.layout.pads[2]
     stage.wait(lambda: raw and stage.says(f"pad {pad} short"))
     stage.zz()
-    _, rows = read_stress(stage.stress[-1])
+    rows = decoded(stage.stress[-1]).rows
     assert rows.status[0] == SkinStress.PAD_FAULT | SkinStress.PAD_SHORT
     # seven pads for seven unknowns: all there still, and right
     assert abs(rows.stress[0, 2] - 5000) < 100
@@ -185,7 +185,7 @@ def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
     stage.diagnostics.clear()
     stage.wait(lambda: stage.says("fine"))
     stage.zz()
-    assert read_stress(stage.stress[-1])[1].status[0] == 0
+    assert decoded(stage.stress[-1]).rows.status[0] == 0
     assert f"pad {pad} short" in stage.children.log("reconstruction")
     stage.ros.wait(lambda: stage.says("stale: no rows any more"))  # nothing is sent now
     stage.ros.wait(lambda: stage.says("no sample for"))

@@ -32,14 +32,15 @@ from selenium.webdriver.common.keys import Keys
 from websockets.sync.client import connect
 
 from conftest import ROOT, end
+from cube_tensor_driver.bags.message_codec import frequency_codec
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
-from cube_tensor_driver.device.scan import Rows
+from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
-from cube_tensor_driver.ros.messages import frequencies_message, to_ns
+from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.srv import SteerReplay
 
 CHROMIUM, DRIVER = (
@@ -104,7 +105,7 @@ class Skin(threading.Thread):
         while not self._ended.wait(1 / RATE):
             frequency = self._frequency * (1 + NOISE * noise.standard_normal(self._frequency.shape))
             sequence, now = np.full(N, self.sent, np.uint32), np.full(N, time.time_ns())
-            scan = Rows(
+            scan = FrequencyRows(
                 cubes,
                 sequence,
                 now,
@@ -112,7 +113,7 @@ class Skin(threading.Thread):
                 np.full(N, np.nan, np.float32),
                 none,
             )
-            self._publisher.publish(frequencies_message(scan, "skin_base"))
+            self._publisher.publish(frequency_codec.encode(scan, b"skin_base\0"))
             self.sent += 1
 
     def end(self) -> None:

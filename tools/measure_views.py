@@ -26,20 +26,21 @@ import viser
 import zstandard
 from photograph import chromium
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from cube_tensor_driver.bags.message_codec import stress_codec
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
-from cube_tensor_driver.core.pipeline import Pipeline, StressRows
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
-from cube_tensor_driver.ros.messages import Times, info_message, stress_message, to_time
+from cube_tensor_driver.ros.messages import info_message
 from cube_tensor_driver.ros.node import LATCHED, make_executor, queue
 from cube_tensor_driver.simulation.load import Load, default_script
 
@@ -126,7 +127,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
                 lambda topic, _: counts.__setitem__(topic, counts[topic] + 1), topic
             )
             node.create_subscription(kind, topic, count, 10, raw=True)
-        index, none = np.arange(cubes, dtype=np.uint16), np.zeros(cubes, np.int32)
+        frame_id = skin.parent_frame.encode() + b"\0"
         rows = [stress_rows(*load.at(k * load.period / INSTANTS)) for k in range(INSTANTS)]
         ended = threading.Event()
 
@@ -134,17 +135,10 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
             number = 0
             while not ended.wait(1 / RATE):
                 number += 1
-                times = Times(
-                    Header(stamp=to_time(time.time_ns())),
-                    index,
-                    (none + number).astype(np.uint32),
-                    none,
-                )
-                publisher.publish(
-                    stress_message(
-                        times, rows[number * INSTANTS // round(load.period * RATE) % INSTANTS]
-                    )
-                )
+                instant = number * INSTANTS // round(load.period * RATE) % INSTANTS
+                rows[instant].sequence[:] = number
+                rows[instant].stamp_ns[:] = time.time_ns()
+                publisher.publish(stress_codec.encode(rows[instant], frame_id))
 
         sender = threading.Thread(target=send)
         sender.start()
@@ -209,7 +203,15 @@ def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
     stress, gradient = stress.astype(np.float32), gradient[:, :3].reshape(n, 9).astype(np.float32)
     stress[:, [1, 3, 5]], gradient[:, [1, 3, 4, 5, 7]] = np.nan, np.nan
     return StressRows(
-        stress, gradient, np.ones(n, np.float32), np.zeros(n, np.uint16), np.zeros(n, np.uint16)
+        cube=np.arange(n, dtype=np.uint16),
+        sequence=np.zeros(n, np.uint32),
+        stamp_ns=np.zeros(n, np.int64),
+        stress=stress,
+        gradient=gradient,
+        residual=np.ones(n, np.float32),
+        status=np.zeros(n, np.uint16),
+        observed=np.zeros(n, np.uint16),
+        left_out=np.zeros(n, np.uint32),
     )
 
 

@@ -55,10 +55,10 @@ def bag_loads(
         calibration.check(layout)
         rest = recording.pipelines[-1].rest_frequency[number, :n_pads]
         parts = []
-        for batch, _ in bag.batches(recording.topic):
-            chosen = (batch.field["cube"] == number) & (batch.field["pad_fault"] == 0)
-            frequency = batch.field["frequency"][chosen][:, :n_pads]
-            parts.append((batch.times_ns[chosen], frequency, batch.field["temperature"][chosen]))
+        for messages, _ in bag.frequencies(recording.topic):
+            rows = messages.rows
+            rows = rows.select((rows.cube == number) & (rows.pad_fault == 0))
+            parts.append((rows.stamp_ns, rows.frequency[:, :n_pads], rows.temperature))
         times, frequency, temperature = (
             np.concatenate(column) for column in zip(*parts, strict=True)
         )
@@ -88,19 +88,17 @@ def _reference(
     kinds = {one.msgtype for one in bag.connections if one.topic == topic}
     kind = kinds.pop() if kinds else None
     if kind == BATCH_TYPE:
-        rows = []
-        for batch, _ in bag.batches(topic):
-            chosen = batch.field["cube"] == number
-            values = np.hstack([batch.field["stress"][chosen], batch.field["gradient"][chosen]])
-            rows.append((batch.times_ns[chosen], values.astype(float)))
-        at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
+        parts = []
+        for messages, _ in bag.stress(topic):
+            rows = messages.rows.select(messages.rows.cube == number)
+            parts.append((rows.stamp_ns, np.hstack([rows.stress, rows.gradient]).astype(float)))
+        at, values = (np.concatenate(column) for column in zip(*parts, strict=True))
     elif kind in (WRENCH, TENSOR):
-        messages = [bag.decode(entry) for entry in bag.entries({topic})]
-        at = np.array(
-            [one.header.stamp.sec * SECOND + one.header.stamp.nanosec for one in messages], np.int64
-        )
+        measured = [bag.decode(entry) for entry in bag.entries({topic})]
+        stamps = [one.header.stamp for one in measured]
+        at = np.array([stamp.sec * SECOND + stamp.nanosec for stamp in stamps], np.int64)
         values = np.array(
-            [_force(one) if kind == WRENCH else _components(one.tensor) for one in messages]
+            [_force(one) if kind == WRENCH else _components(one.tensor) for one in measured]
         )
     else:
         there = ", ".join(sorted({one.topic for one in bag.connections}))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,8 +25,16 @@ from ..config.yaml import parse_yaml
 from ..core.calibration import Calibration
 from ..core.errors import BagError, CalibrationError, ConfigError, CubeError, MessageError
 from ..core.pipeline import Pipeline
-from . import message_codec
+from ..core.rows import FrequencyRows, StressRows
 from .mcap import BagReader
+from .message_codec import (
+    AnyRows,
+    Decoded,
+    MessageCodec,
+    frequency_codec,
+    stress_codec,
+    stress_codec_1,
+)
 
 PACKAGE = "cube_tensor_driver"
 FREQUENCIES, STRESS, INFO = (
@@ -35,8 +43,9 @@ FREQUENCIES, STRESS, INFO = (
 VERSIONS = (1, 2)
 """Of SkinInfo that this package reads. An older one that is not among them has to be converted
 here."""
-BATCH, BATCH_BYTES = 64, 1 << 19
-"""Messages at a time: what numpy costs per call no longer counts, and they fit the cache."""
+TOGETHER, TOGETHER_BYTES = 64, 1 << 19
+"""Most messages that are decoded at once: the cost of calling numpy no longer counts, and they fit
+the cache."""
 # What rosbags and the libraries below it let through where bytes are not what they should be.
 DAMAGE = (
     ReaderError,
@@ -208,32 +217,34 @@ class Bag:
                 )
         return infos
 
-    def batches(self, topic: str) -> Iterator[tuple[message_codec.Batch, NDArray[np.int64]]]:
-        """Frequencies or stress, in order, and when they were recorded in ns, (B,).
+    def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], NDArray[np.int64]]]:
+        """The frequencies on a topic in the order of recording, and when they were recorded, (M,)
+        ns.
 
-        As many messages of one shape at a time as follow each other, at most BATCH. BagError: one
-        contradicts itself.
+        Messages of one shape that follow each other come together, at most `TOGETHER`. BagError: a
+        message contradicts itself.
         """
-        find, read = message_codec.frequencies_shape, message_codec.read_frequencies
-        if topic in self.topics(STRESS):
-            find, read = (
-                partial(message_codec.stress_shape, version=self.version),
-                partial(message_codec.read_stress, version=self.version),
-            )
+        return self._decoded(topic, frequency_codec)
+
+    def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], NDArray[np.int64]]]:
+        """As `frequencies`, of a topic with stress."""
+        return self._decoded(topic, stress_codec if self.version > 1 else stress_codec_1)
+
+    def _decoded(
+        self, topic: str, codec: MessageCodec[AnyRows]
+    ) -> Iterator[tuple[Decoded[AnyRows], NDArray[np.int64]]]:
         waiting: list[bytes] = []
         times_ns: list[int] = []
-        shape, most = message_codec.Shape(0, 0, 0), 0
         try:
             for _, time_ns, data in self._messages({topic}):
-                if len(waiting) >= most or not message_codec.same_shape(data, waiting[0], shape):
-                    if waiting:
-                        yield read(waiting, shape), np.array(times_ns)
-                    waiting, times_ns, most = [], [], max(1, min(BATCH, BATCH_BYTES // len(data)))
-                    shape = find(data)
+                most = max(1, min(TOGETHER, TOGETHER_BYTES // max(1, len(data))))
+                if waiting and (len(waiting) >= most or not codec.same_shape(data, waiting[0])):
+                    yield codec.decode(*waiting), np.array(times_ns)
+                    waiting, times_ns = [], []
                 waiting.append(data)
                 times_ns.append(time_ns)
             if waiting:
-                yield read(waiting, shape), np.array(times_ns)
+                yield codec.decode(*waiting), np.array(times_ns)
         except MessageError as error:
             raise BagError(f"{self.path}: {topic}: {error}") from None
 

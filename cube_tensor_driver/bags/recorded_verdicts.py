@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.rows import StressRows
 from ..core.status import WORDS
-from . import message_codec
+from .message_codec import SECOND, Decoded
 from .read import STRESS, Bag
 
-AHEAD_NS = message_codec.SECOND
+AHEAD_NS = SECOND
 """How far stress is read ahead of frequencies: messages may stand in a bag a little out of
 order."""
 BITS = np.uint16(sum(WORDS))
@@ -98,18 +99,18 @@ class RecordedVerdicts:
         """Stress read before, and what stands behind it, read on until then."""
         yield from tuple(self._waiting)
         while self._newest_ns < until_ns and (read := next(self._unread, None)) is not None:
-            if read[0].shape.rows:
+            if len(read[0].rows):
                 self._take(read[0])
                 yield self._waiting[-1]
 
     def _begin(self) -> None:
         self._asked_ns = self._newest_ns = 0
         self._waiting: deque[_Batch] = deque()
-        self._unread: Iterator[Any] = self._bag.batches(self._topic) if self._there else iter(())
+        self._unread: Iterator[Any] = self._bag.stress(self._topic) if self._there else iter(())
 
-    def _take(self, batch: message_codec.Batch) -> None:
-        order = np.argsort(batch.stamp_ns, kind="stable")
-        stamp_ns, field = batch.stamp_ns[order], batch.field
+    def _take(self, messages: Decoded[StressRows]) -> None:
+        order = np.argsort(messages.stamp_ns, kind="stable")
+        stamp_ns, rows = messages.stamp_ns[order], messages.rows
         begin_ns, end_ns = int(stamp_ns[0]), int(stamp_ns[-1])
         self._newest_ns = max(self._newest_ns, end_ns)
         # Copies: the messages themselves need not be kept.
@@ -118,8 +119,8 @@ class RecordedVerdicts:
                 begin_ns,
                 end_ns,
                 stamp_ns,
-                field["cube"][order, 0],
-                field["left_out"][order],
-                field["status"][order] & BITS,
+                messages.by_message(rows.cube)[order, 0],
+                messages.by_message(rows.left_out)[order],
+                messages.by_message(rows.status)[order] & BITS,
             )
         )

@@ -18,9 +18,10 @@ from ..config.skin import Skin
 from ..core.calibration import Calibration
 from ..core.errors import BagError, CalibrationError, CubeError
 from ..core.health import Health
-from ..core.pipeline import Pipeline, StressRows
-from . import message_codec
+from ..core.pipeline import Pipeline
+from ..core.rows import FrequencyRows, StressRows
 from .mcap import HEAD
+from .message_codec import SECOND, Decoded, stress_codec
 from .read import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, damage, pipeline, typestore
 from .recorded_verdicts import RecordedVerdicts
 from .tables import TableWriter
@@ -89,24 +90,27 @@ class Recording:
 
     def batches(
         self,
-    ) -> Iterator[tuple[message_codec.Batch, NDArray[np.int64], StressRows, NDArray[np.uint32]]]:
-        """Frequencies, when they were recorded, the stress of all their rows in order, the pads
-        left out of each."""
-        for batch, recorded_ns in self.bag.batches(self.topic):
-            field = batch.field
+    ) -> Iterator[tuple[Decoded[FrequencyRows], NDArray[np.int64], StressRows]]:
+        """Frequencies, when they were recorded, the stress of all their rows in order."""
+        for messages, recorded_ns in self.bag.frequencies(self.topic):
+            cube = messages.by_message(messages.rows.cube)
+            times_ns = messages.by_message(messages.rows.stamp_ns)
             # An info holds for what was sampled from its stamp on: the node stamps it just behind
             # the last row before.
-            which = np.maximum(np.searchsorted(self._since, batch.newest_ns, side="right") - 1, 0)
-            known, left_out, bits = self.found.of(batch.stamp_ns, field["cube"])
-            changed = (field["cube"][1:] != field["cube"][:-1]).any(axis=1) | (
-                np.diff(2 * which + known) != 0
-            )
-            ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(field)]
+            newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
+            which = np.maximum(np.searchsorted(self._since, newest_ns, side="right") - 1, 0)
+            known, left_out, bits = self.found.of(messages.stamp_ns, cube)
+            changed = (cube[1:] != cube[:-1]).any(axis=1) | (np.diff(2 * which + known) != 0)
+            ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(cube)]
+            n = cube.shape[1]
             for run in map(slice, ends[:-1], ends[1:]):
-                part = message_codec.Batch(batch.shape, batch.stamp_ns[run], field[run])
+                part = Decoded(
+                    messages.rows.select(slice(run.start * n, run.stop * n)),
+                    messages.stamp_ns[run],
+                    messages.frame_id,
+                )
                 found = (left_out[run], bits[run]) if known[run.start] else None
-                rows, without = self._process(int(which[run.start]), part, found)
-                yield part, recorded_ns[run], rows, without
+                yield part, recorded_ns[run], self._process(int(which[run.start]), part, found)
 
     def number(self, newest_ns: int) -> int:
         """Which info holds for a message whose newest row was sampled then."""
@@ -119,26 +123,30 @@ class Recording:
     def _process(
         self,
         number: int,
-        batch: message_codec.Batch,
+        messages: Decoded[FrequencyRows],
         found: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None,
-    ) -> tuple[StressRows, NDArray[np.uint32]]:
-        """Stress of all rows of a batch of the same cubes, as the node makes it message by message;
-        pads left out.
+    ) -> StressRows:
+        """Stress of all rows of messages of the same cubes, as the node makes it message by
+        message.
 
         found: pads left out and status bits as the node found them, None to find them anew.
         """
         of, health = self._use(number)
-        field = batch.field
-        cube, frequency, temperature = field["cube"][0], field["frequency"], field["temperature"]
+        rows = messages.rows
+        cube = messages.by_message(rows.cube)
+        frequency = messages.by_message(rows.frequency)
+        temperature = messages.by_message(rows.temperature)
+        pad_fault = messages.by_message(rows.pad_fault)
+        stamp_ns = messages.by_message(rows.stamp_ns)
         try:
             left_out, bits = found or health.update_many(
-                cube, frequency, field["pad_fault"], batch.times_ns, temperature
+                cube[0], frequency, pad_fault, stamp_ns, temperature
             )
-            rows = of.process(cube, frequency, left_out, temperature)
+            made = of.process(cube[0], frequency, left_out, temperature)
         except CubeError as error:
             raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
-        rows.status[:] |= bits.ravel()
-        return rows, left_out.ravel()
+        made.status[:] |= bits.ravel()
+        return StressRows(rows.cube, rows.sequence, rows.stamp_ns, *made, left_out.ravel())
 
     def _use(self, number: int) -> tuple[Pipeline, Health]:
         """The pipeline under an info, and the health that goes with it: a tare changes rest
@@ -199,25 +207,17 @@ class Recording:
         of = self.pipelines[-1]
         total, count = np.zeros_like(of.rest_frequency), np.zeros(of.rest_frequency.shape)
         begin_ns, end_ns = (self.bag.start_ns + round(time * 1e9) for time in (begin_s, end_s))
-        for batch, _ in self.bag.batches(self.topic):
-            chosen = (batch.times_ns >= begin_ns) & (batch.times_ns < end_ns)
-            cube = batch.field["cube"][chosen]
-            if not len(cube):
+        for messages, _ in self.bag.frequencies(self.topic):
+            rows = messages.rows
+            inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
+            rows = rows.select(inside & (rows.cube < len(of.calibrations)))
+            if not len(rows):
                 continue
-            known = cube < len(of.calibrations)
-            cube = cube[known]
-            frequency = batch.field["frequency"][chosen][known].astype(float)
-            frequency = frequency / of.temperature_factor(
-                cube, batch.field["temperature"][chosen][known]
-            )
-            bad = (
-                batch.field["pad_fault"][chosen][known][:, None] >> np.arange(frequency.shape[1])
-                & 1
-                > 0
-            )
+            frequency = rows.frequency / of.temperature_factor(rows.cube, rows.temperature)
+            bad = rows.pad_fault[:, None] >> np.arange(frequency.shape[1]) & 1 > 0
             good = np.isfinite(frequency) & (frequency > 0) & ~bad
-            np.add.at(total, cube, np.where(good, frequency, 0))
-            np.add.at(count, cube, good)
+            np.add.at(total, rows.cube, np.where(good, frequency, 0))
+            np.add.at(count, rows.cube, good)
         exists = np.isfinite(of.rest_frequency)
         without = (exists & (count == 0)).any(axis=1)
         if without.any():
@@ -278,11 +278,11 @@ def _to_bag(bag: Bag, topics: list[str], change: Change, output: Path) -> Done:
                 writer.write(
                     f"{skin}info", max(bag.start_ns, min(bag.end_ns, _stamp_ns(info))), data
                 )
-            for batch, recorded_ns, stress, left_out in recording.batches():
-                made = message_codec.stress_messages(batch, (*stress, left_out), HEAD)
+            for source, recorded_ns, stress in recording.batches():
+                made = stress_codec.encode_many(stress, source.stamp_ns, source.frame_id, HEAD)
                 writer.write_many(f"{skin}stress", recorded_ns, made)
                 messages += len(recorded_ns)
-                rows += len(stress.status)
+                rows += len(stress)
     return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
 
 
@@ -292,22 +292,15 @@ def _to_table(bag: Bag, topic: str, change: Change, output: Path) -> Done:
     with TableWriter(
         output, [cube.name for cube in recording.infos[-1].cubes] + ["unknown"]
     ) as table:
-        for batch, recorded_ns, stress, left_out in recording.batches():
-            field = batch.field
-            table.write(
-                batch.times_ns.ravel(),
-                field["cube"].ravel(),
-                field["sequence"].ravel(),
-                stress,
-                left_out,
-            )
+        for _, recorded_ns, stress in recording.batches():
+            table.write(stress)
             messages += len(recorded_ns)
-            rows += len(stress.status)
+            rows += len(stress)
     return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
 
 
 def _stamp_ns(info: Any) -> int:
-    return int(info.header.stamp.sec) * message_codec.SECOND + int(info.header.stamp.nanosec)
+    return int(info.header.stamp.sec) * SECOND + int(info.header.stamp.nanosec)
 
 
 def _info(info: Any, made: Pipeline) -> bytes:

@@ -9,11 +9,10 @@ import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
-from numpy.typing import NDArray
 
 from ..core.errors import BagError
 from ..core.modes import COMPONENTS, STRESS
-from ..core.pipeline import StressRows
+from ..core.rows import StressRows
 
 GROUP = 1 << 16
 """Rows at a time: one row group of a Parquet file."""
@@ -64,19 +63,23 @@ class TableWriter:
                 f"{self._path}: {error.strerror or error}; name a disk with room"
             ) from None
 
-    def write(
-        self,
-        stamp_ns: NDArray[np.int64],
-        cube: NDArray[np.uint16],
-        sequence: NDArray[np.uint32],
-        rows: StressRows,
-        left_out: NDArray[np.uint32],
-    ) -> None:
-        """Add rows: stamp_ns, cube, sequence and left_out (N,)."""
+    def write(self, rows: StressRows) -> None:
+        """Add rows."""
+        # Rows of cubes that the skin does not have get the last name.
         names = pyarrow.DictionaryArray.from_arrays(
-            np.minimum(cube, len(self._cubes)).astype(np.int32), self._cubes
+            np.minimum(rows.cube, len(self._cubes) - 1).astype(np.int32), self._cubes
         )
-        columns = [stamp_ns, names, sequence, *rows.stress.T, *rows.gradient.T, *rows[2:], left_out]
+        columns = [
+            rows.stamp_ns,
+            names,
+            rows.sequence,
+            *rows.stress.T,
+            *rows.gradient.T,
+            rows.residual,
+            rows.status,
+            rows.observed,
+            rows.left_out,
+        ]
         arrays = [
             pyarrow.array(column) if isinstance(column, np.ndarray) else column
             for column in columns
@@ -84,7 +87,7 @@ class TableWriter:
         if self._csv:
             arrays[1] = names.dictionary_decode()
         self._batches.append(pyarrow.RecordBatch.from_arrays(arrays, schema=self._schema))
-        self._rows += len(stamp_ns)
+        self._rows += len(rows)
         if self._rows >= GROUP:
             try:
                 self._flush()

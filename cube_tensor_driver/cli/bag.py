@@ -90,10 +90,9 @@ def _rows(bag: Bag, topic: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     columns: list[tuple[np.ndarray, ...]] = [
         (np.empty(0, np.uint16), np.empty(0, np.uint32), np.empty(0, np.int64))
     ]
-    for batch, _ in bag.batches(topic):
-        columns.append(
-            (batch.field["cube"].ravel(), batch.field["sequence"].ravel(), batch.times_ns.ravel())
-        )
+    for messages, _ in bag.frequencies(topic):
+        rows = messages.rows
+        columns.append((rows.cube, rows.sequence, rows.stamp_ns))
     cube, sequence, times = (np.concatenate(column) for column in zip(*columns, strict=True))
     return cube, sequence, times
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .modes import COMPONENTS, STRESS
-from .pipeline import StressRows
+from .rows import StressRows
 from .status import INVALID, RESIDUAL
 from .tensor import principal_stresses, quaternion_from_rotation
 from .window import WINDOW_S, still_strained
@@ -89,7 +89,7 @@ class Newest:
         are left out."""
         ours = cube < len(self.status)
         if not ours.all():
-            cube, rows = cube[ours], StressRows(*(column[ours] for column in rows))
+            cube, rows = cube[ours], rows.select(ours)
         self.values[cube, : len(STRESS)], self.values[cube, len(STRESS) :] = (
             rows.stress,
             rows.gradient,

@@ -70,10 +70,10 @@ def cube_series(bag: Bag, name: str | None, start_s: float | None, end_s: float 
     n_pads = len(cubes[number].pads)
     start, end = 0.0 if start_s is None else start_s, np.inf if end_s is None else end_s
     parts = []
-    for batch, _, rows, _ in recording.batches():
-        seconds = (batch.times_ns.ravel() - bag.start_ns) * 1e-9
-        chosen = (batch.field["cube"].ravel() == number) & (seconds >= start) & (seconds <= end)
-        frequency = batch.field["frequency"].reshape(len(seconds), -1)[chosen, :n_pads]
+    for source, _, rows in recording.batches():
+        seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
+        chosen = (rows.cube == number) & (seconds >= start) & (seconds <= end)
+        frequency = source.rows.frequency[chosen, :n_pads]
         values = np.hstack([rows.stress, rows.gradient])[chosen]
         parts.append(
             (seconds[chosen], frequency, values, rows.residual[chosen], rows.status[chosen])

@@ -14,7 +14,8 @@ from std_msgs.msg import Header
 from cube_tensor_driver.msg import StressTensorStamped
 
 from ..config.skin import Skin
-from ..core.pipeline import Pipeline, StressRows
+from ..core.pipeline import Pipeline
+from ..core.rows import StressRows
 from ..core.status import INVALID
 from ..core.tensor import contact_wrench
 from ..device.scan import Rows

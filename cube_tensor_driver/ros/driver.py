@@ -8,14 +8,13 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import ROSClock
 from rclpy.event_handler import PublisherEventCallbacks
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
-from ..bags.message_codec import frequencies_buffer
+from ..bags.message_codec import frequency_codec
 from ..config.skin import Skin, read_skin
 from ..core.errors import ConfigError, LinkError
 from ..core.pipeline import Pipeline
@@ -118,7 +117,9 @@ class Driver(CubeNode):
         self._published = self._published_before = 0
         self._turns = scans_per_message(self.value("publish_period"), self._rate)
         self._frame_id = skin.parent_frame.encode() + b"\0"
-        self._blank = lru_cache(maxsize=BUFFERS_KEPT)(partial(frequencies_buffer, self._frame_id))
+        self._blank = lru_cache(maxsize=BUFFERS_KEPT)(
+            partial(frequency_codec.buffer, self._frame_id)
+        )
         rate = None if self._rate is None else self._rate / self._turns
         quality = queue(rate, self.value("qos_reliability"), self._turns * len(skin.cubes))
         self._listened_to = False
@@ -215,7 +216,6 @@ class Driver(CubeNode):
         ):
             first_ns = int(rows.stamp_ns.min())
             if self._take is None or self._listened_to:
-                self._message.field["time_offset"][:] = rows.stamp_ns - first_ns
                 self._frequencies.publish(self._message.data(first_ns))
             if self._take is not None:
                 self._take(rows, first_ns, self._frame_id)
@@ -228,14 +228,14 @@ class Driver(CubeNode):
     def _room(self, rows: int, n_pads: int) -> Rows:
         """The fields of a message: what the scan writes there is not copied any more."""
         self._message = self._blank(rows, n_pads)
-        field = self._message.field
+        room = self._message.rows
         return Rows(
-            field["cube"],
-            field["sequence"],
-            np.empty(rows, np.int64),
-            field["frequency"],
-            field["temperature"],
-            field["pad_fault"],
+            room.cube,
+            room.sequence,
+            room.stamp_ns,
+            room.frequency,
+            room.temperature,
+            room.pad_fault,
         )
 
     def _learn(self, link: int, frame: Hello) -> None:

@@ -7,19 +7,15 @@ executor, the same quality of service, the same flat arrays as the real nodes.
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from std_msgs.msg import Header
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
-from ..core.pipeline import StressRows
-from ..device.scan import Rows
-from .messages import Times, frequencies_message, read_frequencies, stress_message
+from .messages import packed
 from .node import CubeNode, queue, run
 
-PADS = 8
+PADS, STRESS, GRADIENT = 8, 6, 9
 
 
 class Source(CubeNode):
@@ -36,18 +32,24 @@ class Source(CubeNode):
         self._publisher = self.create_lifecycle_publisher(
             SkinFrequencies, "frequencies", queue(rate)
         )
-        self._rows = Rows(
-            np.arange(n, dtype=np.uint16),
-            np.zeros(n, np.uint32),
-            np.full(n, time.time_ns()),
-            np.full((n, PADS), 1e5, np.float32),
-            np.full(n, np.nan, np.float32),
-            np.zeros(n, np.uint32),
-        )
+        self._cube = np.arange(n, dtype=np.uint16)
+        self._zeros = np.zeros(n, np.uint32)
+        self._frequency = np.full((n, PADS), 1e5, np.float32)
+        self._temperature = np.full(n, np.nan, np.float32)
         self._timer = self.create_timer(1.0 / rate, self._publish)
 
     def _publish(self) -> None:
-        self._publisher.publish(frequencies_message(self._rows, "skin"))
+        message = SkinFrequencies(
+            header=Header(frame_id="skin"),
+            cube=packed("H", self._cube),
+            sequence=packed("I", self._zeros),
+            time_offset=packed("i", self._zeros),
+            n_pads=PADS,
+            frequency=packed("f", self._frequency),
+            temperature=packed("f", self._temperature),
+            pad_fault=packed("I", self._zeros),
+        )
+        self._publisher.publish(message)
 
 
 class Echo(CubeNode):
@@ -62,20 +64,25 @@ class Echo(CubeNode):
     def configure(self) -> None:
         n, quality = int(self.value("cubes")), queue(float(self.value("rate")))
         self._publisher = self.create_lifecycle_publisher(SkinStress, "stress", quality)
-        self._rows = StressRows(
-            np.zeros((n, 6), np.float32),
-            np.zeros((n, 9), np.float32),
-            np.zeros(n, np.float32),
-            np.zeros(n, np.uint16),
-            np.zeros(n, np.uint16),
-        )
+        self._zeros = np.zeros((n, GRADIENT), np.float32)
         self._subscription = self.create_subscription(
             SkinFrequencies, "frequencies", self._answer, quality
         )
 
     def _answer(self, message: SkinFrequencies) -> None:
-        times = read_frequencies(message)[0]
-        self._publisher.publish(stress_message(Times(Header(), *times[1:]), self._rows))
+        zeros = self._zeros
+        answer = SkinStress(
+            cube=message.cube,
+            sequence=message.sequence,
+            time_offset=message.time_offset,
+            stress=packed("f", zeros[:, :STRESS]),
+            gradient=packed("f", zeros),
+            residual=packed("f", zeros[:, 0]),
+            status=packed("H", zeros[:, 0]),
+            observed=packed("H", zeros[:, 0]),
+            left_out=packed("I", zeros[:, 0]),
+        )
+        self._publisher.publish(answer)
 
 
 def main() -> None:

@@ -1,11 +1,14 @@
-"""Messages to arrays and back. Flat arrays are moved as bytes, never element by element."""
+"""Messages of rclpy that are made or read one by one: info, single tensors and wrenches, times.
+
+The batch messages go through `bags/message_codec.py`, as serialised bytes.
+"""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -13,41 +16,14 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, WrenchStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from cube_tensor_driver.msg import (
-    CubeInfo,
-    SkinFrequencies,
-    SkinInfo,
-    SkinStress,
-    StressTensor,
-    StressTensorStamped,
-)
+from cube_tensor_driver.msg import CubeInfo, SkinInfo, StressTensor, StressTensorStamped
 
+from ..bags.message_codec import SECOND
 from ..config.calibration import calibration_text
 from ..config.skin import Skin
-from ..core.errors import MessageError
-from ..core.modes import COMPONENTS, STRESS
-from ..core.pipeline import Pipeline, StressRows
+from ..core.pipeline import Pipeline
+from ..core.rows import StressRows
 from ..core.tensor import quaternion_from_rpy
-from ..device.scan import Rows
-
-SECOND = 1_000_000_000
-N_STRESS, N_GRADIENT = len(STRESS), len(COMPONENTS) - len(STRESS)
-
-
-class Times(NamedTuple):
-    """When and of which cube rows are: header as it came, cube (N,), sequence (N,), time_offset
-    (N,) ns."""
-
-    header: Header
-    cube: NDArray[np.uint16]
-    sequence: NDArray[np.uint32]
-    time_offset: NDArray[np.int32]
-
-    @property
-    def stamp_ns(self) -> NDArray[np.int64]:
-        """(N,) ns of the node clock."""
-        stamps: NDArray[np.int64] = to_ns(self.header.stamp) + self.time_offset.astype(np.int64)
-        return stamps
 
 
 def to_time(stamp_ns: int) -> Time:
@@ -64,79 +40,6 @@ def packed(code: str, values: NDArray[Any]) -> array[Any]:
     field = array(code)
     field.frombytes(np.ascontiguousarray(values, dtype=code).tobytes())
     return field
-
-
-def frequencies_message(rows: Rows, frame_id: str) -> SkinFrequencies:
-    first_ns = int(rows.stamp_ns.min())
-    return SkinFrequencies(
-        header=Header(stamp=to_time(first_ns), frame_id=frame_id),
-        cube=packed("H", rows.cube),
-        sequence=packed("I", rows.sequence),
-        time_offset=packed("i", rows.stamp_ns - first_ns),
-        n_pads=rows.frequency.shape[1],
-        frequency=packed("f", rows.frequency),
-        temperature=packed("f", rows.temperature),
-        pad_fault=packed("I", rows.pad_fault),
-    )
-
-
-def read_frequencies(
-    message: SkinFrequencies,
-) -> tuple[Times, NDArray[np.float32], NDArray[np.uint32], NDArray[np.float32]]:
-    """Times, frequency (N, n_pads), pad_fault (N,), temperature (N,): views. MessageError: lengths
-    that do not fit."""
-    rows = len(message.cube)
-    width = message.n_pads
-    times = _times(message)
-    fields = {"frequency": width, "temperature": 1, "pad_fault": 1}
-    for name, per_row in fields.items():
-        _check_length(message, name, rows * per_row)
-    frequency = np.frombuffer(message.frequency, np.float32).reshape(rows, width)
-    return (
-        times,
-        frequency,
-        np.frombuffer(message.pad_fault, np.uint32),
-        np.frombuffer(message.temperature, np.float32),
-    )
-
-
-def stress_message(times: Times, rows: StressRows) -> SkinStress:
-    """Of rows that no pad was left out of."""
-    return SkinStress(
-        header=times.header,
-        cube=packed("H", times.cube),
-        sequence=packed("I", times.sequence),
-        time_offset=packed("i", times.time_offset),
-        stress=packed("f", rows.stress),
-        gradient=packed("f", rows.gradient),
-        residual=packed("f", rows.residual),
-        status=packed("H", rows.status),
-        observed=packed("H", rows.observed),
-        left_out=array("I", bytes(4 * len(times.cube))),
-    )
-
-
-def read_stress(message: SkinStress) -> tuple[Times, StressRows]:
-    """Times and rows, views. MessageError: lengths that do not fit."""
-    rows = len(message.cube)
-    times = _times(message)
-    fields = {
-        "stress": N_STRESS,
-        "gradient": N_GRADIENT,
-        "residual": 1,
-        "status": 1,
-        "observed": 1,
-        "left_out": 1,
-    }
-    for name, per_row in fields.items():
-        _check_length(message, name, rows * per_row)
-    return times, StressRows(
-        np.frombuffer(message.stress, np.float32).reshape(rows, N_STRESS),
-        np.frombuffer(message.gradient, np.float32).reshape(rows, N_GRADIENT),
-        np.frombuffer(message.residual, np.float32),
-        np.frombuffer(message.status, np.uint16),
-        np.frombuffer(message.observed, np.uint16),
-    )
 
 
 def tensor_message(
@@ -211,23 +114,3 @@ def info_message(
             covariance.append(pipeline.covariance(number))
     message.covariance = packed("d", np.array(covariance))
     return message
-
-
-def _times(message: SkinFrequencies | SkinStress) -> Times:
-    rows = len(message.cube)
-    for name in ("sequence", "time_offset"):
-        _check_length(message, name, rows)
-    return Times(
-        message.header,
-        np.frombuffer(message.cube, np.uint16),
-        np.frombuffer(message.sequence, np.uint32),
-        np.frombuffer(message.time_offset, np.int32),
-    )
-
-
-def _check_length(message: Any, name: str, expected: int) -> None:
-    found = len(getattr(message, name))
-    if found != expected:
-        raise MessageError(
-            f"{type(message).__name__}.{name} has {found} values, {len(message.cube)} rows need {expected}"
-        )

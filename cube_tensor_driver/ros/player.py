@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from ..bags.message_codec import stress_of_today
+from ..bags.message_codec import upgrade_stress
 from ..bags.read import PACKAGE, STRESS, Bag, Entry
 from ..core.errors import BagError
 from .messages import SECOND
@@ -222,5 +222,5 @@ class Player:
 
     def _publish(self, entry: Entry) -> None:
         old = entry.msgtype == STRESS and self._bag.version == 1
-        self._publishers[entry.topic].publish(stress_of_today(entry.data) if old else entry.data)
+        self._publishers[entry.topic].publish(upgrade_stress(entry.data) if old else entry.data)
         self.published += 1

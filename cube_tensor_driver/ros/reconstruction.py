@@ -13,17 +13,12 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 
-from ..bags.message_codec import (
-    Shape,
-    frequencies_shape,
-    read_frequencies,
-    same_shape,
-    stress_buffer,
-)
+from ..bags.message_codec import frequency_codec, stress_codec
 from ..config.skin import read_skin
 from ..core.errors import CubeError
 from ..core.health import Health
 from ..core.pipeline import Pipeline
+from ..core.rows import StressRows
 from ..core.status import INVALID
 from ..core.tare import DriftTracker
 from ..device.scan import Rows
@@ -115,8 +110,7 @@ class Reconstruction(CubeNode):
         turns = scans_per_message(self.value("publish_period"), skin.rate)
         rate = None if skin.rate is None else skin.rate / turns
         quality = queue(rate, self.value("qos_reliability"), turns * len(skin.cubes))
-        self._blank = lru_cache(maxsize=BUFFERS_KEPT)(stress_buffer)
-        self._shape: tuple[bytes, Shape] | None = None
+        self._blank = lru_cache(maxsize=BUFFERS_KEPT)(stress_codec.buffer)
         self._stress = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         self._cubes = CubeTopics(self, skin, self._pipeline, self.value("wrench_side") or None)
@@ -168,22 +162,20 @@ class Reconstruction(CubeNode):
     def take(self, data: bytes) -> None:
         """Publish the tensors of one message of frequencies, as it comes: serialised."""
         try:
-            if self._shape is None or not same_shape(data, *self._shape):
-                self._shape = data, frequencies_shape(data)
-            batch = read_frequencies([data], self._shape[1])
+            message = frequency_codec.decode(data)
         except CubeError as error:
             self._refuse(error)
             return
-        field = batch.field[0]
+        rows = message.rows
         given = Rows(
-            field["cube"],
-            field["sequence"],
-            batch.times_ns[0],
-            field["frequency"],
-            field["temperature"],
-            field["pad_fault"],
+            rows.cube,
+            rows.sequence,
+            rows.stamp_ns,
+            rows.frequency,
+            rows.temperature,
+            rows.pad_fault,
         )
-        self.take_rows(given, int(batch.stamp_ns[0]), bytes(field["frame_id"]))
+        self.take_rows(given, int(message.stamp_ns[0]), message.frame_id)
 
     def take_rows(self, given: Rows, stamp_ns: int, frame_id: bytes) -> None:
         """Publish the tensors of rows; stamp and frame of their message are its own, too."""
@@ -208,12 +200,13 @@ class Reconstruction(CubeNode):
         except CubeError as error:
             self._refuse(error)
             return
+        stress = StressRows(cube, given.sequence, given.stamp_ns, *rows, pad_fault)
         message = self._blank(frame_id, len(cube))
-        message.fill(cube, given.sequence, given.stamp_ns - stamp_ns, *rows, pad_fault)
+        message.fill(stress)
         self._stress.publish(message.data(stamp_ns))
         self._rows += len(cube)
         self._invalid += int(np.count_nonzero(rows.status & INVALID))
-        self._cubes.publish(given, rows, pad_fault)
+        self._cubes.publish(given, stress, pad_fault)
 
     def _refuse(self, error: CubeError) -> None:
         self._bad_messages += 1

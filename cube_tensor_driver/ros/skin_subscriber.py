@@ -12,10 +12,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from cube_tensor_driver.msg import SkinInfo, SkinStress
 
+from ..bags.message_codec import stress_codec
 from ..core.errors import MessageError
 from ..core.scene import CubePoses, Newest
 from ..core.tensor import rotation_from_quaternion
-from .messages import read_stress
+from .messages import to_time
 from .node import CubeNode
 
 DEPTH = 10
@@ -42,7 +43,7 @@ class SkinSubscriber:
         quick = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscriptions = [
             node.create_subscription(SkinInfo, "info", self._take_info, latched),
-            node.create_subscription(SkinStress, "stress", self._take_stress, quick),
+            node.create_subscription(SkinStress, "stress", self._take_stress, quick, raw=True),
         ]
 
     def close(self) -> None:
@@ -64,17 +65,17 @@ class SkinSubscriber:
         self.places, self.newest, self.stamp = places(info), Newest(len(info.cubes)), None
         self._on_skin()
 
-    def _take_stress(self, message: SkinStress) -> None:
+    def _take_stress(self, data: bytes) -> None:
         if self.info is None:
             return
         try:
-            times, rows = read_stress(message)
+            message = stress_codec.decode(data)
         except MessageError as error:
             self.bad_messages += 1
             self._node.get_logger().error(str(error), throttle_duration_sec=5.0)
             return
-        self.newest.update(times.cube, rows, self.now())
-        self.stamp = times.header.stamp
+        self.newest.update(message.rows.cube, message.rows, self.now())
+        self.stamp = to_time(int(message.stamp_ns[0]))
 
 
 class SkinSubscriberNode(CubeNode):

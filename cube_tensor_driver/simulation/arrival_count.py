@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bags import message_codec
+from ..bags.message_codec import stress_codec
 from ..config.skin import Skin
 
 
@@ -24,20 +24,15 @@ class Tally:
         self._first[np.unique(link_of, return_index=True)[1]] = True
         self._link_of = link_of
         self.rows = 0
-        self._shape: tuple[bytes, message_codec.Shape] | None = None
         self._arrived: list[tuple[NDArray[Any], NDArray[Any], int]] = []
 
     def take(self, data: bytes) -> None:
         """A message as it comes, serialised: whoever measures should not cost what is measured."""
         received_ns = time.time_ns()
-        if self._shape is None or not message_codec.same_shape(data, *self._shape):
-            self._shape = data, message_codec.stress_shape(data)
-        field = message_codec.read_stress([data], self._shape[1]).field
-        cube = field["cube"][0]
-        first = self._first[cube]
-        sequence = field["sequence"][0][first]
-        self._arrived.append((self._link_of[cube[first]], sequence, received_ns))
-        self.rows += len(cube)
+        rows = stress_codec.decode(data).rows
+        first = rows.select(self._first[rows.cube])
+        self._arrived.append((self._link_of[first.cube], first.sequence, received_ns))
+        self.rows += len(rows)
 
     def result(self, book: dict[str, Any], start_ns: int, end_ns: int) -> dict[str, object]:
         """Rows sent and received of samples taken from start_ns to end_ns (wall clock), latencies

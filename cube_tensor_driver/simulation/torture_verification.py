@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config.skin import Skin
-from ..core.pipeline import StressRows
+from ..core.rows import StressRows
 from .cubes import SimulatedCubes, true_components
 from .faults import PAD
 from .load import Load, default_script

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..config.skin import Skin
 from ..core.errors import MessageError
 from ..core.modes import COMPONENTS
-from ..core.pipeline import StressRows
+from ..core.rows import StressRows
 from ..elastic.surface import Surface
 from .cubes import true_components
 from .load import Load

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from ..config.skin import Skin
 from ..core.modes import COMPONENTS
-from ..core.pipeline import StressRows
+from ..core.rows import StressRows
 from ..core.status import STATUS
 
 REFRESH_S = 0.1

@@ -22,6 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
+from ..bags.message_codec import frequency_codec, stress_codec
 from ..config.grid import grid
 from ..config.load_script import read_script
 from ..config.package_data import package_data
@@ -31,7 +32,6 @@ from ..core.errors import ConfigError, CubeError, MessageError
 from ..plot.plots import draw_forces, save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
-from ..ros.messages import read_stress
 from ..ros.node import make_executor, queue
 from ..simulation.load import Load, default_script
 from ..simulation.verification import Judge
@@ -138,23 +138,29 @@ def _run(
                     "another ROS_DOMAIN_ID for this one"
                 )
 
-        def on_stress(message: SkinStress) -> None:
+        def on_stress(data: bytes) -> None:
             received_ns = time.time_ns()
             try:
-                times, rows = read_stress(message)
+                rows = stress_codec.decode(data).rows
             except MessageError as error:
                 judge.contradictions += 1
                 node.get_logger().error(str(error))
                 return
-            if int(times.cube.max(initial=0)) >= len(skin.cubes):
+            if int(rows.cube.max(initial=0)) >= len(skin.cubes):
                 strangers.set()
                 return
             if options.duration is not None:
-                judge.stress(times.cube, times.sequence, times.stamp_ns, rows, received_ns)
-            table.update(times.cube, rows)
+                judge.stress(rows.cube, rows.sequence, rows.stamp_ns, rows, received_ns)
+            table.update(rows.cube, rows)
 
-        def on_frequencies(message: SkinFrequencies) -> None:
-            judge.frequencies(message.cube, message.sequence)
+        def on_frequencies(data: bytes) -> None:
+            try:
+                rows = frequency_codec.decode(data).rows
+            except MessageError as error:
+                judge.contradictions += 1
+                node.get_logger().error(str(error))
+                return
+            judge.frequencies(rows.cube, rows.sequence)
 
         crc: dict[str, int] = {}
 
@@ -164,9 +170,11 @@ def _run(
                 if counted:
                     crc[status.name] = counted[0]
 
-        node.create_subscription(SkinStress, "stress", on_stress, queue(rate))
+        node.create_subscription(SkinStress, "stress", on_stress, queue(rate), raw=True)
         if options.duration is not None:
-            node.create_subscription(SkinFrequencies, "frequencies", on_frequencies, queue(rate))
+            node.create_subscription(
+                SkinFrequencies, "frequencies", on_frequencies, queue(rate), raw=True
+            )
             node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
         executor = make_executor()
         executor.add_node(node)

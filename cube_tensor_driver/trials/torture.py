@@ -3,6 +3,7 @@ injector's book."""
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import json
 import signal
@@ -25,12 +26,12 @@ from rclpy.signals import SignalHandlerOptions
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
-from ..bags import message_codec
+from ..bags.message_codec import AnyRows, frequency_codec, stress_codec
 from ..config.grid import grid
 from ..config.skin import read_skin
 from ..config.yaml import to_yaml, write_yaml
 from ..core.errors import CubeError
-from ..core.pipeline import StressRows
+from ..core.rows import FrequencyRows, StressRows
 from ..processes.children import Children
 from ..processes.skin_processes import SimulatedHubs, skin_processes
 from ..ros.messages import to_ns
@@ -289,8 +290,8 @@ class _Watch:
     def __init__(self, node: Any, reckoning: TortureVerification) -> None:
         self.rows = self.said_ns = 0
         self._reckoning = reckoning
-        self._frequencies: list[message_codec.Batch] = []
-        self._stress: list[message_codec.Batch] = []
+        self._frequencies: list[FrequencyRows] = []
+        self._stress: list[StressRows] = []
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
         # Deeper than anybody else's: a judge that is held up must not blame the driver for it.
@@ -303,26 +304,26 @@ class _Watch:
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 1000)
 
     def _on_frequencies(self, data: bytes) -> None:
-        batch = message_codec.read_frequencies([data], message_codec.frequencies_shape(data))
-        self.rows += batch.shape.rows
-        self._frequencies.append(batch)
+        rows = frequency_codec.decode(data).rows
+        self.rows += len(rows)
+        self._frequencies.append(rows)
         if len(self._frequencies) >= BATCH:
             self._judge(LAG)
 
     def _on_stress(self, data: bytes) -> None:
-        self._stress.append(message_codec.read_stress([data], message_codec.stress_shape(data)))
+        self._stress.append(stress_codec.decode(data).rows)
 
     def _judge(self, lag: int) -> None:
         """All frequencies that wait, then all tensors but the newest."""
         if self._frequencies:
-            cube, sequence, frequency = _columns(self._frequencies, "cube", "sequence", "frequency")
-            self._reckoning.frequencies(cube, sequence, _stamps(self._frequencies), frequency)
+            rows = _joined(self._frequencies)
+            self._reckoning.frequencies(rows.cube, rows.sequence, rows.stamp_ns, rows.frequency)
             self._frequencies.clear()
         end = max(0, len(self._stress) - lag)
         ready, self._stress = self._stress[:end], self._stress[end:]
         if ready:
-            cube, sequence, *rows = _columns(ready, "cube", "sequence", *StressRows._fields)
-            self._reckoning.stress(cube, sequence, _stamps(ready), StressRows(*rows))
+            made = _joined(ready)
+            self._reckoning.stress(made.cube, made.sequence, made.stamp_ns, made)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -368,13 +369,11 @@ class _Watch:
         return cubes * (counters["lost_on_the_way"] + counters["dropped_in_hub"]) + rows
 
 
-def _columns(batches: list[message_codec.Batch], *names: str) -> list[Any]:
-    """Fields of one message each, all rows of all of them in order."""
-    return [np.concatenate([batch.field[name][0] for batch in batches]) for name in names]
-
-
-def _stamps(batches: list[message_codec.Batch]) -> Any:
-    return np.concatenate([batch.times_ns[0] for batch in batches])
+def _joined(messages: list[AnyRows]) -> AnyRows:
+    """The rows of messages, one after the other."""
+    names = [field.name for field in dataclasses.fields(messages[0])]
+    columns = [np.concatenate([getattr(rows, name) for rows in messages]) for name in names]
+    return type(messages[0])(*columns)
 
 
 def _memory(processes: dict[str, psutil.Process]) -> dict[str, float]:
