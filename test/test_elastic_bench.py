@@ -9,11 +9,11 @@ from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic.body import Body
 from cube_tensor_driver.research import paper
 from cube_tensor_driver.research import virtual_bench as benches
+from cube_tensor_driver.research.layout_study import layout_study
 from cube_tensor_driver.research.material import Material
 from cube_tensor_driver.research.paper import dent, plates
-from cube_tensor_driver.research.rod import Contact, Rod
-from cube_tensor_driver.research.study import study
-from cube_tensor_driver.research.virtual_bench import Bench
+from cube_tensor_driver.research.rod import Rod
+from cube_tensor_driver.research.virtual_bench import VirtualBench
 
 BODY = Body()
 
@@ -22,7 +22,7 @@ BODY = Body()
 def coarse(monkeypatch):
     """Triangles at the cube as the section makes them: enough for what does not ask how exact the
     pads are."""
-    monkeypatch.setattr(benches, "_CUTS", 0)
+    monkeypatch.setattr(benches, "CUBE_REFINEMENTS", 0)
 
 
 def uniaxial(stretch, young, poisson):
@@ -49,7 +49,7 @@ def test_stress_and_moduli_are_derivatives_of_the_energy(finite):
 
 @pytest.mark.parametrize("finite", [False, True])
 def test_sliding_plates_without_a_cube_press_evenly(finite):
-    result = Bench(BODY, cube=False, finite=finite).run([plates(BODY, 2e-3, bonded=False)])
+    result = VirtualBench(BODY, cube=False, finite=finite).run([plates(BODY, 2e-3, bonded=False)])
     strain = 2e-3 / BODY.height
     linear = -strain * BODY.young / (1 - BODY.poisson**2)
     exact = uniaxial(1 - strain, BODY.young, BODY.poisson) if finite else linear
@@ -62,16 +62,16 @@ def test_sliding_plates_without_a_cube_press_evenly(finite):
 
 def test_finite_strain_is_linear_for_small_loads(coarse):
     step = [plates(BODY, 1e-6), plates(BODY, 1e-6, 1e-6)]
-    linear, finite = (Bench(BODY, finite=kind).run(step).pads[1] for kind in (False, True))
+    linear, finite = (VirtualBench(BODY, finite=kind).run(step).pads[1] for kind in (False, True))
     assert np.abs(linear - finite).max() < 2e-3 * np.abs(linear).max()
     assert np.abs(linear - finite).max() > 0
 
 
 def test_shear_leaves_the_linear_normal_sum_alone_and_not_the_finite_one(coarse):
     steps = [plates(BODY, 1e-3), plates(BODY, 1e-3, 3e-3)]
-    before, after = Bench(BODY).run(steps).pads[:, :4]
+    before, after = VirtualBench(BODY).run(steps).pads[:, :4]
     assert after.sum() == pytest.approx(before.sum(), rel=1e-9)
-    before, after = Bench(BODY, finite=True).run(steps).pads[:, :4]
+    before, after = VirtualBench(BODY, finite=True).run(steps).pads[:, :4]
     assert abs(after.sum() / before.sum() - 1) > 1e-3
 
 
@@ -83,8 +83,8 @@ def test_pads_converge_with_the_mesh_at_the_cube(monkeypatch):
     """
     step, found = [plates(BODY, 3e-3, 3e-3)], []
     for more in (0, 1):
-        monkeypatch.setattr(benches, "_CUTS", benches._CUTS + more)
-        found.append(Bench(BODY).run(step).pads[0, :4] @ [-1, 1, 1, -1])
+        monkeypatch.setattr(benches, "CUBE_REFINEMENTS", benches.CUBE_REFINEMENTS + more)
+        found.append(VirtualBench(BODY).run(step).pads[0, :4] @ [-1, 1, 1, -1])
     assert found[0] == pytest.approx(found[1], rel=0.003)
 
 
@@ -92,23 +92,25 @@ def test_plates_that_grip_shear_the_body_as_it_stands():
     """Without a cube the middle of an evenly pressed block takes mu s / h more, for small s, and
     stays pressed."""
     steps = [plates(BODY, 2e-3, bonded=False), plates(BODY, 2e-3, 0.1e-3, gripped=True)]
-    state = Bench(BODY, cube=False).run(steps).state
+    state = VirtualBench(BODY, cube=False).run(steps).state
     shear = -BODY.young / (2 * (1 + BODY.poisson)) * 0.1e-3 / BODY.height
     assert state[1, :2] == pytest.approx([state[0, 0], shear], rel=1e-3)
     assert abs(state[0, 1]) < 1e-9 * abs(state[0, 0])
 
 
 def test_a_mirrored_rod_mirrors_the_pads(coarse):
-    right, left = (Bench(BODY).run([dent(BODY, Rod(1e-3, x))]).pads[0] for x in (2e-3, -2e-3))
+    right, left = (
+        VirtualBench(BODY).run([dent(BODY, Rod(1e-3, x))]).pads[0] for x in (2e-3, -2e-3)
+    )
     assert left == pytest.approx(right[[1, 0, 3, 2, 6, 7, 4, 5]], rel=1e-6)
 
 
 def test_too_large_a_load_is_refused(coarse, monkeypatch):
     monkeypatch.setattr(
-        benches, "_HALVINGS", 1
+        benches, "STEP_HALVINGS", 1
     )  # each further one doubles the time until it gives up
     with pytest.raises(ElasticError, match="too large even in 2 parts; press less"):
-        Bench(BODY, finite=True, size=2.0).run([plates(BODY, 12e-3)])
+        VirtualBench(BODY, finite=True, size=2.0).run([plates(BODY, 12e-3)])
 
 
 # the rod
@@ -124,13 +126,12 @@ def test_a_round_rod_presses_as_hertz_says():
     """
     body = Body(200e-3, 1.0, 100e-3, 10e-3)
     radius = 50e-3
-    bench = Bench(body, cube=False, size=1.0)
+    bench = VirtualBench(body, cube=False, size=1.0)
     rod = Rod(1e-3, 0.0, 2 * radius, radius)
-    nothing = np.zeros(bench.basis.N)
-    u = bench._newton(nothing, bench._task(dent(body, rod), nothing))
-    vertical = np.concatenate([bench.basis.nodal_dofs[1], bench.basis.facet_dofs[1]])
-    force = 5e-3 * Contact(bench._top, rod, 5e-3, body.young, False).force(u)[vertical]
-    square = force @ (5e-3 * bench.basis.doflocs[0, vertical]) ** 2 / force.sum()
+    u, basis = bench.solve(dent(body, rod)), bench.section.basis
+    vertical = np.concatenate([basis.nodal_dofs[1], basis.facet_dofs[1]])
+    force = 5e-3 * bench.rod_contact(rod).force(u)[vertical]
+    square = force @ (5e-3 * basis.doflocs[0, vertical]) ** 2 / force.sum()
     assert 4e-3 < 2 * np.sqrt(square) < 7e-3
     assert force.sum() == pytest.approx(
         np.pi * body.young / (1 - body.poisson**2) * square / radius, rel=0.015
@@ -139,10 +140,10 @@ def test_a_round_rod_presses_as_hertz_says():
 
 @pytest.mark.parametrize("finite", [False, True])
 def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(coarse, finite):
-    bench = Bench(BODY, finite=finite, size=1.0)
-    contact = Contact(bench._top, Rod(0.5e-3, 1e-3), 2e-3, BODY.young, finite)
+    bench = VirtualBench(BODY, finite=finite, size=1.0)
+    contact = bench.rod_contact(Rod(0.5e-3, 1e-3))
     random = np.random.default_rng(8)
-    u, way = 0.05 * random.normal(size=(2, bench.basis.N))
+    u, way = 0.05 * random.normal(size=(2, bench.section.basis.N))
     h = 1e-6
     slope = (contact.energy(u + h * way) - contact.energy(u - h * way)) / (2 * h)
     assert contact.force(u) @ way == pytest.approx(slope, rel=1e-6)
@@ -162,7 +163,7 @@ def test_a_deep_rod_folds_no_element(coarse, bonded, last):
     depths = (0.5e-3, 1e-3, 1.5e-3, 2e-3, *last)
     steps = [dent(BODY, Rod(depth, 1e-3), bonded) for depth in depths]
     coarse, fine = (
-        Bench(BODY, finite=True, size=size).run(some).pads[:, :4] @ [-1, 1, 1, -1]
+        VirtualBench(BODY, finite=True, size=size).run(some).pads[:, :4] @ [-1, 1, 1, -1]
         for size, some in ((2.0, steps), (1.0, steps[:2]))
     )
     assert coarse[:2] == pytest.approx(fine, rel=0.005)
@@ -172,20 +173,32 @@ def test_a_deep_rod_folds_no_element(coarse, bonded, last):
 
 @pytest.mark.parametrize("finite", [False, True])
 def test_a_sliding_bottom_stays_on_average(coarse, finite):
-    """And what keeps it there is spread evenly: in proportion to the mean's weights, on the bottom
-    alone."""
-    bench, nothing = Bench(BODY, finite=finite, size=1.0), np.zeros(0)
-    rod = Rod(0.3e-3, 1e-3)
-    u = bench._newton(np.zeros(bench.basis.N), bench._task(dent(BODY, rod, bonded=False), nothing))
-    assert abs(bench._mean @ u) < 1e-9 * np.abs(bench._mean).max() * np.abs(u).max()
-    left, _ = bench._balance(u, Contact(bench._top, rod, 2e-3, BODY.young, finite))
-    sideways = left[bench._component == 0]
-    weights = bench._mean[bench._component == 0]
-    even = weights * (weights @ sideways) / (weights @ weights)
-    assert np.abs(sideways - even).max() < 1e-6 * np.abs(left).max()
-    assert (
-        np.abs(even).max() > 1e-4 * np.abs(left).max()
-    ) == finite  # linear: the rod has no force along x
+    """And what keeps it there is spread evenly: at each node in proportion to its part of the bottom.
+
+    A middle node of a side has two thirds of the side, a corner a sixth of each side that it ends.
+    """
+    bench, rod = VirtualBench(BODY, finite=finite, size=1.0), Rod(0.3e-3, 1e-3)
+    u = bench.solve(dent(BODY, rod, bonded=False))
+    weights = bottom_weights(bench.section.basis)
+    assert abs(weights @ u) < 1e-9 * np.abs(weights).max() * np.abs(u).max()
+    left, along_x = bench.unbalanced_forces(u, rod), bench.section.component == 0
+    even = weights * (weights @ left) / (weights @ weights)
+    assert np.abs(left - even)[along_x].max() < 1e-6 * np.abs(left).max()
+    pushed = np.abs(even).max() > 1e-4 * np.abs(left).max()
+    assert pushed == finite  # linear: the rod has no force along x
+
+
+def bottom_weights(basis):
+    """(dofs,) with weights @ u = the integral of u_x over the bottom, by Simpson's rule."""
+    mesh, weights = basis.mesh, np.zeros(basis.N)
+    for facet in mesh.facets_satisfying(
+        lambda x: np.abs(x[1] - mesh.p[1].min()) < 1e-9, boundaries_only=True
+    ):
+        corners = mesh.facets[:, facet]
+        length = np.ptp(mesh.p[0, corners])
+        weights[basis.nodal_dofs[0, corners]] += length / 6
+        weights[basis.facet_dofs[0, facet]] += 2 * length / 3
+    return weights
 
 
 def test_prototype_signs():
@@ -202,8 +215,8 @@ def test_rod_sweep_splits_the_signal(coarse):
 def test_study_error_falls_with_the_square_of_the_side(monkeypatch):
     """The pads see the second derivative of the stress: the error of a stress goes as (d0 /
     depth)^2."""
-    monkeypatch.setattr(bodies, "_SPACE_MESHES", ((1.0, 0.3, 6.0),) * 3)
-    result = study(sides=(1e-3, 0.5e-3), widths=(5e-3,), offsets=(-8e-3, -2e-3, 2e-3, 8e-3))
+    monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),) * 3)
+    result = layout_study(sides=(1e-3, 0.5e-3), widths=(5e-3,), offsets=(-8e-3, -2e-3, 2e-3, 8e-3))
     zz, slope = COMPONENTS.index("zz"), COMPONENTS.index("zz_x")
     for error in result.error.values():
         assert error[0, 0, zz] < 0.06 and error[0, 0, slope] < 0.06
@@ -215,4 +228,4 @@ def test_study_error_falls_with_the_square_of_the_side(monkeypatch):
 
 def test_study_refuses_a_cube_at_the_surface():
     with pytest.raises(ElasticError, match="leaves the skin"):
-        study(sides=(6e-3,))
+        layout_study(sides=(6e-3,))

@@ -24,15 +24,16 @@ from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.elastic import body as bodies
+from cube_tensor_driver.elastic import memory
 from cube_tensor_driver.research import paper
-from cube_tensor_driver.research.study import Study
+from cube_tensor_driver.research.layout_study import LayoutStudy
 
 SMALL = ("--width", "20", "--height", "12", "--meshes", "2")
 
 
 @pytest.fixture
 def coarse(monkeypatch):
-    monkeypatch.setattr(bodies, "_SPACE_MESHES", ((1.0, 0.3, 6.0),) * 3)
+    monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),) * 3)
 
 
 def cube(*arguments: object) -> list[str]:
@@ -253,7 +254,7 @@ def test_every_output_is_asked_about_before_any_work(
 
 
 def test_too_little_memory_is_said_before_any_work(monkeypatch, capsys):
-    monkeypatch.setattr(bodies, "available_memory", lambda: 1e8)
+    monkeypatch.setattr(memory, "available_memory", lambda: 1e8)
     monkeypatch.setattr("cube_tensor_driver.elastic.fem.make_solid", None)
     assert cli.main(["fem", "--3d"]) == 1
     assert re.search(
@@ -353,7 +354,7 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
     error["quad"][..., 1] = np.nan
     error["cube"][1] = 0.3
     shape = (2, 2, 3, 15)
-    found = Study(
+    found = LayoutStudy(
         np.array([2e-3, 1e-3]),
         np.array([2e-3, 1e-2]),
         np.arange(3.0),
@@ -362,7 +363,7 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
         dict.fromkeys(LAYOUTS),
         error,
     )
-    monkeypatch.setattr(view_study, "study", lambda progress: found)
+    monkeypatch.setattr(view_study, "layout_study", lambda progress: found)
     assert (
         cli.main(["study", "--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")])
         == 0

@@ -16,12 +16,12 @@ from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.elastic import body as bodies
-from cube_tensor_driver.elastic import fem, mesh
+from cube_tensor_driver.elastic import fem, memory, mesh
 from cube_tensor_driver.elastic.body import Body, strip_layout
 from cube_tensor_driver.elastic.fem import calibration_from_fem, compute_response
 from cube_tensor_driver.elastic.pads import interval_weights
 from cube_tensor_driver.elastic.solid import Solid, brick_stiffness, lame, stiffness
-from cube_tensor_driver.research.virtual_bench import Bench
+from cube_tensor_driver.research.virtual_bench import VirtualBench
 
 HALVES = strip_layout(LAYOUTS["planar"], 1.0)
 RIGID = float("inf")
@@ -244,7 +244,7 @@ def test_nearly_incompressible_body_does_not_lock():
 
 @pytest.fixture
 def coarse(monkeypatch):
-    monkeypatch.setattr(bodies, "_SPACE_MESHES", ((1.0, 0.3, 6.0),) * 3)
+    monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),) * 3)
 
 
 @pytest.fixture(scope="module")
@@ -331,20 +331,20 @@ def test_bad_pads():
 
 
 def test_too_little_memory(monkeypatch):
-    monkeypatch.setattr(bodies, "available_memory", lambda: 1e8)
+    monkeypatch.setattr(memory, "available_memory", lambda: 1e8)
     with pytest.raises(ElasticError, match=r"GB of memory and 0\.1 GB are available"):
         compute_response(Body(), LAYOUTS["cube"], "slab")
 
 
 def test_a_limit_on_this_process_counts(monkeypatch):
     """SuperLU may look for memory for ever where a limit is near: `ulimit -v` is asked before."""
-    taken = bodies.resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[0])
-    monkeypatch.setattr(bodies.resource, "getrlimit", lambda _: (taken + 1e8, -1))
-    assert bodies.available_memory() == pytest.approx(1e8, abs=2e7)
+    taken = memory.resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[0])
+    monkeypatch.setattr(memory.resource, "getrlimit", lambda _: (taken + 1e8, -1))
+    assert memory.available_memory() == pytest.approx(1e8, abs=2e7)
     with pytest.raises(ElasticError, match=r"GB of memory and 0\.\d+ GB are available"):
         compute_response(Body(), HALVES, meshes=1)
     with pytest.raises(ElasticError, match="are available"):
-        Bench(Body())
+        VirtualBench(Body())
 
 
 def test_memory_that_runs_out_is_said(monkeypatch):

@@ -143,7 +143,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.pipeline import Pipeline
     from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
-    from cube_tensor_driver.plot.documentation import draw_markers
+    from cube_tensor_driver.plot.markers import draw_markers
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process
     from cube_tensor_driver.ros.messages import info_message

@@ -13,6 +13,7 @@ import viser
 from viser import uplot
 
 from ..core import scene
+from ..core.defaults import CONTACT_PRESSURE
 from ..core.scene import QUANTITIES, CubePoses, Newest
 from ..elastic.surface import Contact, Surface
 from . import markup
@@ -20,8 +21,6 @@ from .history import History
 from .markup import Facts
 from .scene_3d import LAYERS, SPAN, Scene3D
 
-LEAST_PA = 300.0
-"""Pressure at the cubes that counts as contact."""
 STEP_S = 0.1
 MOST_POINTS = 5000
 """Of the field's carpet."""
@@ -200,7 +199,9 @@ class Page:
         picture costs."""
         k = self._stage.selected
         if not self._paused:
-            self._load = next(iter(self._surface.contacts(newest.believed(health), LEAST_PA)), None)
+            self._load = next(
+                iter(self._surface.contacts(newest.believed(health), CONTACT_PRESSURE)), None
+            )
         hertz = float(np.nanmax(rate, initial=0.0))
         self._head.content = markup.head(
             health, hertz, self._load, self._paused or self._held, facts.recording

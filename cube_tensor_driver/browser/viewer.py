@@ -24,6 +24,7 @@ from std_srvs.srv import Trigger
 from cube_tensor_driver.msg import ReplayState
 from cube_tensor_driver.srv import SteerReplay, Tare
 
+from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ConfigError
 from ..processes.children import LEASH
 from ..ros.node import make_executor
@@ -225,7 +226,7 @@ class Browser:
                 self._links[status.name] = f"{status.name.rpartition(': ')[2]}: {status.message}"
 
 
-def run_view(port: int = PORT, depth: float = 0.004) -> int:
+def run_view(port: int = PORT, depth: float = SURFACE_DEPTH) -> int:
     """Serve until Ctrl-C; returns the exit code. ConfigError: the port cannot be had."""
     stopping = False
 

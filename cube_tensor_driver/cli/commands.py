@@ -217,9 +217,15 @@ def reprocess(options: argparse.Namespace) -> int:
 
 
 def plot(options: argparse.Namespace) -> int:
-    from ..plot.bag import Options, run_plot
+    from ..bags.read import Bag
+    from ..plot.style import save
+    from ..plot.time_series import cube_series, draw_series
 
-    return run_plot(Options(options.bag, options.cube, options.start, options.to, options.output))
+    with Bag(options.bag) as bag:
+        series = cube_series(bag, options.cube, options.start, options.to)
+    save(draw_series(series, options.bag.resolve().name), options.output)
+    print(f"wrote {options.output}: cube {series.name}, {len(series.seconds)} samples")
+    return 0
 
 
 def bag_info(options: argparse.Namespace) -> int:

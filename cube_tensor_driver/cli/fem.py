@@ -18,8 +18,10 @@ from ..core.layout import Layout
 from ..core.symmetry import default_modes, find_structure
 from ..elastic.body import Body, strip_layout
 from ..elastic.fem import Response, calibration_from_fem, compute_response
-from ..plot.elastic import draw_convergence, draw_loads, draw_response
-from ..plot.plots import save
+from ..plot.deformation import draw_loads
+from ..plot.response import draw_convergence, draw_response
+from ..plot.style import save
+from ..research.paper import mode_deformations
 from ..terminal.output import make_folder, progress_bar, write_json
 from .layout import coefficient_counts, named_layout
 
@@ -78,7 +80,8 @@ def run_fem(options: Options) -> int:
         save(draw_convergence(result), options.figures / "convergence.png")
         save(draw_response(result), options.figures / "response.png")
         if layout.planar:
-            save(draw_loads(body, layout), options.figures / "loads.png")
+            loads = draw_loads(layout, mode_deformations(body, layout))
+            save(loads, options.figures / "loads.png")
         console.print(f"pictures in {options.figures}", highlight=False)
     if options.output is not None:
         _write_calibration(console, options, result)

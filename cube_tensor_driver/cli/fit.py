@@ -17,7 +17,8 @@ from ..config.load_table import read_loads, unloaded
 from ..core.errors import ConfigError
 from ..core.fit import Fit, fit, measured_stress
 from ..core.symmetry import find_structure
-from ..plot.plots import draw_fit, save
+from ..plot.calibration import draw_fit
+from ..plot.style import save
 from ..terminal.output import write_json
 from .layout import named_layout, shipped_calibration
 

@@ -18,7 +18,8 @@ from ..core.estimator import summary
 from ..core.layout import LAYOUTS, Layout, find_layout
 from ..core.response import response
 from ..core.symmetry import GENERATORS, find_structure
-from ..plot.plots import draw_layout, save
+from ..plot.calibration import draw_layout
+from ..plot.style import save
 from ..terminal.output import write_json
 
 

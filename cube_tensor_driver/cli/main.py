@@ -508,7 +508,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         check_outputs({"--json": getattr(options, "json", None), "--figure": figure})
         if figure is not None:
-            from ..plot.plots import check_picture
+            from ..plot.style import check_picture
 
             check_picture(figure)
         return int(options.run(options))

@@ -7,9 +7,10 @@ from pathlib import Path
 from rich.console import Console
 
 from ..elastic.fem import Progress
-from ..plot.elastic import draw_experiment, draw_figure_4, draw_rod_sweep
-from ..plot.plots import save
-from ..research.paper import Experiment, experiments, rod_sweep
+from ..plot.deformation import draw_figure_4
+from ..plot.experiments import draw_experiment, draw_rod_sweep
+from ..plot.style import save
+from ..research.paper import Experiment, experiments, figure_4, rod_sweep
 from ..terminal.output import make_folder, progress_bar, write_json
 
 _SHARES = {"linear": (0.01, 0.12), "finite": (0.12, 0.96), "rod": (0.96, 1.0)}
@@ -29,7 +30,7 @@ def run_paper(out: Path) -> int:
 
         report(0, 1, "Fig. 4")
         made = [out / "figure_4.png"]
-        save(draw_figure_4(), made[0])
+        save(draw_figure_4(figure_4()), made[0])
         numbers: dict[str, object] = {}
         for kind in ("linear", "finite"):
             for number, result in enumerate(

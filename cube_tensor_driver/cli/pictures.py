@@ -18,11 +18,13 @@ from visualization_msgs.msg import MarkerArray
 
 from ..config.package_data import package_data
 from ..core.errors import ConfigError, CubeError
-from ..plot.documentation import draw_field, draw_markers, draw_prototype, draw_study, tables_text
-from ..plot.plots import save
+from ..plot.experiments import draw_prototype
+from ..plot.field import draw_field, draw_field_study, field_tables
+from ..plot.markers import draw_markers
+from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
-from ..research.field_study import field_study
+from ..research.field_study import field_example, field_study
 from ..research.paper import experiments
 from ..ros.node import make_executor
 from ..trials.bench import bench_scale
@@ -56,16 +58,16 @@ def run_pictures(folder: Path) -> int:
     bench_scale(COUNTS, RATE, MEASURE_S, folder / "scale.json", folder / "scale.png")
     a, _, b, _, c, _ = experiments()
     save(draw_prototype([a, b, c]), folder / "prototype.png")
-    save(draw_field(), folder / "field.png")
+    save(draw_field(field_example()), folder / "field.png")
     study = field_study()
-    save(draw_study(study), folder / "field_error.png")
+    save(draw_field_study(study), folder / "field_error.png")
     table = {
         name: getattr(study, name).tolist()
         for name in ("pitches", "widths", "error", "position", "force")
     }
     (folder / "field.json").write_text(json.dumps(table) + "\n")
     print(
-        f"{tables_text(study)}\nwrote {', '.join(sorted(path.name for path in folder.iterdir()))} to {folder}"
+        f"{field_tables(study)}\nwrote {', '.join(sorted(path.name for path in folder.iterdir()))} to {folder}"
     )
     return 0
 

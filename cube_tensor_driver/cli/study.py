@@ -9,9 +9,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from ..plot.elastic import draw_trust
-from ..plot.plots import save
-from ..research.study import Study, study
+from ..plot.style import save
+from ..plot.trust import draw_trust
+from ..research.layout_study import LayoutStudy, layout_study
 from ..terminal.output import progress_bar, write_json
 
 
@@ -19,7 +19,7 @@ def run_study(json_path: Path | None, figure: Path) -> int:
     """Sweep indenters over cubes, show from which width on each layout is right, draw the
     errors."""
     with progress_bar() as report:
-        result = study(progress=report)
+        result = layout_study(progress=report)
     _show_study(result)
     save(draw_trust(result), figure)
     if json_path is not None:
@@ -27,7 +27,7 @@ def run_study(json_path: Path | None, figure: Path) -> int:
     return 0
 
 
-def _show_study(result: Study) -> None:
+def _show_study(result: LayoutStudy) -> None:
     rows = result.trusted()
     console = Console()
     console.print(

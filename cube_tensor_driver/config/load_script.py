@@ -14,15 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH, YOUNGS_MODULUS
 from ..core.errors import ConfigError
 from .schema import NAME, TRIPLE, Schema, list_of, mapping, real
 from .yaml import read_yaml
 
 Array = NDArray[np.float64]
-DEPTH_M = 4e-3
-"""From the cubes' centres to the surface of the skin, where a script or an option does not say."""
-YOUNG_PA = 0.3e6
-POISSON = 0.48
 MOST_TAPS = 1000
 SLIP_TOLERANCE = 1e-9
 
@@ -157,9 +154,9 @@ def read_script(path: Path) -> Script:
     period = data.get("period")
     script = Script(
         period=None if period is None else float(period),
-        depth=float(data.get("depth", DEPTH_M)),
-        young=float(data.get("young", YOUNG_PA)),
-        poisson=float(data.get("poisson", POISSON)),
+        depth=float(data.get("depth", SURFACE_DEPTH)),
+        young=float(data.get("young", YOUNGS_MODULUS)),
+        poisson=float(data.get("poisson", POISSONS_RATIO)),
         relative=data.get("places", "m") == "skin",
         indenters=tuple(_indenter(item) for item in data["indenters"]),
     )

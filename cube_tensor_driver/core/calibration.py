@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, HALF_SIDE, REST_FREQUENCY
 from .errors import CalibrationError, LayoutError, SymmetryError
 from .layout import LAYOUTS, Layout, find_layout
 from .modes import Modes
@@ -19,8 +20,6 @@ from .response import illustrative_coefficients, response
 from .symmetry import Structure, default_modes, find_structure
 
 SCHEMA = 1
-# Of the illustrative calibrations: 8 ppm is what counting the periods of 1 ms resolves.
-_FREQUENCY_NOISE, _REST_FREQUENCY, _BETA, _MODULUS, _HALF_SIDE = 8e-6, 100e3, 0.3, 0.3e6, 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,12 +249,12 @@ def illustrative(
         symmetry=symmetry,
         neglect=tuple(neglect),
         uid=uid,
-        half_side=_HALF_SIDE,
+        half_side=HALF_SIDE,
         coefficients=illustrative_coefficients(find_structure(layout, symmetry)),
-        rest_frequency=np.array(_REST_FREQUENCY),
-        beta=np.array(_BETA),
-        modulus=np.array(_MODULUS),
-        noise=np.array(_MODULUS * (1 + _BETA) * _FREQUENCY_NOISE),
+        rest_frequency=np.array(REST_FREQUENCY),
+        beta=np.array(BETA),
+        modulus=np.array(FOAM_MODULUS),
+        noise=np.array(FOAM_MODULUS * (1 + BETA) * FREQUENCY_NOISE),
         source="illustrative",
     )
 

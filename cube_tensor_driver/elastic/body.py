@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import itertools
-import resource
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import skfem
+from numpy.typing import NDArray
 
+from ..core.defaults import HALF_SIDE, POISSONS_RATIO, YOUNGS_MODULUS
 from ..core.errors import ElasticError
 from ..core.layout import Layout
 from .mesh import block, section
 
-_SPACE_MESHES = (
-    (0.5, 0.2, 3.0),
-    (0.25, 0.2, 2.0),
-    (0.25, 0.1, 1.5),
-)  # brick on a face, at an edge, growth
-_FINEST = 1e-3  # distance of two pad edges, d0
-_FIRST_BYTES = (
-    3e8  # of memory, whatever the mesh: SuperLU hangs where less of it can be had, measured
+Array = NDArray[np.float64]
+
+
+class BrickSizes(NamedTuple):
+    """Size of a brick on a face and at an edge of the cube, in d0, and growth away from it."""
+
+    face: float
+    edge: float
+    growth: float
+
+
+BRICK_SIZES = (
+    BrickSizes(0.5, 0.2, 3.0),
+    BrickSizes(0.25, 0.2, 2.0),
+    BrickSizes(0.25, 0.1, 1.5),
 )
-_BYTES = {2: 3e5, 3: 8e5}  # of memory per corner of an element at the peak, measured
+"""Of the meshes in space, coarse to fine."""
+_CLOSEST_EDGES = 1e-3
+"""Smallest distance of two pad edges, d0."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +42,8 @@ class Body:
     """A box of elastomer with a cube bonded in its middle; lengths in m, moduli in Pa.
 
     width, depth, height: along x, y and z (depth in 3-D only); side: of the cube
-    young, poisson: of the body; cube_young, cube_poisson: of the cube, cube_young = inf makes it
-    rigid
+    young, poisson: of the body
+    cube_young, cube_poisson: of the cube; cube_young = inf makes it rigid
     plane: "strain" or "stress", for layouts in a plane
     Raises ElasticError when no such body can be computed.
     """
@@ -40,9 +51,9 @@ class Body:
     width: float = 60e-3
     depth: float = 60e-3
     height: float = 11e-3
-    side: float = 4e-3
-    young: float = 0.3e6
-    poisson: float = 0.48
+    side: float = 2 * HALF_SIDE
+    young: float = YOUNGS_MODULUS
+    poisson: float = POISSONS_RATIO
     cube_young: float = 200e9
     cube_poisson: float = 0.30
     plane: str = "strain"
@@ -56,109 +67,89 @@ class Body:
             value = getattr(self, name)
             if not 0 <= value < 0.5:
                 raise ElasticError(
-                    f"{name} is {value}; it must lie in [0, 0.5). For rubber take 0.48 to 0.4999: the "
-                    "elements do not lock, but at 0.5 pressure is no longer a function of strain"
+                    f"{name} is {value}; it must lie in [0, 0.5). For rubber take 0.48 to 0.4999: "
+                    "the elements do not lock, but at 0.5 pressure is no longer a function of "
+                    "strain"
                 )
         for name in ("width", "depth", "height"):
             if not getattr(self, name) > 1.1 * self.side:
                 raise ElasticError(
                     f"the cube's side is {self.side * 1e3:g} mm but the body's {name} is "
-                    f"{getattr(self, name) * 1e3:g} mm; the body must be at least 1.1 times as large"
+                    f"{getattr(self, name) * 1e3:g} mm; the body must be at least 1.1 times as "
+                    "large"
                 )
         if self.plane not in ("strain", "stress"):
             raise ElasticError(f"plane is {self.plane!r}; it must be 'strain' or 'stress'")
 
 
 def strip_layout(layout: Layout, width: float, centre: float = 0.5) -> Layout:
-    """The same layout with pads of another width and distance from the middle of the face, in units
-    of d0.
+    """The same layout with pads of another width and distance from the middle of their face, in d0.
 
-    The halves of each face are width = 1, centre = 0.5. Raises LayoutError when a pad leaves its
+    width = 1, centre = 0.5 are the halves of each face. Raises LayoutError when a pad leaves its
     face.
     """
     normals = layout.normals
     across = layout.positions - normals
     length = np.linalg.norm(across, axis=1, keepdims=True)
-    return Layout(
-        layout.name, normals + centre * across / np.where(length > 0, length, 1.0), normals, width
-    )
+    directions = across / np.where(length > 0, length, 1.0)
+    return Layout(layout.name, normals + centre * directions, normals, width)
 
 
 def field_axes(layout: Layout) -> tuple[int, ...]:
+    """The axes of a layout's problem: x and z in a plane, all in space."""
     return (0, 2) if layout.planar else (0, 1, 2)
 
 
 def check_pads(body: Body, layout: Layout) -> None:
-    """Pads of one face must not share area: square ones overlap when both distances are below their
-    side."""
+    """Raise ElasticError when pads of one face share area.
+
+    Square pads overlap when they are less than their side apart along both axes.
+    """
     mm = 1e3 * body.side / 2
+    size = layout.pad_size
     for i, j in itertools.combinations(range(layout.n_pads), 2):
         gap = np.abs(layout.positions[i] - layout.positions[j]).max()
-        if np.array_equal(layout.normals[i], layout.normals[j]) and gap < layout.pad_size * (
-            1 - 1e-9
-        ):
+        same_face = np.array_equal(layout.normals[i], layout.normals[j])
+        if same_face and gap < size * (1 - 1e-9):
             raise ElasticError(
-                f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {mm * layout.pad_size:g} mm wide, "
+                f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {mm * size:g} mm wide, "
                 f"{mm * gap:g} mm apart; make them narrower or move them apart"
             )
 
 
 def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
-    """Mesh of the body: level 0 is the coarsest, 2 the finest. ElasticError when the pads are too
-    fine for it."""
-    axes = field_axes(layout)
-    half = [(body.width, body.depth, body.height)[k] / body.side for k in axes]
-    edges = [
-        abs(float(x[k]) + s)
-        for x, n in zip(layout.positions, layout.normals, strict=True)
-        for k in axes
-        for s in (-layout.pad_size / 2, layout.pad_size / 2)
-        if n[k] == 0
-    ]
-    stops = np.unique(np.round(edges, 9))
+    """Mesh of the body's positive part, lengths in d0; level 0 is the coarsest, 2 the finest.
+
+    Raises ElasticError when the edges of pads are too close to each other for it.
+    """
+    half = [(body.width, body.depth, body.height)[k] / body.side for k in field_axes(layout)]
+    stops = _pad_edges(layout)
     steps = np.diff(np.unique([0.0, *stops[stops < 1], 1.0]))
-    if steps.min() < _FINEST:
+    if steps.min() < _CLOSEST_EDGES:
         mm = 1e3 * body.side / 2
         raise ElasticError(
-            f"pad edges are {mm * steps.min():.2g} mm apart and the mesh resolves {mm * _FINEST:g} mm; "
-            "make the pads wider, or move their edges together or apart"
+            f"pad edges are {mm * steps.min():.2g} mm apart and the mesh resolves "
+            f"{mm * _CLOSEST_EDGES:g} mm; make the pads wider, or move their edges together or "
+            "apart"
         )
-    return (
-        section(half, stops, level) if layout.planar else block(half, stops, *_SPACE_MESHES[level])
-    )
+    return _mesh(half, stops, level, layout.planar)
 
 
-def check_memory(grid: skfem.Mesh, per_corner: float | None = None) -> None:
-    """ElasticError, before any work: too little memory. per_corner: bytes, by default of the
-    response's solver.
-
-    SuperLU must not run into a limit: it may look for memory for ever.
-    """
-    need, have = (
-        _FIRST_BYTES + grid.nvertices * (per_corner or _BYTES[int(grid.dim())]),
-        available_memory(),
-    )
-    if have is not None and need > have:
-        raise ElasticError(
-            f"this needs about {need / 1e9:.2g} GB of memory and {max(have, 0.0) / 1e9:.2g} GB are available; "
-            "ask for fewer meshes or wider pads, or give it more"
-        )
+def _mesh(half: Sequence[float], stops: Array, level: int, planar: bool) -> skfem.Mesh:
+    if planar:
+        return section(half, stops, level)
+    sizes = BRICK_SIZES[level]
+    return block(half, stops, sizes.face, sizes.edge, sizes.growth)
 
 
-def available_memory() -> float | None:
-    """Bytes that this process may still take: of the machine, and of its own limit. None: nothing
-    is known."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        free = next(
-            1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable")
-        )
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit == resource.RLIM_INFINITY:
-            return free
-        taken = resource.getpagesize() * int(
-            Path("/proc/self/statm").read_text(encoding="ascii").split()[0]
-        )
-        return min(free, float(limit - taken))
-    except (OSError, StopIteration):
-        return None  # not Linux: nothing is known, so nothing is refused
+def _pad_edges(layout: Layout) -> Array:
+    """Distances of pad edges from the middle of their faces, d0, sorted."""
+    half = layout.pad_size / 2
+    edges = [
+        abs(float(position[k]) + s)
+        for position, normal in zip(layout.positions, layout.normals, strict=True)
+        for k in field_axes(layout)
+        for s in (-half, half)
+        if normal[k] == 0
+    ]
+    return np.unique(np.round(edges, 9))

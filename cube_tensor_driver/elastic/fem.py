@@ -22,7 +22,8 @@ from ..core.estimator import LEAK_TOLERANCE, RANK_TOLERANCE
 from ..core.layout import Layout
 from ..core.response import project
 from ..core.symmetry import default_modes, find_structure
-from .body import Body, check_memory, check_pads, field_axes, make_mesh
+from .body import Body, check_pads, field_axes, make_mesh
+from .memory import check_memory
 from .solid import Parity, Solid, lame
 
 Array = NDArray[np.float64]

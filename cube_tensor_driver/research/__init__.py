@@ -1,4 +1,5 @@
-"""Experiments on a virtual bench: the source paper's figures, and where each layout can be trusted.
+"""Experiments in the computer: the source paper's, and where each layout and field can be trusted.
 
-The driver needs nothing of it.
+A virtual bench with plates and rods, and studies on top of `elastic`. The driver needs nothing of
+it; its pictures are in `plot`, its commands in `cli`.
 """

@@ -1,13 +1,16 @@
 """Newton's method for displacements u (dofs,) at which forces balance, some of them prescribed.
 
-Each step lowers the energy (by Armijo's rule) or the forces out of balance. A row may hold one
-product of the unknowns, row @ u = 0: its force is a multiple of the row. Source: J. Nocedal, S. J.
-Wright, Numerical Optimization (2006), 3.1 and 18.1.
+Each step lowers the energy (by Armijo's rule) or the forces out of balance. One linear combination
+of the unknowns may be held at zero, row @ u = 0: the force that holds it is a multiple of the row.
+
+Source: J. Nocedal, S. J. Wright, Numerical Optimization (2006), 3.1 and 18.1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,63 +18,79 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
 Array = NDArray[np.float64]
-State = tuple[Array, float]  # forces out of balance (dofs,), energy
 
-_TOLERANCE = 1e-9  # of the correction over the largest displacement
+_TOLERANCE = 1e-9
+"""Of the correction, over the largest displacement."""
 _ITERATIONS = 30
-_LONGEST = 0.3  # correction of any unknown at once
+_LONGEST = 0.3
+"""Largest correction of any unknown in one step."""
 _SHORTENINGS = 7
+_ARMIJO = 1e-4
+
+
+class Balance(NamedTuple):
+    """Forces out of balance (dofs,) and energy at some displacements."""
+
+    force: Array
+    energy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Constraints:
+    """What the unknowns must fulfil.
+
+    prescribed: (dofs,) values, NaN where free
+    row: (dofs,) weights with row @ u = 0, or None
+    """
+
+    prescribed: Array
+    row: Array | None = None
 
 
 def find_balance(
     u: Array,
-    prescribed: Array,
-    row: Array | None,
-    balance: Callable[[Array], State | None],
+    constraints: Constraints,
+    balance: Callable[[Array], Balance | None],
     tangents: Callable[[Array], Iterable[sp.csr_matrix]],
     linear: bool = False,
 ) -> Array | None:
-    """u (dofs,) in balance from the guess u; None where the method does not get there.
+    """u (dofs,) in balance from the guess u; None where the method does not converge.
 
-    prescribed: (dofs,), NaN where free; row: (dofs,) or None
-    balance: None where u is not possible; tangents: the derivative of the forces, then what may be
-    taken in its place where it leads nowhere; linear: the first step is the last
+    balance: gives None where u is not possible
+    tangents: the derivative of the forces, then what to try where that one gives no descent
+    linear: one step is enough
     """
-    free, jump = (
-        np.flatnonzero(np.isnan(prescribed)),
-        np.where(np.isnan(prescribed), 0.0, prescribed - u),
-    )
-    held = None if row is None else row[free]
+    fixed = ~np.isnan(constraints.prescribed)
+    free = np.flatnonzero(~fixed)
+    jump = np.where(fixed, constraints.prescribed - u, 0.0)
+    held = None if constraints.row is None else constraints.row[free]
     state = balance(u)
     for _ in range(_ITERATIONS):
         if state is None:
             return None
         tried = None
         for matrix in tangents(u):
-            right = -(state[0] + matrix @ jump)[free]
+            right = -(state.force + matrix @ jump)[free]
+            product = 0.0 if constraints.row is None else -float(constraints.row @ u)
             change = jump.copy()
-            change[free] = _correction(
-                matrix[free][:, free], right, held, 0.0 if row is None else -float(row @ u)
-            )
+            change[free] = _correction(matrix[free][:, free], right, held, product)
             if linear or np.abs(change).max() < _TOLERANCE * np.abs(u).max():
                 return np.asarray(u + change)
-            # prescribed displacements are taken over whole
-            whole = jump.any()
-            tried = (
-                (u + change, balance(u + change))
-                if whole
-                else _search(u, change, state, balance, free, held)
-            )
+            if jump.any():  # prescribed displacements are not shortened
+                tried = u + change, balance(u + change)
+            else:
+                tried = _search(u, change, state, balance, free, held)
             if tried is not None:
                 break
         if tried is None:
             return None
-        (u, state), jump = tried, np.zeros_like(u)
+        u, state = tried
+        jump = np.zeros_like(u)
     return None
 
 
 def factors(matrix: sp.spmatrix) -> SuperLU:
-    """Of a nearly symmetric matrix: half the time of free pivoting."""
+    """LU factors of a nearly symmetric matrix, in half the time of free pivoting."""
     return splu(
         matrix.tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -81,37 +100,38 @@ def factors(matrix: sp.spmatrix) -> SuperLU:
 
 
 def _correction(matrix: sp.csr_matrix, right: Array, held: Array | None, product: float) -> Array:
-    """x with matrix @ x = right, or with a force along `held` besides, and held @ x = product."""
+    """x with matrix @ x = right. With `held`: plus a force along it, so that held @ x = product."""
     if held is None:
         return np.asarray(factors(matrix).solve(right))
     border = sp.csr_matrix(held)
-    whole = sp.bmat([[matrix, border.T], [border, None]])
-    return np.asarray(factors(whole).solve(np.append(right, product))[:-1])
+    bordered = sp.bmat([[matrix, border.T], [border, None]])
+    return np.asarray(factors(bordered).solve(np.append(right, product))[:-1])
 
 
 def _search(
     u: Array,
     change: Array,
-    state: State,
-    balance: Callable[[Array], State | None],
+    state: Balance,
+    balance: Callable[[Array], Balance | None],
     free: NDArray[np.int64],
     held: Array | None,
-) -> tuple[Array, State] | None:
-    """As much of a change of u as lowers the energy or the forces out of balance."""
-    force, energy = state
-    slope, size = float(force @ change), min(1.0, _LONGEST / np.abs(change).max())
+) -> tuple[Array, Balance] | None:
+    """As much of a change of u as lowers the energy or the forces out of balance; None: nothing."""
+    slope = float(state.force @ change)
+    left = _unbalanced(state.force[free], held)
+    size = min(1.0, _LONGEST / np.abs(change).max())
     for _ in range(_SHORTENINGS):
         there = balance(u + size * change)
-        if there is not None and (
-            _left(there[0][free], held) < _left(force[free], held)
-            or (slope < 0 and there[1] <= energy + 1e-4 * size * slope)
-        ):
-            return u + size * change, there
+        if there is not None:
+            lower_force = _unbalanced(there.force[free], held) < left
+            lower_energy = slope < 0 and there.energy <= state.energy + _ARMIJO * size * slope
+            if lower_force or lower_energy:
+                return u + size * change, there
         size /= 2
     return None
 
 
-def _left(force: Array, held: Array | None) -> float:
+def _unbalanced(force: Array, held: Array | None) -> float:
     """Size of the forces that nothing holds."""
     if held is not None:
         force = force - held * (held @ force) / (held @ held)

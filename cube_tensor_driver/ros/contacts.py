@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cube_tensor_driver.msg import SkinContacts
 
+from ..core.defaults import CONTACT_PRESSURE, SURFACE_DEPTH
 from ..elastic.surface import Contact, Surface
 from .node import run
 from .skin_subscriber import SkinSubscriberNode
@@ -19,10 +20,13 @@ class Contacts(SkinSubscriberNode):
     def __init__(self) -> None:
         super().__init__("contacts", SkinContacts, 10)
         self.declare(
-            "depth", 0.004, "From the cubes' centres to the skin's surface, m.", (1e-5, 1.0)
+            "depth", SURFACE_DEPTH, "From the cubes' centres to the skin's surface, m.", (1e-5, 1.0)
         )
         self.declare(
-            "least", 300.0, "Pressure at the cubes that counts as contact, Pa.", (0.0, 1e9)
+            "least",
+            CONTACT_PRESSURE,
+            "Pressure at the cubes that counts as contact, Pa.",
+            (0.0, 1e9),
         )
 
     def new_skin(self) -> None:

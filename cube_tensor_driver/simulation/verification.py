@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..config.skin import Skin
+from ..core.defaults import CONTACT_PRESSURE
 from ..core.errors import MessageError
 from ..core.modes import COMPONENTS
 from ..core.rows import StressRows
@@ -21,8 +22,6 @@ TIMES_CHECKED = 500
 """Instants at most whose tensors are compared with the load: each costs a contact problem."""
 RANGE_TIMES = 100
 """Times of a script at which the range of what it applies is taken."""
-LEAST = 300.0
-"""Pressure at the cubes that counts as contact, Pa."""
 
 
 class Forces(NamedTuple):
@@ -225,7 +224,7 @@ class Judge:
             rows = np.flatnonzero(true_ns == time_ns)
             of_cubes = np.full((len(self._skin.cubes), len(COMPONENTS)), np.nan)
             of_cubes[cube[rows]] = values[rows]
-            contacts = surface.contacts(of_cubes, LEAST)
+            contacts = surface.contacts(of_cubes, CONTACT_PRESSURE)
             weight = np.array([contact.normal_force for contact in contacts])
             places = np.reshape([contact.position for contact in contacts], (-1, 3))
             centre = weight @ places / weight.sum() if contacts else np.full(3, np.nan)

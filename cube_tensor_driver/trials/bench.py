@@ -29,7 +29,8 @@ from ..core.calibration import illustrative
 from ..core.errors import CubeError
 from ..core.oscillator import pad_frequency
 from ..core.pipeline import Pipeline
-from ..plot.plots import draw_scale, save
+from ..plot.scale import draw_scale
+from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import make_executor, queue

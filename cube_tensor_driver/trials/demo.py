@@ -29,7 +29,8 @@ from ..config.package_data import package_data
 from ..config.skin import Skin, read_skin
 from ..config.yaml import write_yaml
 from ..core.errors import ConfigError, CubeError, MessageError
-from ..plot.plots import draw_forces, save
+from ..plot.skin_force import draw_forces
+from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import make_executor, queue
@@ -241,7 +242,15 @@ def _run(
     if options.figure is not None:
         forces = judge.forces()
         result |= forces.figures()
-        save(draw_forces(forces, load.places.position), options.figure)
+        picture = draw_forces(
+            seconds=forces.seconds,
+            force=forces.force,
+            measured_force=forces.found_force,
+            centre=forces.centre,
+            measured_centre=forces.found_centre,
+            cubes=load.places.position,
+        )
+        save(picture, options.figure)
     _report(result, options)
     return 0
 

@@ -1,0 +1,59 @@
+"""The picture of `./cube study`: where each layout can be trusted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..core.modes import COMPONENTS, STRESS
+from ..research.layout_study import TRUSTED_ERROR, LayoutStudy
+from .style import curve_style, print_style
+
+_DIRECTION_DASHES = ("--", "-.", ":")
+_DIRECTION_COLOURS = ("0.0", "0.35", "tab:cyan")
+
+
+@print_style()
+def draw_trust(result: LayoutStudy) -> Figure:
+    """Error over indenter width, one panel per layout and cube side; too large where it is grey.
+
+    Full lines are stresses. Dashed lines are gradients: the marker tells the component, the colour
+    the direction.
+    """
+    names = list(result.error)
+    rows, columns = len(result.sides), len(names)
+    figure = Figure(figsize=(4 * columns, 3 * rows))
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for row, side in enumerate(result.sides):
+        for axis, name in zip(axes[row], names, strict=True):
+            _draw_errors(axis, 1e3 * result.widths, result.error[name][row])
+            axis.set_title(f"{name}, side {1e3 * side:g} mm")
+    handles, labels = axes[0][-1].get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=1, loc="outside right center", handlelength=4)
+    figure.supxlabel(f"width of the indenter, mm (cube's centre {1e3 * result.depth:g} mm deep)")
+    figure.supylabel("largest error over all positions / range of the component")
+    return figure
+
+
+def _draw_errors(axis: Any, widths: np.ndarray, errors: np.ndarray) -> None:
+    """One panel: errors (W, C) over widths (W,) in mm."""
+    axis.axhspan(TRUSTED_ERROR, 100, color="0.92")
+    for number, component in enumerate(COMPONENTS):
+        observed = not np.isnan(errors[0, number])
+        if observed:
+            style = _component_style(number)
+            axis.loglog(widths, errors[:, number], label=component, **style)
+    axis.set_ylim(5e-3, 20)
+
+
+def _component_style(number: int) -> dict[str, Any]:
+    """Style of a component: six stresses, then the gradients xx_x, xx_y, xx_z, yy_x, ..."""
+    if number < len(STRESS):
+        return curve_style(number) | {"linestyle": "-"}
+    component, direction = divmod(number - len(STRESS), 3)
+    return curve_style(component) | {
+        "linestyle": _DIRECTION_DASHES[direction],
+        "color": _DIRECTION_COLOURS[direction],
+    }
