@@ -223,7 +223,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     assert "\n" not in markers["legend"].text and markers["legend"].text.isascii()
 
     figure = draw_markers(pictures[-1])
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     drawn = sum(len(collection.get_paths()) for collection in figure.axes[0].collections)
     assert drawn >= 6 * n  # as ./cube pictures shows it: the faces of every cube, at least
     assert "kPa" in figure.axes[0].texts[0].get_text()

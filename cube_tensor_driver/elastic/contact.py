@@ -116,7 +116,8 @@ def _check(points: Array, sources: Array, forces: Array, poisson: float) -> None
         raise ElasticError(f"Poisson's ratio is {poisson}; it must lie in (-1, 0.5]")
     if np.any(points[..., 2] > 0.0):
         raise ElasticError(
-            f"a point is at z = {points[..., 2].max():g} m; the skin is z <= 0, depths are negative z"
+            f"a point is at z = {points[..., 2].max():g} m; the skin is z <= 0, depths are "
+            "negative z"
         )
     if np.any(sources[..., 2] != 0.0):
         raise ElasticError("a force acts off the surface; sources must have z = 0")

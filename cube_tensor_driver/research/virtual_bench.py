@@ -225,8 +225,9 @@ class VirtualBench:
         if u is not None:
             return _Position(u, task.rod)
         if halvings == STEP_HALVINGS:
+            parts = 2**STEP_HALVINGS
             raise ElasticError(
-                f"step {number} of the load is too large even in {2**STEP_HALVINGS} parts; press less"
+                f"step {number} of the load is too large even in {parts} parts; press less"
             )
         half = self._half_task(start, task)
         guess = (start.u + guess) / 2
