@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import itertools
+import os
 import signal
 import socket
 import subprocess
@@ -16,11 +17,25 @@ from pathlib import Path
 import pytest
 
 # A shell that starts us in the background has SIGINT ignored, in all that we start too.
+# On every processor there is a worker, or a node: threads of a matrix product only get in the way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parents[1]
 # Domains up to 101 leave the ports of the system alone.
 _domains = itertools.cycle(range(1, 101))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """The whole suite runs on all processors, part of it in this process; -n says otherwise."""
+    options, is_worker = config.option, hasattr(config, "workerinput")
+    if is_worker or not config.pluginmanager.hasplugin("xdist") or options.usepdb:
+        return
+    whole = all(Path(argument).is_dir() for argument in config.args)
+    if whole and options.numprocesses is None:
+        options.numprocesses = len(os.sched_getaffinity(0))
+        options.dist = "loadgroup"
 
 
 @pytest.fixture

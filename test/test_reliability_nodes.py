@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from fnmatch import fnmatch
 from pathlib import Path
 from xml.etree import ElementTree
@@ -269,15 +270,18 @@ def test_the_security_policy_allows_what_the_nodes_do(stage):
             (what,) = part.attrib
             names = [item.text.replace("~", f"/{name}") for item in part]
             allowed = {each if each.startswith("/") else f"/{each}" for each in names}
-            there = [each for each, _ in found[what](name, "/")]
-            assert [
-                one for one in there if not any(fnmatch(one, each) for each in allowed)
-            ] == [], (name, what)
-            idle = {each for each in allowed if not any(fnmatch(one, each) for one in there)}
-            assert idle <= {"/clock", "/cubes/*"}, (
-                name,
-                what,
-            )  # with use_sim_time; when somebody listens
+
+            def there(name: str = name, what: str = what) -> list[str]:
+                return [each for each, _ in found[what](name, "/")]
+
+            def idle(there: Callable = there, allowed: set = allowed) -> set[str]:
+                return {each for each in allowed if not any(fnmatch(one, each) for one in there())}
+
+            # Discovery tells of a node before it tells of its last topic. The clock is there with
+            # use_sim_time, topics of cubes when somebody listens.
+            stage.wait(lambda idle=idle: idle() <= {"/clock", "/cubes/*"})
+            more = [one for one in there() if not any(fnmatch(one, each) for each in allowed)]
+            assert more == [], (name, what)
     stage.children.check()
 
 
