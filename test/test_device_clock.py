@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cube_tensor_driver.device.clock import WINDOW, ClockMap
-from cube_tensor_driver.device.sequence import SequenceTracker, Verdict
+from cube_tensor_driver.device.sequence import Arrival, SequenceTracker
 
 BASE_S = 0.3e-3  # delay that every sample has; stamps are late by it, and compared with it
 EPOCH_NS = 1_700_000_000 * 10**9
@@ -157,9 +157,9 @@ def test_device_time_of_64_bits() -> None:
     assert stamps == [EPOCH_NS - 20_000_000, EPOCH_NS - 10_000_000, EPOCH_NS]
 
 
-# (sequence, device time in ms) -> verdict; then delivered, missing, duplicate, out of order,
+# (sequence, device time in ms) -> arrival; then delivered, missing, duplicate, out of order,
 # resets.
-N, L, D, R = Verdict.NEW, Verdict.LATE, Verdict.DUPLICATE, Verdict.RESET
+N, L, D, R = Arrival.NEW, Arrival.LATE, Arrival.DUPLICATE, Arrival.RESET
 TOP = 2**32 - 1
 SEQUENCES = {
     "in order": ([(5, 50), (6, 60), (7, 70)], [N, N, N], (3, 0, 0, 0, 0)),
@@ -195,9 +195,9 @@ SEQUENCES = {
 
 @pytest.mark.parametrize("name", list(SEQUENCES))
 def test_sequence(name: str) -> None:
-    samples, verdicts, counts = SEQUENCES[name]
+    samples, arrivals, counts = SEQUENCES[name]
     tracker = SequenceTracker()
-    assert [tracker.update(number, 1000 * ms) for number, ms in samples] == verdicts
+    assert [tracker.update(number, 1000 * ms) for number, ms in samples] == arrivals
     c = tracker.counters
     assert (c.delivered, c.missing, c.duplicate, c.out_of_order, c.resets) == counts
 

@@ -36,7 +36,7 @@ from cube_tensor_driver.device.protocol import (
     Stats,
     encode,
 )
-from cube_tensor_driver.device.reader import GATHER, Arrivals, Reader
+from cube_tensor_driver.device.reader import LinkBytes, LinkFrames, Reader
 
 WAIT_S = 5.0  # ends a failing test; nothing is measured with it
 BACK_S = 2.0  # limit of the issue: a link is back so soon after its port
@@ -98,12 +98,12 @@ class PtyHub(FakeHub):
         tty.setraw(self.slave)
         self.port = os.ttyname(self.slave)
         self._path = path
-        super().__init__(lambda data: os.write(self.master, data), self._take, self.master)
+        super().__init__(lambda data: os.write(self.master, data), self._receive_bytes, self.master)
         if path is not None:
             path.symlink_to(self.port)
             self.port = str(path)
 
-    def _take(self) -> bytes:
+    def _receive_bytes(self) -> bytes:
         return os.read(self.master, 4096)
 
     def unplug(self) -> None:
@@ -125,9 +125,9 @@ class Watch:
         self.states: queue.Queue[tuple[int, LinkState, LinkError | None, float]] = queue.Queue()
         self.reader = Reader(configs, self._on_frames, self._on_state, **options)  # type: ignore[arg-type]
 
-    def _on_frames(self, batch: Arrivals) -> None:
+    def _on_frames(self, received: list[LinkFrames]) -> None:
         self.batches.append(
-            [(link, arrival_ns, frame) for link, arrival_ns, frames in batch for frame in frames]
+            [(link, arrival_ns, frame) for link, arrival_ns, frames in received for frame in frames]
         )
         for item in self.batches[-1]:
             self.frames.put(item)
@@ -216,22 +216,37 @@ def test_one_callback_for_all_that_is_there(start: Start, hub: PtyHub) -> None:
     )
 
 
-def test_who_comes_first_waits_for_those_that_deliver() -> None:
-    reader = Reader(
-        [LinkConfig(name, "/dev/none") for name in "abc"], print, print, period_us=10_000
-    )
-    for link, session in zip(reader.links, reader._sessions, strict=True):
-        link.state, session.greeted = LinkState.OPEN, True
-    whole, part = b"\0\x01\0", b"\0\x01"
-    assert (
-        reader._gathering([(0, 0, whole), (1, 0, part)]) == GATHER[1]
-    )  # a fifth of 10 ms would be longer
-    reader._sessions[1].actual_us = 2_000
-    assert reader._gathering([(0, 0, whole)]) == pytest.approx(GATHER[0] * 2e-3)
-    assert reader._gathering([(0, 0, part)]) == 0  # nothing to hold back
-    assert reader._gathering([(i, 0, whole) for i in range(3)]) == 0
-    reader._sessions[2].started = reader._sessions[1].greeted = False
-    assert reader._gathering([(0, 0, whole), (0, 0, whole)]) == 0
+@pytest.mark.parametrize("period_us", [1_000, 10_000_000])
+def test_who_comes_first_waits_for_those_that_deliver(
+    start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch, period_us: int
+) -> None:
+    """At most for a part of the sample period: 0.2 ms of the short one, two seconds of the long
+    one."""
+    monkeypatch.setattr(reader_module, "GATHER_S", 5.0)
+    later = PtyHub()
+    watch = start(LinkConfig("a", hub.port), LinkConfig("b", later.port))
+    hub.greet(period_us=period_us)
+    later.greet(period_us=period_us)
+    watch.frame(Hello, link=1)
+    for k in range(10):
+        hub.sample(k)
+        time.sleep(0.02)
+        later.sample(k)
+        watch.frame(Sample, link=1)
+    together = [
+        {link for link, _, frame in batch if isinstance(frame, Sample)} for batch in watch.batches
+    ].count({0, 1})
+    if period_us == 1_000:
+        assert together <= 2  # the scheduler may have held up the reader
+    else:
+        assert together >= 8  # the reader may have been awake already
+        watch.reader.send(1, Request(Command.STOP))
+        later.expect(Command.STOP)
+        sent = time.monotonic()
+        hub.sample(10)
+        assert watch.frame(Sample, link=0).sequence == 10
+        assert time.monotonic() - sent < 1.0, "a stopped link is not waited for"
+    later.unplug()
 
 
 def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
@@ -244,10 +259,9 @@ def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     selector = selectors.DefaultSelector()
     selector.register(link, selectors.EVENT_READ, 0)
     lost, data = LinkError("gone", "lost"), encode(make_sample(1))
-    batch, failed = reader._decode(
-        selector, [(0, 5, data), (0, 6, lost), (0, 7, lost), (0, 8, data)]
-    )
-    assert [(at, [frame.sequence for frame in frames]) for _, at, frames in batch] == [(5, [1])]
+    reads = [(5, data), (6, lost), (7, lost), (8, data)]
+    received, failed = reader._decode(selector, [LinkBytes(0, at, read) for at, read in reads])
+    assert [(at, [frame.sequence for frame in frames]) for _, at, frames in received] == [(5, [1])]
     assert failed == {0: lost}
     # Closed after the frames are delivered: a link that delivers is waited for.
     assert link.is_open
@@ -600,8 +614,8 @@ def test_close_in_the_middle_of_a_reconnect(start: Start, port: str, deaf: str) 
 def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, caplog) -> None:
     seen: queue.Queue[int] = queue.Queue()
 
-    def on_frames(batch: Arrivals) -> None:
-        for frame in (frame for _, _, frames in batch for frame in frames):
+    def on_frames(received: list[LinkFrames]) -> None:
+        for frame in (frame for _, _, frames in received for frame in frames):
             if isinstance(frame, Sample):
                 seen.put(frame.sequence)
                 raise RuntimeError("bug of the caller")

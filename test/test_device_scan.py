@@ -3,14 +3,15 @@ complete."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from cube_tensor_driver.device.chain import LiveLinks, RowCounts
+from cube_tensor_driver.device.cube_table import CubeAddress
+from cube_tensor_driver.device.link import LinkConfig
 from cube_tensor_driver.device.protocol import Hello, Sample
-from cube_tensor_driver.device.scan import CubeAddress, Scan
-from cube_tensor_driver.device.sequence import Account
+from cube_tensor_driver.device.reader import LinkFrames
+from cube_tensor_driver.device.scan import ScanBuilder
 
 
 def hello(uids, n_pads=2):
@@ -28,7 +29,7 @@ def sample(sequence, hertz, first=0, fault=0, celsius=-32768):
 def two_links():
     # cube 0 on link 1 index 0; cube 1 on link 0 index 1; cube 2 by uid 77 anywhere; cube 3 on link
     # 1 index 1
-    scan = Scan(
+    scan = ScanBuilder(
         2,
         [
             CubeAddress("a", 1, 0, None, 2),
@@ -37,53 +38,53 @@ def two_links():
             CubeAddress("d", 1, 1, None, 2),
         ],
     )
-    assert scan.hello(0, hello([77, 5])) == []
-    assert scan.hello(1, hello([6, 7])) == []
+    assert scan.cubes.learn(0, hello([77, 5])) == []
+    assert scan.cubes.learn(1, hello([6, 7])) == []
     return scan
 
 
 def test_rows_carry_the_cubes_of_the_skin():
     scan = two_links()
     scan.add(0, [sample(10, [[1.0, 2.0], [3.0, 4.0]], celsius=2150)], [1000])
-    assert scan.complete()  # link 1 has never delivered: nobody waits for it
+    assert scan.is_complete()  # link 1 has never delivered: nobody waits for it
     scan.add(1, [sample(20, [[5.0, 6.0], [7.0, 8.0]], fault=2)], [3000])
-    rows = scan.take()
+    rows = scan.build()
     assert rows.cube.tolist() == [2, 1, 0, 3]
     assert rows.sequence.tolist() == [10, 10, 20, 20]
     assert rows.stamp_ns.tolist() == [1000, 1000, 3000, 3000]
     assert rows.frequency.tolist() == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]]
     assert rows.pad_fault.tolist() == [0, 0, 2, 2]
     np.testing.assert_allclose(rows.temperature, [21.5, 21.5, np.nan, np.nan], rtol=1e-6)  # float32
-    assert scan.rows == 4
-    assert scan.take() is None
+    assert scan.rows_built == 4
+    assert scan.build() is None
 
 
 def test_a_scan_waits_for_live_links_but_not_twice():
     scan = two_links()
     for link in (0, 1):
         scan.add(link, [sample(0, [[1.0, 1.0]])], [0])
-    scan.take()
+    scan.build()
     scan.add(0, [sample(1, [[1.0, 1.0]])], [1])
-    assert not scan.complete()
+    assert not scan.is_complete()
     scan.add(0, [sample(2, [[1.0, 1.0]])], [2])
-    assert scan.complete()
-    scan.take()
+    assert scan.is_complete()
+    scan.build()
     scan.add(0, [sample(3, [[1.0, 1.0]])], [3])
-    scan.live(1, False)
-    assert scan.complete()
+    scan.set_live(1, False)
+    assert scan.is_complete()
 
 
 def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
     scan = two_links()
 
-    def give(link, turn):
-        scan.add(link, [sample(turn, [[1.0, 1.0]] * 2)], [1000 * (turn + 1) + link])
+    def give(link, number):
+        scan.add(link, [sample(number, [[1.0, 1.0]] * 2)], [1000 * (number + 1) + link])
 
     def taken():
-        rows = scan.take() if scan.complete() else None
+        rows = scan.build() if scan.is_complete() else None
         return None if rows is None else rows.sequence.tolist()
 
-    for link, turn, expected in (
+    for link, number, expected in (
         (0, 0, [0, 0]),
         (1, 0, [0, 0]),  # each begins for itself
         (0, 1, None),
@@ -91,8 +92,8 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
         (1, 2, None),
         (0, 2, [2, 2, 2, 2]),
     ):
-        give(link, turn)
-        assert taken() == expected, (link, turn)
+        give(link, number)
+        assert taken() == expected, (link, number)
     scan = two_links()
     for link in (0, 1):
         give(link, 0)
@@ -117,140 +118,150 @@ def test_a_sample_in_two_frames_goes_on_at_once():
     scan = two_links()
     for link, stamp_ns in ((0, 1010), (0, 1010), (1, 1000)):
         scan.add(link, [sample(0, [[1.0, 1.0]])], [stamp_ns])
-    taken = [len(scan.take().cube) for _ in range(2) if scan.complete()]
-    assert taken == [2, 1] and not scan.complete() and scan.unaccounted() == 0
+    taken = [len(scan.build().cube) for _ in range(2) if scan.is_complete()]
+    assert taken == [2, 1] and not scan.is_complete() and scan.unaccounted() == 0
 
 
 def test_not_measured_is_nan_and_millihertz_survive():
-    scan = Scan(1, [CubeAddress("a", 0, 0, None, 2)])
-    scan.hello(0, hello([1]))
+    scan = ScanBuilder(1, [CubeAddress("a", 0, 0, None, 2)])
+    scan.cubes.learn(0, hello([1]))
     scan.add(0, [sample(0, [[0.0, 100_000.001]])], [0])
-    frequency = scan.take().frequency
+    frequency = scan.build().frequency
     # 1 mHz is below float32's spacing at 100 kHz (7.8 mHz): the nearest float32 is what must come
     # out
     assert np.isnan(frequency[0, 0]) and frequency[0, 1] == np.float32(100_000.001)
 
 
-def test_strangers_are_counted_and_left_out():
-    scan = Scan(1, [CubeAddress("a", 0, 1, None, 2)])
-    assert scan.hello(0, hello([1, 2, 3])) == [
+def test_unknown_cubes_are_counted_and_left_out():
+    scan = ScanBuilder(1, [CubeAddress("a", 0, 1, None, 2)])
+    assert scan.cubes.learn(0, hello([1, 2, 3])) == [
         "the hub's cubes 0 (uid 0x1), 2 (uid 0x3) not in the skin file: add it there",
     ]
     scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]])], [0])
-    rows = scan.take()
+    rows = scan.build()
     assert rows.cube.tolist() == [0] and rows.frequency.tolist() == [[2.0, 2.0]]
-    assert (scan.rows, scan.unknown_cube, scan.wrong_pads) == (1, 3, 0)
+    assert (scan.rows_built, scan.cubes.unknown_cube, scan.cubes.wrong_pads) == (1, 3, 0)
 
 
 def test_another_number_of_pads_names_both_and_invents_nothing():
-    scan = Scan(1, [CubeAddress("a", 0, 0, None, 8), CubeAddress("b", 0, 1, None, 2)])
-    (problem,) = scan.hello(0, hello([1, 2]))
+    scan = ScanBuilder(1, [CubeAddress("a", 0, 0, None, 8), CubeAddress("b", 0, 1, None, 2)])
+    (problem,) = scan.cubes.learn(0, hello([1, 2]))
     assert "cube a" in problem and "reports 2 pads" in problem and "layout has 8" in problem
     scan.add(0, [sample(0, [[1.0, 2.0], [3.0, 4.0]])], [0])
-    rows = scan.take()
-    assert rows.cube.tolist() == [1] and scan.wrong_pads == 1
+    rows = scan.build()
+    assert rows.cube.tolist() == [1] and scan.cubes.wrong_pads == 1
     # narrower than the skin's widest cube: the rest is not measured
     assert rows.frequency[0, :2].tolist() == [3.0, 4.0] and np.isnan(rows.frequency[0, 2:]).all()
 
 
 @pytest.mark.parametrize(
-    ("place", "words"),
+    ("address", "words"),
     [
         (CubeAddress("a", 0, 5, None, 2), ["index 5", "2 cubes"]),
         (CubeAddress("a", 0, None, 99, 2), ["a (uid 0x63)", "no cube of this uid"]),
         (CubeAddress("a", 1, None, 5, 2), ["uid 0x5", "on this link", "file on another"]),
     ],
 )
-def test_what_does_not_fit_is_said(place, words):
-    scan = Scan(2, [place])
-    text = scan.hello(0, hello([5, 6]))[0]
+def test_what_does_not_fit_is_said(address, words):
+    scan = ScanBuilder(2, [address])
+    text = scan.cubes.learn(0, hello([5, 6]))[0]
     for word in words:
         assert word in text
 
 
 def test_a_repeated_hello_says_nothing_and_a_changed_one_counts():
-    scan = Scan(1, [CubeAddress("a", None, None, 5, 2)])
-    assert scan.hello(0, hello([5])) == []
-    assert scan.hello(0, hello([5])) is None
-    assert scan.hello(0, hello([4, 5])) == [
+    scan = ScanBuilder(1, [CubeAddress("a", None, None, 5, 2)])
+    assert scan.cubes.learn(0, hello([5])) == []
+    assert scan.cubes.learn(0, hello([5])) is None
+    assert scan.cubes.learn(0, hello([4, 5])) == [
         "the hub's cube 0 (uid 0x4) not in the skin file: add it there"
     ]
     scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0]])], [0])
-    assert scan.take().frequency.tolist() == [[2.0, 2.0]]
+    assert scan.build().frequency.tolist() == [[2.0, 2.0]]
 
 
 def test_two_cubes_with_one_uid_give_rows_of_one():
     """On one hub, and on two: the second takes over only when the first is gone."""
-    scan = Scan(2, [CubeAddress("a", None, None, 5, 2), CubeAddress("b", None, None, 6, 2)])
-    (problem,) = scan.hello(0, hello([5, 5, 6]))
+    scan = ScanBuilder(2, [CubeAddress("a", None, None, 5, 2), CubeAddress("b", None, None, 6, 2)])
+    (problem,) = scan.cubes.learn(0, hello([5, 5, 6]))
     assert problem == "the hub's cube 1 (uid 0x5) left out: an earlier one has the same uid"
-    (problem, *_) = scan.hello(1, hello([5, 7]))
+    (problem, *_) = scan.cubes.learn(1, hello([5, 7]))
     assert problem == "cube a (uid 0x5) left out here: another link has a cube of the same uid"
     scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])], [0])
     scan.add(1, [sample(0, [[4.0, 4.0], [5.0, 5.0]])], [0])
-    rows = scan.take()
+    rows = scan.build()
     assert rows.cube.tolist() == [0, 1] and rows.frequency[:, 0].tolist() == [1.0, 3.0]
-    assert scan.unknown_cube == 3 and scan.unaccounted() == 0
-    assert scan.hello(1, hello([5, 7])) is None
-    scan.live(0, False)
-    assert scan.hello(1, hello([5, 7])) == [
+    assert scan.cubes.unknown_cube == 3 and scan.unaccounted() == 0
+    assert scan.cubes.learn(1, hello([5, 7])) is None
+    scan.set_live(0, False)
+    assert scan.cubes.learn(1, hello([5, 7])) == [
         "the hub's cube 1 (uid 0x7) not in the skin file: add it there"
     ]
     scan.add(1, [sample(1, [[4.0, 4.0], [5.0, 5.0]])], [0])
-    assert scan.take().cube.tolist() == [0]
+    assert scan.build().cube.tolist() == [0]
     # the first comes back: now it is the second
-    assert "cube a (uid 0x5) left out here" in scan.hello(0, hello([5, 5, 6]))[0]
+    assert "cube a (uid 0x5) left out here" in scan.cubes.learn(0, hello([5, 5, 6]))[0]
 
 
-def test_a_hub_of_strangers_is_one_line():
-    scan = Scan(1, [CubeAddress("a", 0, 0, None, 2), CubeAddress("b", None, None, 1000, 2)])
-    problems = scan.hello(0, hello(range(1, 41)))
+def test_a_hub_of_unknown_cubes_is_one_line():
+    scan = ScanBuilder(1, [CubeAddress("a", 0, 0, None, 2), CubeAddress("b", None, None, 1000, 2)])
+    problems = scan.cubes.learn(0, hello(range(1, 41)))
     assert problems == [
-        "the hub's cubes 1 (uid 0x2), 2 (uid 0x3), 3 (uid 0x4), 4 (uid 0x5), 5 (uid 0x6), 6 (uid 0x7), 7 (uid 0x8), "
-        "8 (uid 0x9) and 31 more not in the skin file: add it there"
+        "the hub's cubes 1 (uid 0x2), 2 (uid 0x3), 3 (uid 0x4), 4 (uid 0x5), 5 (uid 0x6), "
+        "6 (uid 0x7), 7 (uid 0x8), 8 (uid 0x9) and 31 more not in the skin file: add it there"
     ]
 
 
 def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
     scan = two_links()
     for link in (0, 1):
-        scan.live(link, True)
-    for turn in range(3):
+        scan.set_live(link, True)
+    for number in range(3):
         for link in (0, 1):
-            assert not scan.complete(3)
-            scan.add(link, [sample(turn, [[10 * link + turn + 1, 1.0]] * 2)], [100 * turn + link])
-    assert scan.complete(3) and scan.complete(2) and not scan.complete(4)
-    first, second = scan.take(turns=2), scan.take()
+            assert not scan.is_complete(3)
+            scan.add(
+                link, [sample(number, [[10 * link + number + 1, 1.0]] * 2)], [100 * number + link]
+            )
+    assert scan.is_complete(3) and scan.is_complete(2) and not scan.is_complete(4)
+    first, second = scan.build(max_scans=2), scan.build()
     assert first.stamp_ns.tolist() == [0, 0, 1, 1, 100, 100, 101, 101]
     assert first.frequency[:, 0].tolist() == [1, 1, 11, 11, 2, 2, 12, 12]
     assert second.sequence.tolist() == [2, 2, 2, 2]
-    assert scan.take() is None and scan.unaccounted() == 0
+    assert scan.build() is None and scan.unaccounted() == 0
 
 
-def test_samples_take_the_arrival_of_their_read():
-    """An earlier one would be earlier than true, and bend the clock's fit."""
-    driver = pytest.importorskip(
-        "cube_tensor_driver.ros.driver", reason="needs rclpy: run this with ./cube test"
+def test_stamps_use_the_arrival_of_their_own_read():
+    """An earlier one would be earlier than true, and would spoil the fit of the clock."""
+    links = [LinkConfig("a", "/dev/none"), LinkConfig("b", "/dev/none")]
+    addresses = [CubeAddress("a", 0, 0, None, 1), CubeAddress("b", 1, 0, None, 1)]
+    given = []
+    live = LiveLinks(links, addresses, given.append)
+
+    def samples(*numbers_and_us):
+        return [
+            Sample(number, 0, us, np.ones((1, 1), "<u4"), np.zeros(1, "<u4"), np.zeros(1, "<i2"))
+            for number, us in numbers_and_us
+        ]
+
+    live.receive([LinkFrames(0, 0, [hello([1], 1)]), LinkFrames(1, 0, [hello([2], 1)])])
+    live.receive(
+        [
+            LinkFrames(0, 10_000, samples((0, 0), (1, 5))),
+            LinkFrames(1, 20_000, samples((0, 0))),
+            LinkFrames(0, 30_000, samples((2, 25))),
+        ]
     )
-    asked = []
-    clocks = [
-        SimpleNamespace(update=lambda *given, link=link: asked.append((link, *given)) or given[0])
-        for link in (0, 1)
-    ]
-    scan = SimpleNamespace(add=lambda *given: None, unaccounted=lambda: 0)
-    node = SimpleNamespace(
-        _accounts=[Account(), Account()], _clocks=clocks, _scan=scan, _publish=lambda: None
-    )
-    given = ((0, 10, 2), (1, 10, 1), (0, 20, 1))
-    driver.Driver._on_frames(
-        node,
-        [(link, at, [sample(at + n, [[1.0]]) for n in range(many)]) for link, at, many in given],
-    )
-    assert [(link, arrival_ns, len(times)) for link, times, arrival_ns in asked] == list(given)
+    stamps = {
+        (int(cube), int(number)): int(stamp_ns)
+        for rows in given
+        for cube, number, stamp_ns in zip(rows.cube, rows.sequence, rows.stamp_ns, strict=True)
+    }
+    assert stamps == {(0, 0): 5_000, (0, 1): 10_000, (1, 0): 20_000, (0, 2): 30_000}
+    assert live.row_counts() == RowCounts(4, 0, 0, 0)
 
 
-def test_pads_that_a_cube_has_not_are_nan():
-    scan = Scan(
+def test_pads_that_a_cube_does_not_have_are_nan():
+    scan = ScanBuilder(
         2,
         [
             CubeAddress("wide", 0, 0, None, 3),
@@ -258,9 +269,9 @@ def test_pads_that_a_cube_has_not_are_nan():
             CubeAddress("narrow", 1, 1, None, 2),
         ],
     )
-    scan.hello(0, hello([1], 3))
-    scan.hello(1, hello([2, 3], 2))
+    scan.cubes.learn(0, hello([1], 3))
+    scan.cubes.learn(1, hello([2, 3], 2))
     scan.add(0, [sample(0, [[1.0, 0.0, 3.0]])], [0])
     scan.add(1, [sample(0, [[4.0, 5.0], [6.0, 7.0]])], [0])
     expected = [[1, np.nan, 3], [4, 5, np.nan], [6, 7, np.nan]]
-    np.testing.assert_array_equal(scan.take().frequency, expected)
+    np.testing.assert_array_equal(scan.build().frequency, expected)

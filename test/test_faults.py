@@ -16,7 +16,7 @@ from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.protocol import Hello, Sample, Stats
-from cube_tensor_driver.device.sequence import Account, Verdict
+from cube_tensor_driver.device.sequence import Account, Arrival
 from cube_tensor_driver.simulation.faults import FRAME, KINDS, Fault, Injector, parse_faults
 from cube_tensor_driver.simulation.hub import SimulatedHub
 from cube_tensor_driver.simulation.inject import inject
@@ -83,7 +83,7 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
     bench, injector = faulty({"kind": kind, "at": 0.01, "count": 20})
     decoder, samples = bench.play(injector, 100)
     account = Account()
-    verdicts = [account.sample(sample) for sample in samples]
+    arrivals = [account.sample(sample) for sample in samples]
     account.stats(Stats(10_000, bench.hub.sequence, 0))
     counters = account.counters()
     assert not account.contradictions()
@@ -99,7 +99,7 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
         "flip": (lost == 20, noise >= 20),
         "insert": (0 < lost <= 20, noise > 0),
         "duplicate": (lost == 0, counters["duplicate"] == 20),
-        "reorder": (lost == 0, verdicts.count(Verdict.LATE) == 10),
+        "reorder": (lost == 0, arrivals.count(Arrival.LATE) == 10),
         "truncate": (lost == 20, noise == 20),
     }
     assert all(expected[kind]), (counters, noise)
@@ -114,7 +114,7 @@ def test_stats_close_the_book_and_tell_drops_from_loss():
     account.stats(Stats(20, 10, 3))
     assert account.counters()["taken"] == 10
     assert (account.counters()["dropped_in_hub"], account.counters()["lost_on_the_way"]) == (3, 1)
-    assert account.sample(samples[7]) is Verdict.LATE
+    assert account.sample(samples[7]) is Arrival.LATE
     assert account.counters()["lost_on_the_way"] + account.counters()["dropped_in_hub"] == 3
     account.received += 1
     assert "lost count" in account.contradictions()[0]

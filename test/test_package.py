@@ -27,7 +27,8 @@ FLOORS = [
     ["processes"],
     ["simulation"],
     ["bags", "research"],
-    ["device", "elastic", "config"],
+    ["device", "elastic"],
+    ["config"],
     ["core"],
 ]
 # Each heavy library in as few folders as it needs.

@@ -1,11 +1,11 @@
-"""The one thread that reads all links: opens and reopens them, decodes, and calls back once per
+"""One thread that reads all links: it opens and reopens them, decodes, and calls back once per
 wake-up.
 
-Each link is brought up the same way after every opening: ask for HELLO; on HELLO send what the hub
-should do (period, start or stop). A hub that restarts behind an open port falls silent, and its
-next HELLO brings it up again. No link waits for another: ports are read without blocking, a TCP
-connection is made without blocking, and what one link does not take stays in its own bounded
-buffer.
+After every opening a link is brought up in the same way: the reader asks for HELLO, and on HELLO
+sends what the hub should do (period, start or stop). A hub that restarts behind an open port falls
+silent, and its next HELLO brings it up again. No link waits for another: ports are read and TCP
+connections are made without blocking, and bytes that a link does not take stay in a bounded buffer
+of its own.
 """
 
 from __future__ import annotations
@@ -18,55 +18,74 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from ..core.errors import LinkError
 from .link import Link, LinkConfig, LinkState
 from .protocol import Ack, Command, Frame, Hello, Request, Result, Sample, encode
 
 TICK_S = 0.02
-"""How often timers are looked at: silence, back-off, connections under way."""
+"""Interval of the timers: silence, back-off, connections under way."""
 SILENT_S = 0.2
+"""A link is silent after so long without a sample, or after three sample periods if they are
+longer."""
 HELLO_S = 1.0
-"""A hub that does not answer is asked again at this interval."""
+"""Interval at which a hub that does not answer is asked again."""
 REOPEN_S = 5.0
-"""A link without a single byte for so long is opened anew; hubs say HELLO every second."""
+"""A link without a single byte for so long is opened anew. Hubs say HELLO every second."""
 LOOK_S = 0.25
-"""How often a waiting link looks whether its port has come back."""
-GATHER = 0.2, 1e-3
-"""Hubs sample together, but their bytes come one by one. Who comes first waits so long for the
-others, as a share of
-the sample period and in s at most: one message for all instead of several."""
+"""Interval at which the reader looks whether the port of a waiting link has come back."""
+GATHER_PERIODS = 0.2
+GATHER_S = 1e-3
+"""Hubs sample together, but their bytes come one after the other. The reader waits for the other
+hubs for this part of the sample period, and at most for this time. So all come in one callback."""
 GATHER_STEP_S = 2e-4
-"""They are looked for at this interval, instead of a wake-up for each; arrival may look later by
-that."""
+"""While it waits it looks at this interval, instead of waking up for each hub. Arrival times may be
+later than true by that."""
 NO_WAIT_S = 5e-5
-"""A wait for data shorter than this was none."""
+"""If waiting for data took less than this, data was there already."""
 DRAIN_S = 0.05
 """How long closing waits for the last requests to leave the serial ports."""
 CLOSE_S = 1.5
+"""How long closing waits for the thread to end."""
 
-Taken = list[tuple[int, int, bytes | LinkError]]
-"""Link index, arrival in ns, and what one read of this link gave."""
-Arrivals = list[tuple[int, int, list[Frame]]]
-"""Link index, arrival in ns, and the frames that one read of this link completed; one or several of
-each link."""
-OnFrames = Callable[[Arrivals], None]
+
+class LinkBytes(NamedTuple):
+    """What one read of a link gave: index of the link, time of arrival in ns, bytes or error."""
+
+    link: int
+    arrival_ns: int
+    data: bytes | LinkError
+
+
+class LinkFrames(NamedTuple):
+    """Frames that one read of a link completed: index of the link, time of arrival in ns."""
+
+    link: int
+    arrival_ns: int
+    frames: list[Frame]
+
+
+OnFrames = Callable[[list[LinkFrames]], None]
 OnState = Callable[[int, LinkState, LinkError | None], None]
 
 _log = logging.getLogger(__name__)
 
 
 class _Session:
-    """What the reader remembers of one link between wake-ups; times are time.monotonic()
-    seconds."""
+    """What the reader remembers of one link between wake-ups. Times are time.monotonic() s."""
 
     def __init__(self, period_us: int | None) -> None:
-        self.period_us = period_us  # to ask for, None leaves the hub's own
-        self.started = True  # whether samples are asked for
-        self.actual_us = period_us or 0  # what the hub says
-        self.greeted = False  # HELLO seen since the port was opened
-        self.opened_at = self.last_byte = self.last_sample = 0.0
-        self.retry_at = self.look_at = self.hello_at = 0.0
+        self.period_us = period_us  # asked for; None leaves the hub's own
+        self.started = True  # samples are asked for
+        self.actual_us = period_us or 0  # in force, as the hub says
+        self.greeted = False  # HELLO has come since the port was opened
+        self.opened_at = 0.0
+        self.last_byte = 0.0
+        self.last_sample = 0.0
+        self.retry_at = 0.0
+        self.look_at = 0.0
+        self.hello_at = 0.0
         self.fingerprint: tuple[object, ...] = ()
         self.watching_writes = False
 
@@ -77,14 +96,18 @@ class _Session:
 class Reader:
     """Reads all links in one thread.
 
-    on_frames: called once per wake-up with `Arrivals`, in order of arrival per link. on_state:
-    called with (link index, LinkState, LinkError or None) when a link's state, or why it waits,
-    changes. Both run in the reader's thread and must return soon; an exception in them is logged
-    and the reader goes on. clock_ns: the clock of arrival times, read after the bytes, so that
-    arrival is never earlier than true. period_us: sample period to set on every hub, None leaves
-    the hub's own.
+    on_frames: called once per wake-up with a list of `LinkFrames`, in order of arrival per link.
+    on_state: called with (link index, LinkState, LinkError or None) when the state of a link, or
+    the reason why it waits, changes.
+    Both run in the reader's thread and must return soon. If they raise, the error is logged and the
+    reader goes on.
+    clock_ns: the clock of arrival times. It is read after the bytes, so that no arrival is earlier
+    than true.
+    period_us: sample period to set on every hub; None leaves the hub's own.
+    on_end: called last of all in the reader's thread, however it ends.
 
-    failure: what ended the thread though nobody asked it to end, None while all is well.
+    failure: the error that ended the thread; None while it runs and after `close`.
+    callback_errors: how often a callback raised.
     """
 
     def __init__(
@@ -94,13 +117,17 @@ class Reader:
         on_state: OnState,
         clock_ns: Callable[[], int] = time.time_ns,
         period_us: int | None = None,
+        on_end: Callable[[], None] = lambda: None,
     ) -> None:
         """LinkError `bad_port`: a port that can never be opened."""
         self.links = [Link(config) for config in links]
         self.callback_errors = 0
         self.failure: Exception | None = None
         self._sessions = [_Session(period_us) for _ in links]
-        self._on_frames, self._on_state, self._clock_ns = on_frames, on_state, clock_ns
+        self._on_frames = on_frames
+        self._on_state = on_state
+        self._on_end = on_end
+        self._clock_ns = clock_ns
         self._requests: deque[tuple[int, Request]] = deque()
         self._stopping = False
         self._thread: threading.Thread | None = None
@@ -108,8 +135,7 @@ class Reader:
         self._wake_write = -1
 
     def start(self) -> None:
-        """Begin. A reader runs once; make a new one to start again. LinkError `closed`
-        otherwise."""
+        """Begin. LinkError `closed`: it was started before; a reader runs once."""
         if self._thread is not None:
             raise LinkError("a reader starts once: make a new Reader", "closed")
         wake_read, self._wake_write = os.pipe()
@@ -121,9 +147,11 @@ class Reader:
         self._thread.start()
 
     def send(self, link: int, request: Request) -> None:
-        """Send a request, from any thread. Start, stop and set period are remembered and sent again
-        after each reopening; so they may be given while the link is down. LinkError `closed`: any
-        other request then."""
+        """Send a request, from any thread.
+
+        Start, stop and set period are remembered and sent again after each reopening, so they may
+        be given while the link is down. LinkError `closed`: any other request while it is down.
+        """
         target = self.links[link]
         remembered = request.request in (Command.START, Command.STOP, Command.SET_PERIOD)
         if not remembered and not target.is_open:
@@ -135,8 +163,7 @@ class Reader:
         self._wake()
 
     def close(self) -> None:
-        """Stop the hubs, close all links, end the thread; within CLOSE_S, also in the middle of a
-        reconnect."""
+        """Stop the hubs, close all links and end the thread, within CLOSE_S. Safe to call twice."""
         self._stopping = True
         self._wake()
         thread = self._thread
@@ -158,44 +185,50 @@ class Reader:
         selector = selectors.DefaultSelector()
         try:
             selector.register(wake_read, selectors.EVENT_READ, None)
-            tick_at = 0.0
-            while not self._stopping:
-                now = time.monotonic()
-                ready = selector.select(max(0.0, tick_at - now))
-                begun = time.monotonic()
-                taken = self._take(selector, ready, wake_read)
-                # Where data waited for us we are late already.
-                waited = begun - now > NO_WAIT_S
-                while taken and waited and time.monotonic() - begun < self._gathering(taken):
-                    time.sleep(GATHER_STEP_S)
-                    taken += self._take(selector, selector.select(0), wake_read)
-                batch, failed = self._decode(selector, taken)
-                if batch:
-                    self._call(self._on_frames, batch)
-                # Later than what came before: else it would seem to deliver still.
-                for i, error in failed.items():
-                    self._drop(selector, i, error)
-                if self._requests:
-                    self._send_requests(selector)
-                now = time.monotonic()
-                if now >= tick_at:
-                    tick_at = now + TICK_S
-                    for i in range(len(self.links)):
-                        self._tick(selector, i, now)
+            self._loop(selector, wake_read)
         except Exception as error:  # noqa: BLE001  (a thread that ends unseen would look like silent hubs)
             self.failure = error
             _log.exception("the thread that reads the links has ended")
         finally:
-            self._shut(selector, wake_read)
+            try:
+                self._close_all(selector, wake_read)
+            finally:
+                self._on_end()
 
-    def _take(
+    def _loop(self, selector: selectors.BaseSelector, wake_read: int) -> None:
+        tick_at = 0.0
+        while not self._stopping:
+            now = time.monotonic()
+            ready = selector.select(max(0.0, tick_at - now))
+            awake_at = time.monotonic()
+            reads = self._read_ready(selector, ready, wake_read)
+            # If data was there already, this thread is late and does not wait for more.
+            if reads and awake_at - now > NO_WAIT_S:
+                while time.monotonic() - awake_at < self._gather_time(reads):
+                    time.sleep(GATHER_STEP_S)
+                    reads += self._read_ready(selector, selector.select(0), wake_read)
+            received, failed = self._decode(selector, reads)
+            if received:
+                self._call(self._on_frames, received)
+            # Only after its frames were delivered: they would make the link look alive again.
+            for i, error in failed.items():
+                self._drop(selector, i, error)
+            if self._requests:
+                self._send_requests(selector)
+            now = time.monotonic()
+            if now >= tick_at:
+                tick_at = now + TICK_S
+                for i in range(len(self.links)):
+                    self._tick(selector, i, now)
+
+    def _read_ready(
         self,
         selector: selectors.BaseSelector,
         ready: list[tuple[selectors.SelectorKey, int]],
         wake_read: int,
-    ) -> Taken:
-        """All there is of the links that are ready."""
-        taken: list[tuple[int, bytes | LinkError]] = []
+    ) -> list[LinkBytes]:
+        """Read all links that are ready, and send what waits to be sent."""
+        reads: list[tuple[int, bytes | LinkError]] = []
         for key, events in ready:
             if key.data is None:
                 os.read(wake_read, 4096)
@@ -208,24 +241,24 @@ class Reader:
                 if events & selectors.EVENT_READ:
                     data = link.read()
                     if data:
-                        taken.append((key.data, data))
+                        reads.append((key.data, data))
             except LinkError as error:
-                taken.append((key.data, error))
-        arrival_ns = self._clock_ns() if taken else 0
-        return [(i, arrival_ns, data) for i, data in taken]
+                reads.append((key.data, error))
+        arrival_ns = self._clock_ns() if reads else 0
+        return [LinkBytes(i, arrival_ns, data) for i, data in reads]
 
     def _decode(
-        self, selector: selectors.BaseSelector, taken: Taken
-    ) -> tuple[Arrivals, dict[int, LinkError]]:
-        """Look at what was taken, all at once: after each wait Python's code and data are far from
-        the processor.
+        self, selector: selectors.BaseSelector, reads: list[LinkBytes]
+    ) -> tuple[list[LinkFrames], dict[int, LinkError]]:
+        """The frames in what was read, and the links to close, each with the reason.
 
-        Returns the frames, and the links to close with the reason of each.
+        All reads of a wake-up are decoded in one go, because after each wait Python's code and data
+        have left the processor's caches.
         """
-        batch: Arrivals = []
+        received: list[LinkFrames] = []
         failed: dict[int, LinkError] = {}
         now = time.monotonic()
-        for i, arrival_ns, data in taken:
+        for i, arrival_ns, data in reads:
             link = self.links[i]
             if i in failed:
                 continue
@@ -236,23 +269,23 @@ class Reader:
             self._sessions[i].last_byte = now
             try:
                 for frame in link.decoder.feed(data):
-                    if self._note(i, frame):
+                    if self._handle(i, frame):
                         frames.append(frame)
                 if link.unsent:
                     self._watch(selector, i)
             except LinkError as error:
                 failed[i] = error
             if frames:
-                batch.append((i, arrival_ns, frames))
-        return batch, failed
+                received.append(LinkFrames(i, arrival_ns, frames))
+        return received, failed
 
-    def _gathering(self, taken: Taken) -> float:
-        """How long to wait for links that deliver but have not yet, s."""
+    def _gather_time(self, reads: list[LinkBytes]) -> float:
+        """How long to wait for links that deliver but have not come yet, s."""
         # A zero that does not begin the data ends a frame.
-        came = {i for i, _, data in taken if isinstance(data, bytes) and data.find(0, 1) > 0}
+        came = {i for i, _, data in reads if isinstance(data, bytes) and data.find(0, 1) > 0}
         if len(came) in (0, len(self.links)):
             return 0.0
-        late = [
+        periods_us = [
             session.actual_us
             for i, (link, session) in enumerate(zip(self.links, self._sessions, strict=True))
             if i not in came
@@ -260,18 +293,21 @@ class Reader:
             and session.greeted
             and session.started
         ]
-        share, most = GATHER
-        return min(1e-6 * share * min(late), most) if late else 0.0
+        if not periods_us:
+            return 0.0
+        return min(GATHER_PERIODS * 1e-6 * min(periods_us), GATHER_S)
 
-    def _note(self, i: int, frame: Frame) -> bool:
-        """What a frame means for the link itself; whether to deliver it. LinkError: close the
-        link."""
+    def _handle(self, i: int, frame: Frame) -> bool:
+        """Act on what a frame says about the link itself. Returns whether to deliver the frame.
+
+        LinkError: the link must be closed.
+        """
         link, session = self.links[i], self._sessions[i]
         if isinstance(frame, Sample):
             session.last_sample = session.last_byte
             if link.state is not LinkState.OPEN or link.error is not None:
                 self._set_state(i, LinkState.OPEN, None)
-            # After a replug it may be another hub: nothing is delivered under the old one's name.
+            # After a replug it may be another hub, whose samples must not pass for the old one's.
             link.before_hello += not session.greeted
             return session.greeted
         if isinstance(frame, Hello):
@@ -279,8 +315,8 @@ class Reader:
             if wanted is not None and frame.hub_uid != wanted:
                 link.next_candidate()
                 raise LinkError(
-                    f"{link.path}: hub {frame.hub_uid:#018x} answers, "
-                    f"link {link.config.name!r} wants {wanted:#018x}: swap the cables or correct the uid",
+                    f"{link.path}: hub {frame.hub_uid:#018x} answers, link {link.config.name!r} "
+                    f"wants {wanted:#018x}: swap the cables or correct the uid",
                     "wrong_hub",
                 )
             link.hello = frame
@@ -324,48 +360,53 @@ class Reader:
                     self._drop(selector, i, error)
 
     def _tick(self, selector: selectors.BaseSelector, i: int, now: float) -> None:
+        """Look at the timers of one link."""
         link, session = self.links[i], self._sessions[i]
         try:
             if not link.is_open:
                 self._try_open(selector, i, now)
                 return
-            if (
-                session.started
-                and link.state is LinkState.OPEN
-                and now - session.last_sample > session.silent_after()
-            ):
-                link.silences += 1
-                session.hello_at = now
-                period = (
-                    f"sample period {session.actual_us} µs"
-                    if session.actual_us
-                    else "sample period not known yet"
-                )
-                self._set_state(
-                    i,
-                    LinkState.SILENT,
-                    LinkError(
-                        f"{link.path}: no sample for {now - session.last_sample:.2f} s ({period}): "
-                        "check the hub's power and firmware; it is asked again every second",
-                        "silent",
-                    ),
-                )
+            self._check_silence(i, now)
             if now - session.last_byte > REOPEN_S:
                 link.next_candidate()
                 raise LinkError(
-                    f"{link.path}: not a byte for {REOPEN_S:g} s: opening it anew; check the hub's power",
+                    f"{link.path}: not a byte for {REOPEN_S:g} s: opening it anew; "
+                    "check the hub's power",
                     "silent",
                 )
             if link.is_pattern and not session.greeted and now - session.opened_at > REOPEN_S:
                 link.next_candidate()
                 raise LinkError(
-                    f"{link.path}: no hub answers here: trying the next match of {link.config.port}",
+                    f"{link.path}: no hub answers here: trying the next match of "
+                    f"{link.config.port}",
                     "wrong_hub",
                 )
-            if (link.state is LinkState.SILENT or not session.greeted) and now >= session.hello_at:
+            unanswered = link.state is LinkState.SILENT or not session.greeted
+            if unanswered and now >= session.hello_at:
                 self._ask_hello(selector, i, now)
         except LinkError as error:
             self._drop(selector, i, error)
+
+    def _check_silence(self, i: int, now: float) -> None:
+        link, session = self.links[i], self._sessions[i]
+        silence = now - session.last_sample
+        if (
+            not session.started
+            or link.state is not LinkState.OPEN
+            or silence <= session.silent_after()
+        ):
+            return
+        link.silences += 1
+        session.hello_at = now
+        period = "sample period not known yet"
+        if session.actual_us:
+            period = f"sample period {session.actual_us} µs"
+        error = LinkError(
+            f"{link.path}: no sample for {silence:.2f} s ({period}): "
+            "check the hub's power and firmware; it is asked again every second",
+            "silent",
+        )
+        self._set_state(i, LinkState.SILENT, error)
 
     def _ask_hello(self, selector: selectors.BaseSelector, i: int, now: float) -> None:
         self._sessions[i].hello_at = now + HELLO_S
@@ -395,7 +436,7 @@ class Reader:
         self._ask_hello(selector, i, now)
 
     def _drop(self, selector: selectors.BaseSelector, i: int, error: LinkError) -> None:
-        """The link failed: close it and try again later."""
+        """Close a link that failed, and try again later."""
         link, session = self.links[i], self._sessions[i]
         if link.is_open:
             link.lost += 1
@@ -410,27 +451,30 @@ class Reader:
         link, session = self.links[i], self._sessions[i]
         if link.unsent != session.watching_writes:
             session.watching_writes = link.unsent
-            selector.modify(
-                link, selectors.EVENT_READ | (selectors.EVENT_WRITE if link.unsent else 0), i
-            )
+            events = selectors.EVENT_READ
+            if link.unsent:
+                events |= selectors.EVENT_WRITE
+            selector.modify(link, events, i)
 
     def _set_state(self, i: int, state: LinkState, error: LinkError | None) -> None:
         link = self.links[i]
-        before = (link.state, link.error and link.error.kind)
-        link.state, link.error = state, error
-        if before != (state, error and error.kind):
+        before = link.state, link.error and link.error.kind
+        after = state, error and error.kind
+        link.state = state
+        link.error = error
+        if after != before:
             self._call(self._on_state, i, state, error)
 
     def _call(self, callback: Callable[..., None], *arguments: object) -> None:
         try:
             callback(*arguments)
-        except Exception:  # noqa: BLE001  (whatever the caller's code raises, the links go on)
+        except Exception:  # noqa: BLE001  (whatever a callback raises, the links go on)
             self.callback_errors += 1
-            # The first of each power of ten tells enough; at 1 kHz all of them would bury it.
+            # Not all of them: at 1 kHz they would fill the log.
             if self.callback_errors in (1, 10, 100, 1000, 10_000):
                 _log.exception("callback failed (%d so far); reading goes on", self.callback_errors)
 
-    def _shut(self, selector: selectors.BaseSelector, wake_read: int) -> None:
+    def _close_all(self, selector: selectors.BaseSelector, wake_read: int) -> None:
         for link in self.links:
             if link.is_open:
                 with contextlib.suppress(LinkError):

@@ -1,5 +1,5 @@
-"""Accounting of one hub's samples: which are new, which came twice or late, how many are missing
-and why."""
+"""Accounts of one link's samples: which are new, which came twice or late, how many are missing and
+where they were lost."""
 
 from __future__ import annotations
 
@@ -10,18 +10,23 @@ from enum import Enum
 from .protocol import Sample, Stats
 
 MEMORY = 64
-"""Samples remembered; what arrives later than that after its turn belongs to a hub that
-restarted."""
+"""How many samples are remembered. A sample that comes later than so many others is taken for the
+first of a hub that restarted."""
 MAX_GAP = 1 << 20
-"""A longer gap (17 minutes at 1 kHz) is a hub that restarted, not loss."""
+"""A longer gap (17 minutes at 1 kHz) means that the hub restarted, not that samples were lost."""
 RESTART_US = 1_000_000
-"""A sample from before the first seen is late if its time is no further back than this, else of a
-new run."""
+"""A sample with a number below the first one seen is late if its device time is at most so far
+back; otherwise it belongs to a new run of the hub."""
+_WRAP = 0x1_0000_0000
 
 
-class Verdict(str, Enum):
-    """new: next in turn, or after a gap. late: out of order, had been counted missing. duplicate:
-    do not deliver. reset: the hub restarted and this is the first sample of its new count."""
+class Arrival(str, Enum):
+    """What a sample is, by its number.
+
+    new: the next one, or the first after a gap. late: out of order, and counted as missing until
+    now. duplicate: it has come before; do not deliver it. reset: the hub restarted, and this is the
+    first sample of its new count.
+    """
 
     NEW = "new"
     LATE = "late"
@@ -31,10 +36,13 @@ class Verdict(str, Enum):
 
 @dataclass(slots=True)
 class SequenceCounters:
-    """Samples. At any time taken by the hub since the first seen = delivered + missing; received =
-    delivered + duplicate. `out_of_order` are among the delivered. Of what a restart lost, the
-    samples since power-up are among the missing; those that the hub took last before it restarted
-    nobody can know."""
+    """Numbers of samples.
+
+    Samples taken by the hub since the first one seen = delivered + missing.
+    Samples received = delivered + duplicate. Those out of order are among the delivered.
+    After a restart, the samples since power-up that did not come count as missing; the last samples
+    before the restart are unknown and not counted.
+    """
 
     delivered: int = 0
     missing: int = 0
@@ -51,56 +59,71 @@ class SequenceTracker:
 
     def __init__(self) -> None:
         self.counters = SequenceCounters()
-        self._seen: deque[tuple[int, int]] = deque(maxlen=MEMORY)  # unwrapped sequence, device time
-        self._first = self._next = 0  # unwrapped: they count on past 2**32
+        # Numbers are unwrapped: they count on past 2**32.
+        self._seen: deque[tuple[int, int]] = deque(maxlen=MEMORY)  # number, device time
+        self._first = 0
+        self._next = 0
         self._newest_us = 0
 
-    def update(self, sequence: int, device_us: int) -> Verdict:
-        """Judge one SAMPLE by its sequence number (u32) and device time (µs), and count it.
-        Constant time."""
-        if (
-            sequence == self._next % 0x1_0000_0000 and device_us >= self._newest_us
-        ):  # as it mostly is
-            self._next, self._newest_us = self._next + 1, device_us
-            return self._deliver(self._next - 1, device_us, Verdict.NEW)
+    def update(self, sequence: int, device_us: int) -> Arrival:
+        """Classify and count one sample by its sequence number (u32) and device time (µs).
+
+        Constant time.
+        """
+        # The next number is the common case, and it is quick.
+        if sequence == self._next % _WRAP and device_us >= self._newest_us:
+            self._next += 1
+            self._newest_us = device_us
+            return self._deliver(self._next - 1, device_us, Arrival.NEW)
         if not self._seen:
-            return self._begin(sequence, device_us, Verdict.NEW)
-        ahead = (sequence - self._next + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
+            return self._begin(sequence, device_us, Arrival.NEW)
+        ahead = self._ahead(sequence)
         number = self._next + ahead
         if 0 <= ahead <= MAX_GAP:
             self.counters.missing += ahead
-            # The count goes on but the clock went back: whoever maps the clock must begin anew.
-            verdict = Verdict.NEW if device_us >= self._newest_us else Verdict.RESET
-            self.counters.resets += verdict is Verdict.RESET
-            self._next, self._newest_us = number + 1, device_us
-            return self._deliver(number, device_us, verdict)
+            # The count goes on but the clock went back: the clock's map must begin anew.
+            arrival = Arrival.NEW if device_us >= self._newest_us else Arrival.RESET
+            self.counters.resets += arrival is Arrival.RESET
+            self._next = number + 1
+            self._newest_us = device_us
+            return self._deliver(number, device_us, arrival)
         if ahead < -MEMORY or ahead > MAX_GAP:
             return self._restart(sequence, device_us)
         if (number, device_us) in self._seen:
             self.counters.duplicate += 1
-            return Verdict.DUPLICATE
+            return Arrival.DUPLICATE
         if not self._fits(number, device_us):
             return self._restart(sequence, device_us)
-        self.counters.missing += self._first - number - 1 if number < self._first else -1
+        if number < self._first:
+            self.counters.missing += self._first - number - 1
+            self._first = number
+        else:
+            self.counters.missing -= 1
         self.counters.out_of_order += 1
-        self._first = min(self._first, number)
-        return self._deliver(number, device_us, Verdict.LATE)
+        return self._deliver(number, device_us, Arrival.LATE)
 
-    def book(self, taken: int) -> None:
-        """The hub says how many samples it has taken (u32): what has not come by now is missing."""
-        ahead = (taken - self._next + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
+    def count_missing(self, taken: int) -> None:
+        """The hub has taken so many samples (u32): those that have not come by now are missing."""
+        ahead = self._ahead(taken)
         if self._seen and 0 < ahead <= MAX_GAP:
             self.counters.missing += ahead
             self._next += ahead
 
     @property
     def first(self) -> int:
-        """Number of the first sample that is counted, delivered or missing, of the present run."""
+        """Number of the first sample of the present run that is counted, delivered or missing."""
         return self._first
 
+    def _ahead(self, sequence: int) -> int:
+        """How far a u32 lies ahead of the next number; negative: behind it."""
+        half = _WRAP // 2
+        return (sequence - self._next + half) % _WRAP - half
+
     def _fits(self, number: int, device_us: int) -> bool:
-        """Whether a sample from before the newest is of the same run: its time lies where its
-        number does."""
+        """Whether a sample from before the newest belongs to the same run.
+
+        It does if its device time lies between those of its neighbours.
+        """
         if any(other == number for other, _ in self._seen):
             return False
         if number < self._first:
@@ -109,32 +132,33 @@ class SequenceTracker:
             (us <= device_us) if other < number else (us >= device_us) for other, us in self._seen
         )
 
-    def _restart(self, sequence: int, device_us: int) -> Verdict:
+    def _restart(self, sequence: int, device_us: int) -> Arrival:
         self.counters.resets += 1
         self._seen.clear()
-        verdict = self._begin(sequence, device_us, Verdict.RESET)
+        arrival = self._begin(sequence, device_us, Arrival.RESET)
         if sequence <= MAX_GAP:
-            # Numbers begin at 0 with power-up, so what came before this one is missing.
+            # Numbers begin at 0 with power-up, so all before this one are missing.
             self.counters.missing += sequence
             self._first = 0
-        return verdict
+        return arrival
 
-    def _begin(self, sequence: int, device_us: int, verdict: Verdict) -> Verdict:
-        self._first, self._next, self._newest_us = sequence, sequence + 1, device_us
-        return self._deliver(sequence, device_us, verdict)
+    def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
+        self._first = sequence
+        self._next = sequence + 1
+        self._newest_us = device_us
+        return self._deliver(sequence, device_us, arrival)
 
-    def _deliver(self, number: int, device_us: int, verdict: Verdict) -> Verdict:
+    def _deliver(self, number: int, device_us: int, arrival: Arrival) -> Arrival:
         self.counters.delivered += 1
         self._seen.append((number, device_us))
-        return verdict
+        return arrival
 
 
 class Account:
-    """The book of one link: every sample the hub took is delivered, dropped in the hub, or lost on
-    the way.
+    """The account of one link: each sample that the hub took was delivered, dropped in the hub, or
+    lost on the way.
 
-    A hub with many cubes spreads a sample over several frames; each counts here, for itself, as a
-    sample.
+    A hub with many cubes spreads a sample over several frames. Each frame counts as one sample.
     """
 
     def __init__(self) -> None:
@@ -144,8 +168,8 @@ class Account:
         self._dropped = 0
         self._dropped_before = 0
 
-    def sample(self, frame: Sample) -> Verdict:
-        """Judge and count one frame."""
+    def sample(self, frame: Sample) -> Arrival:
+        """Classify and count one frame."""
         tracker = self._trackers.get(frame.first_cube)
         if tracker is None:
             tracker = self._trackers[frame.first_cube] = SequenceTracker()
@@ -153,21 +177,21 @@ class Account:
         return tracker.update(frame.sequence, frame.device_us)
 
     def stats(self, frame: Stats) -> None:
-        """Compare with the hub's own book."""
+        """Compare with the hub's own count."""
         last, self.stats_frame = self.stats_frame, frame
-        if last is None and all(tracker.first for tracker in self._trackers.values()):
-            self._dropped_before = (
-                frame.dropped
-            )  # we joined late: what was dropped before is not ours to count
+        joined_late = all(tracker.first for tracker in self._trackers.values())
+        if last is None and joined_late:
+            # What the hub dropped before our first sample is not ours to count.
+            self._dropped_before = frame.dropped
         elif last is not None and frame.uptime_ms < last.uptime_ms:
-            self._dropped_before = 0  # it restarted, perhaps before any sample of the new run came
+            # The hub restarted, perhaps before any sample of the new run came.
+            self._dropped_before = 0
             return
-        self._dropped += (
-            (frame.dropped - self._dropped_before) % 0x1_0000_0000 * len(self._trackers)
-        )
+        dropped = (frame.dropped - self._dropped_before) % _WRAP
+        self._dropped += dropped * len(self._trackers)
         self._dropped_before = frame.dropped
         for tracker in self._trackers.values():
-            tracker.book(frame.taken)
+            tracker.count_missing(frame.taken)
 
     @property
     def resets(self) -> int:
@@ -176,28 +200,30 @@ class Account:
     def counters(self) -> dict[str, int]:
         """taken = delivered + dropped_in_hub + lost_on_the_way; received = delivered +
         duplicate."""
+        # A copy, because another thread may add a tracker.
         parts = [tracker.counters for tracker in list(self._trackers.values())]
         total = {
             name: sum(getattr(part, name) for part in parts)
             for name in SequenceCounters().as_dict()
         }
         missing = total.pop("missing")
-        # Until the next STATS a drop looks like loss, never the other way round.
+        # Until the next STATS, a sample dropped in the hub counts as lost on the way; never the
+        # other way round.
         dropped = min(self._dropped, missing)
-        book = {
+        return {
             "taken": total["delivered"] + missing,
             "dropped_in_hub": dropped,
             "lost_on_the_way": missing - dropped,
+            **total,
         }
-        return {**book, **total}
 
     def contradictions(self) -> list[str]:
-        """What does not add up, in words. Right after `stats` there must be nothing."""
+        """What does not add up, in words. Empty unless this program lost count."""
         counters = self.counters()
-        found = []
-        if self.received != counters["delivered"] + counters["duplicate"]:
-            found.append(
-                f"{self.received} samples received, {counters['delivered']} delivered and {counters['duplicate']} "
-                "duplicate: the driver lost count, please report it"
-            )
-        return found
+        delivered, duplicate = counters["delivered"], counters["duplicate"]
+        if self.received == delivered + duplicate:
+            return []
+        return [
+            f"{self.received} samples received, {delivered} delivered and {duplicate} duplicate: "
+            "the driver lost count, please report it"
+        ]

@@ -1,5 +1,7 @@
-"""Driver and reconstruction in one process: tensors without the hop over DDS. `frequencies` is sent
-to who listens."""
+"""Driver and reconstruction in one process: the rows of the driver do not travel over DDS.
+
+`frequencies` is published only while somebody subscribes to it.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,9 @@ from .reconstruction import Reconstruction
 
 
 def nodes() -> list[CubeNode]:
-    """Both nodes, the driver handing its rows over."""
+    """Both nodes; the driver calls the reconstruction with its rows."""
     reconstruction = Reconstruction(subscribes=False)
-    return [reconstruction, Driver(reconstruction.take_rows)]
+    return [reconstruction, Driver(reconstruction.on_rows)]
 
 
 def main() -> None:

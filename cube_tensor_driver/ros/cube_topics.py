@@ -15,10 +15,9 @@ from cube_tensor_driver.msg import StressTensorStamped
 
 from ..config.skin import Skin
 from ..core.pipeline import Pipeline
-from ..core.rows import StressRows
+from ..core.rows import FrequencyRows, StressRows
 from ..core.status import INVALID
 from ..core.tensor import contact_wrench
-from ..device.scan import Rows
 from .messages import tensor_message, to_time, wrench_message
 
 ALL_AT_ONCE = 64
@@ -60,7 +59,7 @@ class CubeTopics:
             )
         self._listened = (_heard(self._tensors), _heard(self._wrenches))
 
-    def publish(self, times: Rows, rows: StressRows, pad_fault: NDArray[np.uint32]) -> None:
+    def publish(self, times: FrequencyRows, rows: StressRows, pad_fault: NDArray[np.uint32]) -> None:
         """Send the rows of cubes that somebody listens to; wrenches of valid ones only."""
         tensors, wrenches = self._listened
         if wrenches:
@@ -91,7 +90,7 @@ class CubeTopics:
             kind, publishers, number = self._wanted.pop(name)
             publishers[number] = self._node.create_publisher(kind, name, DEPTH)
 
-    def _header(self, times: Rows, row: int, cube: int) -> Header:
+    def _header(self, times: FrequencyRows, row: int, cube: int) -> Header:
         stamp = to_time(int(times.stamp_ns[row]))
         return Header(stamp=stamp, frame_id=self._skin.frame(self._skin.cubes[cube]))
 

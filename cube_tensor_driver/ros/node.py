@@ -8,15 +8,18 @@ import gc
 import math
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import ROSClock
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
@@ -107,6 +110,16 @@ class CubeNode(LifecycleNode):
             ]
         self.declare_parameter(name, default, descriptor)
 
+    def declare_autostart(self) -> None:
+        """Declare the parameter that says whether `run` brings the node up."""
+        text = "Configure and activate at once; false waits for lifecycle transitions."
+        self.declare("autostart", True, text)
+
+    def declare_reliability(self) -> None:
+        """Declare the reliability that `queue` takes."""
+        text = "Reliability of the batch topics."
+        self.declare("qos_reliability", "reliable", text, choices="reliable, best_effort")
+
     def config(self) -> Path:
         """The skin file of parameter config. ConfigError: not given."""
         if not self.value("config"):
@@ -189,6 +202,28 @@ class CubeNode(LifecycleNode):
         self.cleanup()
         self.configured = False
         return TransitionCallbackReturn.SUCCESS
+
+
+class NodeClock:
+    """The clock of a node, read quickly.
+
+    Without simulated time that is the system's clock, which is read directly in a tenth of the
+    time.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.update()
+
+    def update(self) -> None:
+        """See whether time is simulated; to be called now and then."""
+        clock = self._node.get_clock()
+        self._is_simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
+
+    def now_ns(self) -> int:
+        if self._is_simulated:
+            return int(self._node.get_clock().now().nanoseconds)
+        return time.time_ns()
 
 
 def run(make: Callable[[], Sequence[CubeNode]]) -> None:

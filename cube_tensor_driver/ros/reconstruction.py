@@ -18,10 +18,9 @@ from ..config.skin import read_skin
 from ..core.errors import CubeError
 from ..core.health import Health
 from ..core.pipeline import Pipeline
-from ..core.rows import StressRows
+from ..core.rows import FrequencyRows, StressRows
 from ..core.status import INVALID
 from ..core.tare import DriftTracker
-from ..device.scan import Rows
 from .cube_health import CubeHealth
 from .cube_topics import CubeTopics
 from .diagnostics import Diagnostics, make_status
@@ -166,18 +165,14 @@ class Reconstruction(CubeNode):
         except CubeError as error:
             self._refuse(error)
             return
-        rows = message.rows
-        given = Rows(
-            rows.cube,
-            rows.sequence,
-            rows.stamp_ns,
-            rows.frequency,
-            rows.temperature,
-            rows.pad_fault,
-        )
-        self.take_rows(given, int(message.stamp_ns[0]), message.frame_id)
+        self.take_rows(message.rows, int(message.stamp_ns[0]), message.frame_id)
 
-    def take_rows(self, given: Rows, stamp_ns: int, frame_id: bytes) -> None:
+    def on_rows(self, rows: FrequencyRows) -> None:
+        """Publish the tensors of rows that come from a driver in the same process."""
+        frame_id = self._skin.parent_frame.encode() + b"\0"
+        self.take_rows(rows, int(rows.stamp_ns.min()), frame_id)
+
+    def take_rows(self, given: FrequencyRows, stamp_ns: int, frame_id: bytes) -> None:
         """Publish the tensors of rows; stamp and frame of their message are its own, too."""
         if not self._active:
             return

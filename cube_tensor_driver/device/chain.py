@@ -1,0 +1,291 @@
+"""The chain from bytes to rows: reader, accounts, clocks and scans of all links of a skin.
+
+It calls back in the reader's thread: the driver node publishes from there, and `live.py` puts a
+queue behind it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from ..core.errors import LinkError
+from ..core.rows import FrequencyRows
+from .clock import ClockMap
+from .cube_table import CubeAddress
+from .link import Link, LinkConfig, LinkState
+from .protocol import VERSION, Command, Hello, Request, Sample, Stats
+from .reader import LinkFrames, Reader
+from .scan import MakeRows, ScanBuilder, empty_rows
+from .sequence import Account, Arrival
+
+MAX_SCANS = 4
+"""Scans in one callback at most, or one more than were asked for. After a pause many scans wait;
+buffers that are kept for rows need not be as large as all of them."""
+
+
+class Log(Protocol):
+    """What is needed of a logger, that of Python or of ROS."""
+
+    def info(self, message: str, /) -> object: ...
+
+    def warning(self, message: str, /) -> object: ...
+
+    def error(self, message: str, /) -> object: ...
+
+
+@dataclass(frozen=True)
+class RowCounts:
+    """What became of the rows that came in.
+
+    delivered: given to the callback. unknown_cube, wrong_pads: left out because the skin does not
+    have the cube, or has it with another number of pads. unaccounted: none of these and not waiting
+    either; always 0.
+    """
+
+    delivered: int
+    unknown_cube: int
+    wrong_pads: int
+    unaccounted: int
+
+
+@dataclass(frozen=True)
+class LinkReport:
+    """How one link is doing.
+
+    hub_uid: None before the hub has said it. state: the present one. past_states: other states than
+    open that it had since the last report. notes: what is wrong or was since the last report, each
+    with the way out. values: counters and clock, by name.
+    """
+
+    name: str
+    hub_uid: int | None
+    state: LinkState
+    past_states: tuple[LinkState, ...]
+    notes: tuple[str, ...]
+    values: dict[str, object]
+
+
+@dataclass
+class _LinkRecord:
+    """What `LiveLinks` keeps of one link.
+
+    problems: which cubes do not fit the skin. contradictions: of the account. events: states other
+    than open since the last report, and why.
+    """
+
+    account: Account = field(default_factory=Account)
+    clock: ClockMap = field(default_factory=ClockMap)
+    problems: list[str] = field(default_factory=list)
+    contradictions: list[str] = field(default_factory=list)
+    events: deque[tuple[LinkState, str]] = field(default_factory=deque)
+    logged_version: int | None = None
+
+
+class LiveLinks:
+    """Reads the links of a skin and calls back with rows of frequencies.
+
+    on_rows: called in the reader's thread with the rows of each complete scan. They are only valid
+    until it returns if make_rows gives the same memory again.
+    rate: samples per second to ask of the hubs; None leaves it to them.
+    scans_per_call: how many scans are gathered for one call.
+    make_rows: makes the arrays that rows are written into.
+    clock_ns: the clock of `stamp_ns`.
+    on_end: called in the reader's thread when it ends, whether `close` or an error ended it.
+    """
+
+    def __init__(
+        self,
+        links: Sequence[LinkConfig],
+        cubes: Sequence[CubeAddress],
+        on_rows: Callable[[FrequencyRows], None],
+        *,
+        rate: float | None = None,
+        scans_per_call: int = 1,
+        make_rows: MakeRows = empty_rows,
+        clock_ns: Callable[[], int] = time.time_ns,
+        log: Log | None = None,
+        on_end: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._configs = tuple(links)
+        self._scans = ScanBuilder(len(links), cubes)
+        self._records = [_LinkRecord() for _ in links]
+        self._on_rows = on_rows
+        self._on_end = on_end
+        self._rate = rate
+        self._scans_per_call = scans_per_call
+        self._max_scans = max(MAX_SCANS, scans_per_call + 1)
+        self._make_rows = make_rows
+        self._clock_ns = clock_ns
+        self._log: Log = log or logging.getLogger(__name__)
+        self._delivered = 0
+        self._unaccounted = 0
+        self._reader: Reader | None = None
+
+    def start(self) -> None:
+        """Open the links and start the hubs; again after `close` if need be.
+
+        LinkError `bad_port`: a port that can never be opened.
+        """
+        self._reader = Reader(
+            self._configs,
+            self.receive,
+            self._on_state,
+            self._clock_ns,
+            _period_us(self._rate),
+            self._on_end,
+        )
+        self._reader.start()
+
+    def close(self) -> None:
+        """Stop the hubs and close the links. Safe to call twice."""
+        if self._reader is not None:
+            self._reader.close()
+
+    def set_rate(self, rate: float | None) -> None:
+        """Ask the hubs for another rate, samples per second; None: leave it as it is."""
+        self._rate = rate
+        period_us = _period_us(rate)
+        if self._reader is not None and period_us is not None:
+            for link in range(len(self._configs)):
+                self._reader.send(link, Request(Command.SET_PERIOD, period_us))
+
+    @property
+    def failure(self) -> Exception | None:
+        """The error that ended the reader's thread; None while all is well."""
+        return None if self._reader is None else self._reader.failure
+
+    @property
+    def cube_uids(self) -> dict[int, int]:
+        """uids of the skin's cubes by index, as the hubs say."""
+        return self._scans.cubes.uids
+
+    def row_counts(self) -> RowCounts:
+        """What became of all rows until now."""
+        cubes = self._scans.cubes
+        return RowCounts(self._delivered, cubes.unknown_cube, cubes.wrong_pads, self._unaccounted)
+
+    def report(self) -> list[LinkReport]:
+        """How each link is doing, and what happened since the last report; empty before `start`."""
+        if self._reader is None:
+            return []
+        return [
+            self._report(link, record)
+            for link, record in zip(self._reader.links, self._records, strict=True)
+        ]
+
+    def receive(self, received: Sequence[LinkFrames]) -> None:
+        """Take in frames of the links, and call back with what they complete.
+
+        The reader's thread calls this once per wake-up.
+        """
+        for link, arrival_ns, frames in received:
+            record = self._records[link]
+            samples: list[Sample] = []
+            for frame in frames:
+                if isinstance(frame, Sample):
+                    arrival = record.account.sample(frame)
+                    if arrival is Arrival.RESET:
+                        record.clock.reset()
+                    if arrival is not Arrival.DUPLICATE:
+                        samples.append(frame)
+                elif isinstance(frame, Hello):
+                    self._learn_cubes(link, frame)
+                elif isinstance(frame, Stats):
+                    record.account.stats(frame)
+                    record.contradictions = record.account.contradictions()
+            if samples:
+                device_us = [sample.device_us for sample in samples]
+                stamps_ns = record.clock.update(device_us, arrival_ns)
+                self._scans.add(link, samples, stamps_ns)
+        self._deliver()
+        self._unaccounted = self._scans.unaccounted()
+
+    def _deliver(self) -> None:
+        """Call back with all scans that are complete."""
+        while self._scans.is_complete(self._scans_per_call):
+            rows = self._scans.build(self._make_rows, self._max_scans)
+            if rows is None:
+                return
+            self._on_rows(rows)
+            self._delivered += len(rows)
+
+    def _learn_cubes(self, link: int, hello: Hello) -> None:
+        problems = self._scans.cubes.learn(link, hello)
+        if problems is None:
+            return
+        self._records[link].problems = problems
+        name = self._configs[link].name
+        self._log.info(
+            f"link {name}: hub {hello.hub_uid:#x} with {hello.n_cubes} cubes of {hello.n_pads} pads"
+        )
+        for problem in problems:
+            self._log.error(f"link {name}: {problem}")
+
+    def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
+        """The state of a link, or why it waits, has changed."""
+        if state is not LinkState.OPEN:
+            # Without an error a link waits because it is about to be opened for the first time.
+            if error is not None or state is LinkState.CLOSED:
+                self._records[link].events.append((state, str(error or state.value)))
+            self._scans.set_live(link, False)
+            self._deliver()
+        name = self._configs[link].name
+        if error is not None:
+            self._log.warning(f"link {name}: {state.value}: {error}")
+        else:
+            self._log.info(f"link {name}: {state.value}")
+
+    def _report(self, link: Link, record: _LinkRecord) -> LinkReport:
+        notes = [*record.problems, *record.contradictions]
+        if link.error is not None:
+            notes.insert(0, str(link.error))
+        other = link.decoder.other_version
+        if other is not None:
+            notes.append(
+                f"the hub speaks protocol version {other}, this driver version {VERSION}: "
+                "update the older one"
+            )
+            if other != record.logged_version:
+                record.logged_version = other
+                self._log.error(f"link {link.config.name}: {notes[-1]}")
+        past_states = []
+        # Taken out one by one, because the reader's thread may add to them.
+        while record.events:
+            state, text = record.events.popleft()
+            past_states.append(state)
+            if text not in notes:
+                notes.append(text)
+        return LinkReport(
+            name=link.config.name,
+            hub_uid=None if link.hello is None else link.hello.hub_uid,
+            state=link.state,
+            past_states=tuple(past_states),
+            notes=tuple(notes),
+            values=_values(link, record),
+        )
+
+
+def _period_us(rate: float | None) -> int | None:
+    return None if rate is None else round(1e6 / rate)
+
+
+def _values(link: Link, record: _LinkRecord) -> dict[str, object]:
+    clock = record.clock
+    values: dict[str, object] = {
+        **link.counters,
+        **record.account.counters(),
+        "clock offset s": round(1e-9 * clock.offset_ns, 6),
+        "clock drift ppm": round(clock.drift_ppm, 2),
+        "clock jitter us": round(1e-3 * clock.jitter_ns, 1),
+        "clock resets": clock.resets,
+    }
+    stats = record.account.stats_frame
+    if stats is not None:
+        values["hub uptime s"] = 1e-3 * stats.uptime_ms
+        values["hub supply mV"] = stats.supply_mv or "unknown"
+    return values
