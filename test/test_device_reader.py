@@ -216,11 +216,11 @@ def test_one_callback_for_all_that_is_there(start: Start, hub: PtyHub) -> None:
     )
 
 
-@pytest.mark.parametrize("period_us", [1_000, 10_000_000])
+@pytest.mark.parametrize("period_us", [1_000, 1_000_000])
 def test_who_comes_first_waits_for_those_that_deliver(
     start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch, period_us: int
 ) -> None:
-    """At most for a part of the sample period: 0.2 ms of the short one, two seconds of the long
+    """At most for a part of the sample period: 0.2 ms of the short one, 0.2 s of the long
     one."""
     monkeypatch.setattr(reader_module, "GATHER_S", 5.0)
     later = PtyHub()

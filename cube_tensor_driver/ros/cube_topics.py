@@ -59,7 +59,9 @@ class CubeTopics:
             )
         self._listened = (_heard(self._tensors), _heard(self._wrenches))
 
-    def publish(self, times: FrequencyRows, rows: StressRows, pad_fault: NDArray[np.uint32]) -> None:
+    def publish(
+        self, times: FrequencyRows, rows: StressRows, pad_fault: NDArray[np.uint32]
+    ) -> None:
         """Send the rows of cubes that somebody listens to; wrenches of valid ones only."""
         tensors, wrenches = self._listened
         if wrenches:
