@@ -1,1 +1,5 @@
-"""The page that `./cube view` serves: viser and nothing else draws here."""
+"""The page that `./cube view` serves: a skin in 3-D, its numbers and plots, tare, record, replay.
+
+Only this folder imports viser. What is drawn is computed in core/scene.py and elastic/surface.py,
+which serve the other viewers too.
+"""

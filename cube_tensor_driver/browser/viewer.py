@@ -1,5 +1,7 @@
-"""./cube view: a page on this machine that shows a running skin. A process of its own: it slows
-nothing else."""
+"""`./cube view`: serves a page on this machine that shows the running skin.
+
+It is a process of its own, so that it slows nothing else down.
+"""
 
 from __future__ import annotations
 
@@ -8,226 +10,198 @@ import io
 import logging
 import queue
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 import rclpy
 import viser
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-from cube_tensor_driver.msg import ReplayState
-from cube_tensor_driver.srv import SteerReplay, Tare
+from cube_tensor_driver.srv import Tare
 
 from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ConfigError
-from ..processes.children import LEASH
 from ..ros.node import make_executor
-from ..ros.skin_subscriber import STALE_S, SkinSubscriber
-from .history import History
-from .markup import Facts
+from ..ros.skin_subscriber import STALE_S, FollowedSkin, SkinSubscriber
+from .bag_recorder import BagRecorder
+from .charts import HISTORY_S
+from .history import History, RowRate
+from .markup import PageStatus
 from .page import Buttons, Page
+from .replay_client import ReplayClient
+from .service_calls import ServiceCalls
 
 HOST = "127.0.0.1"
 PORT = 8080
 PICTURES_HZ, NUMBERS_HZ = 20.0, 4.0
-HISTORY_S = 10.0
-WAIT_S = 10.0
-"""How long a service may take to answer before the page says that it does not."""
-HELD_S = 1e9
-"""After which cubes are stale while a replay holds."""
+NEVER_STALE_S = 1e9
+"""For cubes while a replay is held."""
 
 
-class Browser:
-    """The node and the page; `spin` until `stopping`."""
+class ShownSkin(NamedTuple):
+    """What belongs to the skin on the page, and goes when another one comes."""
+
+    skin: FollowedSkin
+    page: Page
+    history: History
+    rows: RowRate
+
+
+class Viewer:
+    """The node and the page.
+
+    All of it runs in the thread that calls `spin`, except that buttons are pressed in viser's
+    threads: what they ask for waits in a queue.
+    """
 
     def __init__(self, port: int, depth: float) -> None:
-        logging.getLogger("websockets").setLevel(logging.ERROR)
-        try:
-            with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner of its own
-                self._server = viser.ViserServer(
-                    HOST, port, label="cube_tensor_driver", verbose=False
-                )
-        except OSError as error:
-            raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
-        self.url = f"http://{HOST}:{self._server.get_port()}"
+        """port: of the page, TCP. depth: from the cubes' centres to the surface, m."""
+        self._server = _serve(port)
         self._depth = depth
         self._node = rclpy.create_node("view")
-        self._subscriber = SkinSubscriber(self._node, self._new_skin)
-        self._page: Page | None = None
-        self._facts = Facts()
-        self._links: dict[str, str] = {}
-        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 10)
+        self._subscriber = SkinSubscriber(self._node, self._show_skin)
+        self._node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._receive_diagnostics, 10
+        )
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
-        self._clear = self._node.create_client(Trigger, "reconstruction/clear_tare")
-        self._steer = self._node.create_client(SteerReplay, "player/steer")
-        self._node.create_subscription(ReplayState, "player/state", self._take_replay, 1)
-        self._replay: ReplayState | None = None
-        self._replay_at = -np.inf
-        self._jump: float | None = None
-        self._steered: Any = None
-        self._jumped = 0.0
-        self._wishes: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._answers: list[tuple[str, Any, float]] = []
-        self._recorder: subprocess.Popen[bytes] | None = None
+        self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
+        self._services = ServiceCalls()
+        self._replay = ReplayClient(self._node, self._services)
+        self._recorder = BagRecorder()
+        self._status = PageStatus()
+        self._links: dict[str, str] = {}
+        self._pressed: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._shown: ShownSkin | None = None
         self._executor = make_executor()
         self._executor.add_node(self._node)
 
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self._server.get_port()}"
+
     def spin(self, stopping: Callable[[], bool]) -> None:
-        picture = numbers = time.monotonic()
+        """Serve until `stopping` is true."""
+        next_picture = next_numbers = time.monotonic()
         while not stopping():
-            self._executor.spin_once(timeout_sec=max(0.0, min(picture - time.monotonic(), 0.05)))
+            wait = min(next_picture - time.monotonic(), 1 / PICTURES_HZ)
+            self._executor.spin_once(timeout_sec=max(0.0, wait))
+            while not self._pressed.empty():
+                self._pressed.get()()
             now = time.monotonic()
-            while not self._wishes.empty():
-                self._wishes.get()()
-            if now < picture:
+            if now < next_picture:
                 continue
-            # After a pause of the machine the pictures that were missed are not made up for.
-            picture = max(picture + 1 / PICTURES_HZ, now)
-            self._draw(now >= numbers)
-            if now >= numbers:
-                numbers = now + 1 / NUMBERS_HZ
+            # After a pause of the computer, pictures that were missed are not made up for.
+            next_picture = max(next_picture + 1 / PICTURES_HZ, now)
+            with_numbers = now >= next_numbers
+            if with_numbers:
+                next_numbers = now + 1 / NUMBERS_HZ
+            if self._shown is not None:
+                self._update(self._shown, with_numbers)
 
     def close(self) -> None:
-        self._end_recording()
+        self._recorder.end()
         self._executor.remove_node(self._node)
         self._node.destroy_node()
         self._server.stop()
 
-    def _new_skin(self) -> None:
-        info = self._subscriber.info
-        if self._page is not None:
-            self._page.close()
-        wish = self._wishes.put
-        buttons = Buttons(
-            tare=lambda: wish(lambda: self._ask("tare", self._tare, Tare.Request())),
-            clear_tare=lambda: wish(
-                lambda: self._ask("clear tare", self._clear, Trigger.Request())
-            ),
-            record=lambda: wish(self._record),
-            hold=lambda: wish(self._hold),
-            jump=lambda position: wish(lambda: setattr(self, "_jump", position)),
-        )
-        names = [cube.name for cube in info.cubes]
-        self._page = Page(
-            self._server, info.name, names, self._subscriber.places, self._depth, buttons
-        )
-        self._history = History(len(names), round(HISTORY_S * PICTURES_HZ))
-        self._page.steer(self._replay)
-        self._count, self._counted_at = np.zeros(len(names), np.int64), time.monotonic()
-        self._rate = np.full(len(names), np.nan)
+    def _show_skin(self, skin: FollowedSkin) -> None:
+        """There is a skin, or another one: make its page."""
+        if self._shown is not None:
+            self._shown.page.close()
+        names = [cube.name for cube in skin.info.cubes]
+        page = Page(self._server, skin.info.name, names, skin.poses, self._depth, self._buttons())
+        page.show_replay(self._replay.state)
+        history = History(len(names), round(HISTORY_S * PICTURES_HZ))
+        self._shown = ShownSkin(skin, page, history, RowRate(len(names), time.monotonic()))
 
-    def _draw(self, numbers: bool) -> None:
-        page = self._page
-        if page is None:
-            return
-        self._make_jump()
-        newest = self._subscriber.newest
-        held = self._replay is not None and self._replay.paused
-        health = self._subscriber.health(HELD_S if held else STALE_S)
+    def _buttons(self) -> Buttons:
+        def tare() -> None:
+            self._ask("tare", self._tare, Tare.Request())
+
+        def clear_tare() -> None:
+            self._ask("clear tare", self._clear_tare, Trigger.Request())
+
+        def hold() -> None:
+            self._status.action = self._replay.toggle_hold() or self._status.action
+
+        put = self._pressed.put
+        return Buttons(
+            tare=lambda: put(tare),
+            clear_tare=lambda: put(clear_tare),
+            record=lambda: put(self._toggle_recording),
+            hold=lambda: put(hold),
+            jump=lambda position: put(lambda: self._replay.jump_to(position)),
+        )
+
+    def _update(self, shown: ShownSkin, with_numbers: bool) -> None:
+        """One picture; with_numbers: and what stands beside it."""
+        skin, page = shown.skin, shown.page
+        if self._replay.update():
+            shown.history.clear()
+        held = self._replay.held
+        now = self._subscriber.now()
+        health = skin.newest.health(now, NEVER_STALE_S if held else STALE_S)
         if not page.paused and not held:
-            self._history.add(self._subscriber.now(), newest)
+            shown.history.add(now, skin.newest)
         # Without a browser there is nobody to draw for.
         if not self._server.get_clients():
             return
         if not page.paused:
-            page.draw(newest, health)
-        if numbers:
-            now = time.monotonic()
-            if now - self._counted_at > 1.0:
-                self._rate = (newest.count - self._count) / (now - self._counted_at)
-                self._count, self._counted_at = newest.count.copy(), now
-            self._look_at_answers(now)
-            if now - self._replay_at > STALE_S:
-                self._replay = self._steered = self._jump = None
-            if self._jump is None and self._steered is None:
-                page.steer(self._replay)
-            self._facts.links = list(self._links.values())
-            page.write(newest, health, self._rate, self._history, self._facts)
+            page.draw(skin.newest, health)
+        if with_numbers:
+            shown.rows.update(time.monotonic(), skin.newest.count)
+            self._update_status(page)
+            page.write(skin.newest, health, shown.rows.rate, shown.history, self._status)
+
+    def _update_status(self, page: Page) -> None:
+        status = self._status
+        for line in self._services.news():
+            status.action = line
+        code = self._recorder.ended_by_itself()
+        if code is not None:
+            status.action = f"recording ended by itself with code {code}"
+        status.recording = self._recorder.recording
+        status.links = list(self._links.values())
+        self._replay.forget_if_silent()
+        if not self._replay.jumping:
+            page.show_replay(self._replay.state)
 
     def _ask(self, what: str, client: Any, request: Any) -> None:
-        if not client.service_is_ready():
-            self._facts.action = f"{what}: no reconstruction node that can is running"
-            return
-        self._facts.action = f"{what}: asked …"
-        self._answers.append((what, client.call_async(request), time.monotonic()))
+        self._status.action = self._services.ask(what, client, request)
 
-    def _take_replay(self, message: ReplayState) -> None:
-        self._replay, self._replay_at = message, time.monotonic()
+    def _toggle_recording(self) -> None:
+        if self._recorder.recording:
+            self._recorder.end()
+            self._status.action = "recording ended"
+        else:
+            self._status.action = f"recording to {self._recorder.start()}"
 
-    def _hold(self) -> None:
-        if self._replay is not None:
-            request = SteerReplay.Request(position=np.nan, paused=not self._replay.paused)
-            self._ask("replay", self._steer, request)
-
-    def _make_jump(self) -> None:
-        """The last place that the slider was drawn to, once the place before it has been
-        reached."""
-        now = time.monotonic()
-        if self._steered is not None and (self._steered.done() or now > self._jumped + WAIT_S):
-            self._steered = None
-        if self._jump is None or self._steered is not None or self._replay is None:
-            return
-        request = SteerReplay.Request(
-            position=min(self._jump, self._replay.length), paused=self._replay.paused
-        )
-        self._jump, self._steered, self._jumped = None, self._steer.call_async(request), now
-        self._replay.position = request.position
-        self._history.clear()
-
-    def _look_at_answers(self, now: float) -> None:
-        waiting = []
-        for what, future, since in self._answers:
-            if future.done():
-                answer = future.result()
-                sign = "done" if answer.success else "refused"
-                self._facts.action = f"{what} {sign}: {answer.message}"
-            elif now - since > WAIT_S:
-                self._facts.action = f"{what}: no answer within {WAIT_S:g} s"
-                future.cancel()
-            else:
-                waiting.append((what, future, since))
-        self._answers = waiting
-        if self._recorder is not None and self._recorder.poll() is not None:
-            self._facts.action = f"recording ended by itself with code {self._recorder.returncode}"
-            self._recorder, self._facts.recording = None, False
-
-    def _record(self) -> None:
-        """Start a recording in the folder that we run in, or end it."""
-        if self._recorder is not None:
-            self._end_recording()
-            return
-        name = time.strftime("skin_%Y%m%d_%H%M%S")
-        command = [*LEASH, sys.executable, "-m", "cube_tensor_driver.cli", "record", "-o", name]
-        self._recorder = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
-        )
-        self._facts.recording, self._facts.action = True, f"recording to {name}"
-
-    def _end_recording(self) -> None:
-        if self._recorder is None:
-            return
-        self._recorder.send_signal(signal.SIGINT)
-        try:
-            self._recorder.wait(WAIT_S)
-        except subprocess.TimeoutExpired:
-            self._recorder.kill()
-            self._recorder.wait()
-        self._recorder, self._facts.recording, self._facts.action = None, False, "recording ended"
-
-    def _take_diagnostics(self, message: DiagnosticArray) -> None:
+    def _receive_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if ": link " in status.name:
-                self._links[status.name] = f"{status.name.rpartition(': ')[2]}: {status.message}"
+                name = status.name.rpartition(": ")[2]
+                self._links[status.name] = f"{name}: {status.message}"
+
+
+def _serve(port: int) -> viser.ViserServer:
+    """ConfigError: the port is in use."""
+    logging.getLogger("websockets").setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+            return viser.ViserServer(HOST, port, label="cube_tensor_driver", verbose=False)
+    except OSError as error:
+        raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
 
 
 def run_view(port: int = PORT, depth: float = SURFACE_DEPTH) -> int:
-    """Serve until Ctrl-C; returns the exit code. ConfigError: the port cannot be had."""
+    """Serve the page until Ctrl-C; returns the exit code.
+
+    port: TCP. depth: from the cubes' centres to the surface, m. Raises ConfigError if the port is
+    in use.
+    """
     stopping = False
 
     def stop(*_: object) -> None:
@@ -238,9 +212,9 @@ def run_view(port: int = PORT, depth: float = SURFACE_DEPTH) -> int:
         signal.signal(number, stop)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        with contextlib.closing(Browser(port, depth)) as browser:
-            print(f"{browser.url}  (Ctrl-C ends it)", flush=True)
-            browser.spin(lambda: stopping)
+        with contextlib.closing(Viewer(port, depth)) as viewer:
+            print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
+            viewer.spin(lambda: stopping)
     finally:
         rclpy.try_shutdown()
     return 0

@@ -1,7 +1,8 @@
-"""The contacts node: `stress` in, where something presses on the skin and how hard out."""
+"""The node `contacts`: from `stress`, where something presses on the skin and how hard."""
 
 from __future__ import annotations
 
+import numpy as np
 from geometry_msgs.msg import Point, Vector3
 from numpy.typing import NDArray
 
@@ -9,13 +10,16 @@ from cube_tensor_driver.msg import SkinContacts
 
 from ..core.defaults import CONTACT_PRESSURE, SURFACE_DEPTH
 from ..elastic.surface import Contact, Surface
+from .messages import to_time
 from .node import run
-from .skin_subscriber import SkinSubscriberNode
+from .skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 
 class Contacts(SkinSubscriberNode):
-    """Publishes `contacts` for the newest `stress`, at most `rate` times a second; empty arrays:
-    nothing presses."""
+    """Publishes `contacts` for the newest `stress`, at most `rate` times a second.
+
+    The arrays of a message are empty where nothing presses.
+    """
 
     def __init__(self) -> None:
         super().__init__("contacts", SkinContacts, 10)
@@ -29,23 +33,23 @@ class Contacts(SkinSubscriberNode):
             (0.0, 1e9),
         )
 
-    def new_skin(self) -> None:
-        self._surface, self._said = Surface(self.subscriber.places, self.value("depth")), None
+    def set_up(self, skin: FollowedSkin) -> None:
+        self._surface = Surface(skin.poses, self.value("depth"))
+        self._seen = 0
 
-    def message(self) -> SkinContacts | None:
-        stamp = self.subscriber.stamp
-        if stamp is self._said:
+    def message(self, skin: FollowedSkin, health: np.ndarray) -> SkinContacts | None:
+        if skin.messages == self._seen:
             return None
-        self._said = stamp
-        values = self.subscriber.newest.believed(self.subscriber.health())
+        self._seen = skin.messages
+        values = skin.newest.believed(health)
         message = contacts_message(self._surface.contacts(values, self.value("least")))
-        message.header.stamp = stamp
-        message.header.frame_id = self.subscriber.info.header.frame_id
+        message.header.stamp = to_time(skin.stamp_ns)
+        message.header.frame_id = skin.info.header.frame_id
         return message
 
 
 def contacts_message(contacts: list[Contact]) -> SkinContacts:
-    """Without its header."""
+    """The message without its header."""
     return SkinContacts(
         position=[Point(**_xyz(contact.position)) for contact in contacts],
         normal=[Vector3(**_xyz(contact.normal)) for contact in contacts],
@@ -58,7 +62,7 @@ def contacts_message(contacts: list[Contact]) -> SkinContacts:
     )
 
 
-def _xyz(vector: NDArray) -> dict[str, float]:
+def _xyz(vector: NDArray[np.floating]) -> dict[str, float]:
     return dict(zip("xyz", vector.tolist(), strict=True))
 
 

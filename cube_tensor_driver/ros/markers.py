@@ -1,58 +1,61 @@
-"""The markers node: `stress` in, one MarkerArray with a few markers out, at a rate for eyes.
-
-A marker's points and colours are thousands of Python objects to rclpy. So the array is serialised
-once per skin, and each picture is numpy writing into those bytes.
-"""
+"""The node `markers`: from `stress`, a MarkerArray with a few markers, at a rate for eyes."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point, Quaternion, Vector3
-from rclpy.serialization import serialize_message
+from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..core import scene
 from ..core.errors import ConfigError
 from .node import run
-from .skin_subscriber import SkinSubscriberNode
+from .serialised_markers import SerialisedMarkers
+from .skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 LEGEND_BYTES = 128
-"""One line, filled up on both sides: viewers centre it. RViz sets a second one 1 cm lower, whatever
-the text's size.
+"""One line, with spaces on both sides, because viewers centre it. RViz sets a second line 1 cm
+lower, whatever the size of the text.
 
-A dot at either end: RViz 2 first takes a blank for over a metre, finds a text that begins with
-blanks out of sight and never draws it."""
-PLAIN = str.maketrans("−σ∂", "-sd")
-"""RViz 2 reads a text byte by byte: each byte of another letter is a gap."""
+A dot stands at either end. RViz 2 takes a space for more than a metre at first. If a text began
+with spaces it would seem out of sight, and never be drawn."""
+PLAIN_LETTERS = str.maketrans("−σ∂", "-sd")
+"""RViz 2 reads a text byte by byte, so a letter of two bytes makes two gaps."""
 LIFETIME_S = 2
-"""Viewers drop the picture so long after the node is gone: no old load stands there as if it were
-true."""
-BAR = 32
+"""Viewers remove the picture so long after the node has gone, so that no old load is shown as if it
+were there."""
+BAR_CUBES = 32
+"""The bar of the legend is made of so many boxes."""
 UPSIDE_DOWN = np.array([-1.0, 1.0, -1.0])
-"""Half a turn about y: the same box. RViz 2 draws a box's −z face at 0.9 of its colour, the +z face
-at 0.5."""
-WHITE, TRACTION, GRADIENT, PULL, PUSH = (
-    (0.9, 0.9, 0.9),
-    (0.95, 0.95, 0.95),
-    (1.0, 0.6, 0.1),
-    (0.9, 0.3, 0.2),
-    (0.3, 0.5, 1),
-)
+"""Half a turn about y, after which a box is the same. RViz 2 draws the face -z of a box at 0.9 of
+its colour and the face +z at 0.5."""
+SIDE = 2.04
+"""Of a cube, in half sides: a little larger than in the robot model, so that faces in one plane do
+not flicker."""
+
+Colour = tuple[float, float, float]
+WHITE, TRACTION, GRADIENT = (0.9, 0.9, 0.9), (0.95, 0.95, 0.95), (1.0, 0.6, 0.1)
+PULL, PUSH = (0.9, 0.3, 0.2), (0.3, 0.5, 1.0)
 
 
-class Drawn(NamedTuple):
-    """A marker's arrays inside the serialised message: points (n, 3), colours (n, 4) or (0, 4)."""
+class Ranges(NamedTuple):
+    """The values that the longest arrows and the top of the colours stand for; they follow what is
+    there.
 
-    points: np.ndarray
-    colours: np.ndarray
+    colours: SI of the quantity. traction: Pa. gradient: Pa/m.
+    """
+
+    colours: float = 0.0
+    traction: float = 0.0
+    gradient: float = 0.0
 
 
 class Markers(SkinSubscriberNode):
-    """Publishes `markers`: cubes coloured by a quantity, traction and gradient arrows, crosses over
-    faulty cubes."""
+    """Publishes `markers`: cubes in colours, arrows of traction and gradient, a legend, and crosses
+    over cubes that are not fine."""
 
     def __init__(self) -> None:
         super().__init__("markers", MarkerArray, 2)
@@ -73,159 +76,215 @@ class Markers(SkinSubscriberNode):
         self._quantity = scene.QUANTITIES[name]
         super().configure()
 
-    def new_skin(self) -> None:
-        places = self.subscriber.places
-        self._pitch = places.pitch
-        self._canvas = Canvas(
-            self.subscriber.info.header.frame_id, places, self._pitch, self.value("crosses")
+    def set_up(self, skin: FollowedSkin) -> None:
+        frame_id = skin.info.header.frame_id
+        self._canvas = Canvas(frame_id, skin.poses, self.value("crosses"))
+        self._ranges = Ranges()
+
+    def message(self, skin: FollowedSkin, health: np.ndarray) -> bytes:
+        values, residual = skin.newest.believed(health), skin.newest.residual
+        shown = self._quantity.of(values, residual)
+        ranges = self._ranges = self._follow(values, residual, shown)
+        canvas = self._canvas
+        canvas.draw_cubes(scene.colours(self._quantity, shown, ranges.colours))
+        canvas.draw_arrows(values, ranges)
+        canvas.draw_faults(health)
+        canvas.draw_crosses(values, ranges.traction)
+        low = -ranges.colours if self._quantity.signed else 0.0
+        bar = np.linspace(low, ranges.colours, BAR_CUBES)
+        canvas.draw_legend(
+            scene.colours(self._quantity, bar, ranges.colours),
+            legend_text(self._quantity, ranges.colours, health),
         )
-        self._top = self._longest = self._steepest = 0.0
-        self._health = np.empty(0)
+        return bytes(canvas.data)
 
-    def message(self) -> bytes:
-        canvas, places, newest = self._canvas, self.subscriber.places, self.subscriber.newest
-        health = self.subscriber.health()
-        values = newest.believed(health)
-        shown = self._quantity.of(values, newest.residual)
-        self._top = float(self.value("range")) or scene.automatic(self._quantity, shown, self._top)
-        canvas.colour_cubes(scene.colours(self._quantity, shown, self._top))
-
-        normal = places.rotation[:, :, 2]
+    def _follow(
+        self, values: NDArray[np.float64], residual: NDArray[np.float64], shown: NDArray[np.float64]
+    ) -> Ranges:
         shear, gradient = scene.QUANTITIES["shear"], scene.QUANTITIES["gradient"]
-        self._longest = scene.automatic(shear, values[:, 2:5], self._longest)
-        self._steepest = scene.automatic(
-            gradient, gradient.of(values, newest.residual), self._steepest
+        last, fixed = self._ranges, float(self.value("range"))
+        return Ranges(
+            colours=fixed or scene.automatic(self._quantity, shown, last.colours),
+            traction=scene.automatic(shear, values[:, 2:5], last.traction),
+            gradient=scene.automatic(gradient, gradient.of(values, residual), last.gradient),
         )
-        arrows = scene.traction_arrows(places, values, 1.2 * self._pitch / self._longest)
-        canvas["traction"].points[:] = scene.heads(arrows, normal).reshape(-1, 3)
-        arrows = scene.gradient_arrows(places, values, 0.8 * self._pitch / self._steepest)
-        canvas["gradient"].points[:] = scene.heads(arrows, normal).reshape(-1, 3)
-        if not np.array_equal(health, self._health):
-            self._health = health
-            canvas["faults"].points[:] = scene.fault_crosses(places, health).reshape(-1, 3)
-            canvas["faults"].colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
-        if "crosses" in canvas:
-            lines, pulls = scene.principal_crosses(places, values, self._pitch / self._longest)
-            canvas["crosses"].points[:] = lines.reshape(-1, 3)
-            canvas["crosses"].colours[:, :3] = np.repeat(
-                np.where(pulls.reshape(-1, 1), PULL, PUSH), 2, axis=0
-            )
-        bar = np.linspace(-self._top if self._quantity.signed else 0.0, self._top, BAR)
-        canvas["legend bar"].colours[:, :3] = scene.colours(self._quantity, bar, self._top)
-        canvas.write(self._legend(health))
-        return bytes(canvas.message)
 
-    def _legend(self, health: np.ndarray) -> str:
-        quantity = self._quantity
-        top = self._top / quantity.size
-        counts = [f"{np.count_nonzero(health == k)} {word}" for k, word in enumerate(scene.HEALTH)]
-        states = ", ".join(
-            text for k, text in enumerate(counts) if k == scene.FINE or np.any(health == k)
-        )
-        low = -top if quantity.signed else 0
-        label, unit = quantity.label.translate(PLAIN), quantity.unit.replace("σ", "sigma")
-        return f"{label}: {low:.3g} to {top:.3g} {unit}; {states}"
+
+def legend_text(quantity: scene.Quantity, top: float, health: NDArray[np.integer]) -> str:
+    """What colours mean and how the cubes are; top: of the range, SI."""
+    high = top / quantity.size
+    low = -high if quantity.signed else 0
+    label, unit = quantity.label.translate(PLAIN_LETTERS), quantity.unit.replace("σ", "sigma")
+    states = []
+    for state, word in enumerate(scene.HEALTH):
+        count = np.count_nonzero(health == state)
+        if count or state == scene.FINE:
+            states.append(f"{count} {word}")
+    return f"{label}: {low:.3g} to {high:.3g} {unit}; {', '.join(states)}"
 
 
 class Canvas:
-    """A serialised MarkerArray whose points, colours and legend are numpy's to write; drawn by
-    name."""
+    """The picture of a skin as a serialised MarkerArray.
 
-    def __init__(self, frame: str, places: scene.CubePoses, pitch: float, crosses: bool) -> None:
-        self._drawn: dict[str, Drawn] = {}
-        self._markers: list[Marker] = []
-        self._frame = frame
-        n = len(places.position)
-        # CUBE_LIST has one orientation for all its points: one marker for each orientation in the
-        # skin.
-        unique, group = np.unique(
-            places.rotation.round(6).reshape(n, 9), axis=0, return_inverse=True
-        )
-        turns = unique.reshape(-1, 3, 3) * UPSIDE_DOWN
-        self._groups = [np.flatnonzero(group.ravel() == k) for k in range(len(turns))]
-        for k, ((w, x, y, z), members) in enumerate(
-            zip(scene.turns(turns).tolist(), self._groups, strict=True)
-        ):
-            marker = self._add(f"cubes {k}", Marker.CUBE_LIST, len(members), True)
-            marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
-            # A little larger than the robot model's, so that faces in one plane do not flicker.
-            side = 2.04 * float(places.half_side[members].max())
-            marker.scale = Vector3(x=side, y=side, z=side)
-        for name, count, many, colour in (
-            ("traction", 6, False, TRACTION),
-            ("gradient", 6, False, GRADIENT),
-            ("faults", 4, True, WHITE),
-            ("crosses", 6, True, WHITE),
-        ):
-            if name != "crosses" or crosses:
-                marker = self._add(name, Marker.LINE_LIST, count * n, many, colour)
-                marker.scale.x = 0.05 * pitch
-        low, high = places.position.min(axis=0), places.position.max(axis=0)
-        width = max(high[0] - low[0], 4 * pitch)
-        bar = self._add("legend bar", Marker.CUBE_LIST, BAR, True)
-        bar.pose.orientation = Quaternion(y=1.0, w=0.0)
-        bar.scale = Vector3(x=width / BAR, y=0.3 * pitch, z=0.05 * pitch)
-        text = self._add("legend", Marker.TEXT_VIEW_FACING, 0, False, WHITE)
-        text.scale.z = 0.05 * width
-        text.scale.x = (
-            0.5 * text.scale.z
-        )  # of a blank in RViz 2, drawn half as wide; else over a metre
-        text.text = "\x01" * LEGEND_BYTES
-        middle = 0.5 * (low[0] + high[0])
-        text.pose.position = Point(x=middle, y=low[1] - 2.2 * pitch - 0.07 * width, z=low[2])
-        self._serialise()
-        for k, (turn, members) in enumerate(zip(turns, self._groups, strict=True)):
-            # points of a marker are in its pose, which is turned
-            self[f"cubes {k}"].points[:] = places.position[members] @ turn
-        across = middle + width * (np.linspace(0, 1, BAR) - 0.5)
-        beside = np.broadcast_to([low[1] - 1.2 * pitch, low[2]], (BAR, 2))
-        self["legend bar"].points[:] = np.column_stack([across, beside]) * UPSIDE_DOWN
+    data: the message. Each marker has its name as namespace.
+    """
 
-    def __getitem__(self, name: str) -> Drawn:
-        return self._drawn[name]
+    def __init__(self, frame_id: str, poses: scene.CubePoses, crosses: bool) -> None:
+        """crosses: whether principal stresses are drawn."""
+        self._poses = poses
+        self._pitch = poses.pitch
+        self._health: NDArray[np.integer] | None = None
+        self._groups, rotations = _group_by_orientation(poses.rotation)
+        legend = LegendPlace.beside(poses)
+        markers = [
+            *self._cube_markers(frame_id, rotations),
+            *self._line_markers(frame_id, crosses),
+            *_legend_markers(frame_id, legend),
+        ]
+        self._markers = SerialisedMarkers(markers)
+        for group, (members, rotation) in enumerate(zip(self._groups, rotations, strict=True)):
+            # The points of a marker are in the frame of its pose.
+            self._markers[f"cubes {group}"].points[:] = poses.position[members] @ rotation
+        self._markers["legend bar"].points[:] = legend.bar * UPSIDE_DOWN
+        for marker in markers:
+            self._markers[marker.ns].colours[:, 3] = 1.0
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._drawn
+    @property
+    def data(self) -> bytearray:
+        return self._markers.data
 
-    def colour_cubes(self, colours: np.ndarray) -> None:
-        for k, members in enumerate(self._groups):
-            self[f"cubes {k}"].colours[:, :3] = colours[members]
+    def draw_cubes(self, colours: NDArray[np.float64]) -> None:
+        for group, members in enumerate(self._groups):
+            self._markers[f"cubes {group}"].colours[:, :3] = colours[members]
 
-    def write(self, legend: str) -> None:
+    def draw_arrows(self, values: NDArray[np.float64], ranges: Ranges) -> None:
+        normal = self._poses.rotation[:, :, 2]
+        traction = scene.traction_arrows(self._poses, values, 1.2 * self._pitch / ranges.traction)
+        gradient = scene.gradient_arrows(self._poses, values, 0.8 * self._pitch / ranges.gradient)
+        for name, lines in (("traction", traction), ("gradient", gradient)):
+            self._markers[name].points[:] = scene.heads(lines, normal).reshape(-1, 3)
+
+    def draw_faults(self, health: NDArray[np.integer]) -> None:
+        """Crosses over cubes that are not fine; drawn again only when health has changed."""
+        if self._health is not None and np.array_equal(health, self._health):
+            return
+        self._health = health
+        faults = self._markers["faults"]
+        faults.points[:] = scene.fault_crosses(self._poses, health).reshape(-1, 3)
+        faults.colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
+
+    def draw_crosses(self, values: NDArray[np.float64], longest: float) -> None:
+        """Principal stresses, if the picture has them; a line for `longest`, Pa, has the length of
+        the pitch."""
+        if "crosses" not in self._markers:
+            return
+        crosses = self._markers["crosses"]
+        lines, pulls = scene.principal_crosses(self._poses, values, self._pitch / longest)
+        crosses.points[:] = lines.reshape(-1, 3)
+        crosses.colours[:, :3] = np.repeat(np.where(pulls.reshape(-1, 1), PULL, PUSH), 2, axis=0)
+
+    def draw_legend(self, bar: NDArray[np.float64], text: str) -> None:
+        """bar: (BAR_CUBES, 3) colours."""
+        self._markers["legend bar"].colours[:, :3] = bar
         room = LEGEND_BYTES - 2
-        self._legend[:] = np.frombuffer(b"." + legend.encode()[:room].center(room) + b".", np.uint8)
+        line = b"." + text.encode()[:room].center(room) + b"."
+        self._markers["legend"].text[:] = np.frombuffer(line, np.uint8)
 
-    def _add(
-        self, name: str, kind: int, n: int, many: bool, colour: tuple[float, float, float] = WHITE
-    ) -> Marker:
-        """A marker whose points, and colours if `many`, are its number until `_serialise` finds
-        them by it."""
-        number = 1e-30 * (len(self._markers) + 1)
-        marker = Marker(ns=name, type=kind, action=Marker.ADD, frame_locked=True)
-        marker.header.frame_id = self._frame
-        marker.lifetime.sec = LIFETIME_S
-        marker.pose.orientation.w = 1.0
-        r, g, b = colour
-        marker.color = ColorRGBA(r=float(r), g=float(g), b=float(b), a=1.0)
-        marker.points = [Point(x=number, y=number, z=number)] * n
-        marker.colors = [ColorRGBA(r=number, g=number, b=number, a=number)] * (n if many else 0)
-        self._markers.append(marker)
-        return marker
+    def _cube_markers(self, frame_id: str, rotations: NDArray[np.float64]) -> list[Marker]:
+        """One for each orientation, because all boxes of a CUBE_LIST are parallel."""
+        markers = []
+        for group, (w, x, y, z) in enumerate(scene.turns(rotations).tolist()):
+            members = self._groups[group]
+            side = SIDE * float(self._poses.half_side[members].max())
+            marker = _marker(frame_id, f"cubes {group}", Marker.CUBE_LIST)
+            marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
+            marker.scale = Vector3(x=side, y=side, z=side)
+            _allocate(marker, len(members), with_colours=True)
+            markers.append(marker)
+        return markers
 
-    def _serialise(self) -> None:
-        self.message = bytearray(serialize_message(MarkerArray(markers=self._markers)))
-        for k, marker in enumerate(self._markers):
-            number = 1e-30 * (k + 1)
-            points = self._find(np.full((len(marker.points), 3), number, "<f8"))
-            colours = self._find(np.full((len(marker.colors), 4), number, "<f4"))
-            colours[:, 3] = 1.0
-            self._drawn[marker.ns] = Drawn(points, colours)
-        self._legend = self._find(np.full(LEGEND_BYTES, 1, np.uint8))
+    def _line_markers(self, frame_id: str, crosses: bool) -> list[Marker]:
+        """Arrows of three lines, crosses over faults of two, principal crosses of three."""
+        cubes = len(self._poses.position)
+        traction = _marker(frame_id, "traction", Marker.LINE_LIST, TRACTION)
+        gradient = _marker(frame_id, "gradient", Marker.LINE_LIST, GRADIENT)
+        faults = _marker(frame_id, "faults", Marker.LINE_LIST)
+        principal = _marker(frame_id, "crosses", Marker.LINE_LIST)
+        _allocate(traction, 6 * cubes, with_colours=False)
+        _allocate(gradient, 6 * cubes, with_colours=False)
+        _allocate(faults, 4 * cubes, with_colours=True)
+        _allocate(principal, 6 * cubes, with_colours=True)
+        markers = [traction, gradient, faults, *([principal] if crosses else [])]
+        for marker in markers:
+            marker.scale.x = 0.05 * self._pitch
+        return markers
 
-    def _find(self, values: np.ndarray) -> Any:
-        """The values' place in the message as an array to write to."""
-        start = self.message.index(values.tobytes())
-        return np.frombuffer(self.message, values.dtype, values.size, start).reshape(values.shape)
+
+class LegendPlace(NamedTuple):
+    """Where the legend is, in the parent frame, m.
+
+    width, height: of the bar. bar: (BAR_CUBES, 3) its boxes. text: (3,) the middle of the text.
+    """
+
+    width: float
+    height: float
+    bar: NDArray[np.float64]
+    text: NDArray[np.float64]
+
+    @classmethod
+    def beside(cls, poses: scene.CubePoses) -> LegendPlace:
+        """Beside the skin, towards -y."""
+        pitch = poses.pitch
+        low, high = poses.position.min(axis=0), poses.position.max(axis=0)
+        middle = 0.5 * (low[0] + high[0])
+        width = max(high[0] - low[0], 4 * pitch)
+        bar = np.empty((BAR_CUBES, 3))
+        bar[:, 0] = middle + width * (np.linspace(0, 1, BAR_CUBES) - 0.5)
+        bar[:, 1] = low[1] - 1.2 * pitch
+        bar[:, 2] = low[2]
+        text = np.array([middle, low[1] - 2.2 * pitch - 0.07 * width, low[2]])
+        return cls(width, 0.3 * pitch, bar, text)
+
+
+def _legend_markers(frame_id: str, place: LegendPlace) -> list[Marker]:
+    bar = _marker(frame_id, "legend bar", Marker.CUBE_LIST)
+    bar.pose.orientation = Quaternion(y=1.0, w=0.0)
+    bar.scale = Vector3(x=place.width / BAR_CUBES, y=place.height, z=place.height / 6)
+    _allocate(bar, BAR_CUBES, with_colours=True)
+
+    text = _marker(frame_id, "legend", Marker.TEXT_VIEW_FACING)
+    x, y, z = place.text.tolist()
+    text.pose.position = Point(x=x, y=y, z=z)
+    text.scale.z = 0.05 * place.width
+    # RViz 2 draws a space half as wide as this; if it is 0, over a metre wide.
+    text.scale.x = 0.5 * text.scale.z
+    text.text = " " * LEGEND_BYTES
+    return [bar, text]
+
+
+def _marker(frame_id: str, name: str, shape: int, colour: Colour = WHITE) -> Marker:
+    marker = Marker(ns=name, type=shape, action=Marker.ADD, frame_locked=True)
+    marker.header.frame_id = frame_id
+    marker.lifetime.sec = LIFETIME_S
+    marker.pose.orientation.w = 1.0
+    red, green, blue = colour
+    marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+    return marker
+
+
+def _allocate(marker: Marker, points: int, with_colours: bool) -> None:
+    marker.points = [Point()] * points
+    marker.colors = [ColorRGBA()] * (points if with_colours else 0)
+
+
+def _group_by_orientation(
+    rotation: NDArray[np.float64],
+) -> tuple[list[NDArray[np.intp]], NDArray[np.float64]]:
+    """The cubes of each orientation that occurs, and the orientations (G, 3, 3), upside down."""
+    flat = rotation.round(6).reshape(len(rotation), 9)
+    unique, group = np.unique(flat, axis=0, return_inverse=True)
+    members = [np.flatnonzero(group.ravel() == number) for number in range(len(unique))]
+    return members, unique.reshape(-1, 3, 3) * UPSIDE_DOWN
 
 
 def main() -> None:

@@ -1,9 +1,13 @@
-"""Following a skin: its `info` and its newest `stress`, for nodes that show it or make something of
-it now and then."""
+"""Subscribes to a skin: its `info` and its newest `stress`.
+
+For nodes that show the skin, or make something of its newest rows now and then.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,34 +20,48 @@ from ..bags.message_codec import stress_codec
 from ..core.errors import MessageError
 from ..core.scene import CubePoses, Newest
 from ..core.tensor import rotation_from_quaternion
-from .messages import to_time
 from .node import CubeNode
 
 DEPTH = 10
-"""A viewer wants the newest messages, not all: a short queue, best effort, so that a slow one holds
-up nobody."""
+"""A viewer wants the newest messages, not all of them. So its queue is short and it asks for best
+effort: a slow viewer holds up nobody."""
 STALE_S = 1.0
-"""A cube that nothing came from for so long is stale."""
+"""A cube is stale when no row of it has come for so long."""
+ERROR_PERIOD_S = 5.0
+"""The log has at most one line about damaged messages in this time."""
+
+
+@dataclass
+class FollowedSkin:
+    """A skin as its topics show it.
+
+    info: of type SkinInfo. poses: of its cubes. newest: row of each cube. messages: how many of
+    `stress` have come. stamp_ns: of the newest of them.
+    """
+
+    info: Any
+    poses: CubePoses
+    newest: Newest
+    messages: int = 0
+    stamp_ns: int = 0
 
 
 class SkinSubscriber:
-    """Keeps `info`, `places` and `newest` of the skin whose topics the node sees; `info` is None
-    until it came.
+    """Follows the skin whose topics a node sees.
 
-    on_skin: called when there is a skin, or another one. stamp: of the newest rows, None before
-    they came. Messages that contradict themselves are counted and left out.
+    skin: None until its `info` has come.
     """
 
-    def __init__(self, node: Node, on_skin: Callable[[], None]) -> None:
-        self.info: Any = None  # of type SkinInfo
-        self.stamp: Any = None  # of type builtin_interfaces/Time
-        self.bad_messages = 0
-        self._node, self._on_skin = node, on_skin
+    def __init__(self, node: Node, on_skin: Callable[[FollowedSkin], None]) -> None:
+        """on_skin: called when there is a skin, and when there is another one."""
+        self.skin: FollowedSkin | None = None
+        self._node = node
+        self._on_skin = on_skin
         latched = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        quick = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        newest = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscriptions = [
-            node.create_subscription(SkinInfo, "info", self._take_info, latched),
-            node.create_subscription(SkinStress, "stress", self._take_stress, quick, raw=True),
+            node.create_subscription(SkinInfo, "info", self._receive_info, latched),
+            node.create_subscription(SkinStress, "stress", self._receive_stress, newest, raw=True),
         ]
 
     def close(self) -> None:
@@ -51,41 +69,42 @@ class SkinSubscriber:
             self._node.destroy_subscription(subscription)
 
     def now(self) -> float:
-        """The node's clock in s."""
+        """The time of the node's clock in s, which `Newest` is told."""
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
-    def health(self, stale: float = STALE_S) -> np.ndarray:
-        """(cubes,) as `Newest.health` has it."""
-        return self.newest.health(self.now(), stale)
-
-    def _take_info(self, info: SkinInfo) -> None:
-        before, self.info = self.info, info
-        if before is not None and _where(before) == _where(info):
+    def _receive_info(self, info: SkinInfo) -> None:
+        if self.skin is not None and _geometry(self.skin.info) == _geometry(info):
+            self.skin.info = info
             return
-        self.places, self.newest, self.stamp = places(info), Newest(len(info.cubes)), None
-        self._on_skin()
+        self.skin = FollowedSkin(info, cube_poses(info), Newest(len(info.cubes)))
+        self._on_skin(self.skin)
 
-    def _take_stress(self, data: bytes) -> None:
-        if self.info is None:
+    def _receive_stress(self, data: bytes) -> None:
+        if self.skin is None:
             return
         try:
             message = stress_codec.decode(data)
         except MessageError as error:
-            self.bad_messages += 1
-            self._node.get_logger().error(str(error), throttle_duration_sec=5.0)
+            self._node.get_logger().error(str(error), throttle_duration_sec=ERROR_PERIOD_S)
             return
-        self.newest.update(message.rows.cube, message.rows, self.now())
-        self.stamp = to_time(int(message.stamp_ns[0]))
+        self.skin.newest.update(message.rows.cube, message.rows, self.now())
+        self.skin.messages += 1
+        self.skin.stamp_ns = int(message.stamp_ns[0])
 
 
 class SkinSubscriberNode(CubeNode):
-    """A lifecycle node that makes one topic of a skin's newest rows, `rate` times a second while
-    somebody listens."""
+    """A lifecycle node that makes one topic, named as the node, of a skin's newest rows.
 
-    def __init__(self, name: str, kind: type, depth: int) -> None:
-        """kind: of the messages on the topic `name`; depth: of its queue."""
+    It publishes at most `rate` messages a second, and only while somebody listens.
+    """
+
+    def __init__(self, name: str, message_type: type, depth: int) -> None:
+        """depth: of the queue of the topic."""
         super().__init__(name)
-        self._kind, self._depth, self._active = kind, depth, False
+        self._message_type = message_type
+        self._depth = depth
+        self._active = False
+        self._configured = ExitStack()
         self.declare(
             "autostart",
             True,
@@ -93,16 +112,25 @@ class SkinSubscriberNode(CubeNode):
         )
         self.declare("rate", 20.0, "Most messages per second.", (0.1, 100.0))
 
-    def new_skin(self) -> None:
-        """There is a skin, or another one: `follower` has it."""
+    def set_up(self, skin: FollowedSkin) -> None:
+        """Prepare for a skin: there is one, or another one."""
 
-    def message(self) -> Any:
-        """What to publish now, a message or its bytes; None: nothing."""
+    def message(self, skin: FollowedSkin, health: np.ndarray) -> Any:
+        """What to publish now: a message, or its bytes, or None for nothing.
+
+        health: (cubes,) as `Newest.health` gives it.
+        """
 
     def configure(self) -> None:
-        self.subscriber = SkinSubscriber(self, self.new_skin)
-        self._publisher = self.create_lifecycle_publisher(self._kind, self.get_name(), self._depth)
-        self._timer = self.create_timer(1.0 / self.value("rate"), self._publish)
+        topic = self.get_name()
+        subscriber = SkinSubscriber(self, self.set_up)
+        publisher = self.create_lifecycle_publisher(self._message_type, topic, self._depth)
+        timer = self.create_timer(
+            1.0 / self.value("rate"), lambda: self._publish(subscriber, publisher)
+        )
+        self._configured.callback(self.destroy_publisher, publisher)
+        self._configured.callback(subscriber.close)
+        self._configured.callback(self.destroy_timer, timer)
 
     def activate(self) -> None:
         self._active = True
@@ -111,34 +139,29 @@ class SkinSubscriberNode(CubeNode):
         self._active = False
 
     def cleanup(self) -> None:
-        if hasattr(self, "_timer"):
-            self.destroy_timer(self._timer)
-            self.subscriber.close()
-            self.destroy_publisher(self._publisher)
-            del self._timer
+        self._configured.close()
 
-    def _publish(self) -> None:
-        if (
-            self._active
-            and self.subscriber.info is not None
-            and self._publisher.get_subscription_count()
-        ):
-            message = self.message()
-            if message is not None:
-                self._publisher.publish(message)
+    def _publish(self, subscriber: SkinSubscriber, publisher: Any) -> None:
+        skin = subscriber.skin
+        if skin is None or not self._active or not publisher.get_subscription_count():
+            return
+        message = self.message(skin, skin.newest.health(subscriber.now(), STALE_S))
+        if message is not None:
+            publisher.publish(message)
 
 
-def places(info: SkinInfo) -> CubePoses:
-    """Where the cubes of an `info` are. CubeError: a pose that is none."""
-    position = [
-        (cube.pose.position.x, cube.pose.position.y, cube.pose.position.z) for cube in info.cubes
-    ]
-    turns = [cube.pose.orientation for cube in info.cubes]
-    rotation = [rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w])) for q in turns]
+def cube_poses(info: SkinInfo) -> CubePoses:
+    """Where the cubes of an `info` are, in m. CubeError: an orientation that is no rotation."""
+    positions = [cube.pose.position for cube in info.cubes]
+    orientations = [cube.pose.orientation for cube in info.cubes]
+    rotations = [rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w])) for q in orientations]
     return CubePoses(
-        np.array(position), np.array(rotation), np.array([cube.half_side for cube in info.cubes])
+        position=np.array([(p.x, p.y, p.z) for p in positions]),
+        rotation=np.array(rotations),
+        half_side=np.array([cube.half_side for cube in info.cubes]),
     )
 
 
-def _where(info: SkinInfo) -> list[object]:
+def _geometry(info: SkinInfo) -> list[object]:
+    """What makes it another skin for a viewer if it changes."""
     return [info.header.frame_id, *((cube.name, cube.pose, cube.half_side) for cube in info.cubes)]

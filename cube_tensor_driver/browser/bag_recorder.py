@@ -1,0 +1,52 @@
+"""Records a bag while the page is open: `./cube record` as a child process."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+from ..processes.children import LEASH
+
+END_S = 10.0
+"""How long the recorder may take to finish its file."""
+
+
+class BagRecorder:
+    """At most one recording, in the folder that this process runs in."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def recording(self) -> bool:
+        return self._process is not None
+
+    def start(self) -> str:
+        """Start to record; returns the name of the bag."""
+        name = time.strftime("skin_%Y%m%d_%H%M%S")
+        command = [*LEASH, sys.executable, "-m", "cube_tensor_driver.cli", "record", "-o", name]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
+        )
+        return name
+
+    def end(self) -> None:
+        """Finish the bag; safe to call without a recording."""
+        if self._process is None:
+            return
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+    def ended_by_itself(self) -> int | None:
+        """The exit code of a recording that ended unasked, once; None: it did not."""
+        code = None if self._process is None else self._process.poll()
+        if code is not None:
+            self._process = None
+        return code
