@@ -24,7 +24,10 @@ class Contacts(SkinSubscriberNode):
     def __init__(self) -> None:
         super().__init__("contacts", SkinContacts, 10)
         self.declare(
-            "depth", SURFACE_DEPTH, "From the cubes' centres to the skin's surface, m.", (1e-5, 1.0)
+            "depth",
+            SURFACE_DEPTH,
+            "From the cubes' centres to the skin's surface, m.",
+            (1e-5, 1.0),
         )
         self.declare(
             "least",
