@@ -1,139 +1,213 @@
-"""./cube fem: a response matrix computed, as tables, files and pictures."""
+"""./cube fem: a response matrix by finite elements, as tables, files and pictures."""
 
 from __future__ import annotations
 
+import argparse
+import math
 import shlex
-from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
+from ..core.defaults import POISSONS_RATIO, YOUNGS_MODULUS
+from .parser import Parser, number, positive
 
-from ..config.atomic_write import check_outputs
-from ..config.calibration import write_calibration
-from ..core.errors import ElasticError, LayoutError
-from ..core.layout import Layout
-from ..core.symmetry import default_modes, find_structure
-from ..elastic.body import Body, strip_layout
-from ..elastic.fem import Response, calibration_from_fem, compute_response
-from ..plot.deformation import draw_loads
-from ..plot.response import draw_convergence, draw_response
-from ..plot.style import save
-from ..research.paper import mode_deformations
-from ..terminal.output import make_folder, progress_bar, write_json
-from .layout import coefficient_counts, named_layout
+if TYPE_CHECKING:
+    from ..core.layout import Layout
+    from ..elastic.body import Body
+    from ..elastic.fem import Response
 
-_COLUMNS = 7  # modes in one table, so that it fits a terminal
-_ROWS = 40  # coefficients shown; more are in the JSON file
-_EXPLAINED = 1e-3  # of the response may be left out of a calibration by its coefficients
+STEEL_PA = 200e9
+UNEXPLAINED = 1e-3
+"""Part of the response that coefficients may leave out of a calibration; beyond it the whole matrix
+is written."""
+WRITTEN = ("json", "figures", "output")
+"""Options that change nothing in the result."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """As on the command line; lengths in mm, young in Pa. None: not given."""
-
-    space: bool = False
-    layout: str | None = None
-    symmetry: str | None = None
-    plane: str | None = None
-    width: float = 60.0
-    height: float = 11.0
-    side: float = 4.0
-    young: float = 0.3e6
-    poisson: float = 0.48
-    rigid: bool = False
-    pad: str | None = None
-    pad_centre: float | None = None
-    neglect: tuple[str, ...] = ()
-    meshes: int = 3
-    json: Path | None = None
-    figures: Path | None = None
-    output: Path | None = None
-
-
-def run_fem(options: Options) -> int:
-    """Compute a response matrix, show it, write what is asked for. CubeError: what is wrong, before
-    any work."""
-    layout = _layout(options)
-    symmetry = options.symmetry or next(
-        name for name, count in coefficient_counts(layout).items() if count
+def arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "--3d",
+        dest="space",
+        action="store_true",
+        help="compute in space, for 24 pads: takes minutes and up to 6 GB",
     )
+    parser.add_argument(
+        "--layout",
+        metavar="NAME",
+        help="quad, planar, cube, or a YAML file (default: planar; cube with --3d)",
+    )
+    parser.add_argument(
+        "--symmetry",
+        metavar="G",
+        help="full, slab, mirrors or none (default: the first that the layout has)",
+    )
+    parser.add_argument(
+        "--plane",
+        choices=["strain", "stress"],
+        help="of a layout in a plane (default: strain)",
+    )
+    parser.add_argument(
+        "--width",
+        type=positive,
+        default=60.0,
+        metavar="MM",
+        help="of the body along x, and along y in space, mm (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--height",
+        type=positive,
+        default=11.0,
+        metavar="MM",
+        help="of the body along z, mm (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--side",
+        type=positive,
+        default=4.0,
+        metavar="MM",
+        help="of the cube, mm (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--young",
+        type=positive,
+        default=YOUNGS_MODULUS,
+        metavar="PA",
+        help="Young's modulus of the body, Pa (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--poisson",
+        type=number,
+        default=POISSONS_RATIO,
+        metavar="NU",
+        help="Poisson's ratio of the body (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--rigid", action="store_true", help="a rigid cube (default: steel, 200 GPa, 0.30)"
+    )
+    parser.add_argument(
+        "--pad",
+        metavar="half|MM",
+        help="width of the pads: the halves of each face, or mm (default: that of the layout)",
+    )
+    parser.add_argument(
+        "--pad-centre",
+        type=positive,
+        metavar="MM",
+        help="distance of the pads' centres from the middle of the face, mm (default: 1 with --pad MM)",
+    )
+    parser.add_argument(
+        "--neglect",
+        nargs="+",
+        default=[],
+        metavar="MODE",
+        help="modes that the calibration takes as zero",
+    )
+    parser.add_argument(
+        "--meshes",
+        type=int,
+        choices=[1, 2, 3],
+        default=3,
+        help="number of meshes; fewer need less memory and show less of the convergence "
+        "(default: %(default)s)",
+    )
+    parser.add_json()
+    parser.add_output(
+        "--figures", kind="folder", help="write pictures of convergence, response and each load"
+    )
+    parser.add_output("-o", "--output", help="calibration file to write")
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..config.output_files import write_json
+    from ..core.symmetry import default_modes, find_structure, largest_symmetry
+    from ..elastic.fem import compute_response
+    from ..terminal.fem import show_response
+    from ..terminal.output import progress_bar
+
+    layout = padded_layout(options)
+    symmetry = options.symmetry or largest_symmetry(layout)
+    # Mistakes are named before any work.
     find_structure(layout, symmetry)
     default_modes(layout).index(options.neglect)
-    body = _body(options, layout)
-    check_outputs({"--json": options.json, "-o": options.output})
-    make_folder("--figures", options.figures)
-    console = Console()
-    console.print(
-        f"{_describe(body, layout)}; {layout.n_pads} pads, symmetry {symmetry}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    body = body_of(options, layout)
+
+    print(f"{describe(body, layout)}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
     with progress_bar() as report:
         result = compute_response(body, layout, symmetry, options.meshes, report)
-    _show(console, result)
+    show_response(result)
     if options.json is not None:
         write_json(options.json, result.to_dict())
     if options.figures is not None:
-        save(draw_convergence(result), options.figures / "convergence.png")
-        save(draw_response(result), options.figures / "response.png")
-        if layout.planar:
-            loads = draw_loads(layout, mode_deformations(body, layout))
-            save(loads, options.figures / "loads.png")
-        console.print(f"pictures in {options.figures}", highlight=False)
+        draw(result, options.figures)
     if options.output is not None:
-        _write_calibration(console, options, result)
+        write(options, result)
     return 0
 
 
-def _layout(options: Options) -> Layout:
-    name = options.layout or ("cube" if options.space else "planar")
-    layout = named_layout(name)
+def padded_layout(options: argparse.Namespace) -> Layout:
+    """The layout with the pads that are asked for. ElasticError: they do not fit."""
+    from ..config.layout import named_layout
+    from ..core.errors import ElasticError, LayoutError
+    from ..elastic.body import strip_layout
+
+    layout = named_layout(options.layout or ("cube" if options.space else "planar"))
     if options.space and layout.planar:
         raise ElasticError(
             f"layout {layout.name!r} lies in a plane; leave out --3d, or take --layout cube"
         )
-    d0 = options.side / 2
-    width, centre = layout.pad_size, None if options.pad_centre is None else options.pad_centre / d0
-    if options.pad == "half":
-        if centre not in (None, 0.5):
-            raise ElasticError(
-                f"--pad half sets the pads' centres; leave out --pad-centre {options.pad_centre:g}"
-            )
-        width, centre = 1.0, 0.5
-    elif options.pad is not None:
-        width, centre = _millimetres(options.pad) / d0, 1.0 / d0 if centre is None else centre
-    if centre is None:
+    width_mm, centre_mm = pad_geometry(options, layout)
+    if centre_mm is None:
         return layout
+    d0_mm = options.side / 2
     try:
-        return strip_layout(layout, width, centre)
+        return strip_layout(layout, width_mm / d0_mm, centre_mm / d0_mm)
     except LayoutError as error:
-        where = f"pads {width * d0:g} mm wide, {centre * d0:g} mm from the middle of their faces"
-        reach = (centre + width / 2) * d0
-        why = (
-            f"they reach to {reach:g} mm and the faces end at {d0:g} mm"
-            if reach > d0
-            else str(error)
-        )
-        raise ElasticError(f"{where}: {why}; change --pad or --pad-centre") from None
+        reach_mm = centre_mm + width_mm / 2
+        reason = str(error)
+        if reach_mm > d0_mm:
+            reason = f"they reach to {reach_mm:g} mm and the faces end at {d0_mm:g} mm"
+        raise ElasticError(
+            f"pads {width_mm:g} mm wide, {centre_mm:g} mm from the middle of their faces: "
+            f"{reason}; change --pad or --pad-centre"
+        ) from None
 
 
-def _millimetres(text: str) -> float:
+def pad_geometry(options: argparse.Namespace, layout: Layout) -> tuple[float, float | None]:
+    """Width of the pads and distance of their centres from the middle of the face, mm.
+
+    None: neither is asked for, they stay where the layout has them.
+    """
+    from ..core.errors import ElasticError
+
+    d0_mm, centre_mm = options.side / 2, options.pad_centre
+    if options.pad is None:
+        return layout.pad_size * d0_mm, centre_mm
+    if options.pad == "half":
+        if centre_mm not in (None, d0_mm / 2):
+            raise ElasticError(
+                f"--pad half sets the pads' centres; leave out --pad-centre {centre_mm:g}"
+            )
+        return d0_mm, d0_mm / 2
     try:
-        value = float(text)
+        width_mm = float(options.pad)
     except ValueError:
-        value = np.nan
-    if not 0 < value < np.inf:
-        raise ElasticError(f"--pad is {text!r}; it must be half, or a width in mm above 0")
-    return value
+        width_mm = math.nan
+    if not 0 < width_mm < math.inf:
+        raise ElasticError(
+            f"--pad is {options.pad!r}; it must be half, or a width in mm above 0"
+        )
+    return width_mm, 1.0 if centre_mm is None else centre_mm
 
 
-def _body(options: Options, layout: Layout) -> Body:
+def body_of(options: argparse.Namespace, layout: Layout) -> Body:
+    """ElasticError: no such body can be computed."""
+    from ..core.errors import ElasticError
+    from ..elastic.body import Body
+
     if options.plane is not None and not layout.planar:
         raise ElasticError(
-            f"--plane {options.plane} is for layouts in a plane; {layout.name!r} is computed in space"
+            f"--plane {options.plane} is for layouts in a plane; "
+            f"{layout.name!r} is computed in space"
         )
     return Body(
         width=options.width * 1e-3,
@@ -142,118 +216,84 @@ def _body(options: Options, layout: Layout) -> Body:
         side=options.side * 1e-3,
         young=options.young,
         poisson=options.poisson,
-        cube_young=np.inf if options.rigid else Body.cube_young,
+        cube_young=math.inf if options.rigid else STEEL_PA,
         plane=options.plane or "strain",
     )
 
 
-def _describe(body: Body, layout: Layout) -> str:
-    lengths = (body.width, body.height) if layout.planar else (body.width, body.depth, body.height)
+def describe(body: Body, layout: Layout) -> str:
+    lengths = [body.width, body.height]
+    plane = f", plane {body.plane}"
+    if not layout.planar:
+        lengths.insert(1, body.depth)
+        plane = ""
     size = " x ".join(f"{1e3 * length:g}" for length in lengths)
-    plane = f", plane {body.plane}" if layout.planar else ""
-    cube = "rigid" if np.isinf(body.cube_young) else "steel"
+    cube = "rigid" if math.isinf(body.cube_young) else "steel"
     law = f"E {body.young / 1e6:g} MPa, nu {body.poisson:g}{plane}"
     return f"{cube} cube of {1e3 * body.side:g} mm in a body of {size} mm ({law})"
 
 
-def _show(console: Console, result: Response) -> None:
-    names = result.modes
-    for start in range(0, len(names), _COLUMNS):
-        title = "response, Pa per Pa; below, what the symmetry does not explain"
-        table = Table(
-            title=None if start else title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False
-        )
-        table.add_column("pad")
-        modes = range(start, min(start + _COLUMNS, len(names)))
-        for mode in modes:
-            table.add_column(names[mode], justify="right")
-        for number, (pad, row) in enumerate(zip(result.layout.pads, result.matrix, strict=True), 1):
-            table.add_row(
-                f"V{number} {pad}" if result.layout.planar else pad,
-                *(f"{row[mode] + 0.0:.4f}" for mode in modes),
-            )
-        table.add_section()
-        table.add_row(
-            "left, %", *(f"{100 * result.mode_residual[names[mode]]:.2f}" for mode in modes)
-        )
-        console.print(table)
-    rows = result.convergence
-    table = Table(
-        title="coefficients on meshes of so many unknowns",
-        title_justify="left",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    table.add_column("unknowns")
-    for row in rows:
-        table.add_column(str(row["unknowns"]), justify="right")
-    table.add_column("last step", justify="right")
-    for name in list(result.coefficients)[:_ROWS]:
-        values = [row["coefficients"][name] for row in rows]
-        step = (
-            f"{100 * abs(values[-1] / values[-2] - 1):.2g} %"
-            if len(rows) > 1 and values[-2]
-            else ""
-        )
-        table.add_row(name, *(f"{value:.5f}" for value in values), step)
-    table.add_section()
-    changes = ("" if row["change"] is None else f"{100 * row['change']:.2g} %" for row in rows)
-    table.add_row("change to the next", *changes)
-    table.add_row("seconds", *(f"{row['seconds']:.1f}" for row in rows))
-    console.print(table)
-    if len(result.coefficients) > _ROWS:
-        console.print(
-            f"and {len(result.coefficients) - _ROWS} coefficients more, in the --json file"
-        )
-    console.print(
-        f"symmetry {result.symmetry} leaves {100 * result.structure_residual:.3g} % of the response unexplained; "
-        f"rank {result.rank} of {len(names)}; unobservable: {', '.join(result.unobservable) or 'nothing'}; "
-        f"{result.seconds:.1f} s",
-        highlight=False,
-        soft_wrap=True,
-    )
-
-
-def _command(options: Options) -> str:
-    """The command line that computes this, without the files that it writes."""
-    flags = {"space": "3d", "pad_centre": "pad-centre"}
+def command_of(options: argparse.Namespace) -> str:
+    """The command line that computes the same, without what is default and what it writes."""
+    parser = Parser()
+    arguments(parser)
     words = ["./cube", "fem"]
-    for item in fields(options):
-        value = getattr(options, item.name)
-        if value == item.default or item.name in ("json", "figures", "output"):
+    for name, default in vars(parser.parse_args([])).items():
+        value = getattr(options, name)
+        if value == default or name in (*WRITTEN, "outputs"):
             continue
-        words.append(f"--{flags.get(item.name, item.name)}")
-        if value is not True:
-            words += (
-                map(str, value)
-                if isinstance(value, tuple)
-                else [f"{value:g}" if item.type == "float" else str(value)]
-            )
+        words.append("--3d" if name == "space" else f"--{name.replace('_', '-')}")
+        if isinstance(value, float):
+            words.append(f"{value:g}")
+        elif isinstance(value, list):
+            words += value
+        elif value is not True:
+            words.append(str(value))
     return shlex.join(words)
 
 
-def _write_calibration(console: Console, options: Options, result: Response) -> None:
-    whole = result.structure_residual > _EXPLAINED
+def draw(result: Response, folder: Path) -> None:
+    """Pictures of convergence and response, and of the loads of a layout in a plane."""
+    from ..plot.deformation import draw_loads
+    from ..plot.response import draw_convergence, draw_response
+    from ..plot.style import save
+    from ..research.paper import mode_deformations
+
+    folder.mkdir(parents=True, exist_ok=True)
+    save(draw_convergence(result), folder / "convergence.png")
+    save(draw_response(result), folder / "response.png")
+    if result.layout.planar:
+        loads = draw_loads(result.layout, mode_deformations(result.body, result.layout))
+        save(loads, folder / "loads.png")
+    print(f"pictures in {folder}")
+
+
+def write(options: argparse.Namespace, result: Response) -> None:
+    """The calibration file, with what it holds and does not hold in its first lines."""
+    from ..config.calibration import write_calibration
+    from ..elastic.fem import calibration_from_fem
+
+    command = command_of(options)
+    whole = result.structure_residual > UNEXPLAINED
     calibration = calibration_from_fem(
-        result,
-        whole_matrix=whole,
-        neglect=options.neglect,
-        source=f"computed by {_command(options)}",
+        result, whole_matrix=whole, neglect=options.neglect, source=f"computed by {command}"
     )
-    strongest = float(np.abs(result.matrix[:, result.modes.index("zz")]).max())
-    crushing = f"{calibration.modulus.max() / strongest / 1e3:.3g}"
+    strongest = float(abs(result.matrix[:, result.modes.index("zz")]).max())
+    crushing_kpa = calibration.modulus.max() / strongest / 1e3
     lines = [
-        f"Made by: {_command(options)} -o {options.output}",
-        f"The response is computed: {_describe(result.body, result.layout)}.",
-        "Rest frequencies, beta and modulus are not: they are placeholders until the cube is tared and fitted.",
-        f"With this modulus a uniform sigma_zz of -{crushing} kPa crushes a pad, which is where its law ends.",
+        f"Made by: {command} -o {options.output}",
+        f"The response is computed: {describe(result.body, result.layout)}.",
+        "Rest frequencies, beta and modulus are not: they are placeholders until the cube is tared"
+        " and fitted.",
+        f"With this modulus a uniform sigma_zz of -{crushing_kpa:.3g} kPa crushes a pad, which is"
+        " where its law ends.",
     ]
     if options.neglect:
         lines.append(
             "The modes under neglect must be small: too few pads to tell them from the others."
         )
-    write_calibration(options.output or Path(), calibration, "\n".join(lines))
+    write_calibration(options.output, calibration, "\n".join(lines))
     what = f"calibration {calibration.id}"
     if whole:
         what += f", with the whole matrix: symmetry {result.symmetry} does not explain it"
-    console.print(f"wrote {options.output}: {what}", highlight=False, soft_wrap=True)
+    print(f"wrote {options.output}: {what}")

@@ -1,133 +1,25 @@
-"""./cube pictures: the pictures of the documentation, made anew so that they stay true."""
+"""./cube pictures: the pictures of the documentation, drawn again so that they stay true."""
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+import argparse
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
-from visualization_msgs.msg import MarkerArray
-
-from ..config.package_data import package_data
-from ..core.errors import ConfigError, CubeError
-from ..plot.experiments import draw_prototype
-from ..plot.field import draw_field, draw_field_study, field_tables
-from ..plot.markers import draw_markers
-from ..plot.style import save
-from ..processes.children import Children
-from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
-from ..research.field_study import field_example, field_study
-from ..research.paper import experiments
-from ..ros.node import make_executor
-from ..trials.bench import bench_scale
-
-START_S, LOOK_S = 30.0, 120.0
-"""How long the processes may take to start, and the browser to make its picture."""
-PERIOD = 160
-"""Pictures of the markers in one period of the demo's load: 8 s at 20 Hz."""
-COUNTS, RATE, MEASURE_S = [1, 4, 16, 64, 256, 1024, 4096], 100.0, 6.0
-"""Of the scale plot: a range that most machines can do."""
+from . import ROOT
+from .parser import Parser
 
 
-def run_pictures(folder: Path) -> int:
-    """Write all pictures, view.png where there is Chromium, and what the field study found; returns
-    the exit code."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"{folder}: {error.strerror}; name a folder that can be written"
-        ) from None
-    with _demo_skin() as children:
-        save(draw_markers(_strongest(children)), folder / "markers.png")
-        if shutil.which("chromedriver"):
-            _photograph(children, folder / "view.png")
-        else:
-            print(
-                "no view.png: needs Chromium, apt-get install chromium chromium-driver",
-                file=sys.stderr,
-            )
-    bench_scale(COUNTS, RATE, MEASURE_S, folder / "scale.json", folder / "scale.png")
-    a, _, b, _, c, _ = experiments()
-    save(draw_prototype([a, b, c]), folder / "prototype.png")
-    save(draw_field(field_example()), folder / "field.png")
-    study = field_study()
-    save(draw_field_study(study), folder / "field_error.png")
-    table = {
-        name: getattr(study, name).tolist()
-        for name in ("pitches", "widths", "error", "position", "force")
-    }
-    (folder / "field.json").write_text(json.dumps(table) + "\n")
-    print(
-        f"{field_tables(study)}\nwrote {', '.join(sorted(path.name for path in folder.iterdir()))} to {folder}"
+def arguments(parser: Parser) -> None:
+    parser.add_output(
+        "-o",
+        "--output",
+        kind="folder",
+        default=ROOT / "docs" / "pictures",
+        help="folder to write to (default: docs/pictures)",
     )
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..trials.pictures import make_pictures
+
+    make_pictures(options.output)
     return 0
-
-
-@contextmanager
-def _demo_skin() -> Iterator[Children]:
-    """The simulated demo skin under its load, with markers and the browser view."""
-    skin = package_data() / "config" / "skin_demo.yaml"
-    with (
-        tempfile.TemporaryDirectory(prefix="cube_pictures_") as name,
-        Children(Path(name)) as children,
-    ):
-        hubs = SimulatedHubs(Path(name) / "ports")
-        for process in skin_processes(skin, markers=True, simulated=hubs):
-            children.start(process)
-        children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-        yield children
-
-
-def _strongest(children: Children) -> MarkerArray:
-    """Of the pictures of one period of the load the one with the largest load. CubeError: none
-    came."""
-    heard: list[tuple[float, MarkerArray]] = []
-
-    def take(message: MarkerArray) -> None:
-        marker = {marker.ns: marker for marker in message.markers}
-        # Arrows are drawn in parts of the range, whose top the legend tells.
-        top = float(marker["legend"].text.split(" to ")[1].split()[0])
-        heard.append((top * sum(point.z for point in marker["traction"].points), message))
-
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node, executor = rclpy.create_node("pictures"), make_executor()
-        node.create_subscription(MarkerArray, "markers", take, 10)
-        executor.add_node(node)
-        until = time.monotonic() + START_S
-        while len(heard) < PERIOD and time.monotonic() < until:
-            executor.spin_once(timeout_sec=0.1)
-            children.check()
-        executor.remove_node(node)
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
-    if len(heard) < PERIOD:
-        raise CubeError(
-            f"{len(heard)} of {PERIOD} markers within {START_S:g} s:\n{children.log('markers')}"
-        )
-    return max(heard, key=lambda one: one[0])[1]
-
-
-def _photograph(children: Children, path: Path) -> None:
-    """The browser view. CubeError: no picture came."""
-    url = children.said("view", "http://", START_S).split()[0]
-    # A tool of the repository, not of the package: only it needs a browser's driver.
-    command = [
-        sys.executable,
-        str(package_data() / "tools" / "photograph.py"),
-        url,
-        str(path.resolve()),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LOOK_S, check=False)
-    if done.returncode:
-        raise CubeError(f"no picture of {url}:\n{done.stderr[-500:]}")

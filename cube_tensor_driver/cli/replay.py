@@ -1,151 +1,109 @@
-"""./cube replay: a bag onto its topics, with a progress bar, keys to pause, step and quit, and the
-browser view."""
+"""./cube replay: a bag onto its topics, with keys to pause, step and quit, and the browser view."""
 
 from __future__ import annotations
 
-import os
-import select
-import signal
+import argparse
 import sys
-import tempfile
-import termios
-import threading
-import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from .parser import Parser, not_negative, positive
 
-from ..bags.read import PACKAGE, Bag
-from ..core.errors import BagError
-from ..processes.children import Children
-from ..processes.skin_processes import Process
-from ..ros.node import make_executor
-from ..ros.player import Player
-from ..ros.replay_control import ReplayControl
+if TYPE_CHECKING:
+    from ..bags.read import Bag
+    from ..processes.children import Children
+    from ..ros.player import Player
 
-KEYS = "space: pause, s: step, q: quit"
-LOOK_S, START_S = 0.05, 30.0
+START_S = 30.0
+"""How long the browser view may take to start."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """As on the command line. start in s after the begin of the bag. view: show the recorded stress
-    in the browser."""
+def arguments(parser: Parser) -> None:
+    parser.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+    parser.add_argument(
+        "--rate",
+        type=positive,
+        default=1.0,
+        metavar="R",
+        help="times the recorded speed (default: %(default)g)",
+    )
+    parser.add_argument("--loop", action="store_true", help="begin again at the end")
+    parser.add_argument(
+        "--start",
+        type=not_negative,
+        default=0.0,
+        metavar="S",
+        help="begin S seconds after the start of the bag (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--clock", action="store_true", help="publish /clock for nodes with use_sim_time"
+    )
+    parser.add_argument("--stress", action="store_true", help="publish the recorded stress too")
+    parser.add_argument(
+        "--view",
+        action="store_true",
+        help="show the recorded stress in the browser, with a time slider",
+    )
 
-    bag: Path
-    rate: float
-    loop: bool
-    start: float
-    clock: bool
-    stress: bool
-    view: bool = False
 
+def run(options: argparse.Namespace) -> int:
+    from ..bags.read import Bag
+    from ..ros.replaying import replay
+    from ..terminal.replaying import ReplayBar, pressed_key, single_keys
 
-def run_replay(options: Options) -> int:
-    """Replay until the bag ends or asked to end. BagError: what is wrong with the bag."""
-    failed: list[BagError] = []
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with Bag(options.bag) as bag, _view(options, bag) as children, _keys() as keys:
-            node = rclpy.create_node("player")
-            player = Player(
-                node,
+    with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as keys:
+        length = (bag.end_ns - bag.start_ns) * 1e-9
+        with ReplayBar(length, keys) as bar:
+
+            def each(player: Player) -> None:
+                children.check()
+                if keys:
+                    obey(pressed_key(), player)
+                bar.show(player.position, player.paused)
+
+            replay(
                 bag,
                 rate=options.rate,
-                stress=options.stress or options.view,
+                loop=options.loop,
+                start=options.start,
                 clock=options.clock,
+                stress=options.stress or options.view,
+                hold=options.view,
+                each=each,
             )
-            ReplayControl(node, player)
-            executor = make_executor()
-            executor.add_node(node)
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, lambda *_: player.end())
-
-            def play() -> None:
-                try:
-                    player.run(options.start, options.loop, hold=options.view)
-                except BagError as error:
-                    failed.append(error)
-
-            thread = threading.Thread(target=play, name="player")
-            thread.start()
-            try:
-                with _progress(bool(keys)) as progress:
-                    task = progress.add_task("", total=player.length)
-                    while thread.is_alive():
-                        executor.spin_once(timeout_sec=LOOK_S)
-                        children.check()
-                        _obey(keys, player)
-                        shown = "paused" if player.paused else "replaying"
-                        progress.update(task, completed=player.position, description=shown)
-                    progress.update(task, completed=player.position)
-            finally:
-                player.end()
-                thread.join()
-            executor.remove_node(node)
-            node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
-    if failed:
-        raise failed[0]
     return 0
 
 
-@contextmanager
-def _view(options: Options, bag: Bag) -> Iterator[Children]:
-    """The browser view as a child, if asked for. BagError: it would have nothing to show."""
-    with (
-        tempfile.TemporaryDirectory(prefix="cube_replay_") as name,
-        Children(Path(name)) as children,
-    ):
-        if options.view:
-            if not bag.topics(f"{PACKAGE}/msg/SkinStress"):
-                raise BagError(
-                    f"{bag.path}: no stress to show; ./cube reprocess makes it of the frequencies"
-                )
-            children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-            print(children.said("view", "http://", START_S), file=sys.stderr)
-        yield children
-
-
-def _progress(keys: bool) -> Progress:
-    columns = [
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.1f} / {task.total:.1f} s"),
-    ]
-    return Progress(*columns, TextColumn(KEYS if keys else ""), console=Console(stderr=True))
-
-
-def _obey(keys: bool, player: Player) -> None:
-    """Do what the key says that was pressed, if any."""
-    if not keys or not select.select([sys.stdin], [], [], 0)[0]:
-        return
-    key = os.read(sys.stdin.fileno(), 1)
-    if key == b" ":
+def obey(key: str, player: Player) -> None:
+    if key == " ":
         player.pause(not player.paused)
-    elif key == b"s":
+    elif key == "s":
         player.step()
-    elif key == b"q":
+    elif key == "q":
         player.end()
 
 
 @contextmanager
-def _keys() -> Iterator[bool]:
-    """Keys one by one, without echo; False where there is no terminal."""
-    if not sys.stdin.isatty():
-        yield False
-        return
-    number = sys.stdin.fileno()
-    before = termios.tcgetattr(number)
-    try:
-        tty.setcbreak(number)
-        yield True
-    finally:
-        termios.tcsetattr(number, termios.TCSADRAIN, before)
+def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
+    """The browser view as a child, if wanted. BagError: it would have nothing to show."""
+    import tempfile
+
+    from ..bags.read import PACKAGE
+    from ..core.errors import BagError
+    from ..processes.children import Children
+    from ..processes.skin_processes import Process
+
+    with (
+        tempfile.TemporaryDirectory(prefix="cube_replay_") as name,
+        Children(Path(name)) as children,
+    ):
+        if wanted:
+            if not bag.topics(f"{PACKAGE}/msg/SkinStress"):
+                raise BagError(
+                    f"{bag.path}: no stress to show; ./cube reprocess computes it from the frequencies"
+                )
+            children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
+            print(children.said("view", "http://", START_S), file=sys.stderr)
+        yield children

@@ -31,22 +31,6 @@ def check_writable(path: Path) -> None:
         temporary.touch()
 
 
-def check_outputs(paths: dict[str, Path | None]) -> None:
-    """Check the output files of a command, by the option that names each, before any work is done.
-
-    Raises ConfigError if a file cannot be written, or if two options name the same file.
-    """
-    given = {option: path for option, path in paths.items() if path is not None}
-    for option, path in given.items():
-        for other in given:
-            if other != option and given[other].resolve() == path.resolve():
-                raise ConfigError(f"{option} and {other} both name {path}; name two files")
-        try:
-            check_writable(path)
-        except ConfigError as error:
-            raise ConfigError(f"{option} {error}") from None
-
-
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
     """A name in the folder of `path`; no file of that name is left at the end."""

@@ -56,6 +56,13 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
     return project(structure, _illustrative_response(structure))[0]
 
 
+def generic_response(structure: Structure) -> np.ndarray:
+    """A response (P, M) with random coefficients: its ranks are those of almost all others."""
+    names = structure.names
+    values = np.random.default_rng(0).uniform(0.5, 1.5, len(names))
+    return response(structure, dict(zip(names, values.tolist(), strict=True)))
+
+
 def response(structure: Structure, coefficients: Mapping[str, float]) -> np.ndarray:
     """A = sum_k c_k B_k, shape (P, M); CalibrationError names what is missing, unknown or not
     finite."""

@@ -187,6 +187,23 @@ def _structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
     return Structure(layout, modes, symmetry, tuple(names), stacked)
 
 
+def coefficient_counts(layout: Layout) -> dict[str, int | None]:
+    """Number of coefficients under each symmetry, the largest group first; None where the layout
+    lacks it."""
+    counts: dict[str, int | None] = {}
+    for name in GENERATORS:
+        try:
+            counts[name] = find_structure(layout, name).n_coefficients
+        except SymmetryError:
+            counts[name] = None
+    return counts
+
+
+def largest_symmetry(layout: Layout) -> str:
+    """The largest group whose response matrices are not all zero."""
+    return next(name for name, count in coefficient_counts(layout).items() if count)
+
+
 def count_by_characters(layout: Layout, symmetry: str, modes: Modes | None = None) -> int:
     """Number of coefficients as the mean over the group of (pads kept) x (trace on modes)."""
     modes = modes or default_modes(layout)

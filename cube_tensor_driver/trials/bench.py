@@ -23,6 +23,7 @@ from rich.progress import Progress
 from cube_tensor_driver.msg import SkinStress
 
 from ..config.grid import grid
+from ..config.output_files import write_json
 from ..config.skin import read_skin
 from ..config.yaml import write_yaml
 from ..core.calibration import illustrative
@@ -35,7 +36,6 @@ from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import make_executor, queue
 from ..simulation.arrival_count import Tally
-from ..terminal.output import write_json
 
 CALIBRATION, LAYOUT, PITCH, CUBES_PER_HUB, INSTANTS = "planar", "planar", 0.012, 80, 16
 ROUNDS = 400

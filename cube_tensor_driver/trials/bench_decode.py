@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..config.output_files import write_json
 from ..device.decoder import Decoder
 from ..device.protocol import Sample, encode
-from ..terminal.output import write_json
 
 BYTES = 500_000
 READ = 4096

@@ -25,6 +25,7 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from ..bags.message_codec import frequency_codec, stress_codec
 from ..config.grid import grid
 from ..config.load_script import read_script
+from ..config.output_files import write_json
 from ..config.package_data import package_data
 from ..config.skin import Skin, read_skin
 from ..config.yaml import write_yaml
@@ -37,7 +38,6 @@ from ..ros.node import make_executor, queue
 from ..simulation.load import Load, default_script
 from ..simulation.verification import Judge
 from ..terminal.live_table import LiveTable
-from ..terminal.output import write_json
 
 FIRST_TENSORS_S = 20.0
 LAST_TENSORS_S = 2.0

@@ -28,6 +28,7 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
 from ..bags.message_codec import AnyRows, frequency_codec, stress_codec
 from ..config.grid import grid
+from ..config.output_files import write_json
 from ..config.skin import read_skin
 from ..config.yaml import to_yaml, write_yaml
 from ..core.errors import CubeError
@@ -39,7 +40,6 @@ from ..ros.node import make_executor, queue
 from ..simulation.faults import FRAME, PAD
 from ..simulation.simulator import CONTROL
 from ..simulation.torture_verification import TortureVerification
-from ..terminal.output import write_json
 
 HUBS, NX, NY, RATE, INSTANTS = 4, 8, 4, 500.0, 1000
 START_S, SETTLE_S, MARGIN_S, DRAIN_S = 40.0, 8.0, 2.0, 60.0

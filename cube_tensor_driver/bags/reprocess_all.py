@@ -1,0 +1,99 @@
+"""Many bags reprocessed into a folder: in processes here, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..config.yaml import read_yaml, write_yaml
+from ..core.errors import BagError, ConfigError, CubeError
+from .reprocess import Change, Done, Job, reprocess
+
+SUFFIX = {"bag": "", "parquet": ".parquet", "csv": ".csv"}
+RECIPE = "reprocess.yaml"
+"""File in the folder of the results that says how they were made."""
+
+
+def make_jobs(bags: Sequence[Path], folder: Path, form: str, change: Change) -> list[Job]:
+    """One job per bag, whose name its result has. BagError: two bags have one name."""
+    names: dict[str, Path] = {}
+    for bag in bags:
+        path = bag.resolve()
+        name = path.stem if path.is_file() else path.name
+        if name in names:
+            raise BagError(
+                f"{names[name]} and {bag} would both become {name}; reprocess them into two folders"
+            )
+        names[name] = bag
+    return [
+        Job(bag, folder / f"{name}{SUFFIX[form]}", form, change) for name, bag in names.items()
+    ]
+
+
+def write_recipe(folder: Path, form: str, change: Change) -> None:
+    """Make the folder and note how its results are made, so that a restart continues the same way.
+
+    BagError: results in it were made another way, or it cannot be written.
+    """
+    cubes = change.skin.cubes if change.skin else ()
+    recipe: dict[str, Any] = {
+        "format": form,
+        "calibration": change.calibration.id if change.calibration else None,
+        "skin": {cube.name: cube.calibration.id for cube in cubes} or None,
+        "tare_from_s": list(change.tare) if change.tare else None,
+    }
+    path = folder / RECIPE
+    if path.exists():
+        if read_yaml(path) != recipe:
+            raise BagError(
+                f"{folder} was made with other options ({path} says which); name another folder"
+            )
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BagError(f"{folder}: {error.strerror}; name a folder that can be written") from None
+    write_yaml(path, recipe, "How the bags of this folder were reprocessed.")
+
+
+def reprocess_all(jobs: Sequence[Job], executor: Executor) -> Iterator[tuple[Job, Done | CubeError]]:
+    """Each job with what it did, or with the error that ended it, as they end."""
+    futures = {executor.submit(reprocess, job): job for job in jobs}
+    for future in as_completed(futures):
+        try:
+            yield futures[future], future.result()
+        except CubeError as error:
+            yield futures[future], error
+
+
+@contextmanager
+def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
+    """`count` processes here, or the Dask cluster at the address `scheduler`.
+
+    ConfigError: no scheduler there. ModuleNotFoundError: `distributed` is not installed.
+    """
+    if scheduler is None:
+        # Spawned, not forked: numpy's threads do not survive a fork.
+        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as executor:
+            yield executor
+        return
+    from distributed import Client
+
+    try:
+        client = Client(scheduler, timeout="5s")
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"--scheduler {scheduler}: {error}; name a running scheduler, tcp://host:8786"
+        ) from None
+    with client:
+        yield client.get_executor()
+
+
+def useful_workers(wanted: int | None, jobs: int) -> int:
+    """At least one and no more than jobs; None: one per core."""
+    return max(1, min(wanted or os.cpu_count() or 1, jobs))

@@ -1,0 +1,109 @@
+"""./cube bench: speed, beside the bare minimum that does the same."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .parser import Parser, count, not_negative, positive
+
+
+def arguments(parser: Parser) -> None:
+    pipeline = parser.add_subcommand(
+        "pipeline", "the core beside the same equations and matrix product in bare numpy"
+    )
+    _add_cubes(pipeline, 1260)
+    pipeline.add_json()
+
+    decode = parser.add_subcommand(
+        "decode", "the decoder on all kinds of noise, beside clean frames"
+    )
+    decode.add_json()
+
+    echo = parser.add_subcommand(
+        "echo", "bare rclpy: publish, echo and receive messages of a skin's sizes"
+    )
+    _add_cubes(echo, 64)
+    _add_time(echo)
+    echo.add_json()
+
+    skin = parser.add_subcommand(
+        "skin", "from simulated hubs to received tensors, beside the echo"
+    )
+    _add_cubes(skin, 64)
+    _add_time(skin)
+    skin.add_argument(
+        "--composed", action="store_true", help="run driver and reconstruction in one process"
+    )
+    skin.add_argument(
+        "--publish-period",
+        type=not_negative,
+        default=0.0,
+        metavar="S",
+        help="time that one message covers, s; 0: one message per scan (default: %(default)g)",
+    )
+    skin.add_json()
+
+    scale = parser.add_subcommand("scale", "skin for growing numbers of cubes, with a picture")
+    scale.add_argument(
+        "--counts",
+        type=count,
+        nargs="+",
+        default=[1, 4, 16, 64, 256, 1024, 4096],
+        metavar="N",
+        help="numbers of cubes (default: 1 4 16 64 256 1024 4096)",
+    )
+    _add_time(scale)
+    scale.add_json()
+    scale.add_output(
+        "--figure",
+        kind="picture",
+        default=Path("scale.png"),
+        help="picture to write (default: %(default)s)",
+    )
+
+
+def _add_cubes(parser: Parser, default: int) -> None:
+    parser.add_argument(
+        "--cubes",
+        type=count,
+        default=default,
+        metavar="N",
+        help="number of cubes (default: %(default)s)",
+    )
+
+
+def _add_time(parser: Parser) -> None:
+    parser.add_argument(
+        "--rate",
+        type=positive,
+        default=1000.0,
+        metavar="HZ",
+        help="scans per second (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--duration",
+        type=positive,
+        default=10.0,
+        metavar="S",
+        help="how long to measure, s (default: %(default)g)",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    if options.what == "decode":
+        from ..trials.bench_decode import bench_decode
+
+        return bench_decode(options.json)
+    from ..trials import bench
+
+    if options.what == "pipeline":
+        return bench.bench_pipeline(options.cubes, options.json)
+    timing = (options.rate, options.duration)
+    if options.what == "echo":
+        return bench.bench_echo(options.cubes, *timing, options.json)
+    if options.what == "scale":
+        return bench.bench_scale(options.counts, *timing, options.json, options.figure)
+    return bench.bench_skin(
+        options.cubes, *timing, options.publish_period, options.composed, options.json
+    )

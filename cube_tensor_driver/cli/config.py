@@ -1,0 +1,100 @@
+"""./cube config grid, ./cube config check: skin files."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+
+from .parser import Parser, count, positive
+
+
+def arguments(parser: Parser) -> None:
+    grid = parser.add_subcommand("grid", "write the skin file of a flat grid of cubes")
+    grid.add_argument("--nx", type=count, required=True, metavar="N", help="cubes along x")
+    grid.add_argument("--ny", type=count, required=True, metavar="N", help="cubes along y")
+    grid.add_argument(
+        "--pitch",
+        type=positive,
+        default=0.012,
+        metavar="M",
+        help="distance from cube to cube, m (default: %(default)s)",
+    )
+    grid.add_argument(
+        "--links",
+        type=count,
+        default=1,
+        metavar="N",
+        help="hubs that share the cubes (default: %(default)s)",
+    )
+    grid.add_argument(
+        "--rate",
+        type=positive,
+        default=100.0,
+        metavar="HZ",
+        help="samples per second (default: %(default)g)",
+    )
+    grid.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
+    grid.add_argument(
+        "--port",
+        default="/dev/ttyACM{}",
+        help="ports; {} is the number of the link (default: %(default)s)",
+    )
+    grid.add_argument(
+        "--layout",
+        default="planar",
+        metavar="NAME",
+        help="layout of the cubes (default: %(default)s)",
+    )
+    grid.add_argument(
+        "--calibration",
+        default="planar",
+        metavar="FILE",
+        help="calibration file or name (default: %(default)s)",
+    )
+    grid.add_output("-o", "--output", required=True, help="skin file to write")
+    check = parser.add_subcommand("check", "list what is wrong with a skin file, or what it holds")
+    check.add_argument("file", type=Path, metavar="FILE", help="skin file")
+
+
+def run(options: argparse.Namespace) -> int:
+    return write_grid(options) if options.what == "grid" else check_file(options.file)
+
+
+def write_grid(options: argparse.Namespace) -> int:
+    from ..config.grid import grid
+    from ..config.yaml import write_yaml
+
+    skin = grid(
+        options.name,
+        nx=options.nx,
+        ny=options.ny,
+        pitch=options.pitch,
+        links=options.links,
+        calibration=options.calibration,
+        layout=options.layout,
+        rate=options.rate,
+        port=options.port,
+    )
+    size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
+    text = f"{size}, on {options.links} links"
+    write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
+    print(f"wrote {options.output}: {text}")
+    return 0
+
+
+def check_file(path: Path) -> int:
+    """Print every mistake of a skin file and return 1, or print what the file holds."""
+    from ..config.skin import check_skin
+
+    skin, mistakes = check_skin(path)
+    if skin is None:
+        for mistake in mistakes:
+            print(f"cube: {path}: {mistake}", file=sys.stderr)
+        return 1
+    layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
+    cubes = ", ".join(f"{number} {name}" for name, number in layouts.items())
+    rate = "the rate of the hubs" if skin.rate is None else f"{skin.rate:g} Hz"
+    print(f"{path}: skin {skin.name}, {cubes} on {len(skin.links)} links, {rate}: nothing wrong")
+    return 0

@@ -1,0 +1,73 @@
+"""./cube demo: simulated hubs, driver and reconstruction, checked against the simulated load."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .parser import Parser, count, positive
+
+MEASURE_S = 10.0
+"""How long a demo that measures runs."""
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="skin file to simulate (default: sixteen planar cubes)",
+    )
+    parser.add_argument(
+        "--cubes", type=count, metavar="N", help="simulate a grid of N planar cubes instead"
+    )
+    parser.add_argument(
+        "--load",
+        type=Path,
+        metavar="FILE",
+        help="load script (default: a contact that wanders over the skin)",
+    )
+    parser.add_argument(
+        "--rate",
+        type=positive,
+        metavar="HZ",
+        help="samples per second (default: those of the skin file, else 100)",
+    )
+    parser.add_argument(
+        "--duration",
+        type=positive,
+        metavar="S",
+        help="end after S seconds and print the figures (default: until Ctrl-C; "
+        f"{MEASURE_S:g} with --headless, --json or --figure)",
+    )
+    parser.add_argument("--headless", action="store_true", help="show no live table")
+    parser.add_argument(
+        "--view", action="store_true", help="show the skin in the browser too, as ./cube view does"
+    )
+    parser.add_output(
+        "--figure",
+        kind="picture",
+        help="draw force and centre of pressure beside those of the load script",
+    )
+    parser.add_output("--json", help="write the figures to FILE instead of printing them")
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..trials.demo import Options, run_demo
+
+    duration = options.duration
+    if duration is None and (options.headless or options.json or options.figure):
+        duration = MEASURE_S
+    return run_demo(
+        Options(
+            config=options.config,
+            cubes=options.cubes,
+            rate=options.rate,
+            duration=duration,
+            headless=options.headless,
+            json=options.json,
+            view=options.view,
+            load=options.load,
+            figure=options.figure,
+        )
+    )

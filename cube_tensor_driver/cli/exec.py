@@ -1,0 +1,34 @@
+"""./cube exec: any command inside the environment that ./cube made."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+
+from .parser import Parser
+
+NOT_FOUND = 127
+"""Exit code of a shell for a command that it does not find."""
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_words(
+        "words",
+        "CMD",
+        "command and its arguments, as in ./cube exec python -c '...'",
+        missing="name a command to run, as in ./cube exec python or ./cube exec bash",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Become the command."""
+    # Python ignores SIGPIPE, and a command would inherit that.
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    name = options.words[0]
+    try:
+        os.execvp(name, options.words)
+    except OSError as error:
+        print(f"cube: exec: {name}: {error.strerror}", file=sys.stderr)
+        return NOT_FOUND

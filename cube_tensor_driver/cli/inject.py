@@ -1,0 +1,31 @@
+"""./cube inject: a fault for simulated hubs that run in another process."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "fault",
+        nargs="+",
+        metavar="KEY=VALUE",
+        help="kind=... and what it needs, as in kind=unplug link=hub0 seconds=2; "
+        "docs/reliability.md lists them",
+    )
+    parser.add_argument(
+        "--ports",
+        type=Path,
+        metavar="DIR",
+        help="folder of the simulated ports (default: that of the newest demo)",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..simulation.inject import inject
+
+    inject(options.ports, options.fault)
+    return 0

@@ -1,0 +1,40 @@
+"""./cube plot: one cube of a bag over time, as a picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .parser import Parser, number
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+    parser.add_argument("--cube", metavar="NAME", help="which cube (default: the first)")
+    parser.add_argument(
+        "--from",
+        dest="start",
+        type=number,
+        metavar="S",
+        help="begin so many seconds after the start of the bag",
+    )
+    parser.add_argument(
+        "--to",
+        dest="end",
+        type=number,
+        metavar="S",
+        help="end so many seconds after the start of the bag",
+    )
+    parser.add_output("-o", "--output", kind="picture", required=True, help="picture to write")
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..bags.read import Bag
+    from ..plot.style import save
+    from ..plot.time_series import cube_series, draw_series
+
+    with Bag(options.bag) as bag:
+        series = cube_series(bag, options.cube, options.start, options.end)
+    save(draw_series(series, options.bag.resolve().name), options.output)
+    print(f"wrote {options.output}: cube {series.name}, {len(series.seconds)} samples")
+    return 0

@@ -1,0 +1,45 @@
+"""The table of commands: what ./cube --help prints. The module of a command has its name."""
+
+from __future__ import annotations
+
+GROUPS = {
+    "Run a skin": {
+        "demo": "run simulated cubes, driver and reconstruction, with a live table",
+        "view": "show a running skin in the browser: 3-D, plots, tare, recording",
+    },
+    "Describe a skin": {
+        "config": "write the skin file of a grid, or check a skin file",
+        "urdf": "print the URDF of a skin: one link per cube under its parent frame",
+    },
+    "Record and evaluate": {
+        "record": "record the topics of a running skin into a bag that ros2 bag reads too",
+        "replay": "publish a bag; the stress is left to a reconstruction node",
+        "bag": "show what a bag holds, or repair one",
+        "plot": "draw frequencies, stress, gradient and residual of one cube of a bag",
+        "reprocess": "compute stress from recorded frequencies again, with another calibration",
+    },
+    "Design and calibrate a cube": {
+        "layout": "show what a layout's pads can measure: ranks, unobservable modes, noise",
+        "fem": "compute a cube's response matrix by finite elements",
+        "fit": "calibrate from a table of known loads and measured frequencies",
+    },
+    "Test faults and speed": {
+        "inject": "inject a fault into running simulated hubs",
+        "torture": "run 32 cubes at 500 Hz under a random mix of all faults and check the result",
+        "bench": "measure speed beside the bare minimum",
+    },
+    "Study the sensor": {
+        "study": "find how wide a contact must be for each layout to measure it right",
+        "paper": "repeat the source paper's simulation and experiments on a virtual bench",
+    },
+    "Develop": {
+        "test": "build and run the test suite",
+        "lint": "check style and types (ruff, mypy)",
+        "docs": "build the documentation as HTML",
+        "pictures": "draw the pictures of the documentation again",
+        "exec": "run any command inside the built environment",
+    },
+}
+"""Heading -> command -> one line of help, in the order in which a user needs them."""
+
+COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}

@@ -1,0 +1,33 @@
+"""./cube torture: a skin in real processes under all faults, checked against the simulator's log."""
+
+from __future__ import annotations
+
+import argparse
+
+from .parser import Parser, positive, whole_number
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "--duration",
+        type=positive,
+        default=60.0,
+        metavar="S",
+        help="how long faults are injected, s (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="N",
+        help="seed of the random mix (default: %(default)s)",
+    )
+    parser.add_json()
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..trials.torture import Options, run_torture
+
+    return run_torture(
+        Options(duration=options.duration, seed=options.seed, json=options.json)
+    )

@@ -1,0 +1,52 @@
+"""The pictures and numbers of docs/paper.md: the source paper's figure 4, its experiments, a rod."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..config.output_files import write_json
+from ..elastic.fem import Progress
+from ..research.paper import Experiment, experiments, figure_4, rod_sweep
+from .deformation import draw_figure_4
+from .experiments import draw_experiment, draw_rod_sweep
+from .style import save
+
+BEGIN_END = {"linear": (0.01, 0.12), "finite": (0.12, 0.96), "rod": (0.96, 1.0)}
+"""When the parts begin and end, as measured parts of the whole time; before them comes Fig. 4."""
+
+
+def save_paper(folder: Path, report: Progress) -> list[Path]:
+    """Pictures and paper.json into a folder; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    report(0, 1, "Fig. 4")
+    written = [folder / "figure_4.png"]
+    save(draw_figure_4(figure_4()), written[0])
+    numbers: dict[str, object] = {}
+    for law in ("linear", "finite"):
+        results = experiments(finite=law == "finite", progress=_part(report, law))
+        for number, result in enumerate(results, 1):
+            written.append(folder / f"experiment_{number}_{law}.png")
+            save(draw_experiment(result), written[-1])
+            numbers[f"{result.name}, {law}"] = _numbers(result)
+    table = rod_sweep(progress=_part(report, "rod"))
+    written.append(folder / "rod_positions.png")
+    save(draw_rod_sweep(table), written[-1])
+    numbers["rod positions"] = table
+    written.append(folder / "paper.json")
+    write_json(written[-1], numbers)
+    return written
+
+
+def _part(report: Progress, name: str) -> Progress:
+    """Progress of a part as progress of the whole."""
+    begin, end = BEGIN_END[name]
+
+    def report_part(done: float, total: float, what: str) -> None:
+        report(begin + (end - begin) * done / total, 1, f"{name}: {what}")
+
+    return report_part
+
+
+def _numbers(result: Experiment) -> dict[str, object]:
+    names = ("displacement", "prototype", "pads", "recovered", "truth")
+    return {name: getattr(result, name).tolist() for name in names}

@@ -1,0 +1,37 @@
+"""A node for the time of a command: rclpy started and ended, signals left to the command."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from .node import make_executor
+
+
+@contextmanager
+def node_session(name: str) -> Iterator[tuple[Node, Any]]:
+    """A node and the executor that it is in, to be spun in the main thread."""
+    # rclpy's own handlers would end the context under a thread that publishes.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node, executor = rclpy.create_node(name), make_executor()
+        executor.add_node(node)
+        try:
+            yield node, executor
+        finally:
+            executor.remove_node(node)
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def on_stop_signal(stop: Callable[[], None]) -> None:
+    """Call `stop` when Ctrl-C, SIGTERM or the end of the terminal asks the process to end."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: stop())
