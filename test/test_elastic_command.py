@@ -16,10 +16,7 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
-from cube_tensor_driver.cli import fem
 from cube_tensor_driver.cli import main as cli
-from cube_tensor_driver.cli import paper as view_paper
-from cube_tensor_driver.cli import study as view_study
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -145,7 +142,7 @@ def computed(monkeypatch):
         calls.append(arguments)
         raise ElasticError("enough")
 
-    monkeypatch.setattr(fem, "compute_response", compute)
+    monkeypatch.setattr("cube_tensor_driver.elastic.fem.compute_response", compute)
     return calls
 
 
@@ -238,17 +235,22 @@ def test_a_mistake_is_one_line_before_any_work(monkeypatch, capsys, flags, words
         ("bench pipeline --json /proc/x", ["--json /proc/x", "can be written"]),
         ("bench scale --figure .", ["--figure .", "is no file"]),
         ("bench scale --figure x.abc", ["x.abc", "no format of a picture"]),
-        ("demo --json x --figure x", ["--json and --figure", "name two files"]),
+        ("demo --json x --figure x", ["--figure and --json", "name two files"]),
         ("torture --json none/x.json", ["--json none/x.json", "can be written"]),
         ("layout cube --json .", ["--json .", "is no file"]),
         ("study --figure x.abc", ["x.abc", "no format of a picture"]),
+        ("fit x.csv --layout cube -o none/c.yaml", ["-o none/c.yaml", "can be written"]),
+        ("fit x.csv --layout cube -o c.png", ["-o and --figure", "name two files"]),
+        ("plot bag -o x.abc", ["x.abc", "no format of a picture"]),
+        ("config grid --nx 1 --ny 1 -o /proc/x", ["-o /proc/x", "can be written"]),
+        ("paper --out /proc/x", ["--out /proc/x", "name a folder"]),
     ],
 )
 def test_every_output_is_asked_about_before_any_work(
     monkeypatch, capsys, tmp_path, arguments, words
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(f"cube_tensor_driver.cli.commands.{arguments.split()[0]}", work)
+    monkeypatch.setattr(f"cube_tensor_driver.cli.{arguments.split()[0]}.run", work)
     refused(capsys, arguments, words)
     assert not list(tmp_path.iterdir())
 
@@ -363,7 +365,9 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
         dict.fromkeys(LAYOUTS),
         error,
     )
-    monkeypatch.setattr(view_study, "layout_study", lambda progress: found)
+    monkeypatch.setattr(
+        "cube_tensor_driver.research.layout_study.layout_study", lambda progress: found
+    )
     assert (
         cli.main(["study", "--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")])
         == 0
@@ -394,11 +398,10 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     def bar():
         yield lambda done, total, what: told.append(done / total)
 
-    monkeypatch.setattr(view_paper, "progress_bar", bar)
-    monkeypatch.setattr(view_paper, "experiments", one)
+    monkeypatch.setattr("cube_tensor_driver.terminal.output.progress_bar", bar)
+    monkeypatch.setattr("cube_tensor_driver.plot.paper.experiments", one)
     monkeypatch.setattr(
-        view_paper,
-        "rod_sweep",
+        "cube_tensor_driver.plot.paper.rod_sweep",
         lambda progress: paper.rod_sweep(places=(0.0, 2e-3), progress=progress),
     )
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0

@@ -10,15 +10,25 @@ import subprocess
 import sys
 import sysconfig
 import threading
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import psutil
 import pytest
 
 from conftest import ROOT
+from cube_tensor_driver.cli.table import COMMANDS
 
 sys.path.insert(0, str(ROOT / "tools"))
 import environment
+
+CLI = ROOT / "cube_tensor_driver" / "cli"
+MODULES = [
+    path
+    for path in CLI.glob("*.py")
+    if path.stem not in ("__init__", "__main__", "main", "parser", "table")
+]
+CAPTURED = {"capture_output": True, "text": True, "check": False}
 
 
 def test_missing_system_packages_are_named_with_the_command(monkeypatch):
@@ -140,17 +150,93 @@ def test_an_interrupted_step_leaves_no_process(tmp_path):
         watchdog.cancel()
 
 
-def test_help_needs_no_environment(tmp_path):
-    done = subprocess.run(
-        [ROOT / "cube", "--help"],
+def bare(*arguments: str, columns: int = 80) -> subprocess.CompletedProcess[str]:
+    """As on a fresh clone: without site-packages, and where set-up could not even begin."""
+    script = (
+        "import sys\n"
+        f"sys.path.insert(0, {str(ROOT / 'tools')!r})\n"
+        "import environment\n"
+        "environment.prepare = None\n"
+        "sys.exit(environment.main(sys.argv[1:]))"
+    )
+    return subprocess.run(
+        [sys.executable, "-I", "-S", "-c", script, *arguments],
         capture_output=True,
         text=True,
         check=False,
-        env={"PATH": os.environ["PATH"]},
+        env={"PATH": os.environ["PATH"], "COLUMNS": str(columns)},
     )
-    assert done.returncode == 0
-    for command in ("demo", "test", "lint", "exec"):
-        assert f"\n    {command} " in done.stdout
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]], ids=" ".join)
+def test_help_lists_every_command_without_the_environment(arguments):
+    done = bare(*arguments)
+    assert done.returncode == 0 and not done.stderr
+    for command in COMMANDS:
+        assert f"\n  {command} " in done.stdout
+    assert {f"{path.stem}" for path in MODULES} == set(COMMANDS)
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_help_is_readable(columns):
+    """No line is wider than the terminal, of any command, and none needs the environment."""
+    for words in ([], *([name] for name in COMMANDS), ["config", "grid"], ["bench", "scale"]):
+        done = bare(*words, "--help", columns=columns)
+        assert done.returncode == 0 and not done.stderr, words
+        lines = done.stdout.splitlines()
+        assert lines[0].startswith(" ".join(["usage: ./cube", *words]))
+        assert max(map(len, lines)) <= min(columns, 100), words
+
+
+def test_help_of_a_command_in_three_ways():
+    texts = [bare(*words.split()).stdout for words in ("demo --help", "demo -h", "help demo")]
+    assert "--duration S" in texts[0] and len(set(texts)) == 1
+
+
+def test_version_is_that_of_the_package():
+    version = ElementTree.parse(ROOT / "package.xml").findtext("version")
+    assert bare("--version").stdout == f"cube_tensor_driver {version}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("dmo", "unknown command dmo; did you mean demo?"),
+        ("--versoin", "unknown option --versoin; did you mean --version?"),
+        ("demo --cubs 3", "demo: unknown option --cubs; did you mean --cubes?"),
+        ("record --outptu x", "record: unknown option --outptu; did you mean --output?"),
+        ("record", "record: the following arguments are required: -o/--output"),
+        ("config", "config: one of these has to follow: grid, check"),
+        ("config gird", "config: unknown command gird; did you mean grid?"),
+        ("bench skin --rat x", "bench skin: --rate: 'x' is not a number above 0"),
+        ("demo --cubes -1", "demo: --cubes: '-1' is not a whole number of at least 1"),
+        ("demo --duration inf", "demo: --duration: 'inf' is not a number above 0"),
+        ("reprocess x -o y --jobs -1", "--jobs: '-1' is not a whole number of at least 1"),
+        ("torture --seed -1", "--seed: '-1' is not a whole number of at least 0"),
+        ("replay x --start -1", "--start: '-1' is not a number of at least 0"),
+        ("plot x -o y --from nan", "--from: 'nan' is not a finite number"),
+        ("view --port 99999", "--port: '99999' is not a TCP port, 1 to 65535"),
+        ("fit x --layout cube -o y --uid 0xg", "--uid: '0xg' is not a uid, 0 to 2^64 - 1"),
+        ("urdf a b", "urdf: unrecognized arguments: b"),
+        ("exec", "exec: name a command to run"),
+    ],
+)
+def test_a_usage_error_is_short_and_needs_no_environment(arguments, said):
+    done = bare(*arguments.split())
+    assert done.returncode == 2 and not done.stdout
+    assert done.stderr.startswith("cube: ") and said in done.stderr
+    assert done.stderr.count("\n") <= 2 and "usage" not in done.stderr
+
+
+def test_exec_becomes_the_command():
+    command = [sys.executable, "-m", "cube_tensor_driver.cli", "exec"]
+    done = subprocess.run([*command, "sh", "-c", "echo $0 -x; exit 7"], **CAPTURED)
+    assert (done.returncode, done.stdout) == (7, "sh -x\n")
+    done = subprocess.run([*command, "no-such-command"], **CAPTURED)
+    assert done.returncode == 127 and "no-such-command: No such file" in done.stderr
+    # As below any shell: a reader that has enough ends the writer.
+    done = subprocess.run([*command, "sh", "-c", "yes | head -n 1"], **CAPTURED)
+    assert (done.stdout, done.stderr) == ("y\n", "")
 
 
 def test_no_python_is_said_with_the_way_out(tmp_path):

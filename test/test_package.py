@@ -33,16 +33,16 @@ FLOORS = [
 ]
 # Each heavy library in as few folders as it needs.
 HOMES = {
-    "rclpy": {"ros", "browser", "trials", "cli"},
+    "rclpy": {"ros", "browser", "trials"},
     "serial": {"device"},
     "cobs": {"device", "simulation"},
     "yaml": {"config"},
     "jsonschema": {"config"},
-    "rich": {"terminal", "trials", "cli"},
+    "rich": {"terminal", "trials"},
     "matplotlib": {"plot"},
     "rosbags": {"bags"},
     "pyarrow": {"bags"},
-    "distributed": {"cli"},
+    "distributed": {"bags"},
     "skfem": {"elastic", "research"},
     "transforms3d": {"core"},
     "launch": {"ros"},

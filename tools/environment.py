@@ -349,11 +349,11 @@ def interrupt(*_: object) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        sys.path.insert(0, str(ROOT))
-        from cube_tensor_driver.cli.main import main as help_only
+    sys.path.insert(0, str(ROOT))
+    from cube_tensor_driver.cli.main import parse
 
-        return help_only(["--help"])
+    # Help, --version and usage errors end here (SystemExit), before anything is set up.
+    parse(arguments)
     signal.signal(signal.SIGTERM, interrupt)
     try:
         python, env = prepare()
@@ -366,15 +366,12 @@ def main(arguments: list[str]) -> int:
     except OSError as error:
         say(f"set-up failed: {error}")
         return 1
-    if arguments[0] == "exec":
-        command = arguments[1:] or [os.environ.get("SHELL", "sh")]
-    else:
-        command = [python, "-m", "cube_tensor_driver.cli", *arguments]
+    command = [python, "-m", "cube_tensor_driver.cli", *arguments]
     try:
-        os.execvpe(command[0], command, env)
+        os.execve(python, command, env)
     except OSError as error:
-        say(f"{command[0]}: {error.strerror}")
-        return 127
+        say(f"{python}: {error.strerror}; remove {STATE}, and ./cube sets it up again")
+        return 1
 
 
 if __name__ == "__main__":

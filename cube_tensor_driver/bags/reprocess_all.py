@@ -30,9 +30,7 @@ def make_jobs(bags: Sequence[Path], folder: Path, form: str, change: Change) -> 
                 f"{names[name]} and {bag} would both become {name}; reprocess them into two folders"
             )
         names[name] = bag
-    return [
-        Job(bag, folder / f"{name}{SUFFIX[form]}", form, change) for name, bag in names.items()
-    ]
+    return [Job(bag, folder / f"{name}{SUFFIX[form]}", form, change) for name, bag in names.items()]
 
 
 def write_recipe(folder: Path, form: str, change: Change) -> None:
@@ -61,7 +59,9 @@ def write_recipe(folder: Path, form: str, change: Change) -> None:
     write_yaml(path, recipe, "How the bags of this folder were reprocessed.")
 
 
-def reprocess_all(jobs: Sequence[Job], executor: Executor) -> Iterator[tuple[Job, Done | CubeError]]:
+def reprocess_all(
+    jobs: Sequence[Job], executor: Executor
+) -> Iterator[tuple[Job, Done | CubeError]]:
     """Each job with what it did, or with the error that ended it, as they end."""
     futures = {executor.submit(reprocess, job): job for job in jobs}
     for future in as_completed(futures):

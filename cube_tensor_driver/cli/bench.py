@@ -27,9 +27,7 @@ def arguments(parser: Parser) -> None:
     _add_time(echo)
     echo.add_json()
 
-    skin = parser.add_subcommand(
-        "skin", "from simulated hubs to received tensors, beside the echo"
-    )
+    skin = parser.add_subcommand("skin", "from simulated hubs to received tensors, beside the echo")
     _add_cubes(skin, 64)
     _add_time(skin)
     skin.add_argument(

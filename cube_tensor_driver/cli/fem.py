@@ -93,7 +93,8 @@ def arguments(parser: Parser) -> None:
         "--pad-centre",
         type=positive,
         metavar="MM",
-        help="distance of the pads' centres from the middle of the face, mm (default: 1 with --pad MM)",
+        help="distance of the pads' centres from the middle of the face, mm "
+        "(default: 1 with --pad MM)",
     )
     parser.add_argument(
         "--neglect",
@@ -193,9 +194,7 @@ def pad_geometry(options: argparse.Namespace, layout: Layout) -> tuple[float, fl
     except ValueError:
         width_mm = math.nan
     if not 0 < width_mm < math.inf:
-        raise ElasticError(
-            f"--pad is {options.pad!r}; it must be half, or a width in mm above 0"
-        )
+        raise ElasticError(f"--pad is {options.pad!r}; it must be half, or a width in mm above 0")
     return width_mm, 1.0 if centre_mm is None else centre_mm
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from .parser import Parser, positive, uid
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..core.fit import Fit
 
 
@@ -74,15 +76,18 @@ def run(options: argparse.Namespace) -> int:
 
     layout = named_layout(options.layout)
     base = shipped_calibration(layout)
+    rest: np.ndarray | None
     if options.reference is not None:
         from ..bags.loads import bag_loads
 
         loads, base = bag_loads(
             options.loads, options.cube, options.reference, layout, options.area
         )
-        # A reference sensor never reads exactly 0: which time was without load says the tare.
-        rest = base.rest_frequency
-        rest_source = "of the bag, after tare"
+        # A reference sensor never reads exactly 0: only the tare tells when there was no load.
+        rest, rest_source = base.rest_frequency, "of the bag, after tare"
+    else:
+        loads = read_loads(options.loads, layout, options.area)
+        rest, rest_source = unloaded(loads), "of the rows without load"
     if options.base is not None:
         base = read_calibration(find_calibration(options.base, Path()))
         base.check(layout, options.uid)
@@ -90,10 +95,6 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError(
             f"layout {layout.name!r} is not a built-in one: name a calibration for it with --base"
         )
-    if options.reference is None:
-        loads = read_loads(options.loads, layout, options.area)
-        rest = unloaded(loads)
-        rest_source = "of the rows without load"
     if rest is None:
         rest = base.rest_frequency
         rest_source = "of the base calibration: the table has no row without load"

@@ -66,7 +66,7 @@ def command_parser(name: str) -> Parser:
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
         close = nearest(name, [*COMMANDS, "help", "--help", "--version"])
-        Parser(prog=PROGRAM).error(f"unknown {kind} {name!r}; {close}")
+        Parser(prog=PROGRAM).error(f"unknown {kind} {name}; {close}")
     module = importlib.import_module(f".{name}", __package__)
     parser = Parser(prog=f"{PROGRAM} {name}", description=sentence(COMMANDS[name]))
     module.arguments(parser)
@@ -87,7 +87,9 @@ def help_text() -> str:
         lines += ["", f"{heading}:"]
         for name, text in commands.items():
             first = f"  {name}".ljust(indent)
-            lines += textwrap.wrap(text, width, initial_indent=first, subsequent_indent=" " * indent)
+            lines += textwrap.wrap(
+                text, width, initial_indent=first, subsequent_indent=" " * indent
+            )
     last = f"{PROGRAM} COMMAND --help explains a command, {PROGRAM} --version prints the version."
     return "\n".join([*lines, "", *textwrap.wrap(last, width)])
 

@@ -66,6 +66,7 @@ class Parser(argparse.ArgumentParser):
         """All words that follow, options too, belong to another program; missing: what to say
         without any."""
         self.add_argument(name, nargs=argparse.REMAINDER, metavar=metavar, help=text)
+        self.usage = f"%(prog)s {metavar} ..."
         self._words, self._missing = name, missing
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -83,14 +84,14 @@ class Parser(argparse.ArgumentParser):
         return namespace, []
 
     def _refuse_unknown(self, words: list[str]) -> None:
-        """Before argparse looks: it would complain about what is missing because of a typing error."""
+        """Before argparse looks, which would call a mistyped option a missing one."""
         if self._subcommands is not None:
             known = list(self._subcommands.choices)
             word = next((word for word in words if not word.startswith("-")), None)
             if word is None and not {"-h", "--help"} & set(words):
                 self.error(f"one of these has to follow: {', '.join(known)}")
             if word is not None and word not in known:
-                self.error(f"unknown command {word!r}; {nearest(word, known)}")
+                self.error(f"unknown command {word}; {nearest(word, known)}")
             return
         for word in words:
             if word == "--":
@@ -131,11 +132,12 @@ def sentence(text: str) -> str:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """The question after an unknown word, or all words that are known."""
-    known = [one for one in known if len(one) > 2] or list(known)
-    close = difflib.get_close_matches(word, known, n=2, cutoff=0.5)
+    # Without the dashes, which would make all options alike.
+    names = {one.lstrip("-"): one for one in known if len(one) > 2}
+    close = difflib.get_close_matches(word.lstrip("-"), names, n=2)
     if close:
-        return f"did you mean {' or '.join(close)}?"
-    return f"known: {', '.join(known)}"
+        return f"did you mean {' or '.join(names[one] for one in close)}?"
+    return f"known: {', '.join(names.values())}"
 
 
 def check_outputs(options: argparse.Namespace) -> None:
@@ -143,6 +145,7 @@ def check_outputs(options: argparse.Namespace) -> None:
     from ..config.output_files import check_folder, check_outputs
 
     files: dict[str, Path | None] = {}
+    pictures: list[Path] = []
     for output in getattr(options, "outputs", ()):
         value = getattr(options, output.name)
         if callable(value):
@@ -150,13 +153,16 @@ def check_outputs(options: argparse.Namespace) -> None:
             setattr(options, output.name, value)
         if output.kind == "folder":
             check_folder(output.flag, value)
-            continue
-        files[output.flag] = value
+        else:
+            files[output.flag] = value
         if output.kind == "picture" and value is not None:
-            from ..plot.style import check_picture
-
-            check_picture(value)
+            pictures.append(value)
     check_outputs(files)
+    if pictures:
+        from ..plot.style import check_picture
+
+        for picture in pictures:
+            check_picture(picture)
 
 
 def _number(kind: Callable[[str], Any], text: str, what: str, fits: Callable[[Any], bool]) -> Any:

@@ -102,7 +102,8 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
         if wanted:
             if not bag.topics(f"{PACKAGE}/msg/SkinStress"):
                 raise BagError(
-                    f"{bag.path}: no stress to show; ./cube reprocess computes it from the frequencies"
+                    f"{bag.path}: no stress to show; "
+                    "./cube reprocess computes it from the frequencies"
                 )
             children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
             print(children.said("view", "http://", START_S), file=sys.stderr)

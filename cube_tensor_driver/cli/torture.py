@@ -1,4 +1,4 @@
-"""./cube torture: a skin in real processes under all faults, checked against the simulator's log."""
+"""./cube torture: real processes under all faults, checked against the simulator's log."""
 
 from __future__ import annotations
 
@@ -28,6 +28,4 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from ..trials.torture import Options, run_torture
 
-    return run_torture(
-        Options(duration=options.duration, seed=options.seed, json=options.json)
-    )
+    return run_torture(Options(duration=options.duration, seed=options.seed, json=options.json))

@@ -127,6 +127,8 @@ def _photograph(children: Children, path: Path) -> None:
         url,
         str(path.resolve()),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PHOTOGRAPH_S, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=PHOTOGRAPH_S, check=False
+    )
     if done.returncode:
         raise CubeError(f"no picture of {url}:\n{done.stderr[-500:]}")
