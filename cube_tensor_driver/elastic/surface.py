@@ -1,21 +1,11 @@
-"""The field between the cubes: pressure and shear over a skin's surface from each cube's values and
-gradients.
+"""Pressure and shear over a skin's surface from each cube's values and gradients; its contacts.
 
-Pressure is p = −σzz in the cubes' plane, `depth` below the surface. It is interpolated by radial
-functions that meet the value of every cube and, along the cube's own x and y where it observes
-them, the derivative (Hermite or gradient-enhanced interpolation; in statistics co-kriging with
-derivatives)::
-
-    φ(r) = (1 + r²/c²)^(−5/2),  c = 3 depth
-    cov(p(a), p(b)) = φ,   cov(p(a), ∂_v p(b)) = ∂φ/∂b·v,   cov(∂_u p(a), ∂_v p(b)) = u·∂²φ/∂a∂b·v
-
-The exponent is that of a point force's pressure at a depth (Boussinesq), c is the best of those
+Pressure is p = −σzz in the cubes' plane, `depth` below the surface. It is interpolated from the
+values and gradients of the cubes (interpolation.py), with the length c = 3 depth: the best of those
 tried for indenters of 2 to 20 mm at pitches of 6 to 24 mm (`./cube pictures` draws the errors).
-Each cube's patch of the surface takes its NEIGHBOURS nearest cubes. Shear (σzx, σyz) has no
-measured gradients; it takes values alone.
+Shear (σzx, σyz) has no measured gradients; it is interpolated from values.
 
-Source: G. E. Fasshauer, Meshfree Approximation Methods with MATLAB (2007), ch. 36 (Hermite
-interpolation); equilibrium of the layer above the cubes for the contact's force and centre.
+A contact's force and position follow from the equilibrium of the layer above the cubes.
 """
 
 from __future__ import annotations
@@ -24,28 +14,30 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS
 from ..core.scene import CubePoses
+from .interpolation import Interpolation
 
 Array = NDArray[np.float64]
-NEIGHBOURS = 9
-RIDGE = 1e-6
-"""Added to φ(0) = 1: a thousandth of what is measured counts as noise, which keeps close cubes
-solvable."""
+
 PRESSURE = [COMPONENTS.index(name) for name in ("zz", "zz_x", "zz_y")]
 SHEAR = [COMPONENTS.index(name) for name in ("zx", "yz")]
-FLOOR = 0.2
-"""A contact is where the pressure is above this part of the skin's greatest."""
+RELATIVE_THRESHOLD = 0.2
+"""A contact is where the pressure is above this part of the skin's greatest pressure."""
+LENGTH_PER_DEPTH = 3.0
+"""Length of the radial function over the depth of the cubes."""
 
 
 class Field(NamedTuple):
-    """On the M points of a surface: pressure (M,) Pa, shear (M, 2) Pa = σzx, σyz in the frame of
-    the point's cube."""
+    """On the M points of a surface.
+
+    pressure: (M,) Pa; shear: (M, 2) Pa, σzx and σyz in the frame of the point's cube
+    """
 
     pressure: Array
     shear: Array
@@ -64,227 +56,169 @@ class Contact(NamedTuple):
     force_uncertainty: float
 
 
-class Weights:
-    """What makes points of cubes: matrix (M, cubes × width), its entries data (cubes, points,
-    neighbours × width).
-
-    known (cubes, width): what they were solved for; doubt (cubes, points): relative uncertainty;
-    blank (cubes,): none of the neighbours has a value.
-    """
-
-    def __init__(self, near: NDArray[np.intp], points: int, known: NDArray[np.bool_]) -> None:
-        n, width = known.shape
-        columns = (near[:, :, None] * width + np.arange(width)).reshape(n, -1)
-        self.known, self.blank, self.doubt = known, np.zeros(n, bool), np.zeros((n, points // n))
-        self.data = np.zeros((n, points // n, columns.shape[1]))
-        place = np.repeat(columns, points // n, axis=0).ravel()
-        ends = np.arange(points + 1) * columns.shape[1]
-        self.matrix = csr_matrix(
-            (self.data.ravel(), place, ends), shape=(points, n * width), copy=False
-        )
-
-
 class Surface:
-    """Points of a skin's surface, `side` × `side` on each cube's patch, and the field on them.
+    """Points of a skin's surface, `side` × `side` on the patch of each cube, and the field on them.
 
-    points (M, 3) m in the parent frame, in the cubes' plane; cube (M,) which cube's patch; area: of
-    a point, m².
-    depth: from the cubes' centres to the surface, m. gradients: False leaves them out, to see what
-    they buy. Raises ElasticError unless depth > 0 and side >= 1.
+    points: (M, 3) m in the parent frame, in the cubes' plane; cube: (M,) whose patch it is
+    spacing: of the points, m; area: of a point, m²
+
+    Parameters: depth: from the cubes' centres to the surface, m. gradients: False ignores the
+    cubes' gradients, which shows what they gain. Raises ElasticError unless depth > 0 and
+    side >= 1.
     """
 
     def __init__(
-        self, places: CubePoses, depth: float, side: int = 4, gradients: bool = True
+        self, poses: CubePoses, depth: float, side: int = 4, gradients: bool = True
     ) -> None:
         if not depth > 0 or side < 1:
             raise ElasticError(
                 f"surface: depth {depth} m, {side} points a side; both must be greater than 0"
             )
-        self.places, self.depth, self.pitch = places, depth, places.pitch
+        self.poses, self.depth, self.pitch = poses, depth, poses.pitch
         self.spacing = self.pitch / side
-        self.area, self._scale = self.spacing**2, 3.0 * depth
-        offset = (np.arange(side) - (side - 1) / 2) * self.spacing
-        grid = np.stack(
-            [*(a.ravel() for a in np.meshgrid(offset, offset)), np.zeros(side**2)], axis=1
-        )
-        patches = places.position[:, None] + np.einsum("nij,qj->nqi", places.rotation, grid)
-        self.points = patches.reshape(-1, 3)
-        self.cube = np.repeat(np.arange(len(places.position)), side**2)
-        count = min(NEIGHBOURS, len(places.position))
-        apart, near = cKDTree(places.position).query(
-            places.position, min(3 * count, len(places.position))
-        )
-        apart, near = apart.reshape(len(near), -1), near.reshape(len(near), -1)
-        # of cubes equally far the first ones, not those that rounding favours
-        order = np.lexsort((near, (apart / self.pitch).round(6)))[:, :count]
-        self._near = np.take_along_axis(near, order, axis=1)
-        self._columns = PRESSURE if gradients else PRESSURE[:1]
-        pairs = cKDTree(self.points).query_pairs(1.5 * self.spacing, output_type="ndarray")
-        self._from, self._to = pairs.T
-        self._solved: dict[tuple[int, ...], Weights] = {}
+        self.area = self.spacing**2
+        self._patches = _patches(poses, self.spacing, side)
+        self.points = self._patches.reshape(-1, 3)
+        self.cube = np.repeat(np.arange(len(poses.position)), side**2)
+        self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
+        self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
+        # (pairs, 2) points next to each other
+        self._pairs = cKDTree(self.points).query_pairs(1.5 * self.spacing, output_type="ndarray")
 
     def field(self, values: Array) -> Field:
-        """The field of values (cubes, 15), NaN where not observed; such a cube is filled in by the
-        others. O(M)."""
+        """The field of values (cubes, 15), NaN where not observed. Takes O(M) time.
+
+        Where a cube has no value, its neighbours fill the gap.
+        """
         return Field(self._pressure(values), self._shear(values))
 
     def uncertainty(self, values: Array) -> Array:
-        """(M,) standard deviation of the pressure between the cubes, as a part of its own size (0
-        .. 1)."""
-        return self._weights(np.isfinite(values), self._columns).doubt.ravel()
+        """(M,) standard deviation of the pressure between the cubes over its own size: 0 to 1."""
+        return self._interpolation.uncertainty(values, self._pressure_columns)
 
-    def contacts(self, values: Array, least: float) -> list[Contact]:
-        """Where pressure exceeds `least` Pa and FLOOR of the greatest: the strongest first; see
-        Contact.
+    def contacts(self, values: Array, threshold: float) -> list[Contact]:
+        """Where the pressure exceeds `threshold` Pa and a part of its greatest; strongest first.
 
-        The layer above the cubes is in equilibrium: the pressure's integral is the force, its first
-        moment is that of the load plus depth × shear force, which is taken off again. For the
-        moment pressure and shear are interpolated
-        alike, by values: below a point force (σzx, σyz, σzz) points away from it in an
-        incompressible body, so that each cube by itself gives the place, and any common weights do.
-        Each patch counts for the contact nearest to it.
-        What spreads beyond the skin is lost: hardly any pressure, of shear about 1.5 depth /
+        values: (cubes, 15) as in `field`. Each patch counts for the contact nearest to it.
+
+        The layer above the cubes is in equilibrium: the integral of the pressure is the force. The
+        first moment of the pressure is that of the load plus depth × shear force, which is
+        subtracted again. For this moment pressure and shear are interpolated alike, from values:
+        below a point force (σzx, σyz, σzz) points away from it in an incompressible body, so each
+        cube by itself gives the position, and so do any common weights.
+
+        What spreads beyond the skin is lost: hardly any pressure, but of shear about 1.5 depth /
         distance to the edge.
         """
-        # Where no cube around has a value nothing presses that we know of.
+        # Around cubes without any value, no pressure is known: none is assumed.
         pressure = np.nan_to_num(self._pressure(values))
-        inside = pressure > max(least, FLOOR * float(pressure.max()))
+        inside = pressure > max(threshold, RELATIVE_THRESHOLD * float(pressure.max()))
         if not inside.any():
             return []
-        field = Field(pressure, np.nan_to_num(self._shear(values)))
-        doubt, alike = (
-            self.uncertainty(values),
-            -np.nan_to_num(self._interpolate(values, PRESSURE[:1])),
+        shear = np.nan_to_num(self._shear(values))
+        loaded = _LoadedSurface(
+            pressure=self._by_patch(pressure),
+            shear=np.stack([self._by_patch(one) for one in shear.T]),
+            moment_pressure=self._by_patch(-np.nan_to_num(self._from_values(values))),
+            uncertainty=self._by_patch(self.uncertainty(values)),
+            sees_shear=bool(np.isfinite(values[:, SHEAR]).any()),
         )
-        sheared = bool(np.isfinite(values[:, SHEAR]).any())
         owner = self._owners(inside)
-        found = [self._contact(owner == k, field, alike, doubt, sheared) for k in np.unique(owner)]
-        return sorted(found, key=lambda contact: -contact.normal_force)
+        contacts = [self._contact(loaded, owner == k) for k in np.unique(owner)]
+        return sorted(contacts, key=lambda contact: -contact.normal_force)
+
+    def _pressure(self, values: Array) -> Array:
+        return -self._interpolation.values(values, self._pressure_columns)
+
+    def _from_values(self, values: Array) -> Array:
+        """σzz (M,) from values alone, as shear is interpolated."""
+        return self._interpolation.values(values, PRESSURE[:1])
+
+    def _shear(self, values: Array) -> Array:
+        columns = [self._interpolation.values(values, [column]) for column in SHEAR]
+        return np.stack(columns, axis=1)
+
+    def _by_patch(self, on_points: Array) -> Array:
+        """(M,) as (cubes, points of a patch)."""
+        return on_points.reshape(len(self._patches), -1)
 
     def _owners(self, inside: NDArray[np.bool_]) -> NDArray[np.int32]:
-        """(cubes,) number of the contact that each patch counts for; what meets in a patch is one
-        contact."""
-        n = len(self._near)
-        joined = inside[self._from] & inside[self._to]
-        links = coo_matrix(
-            (joined[joined], (self.cube[self._from[joined]], self.cube[self._to[joined]])),
-            shape=(n, n),
-        )
+        """(cubes,) number of the contact that each patch counts for.
+
+        Points in contact that are next to each other, or in one patch, belong to one contact.
+        """
+        n = len(self._patches)
+        here, there = self._pairs.T
+        joined = inside[here] & inside[there]
+        ends = (self.cube[here[joined]], self.cube[there[joined]])
+        links = coo_matrix((joined[joined], ends), shape=(n, n))
         part = connected_components(links, directed=False)[1]
         touched = inside.reshape(n, -1).any(axis=1)
-        nearest = cKDTree(self.places.position[touched]).query(self.places.position)[1]
+        nearest = cKDTree(self.poses.position[touched]).query(self.poses.position)[1]
         owners: NDArray[np.int32] = part[touched][nearest]
         return owners
 
-    def _contact(
-        self, mine: NDArray[np.bool_], field: Field, alike: Array, doubt: Array, sheared: bool
-    ) -> Contact:
+    def _contact(self, loaded: _LoadedSurface, mine: NDArray[np.bool_]) -> Contact:
         """The contact of the patches `mine` (cubes,)."""
-
-        def of_mine(on_points: Array) -> Array:
-            return on_points.reshape(len(mine), -1)[mine]
-
-        turn, points = self.places.rotation[mine], self.points.reshape(len(mine), -1, 3)[mine]
-        pressure, weight = of_mine(field.pressure), of_mine(alike) * self.area
+        rotation, points = self.poses.rotation[mine], self._patches[mine]
+        pressure = loaded.pressure[mine]
+        weight = loaded.moment_pressure[mine] * self.area
         normal_force = float(pressure.sum() * self.area)
-        normal = _total(pressure.sum(axis=1), turn[:, :, 2])
+        normal = _weighted_sum(pressure.sum(axis=1), rotation[:, :, 2])
         normal /= np.linalg.norm(normal)
-        shear = (
-            sum(_total(of_mine(field.shear[:, k]).sum(axis=1), turn[:, :, k]) for k in (0, 1))
-            * self.area
-        )
+        shear = self._shear_force(loaded.shear[:, mine], rotation)
         shear -= normal * (shear @ normal)
-        centre = _total(weight, points) / weight.sum()
+        centre = _weighted_sum(weight, points) / weight.sum()
         position = centre + self.depth * (normal - shear / weight.sum())
-        # errors between cubes are as wide as the pitch is: so many points are wrong together
-        variance = (of_mine(doubt) * pressure * self.pitch * self.spacing) ** 2
-        apart = ((points - centre) ** 2).sum(axis=2) / 2
+        # Errors between cubes are as wide as the pitch: so many points are wrong together.
+        deviation = loaded.uncertainty[mine] * pressure * self.pitch * self.spacing
+        variance = deviation**2
+        lever = ((points - centre) ** 2).sum(axis=2) / 2
+        pressed = np.count_nonzero(pressure > 0.5 * pressure.max())
         return Contact(
-            position,
-            normal,
-            shear - normal * normal_force,
-            normal_force,
-            float(np.linalg.norm(shear)) if sheared else np.nan,
-            float(np.count_nonzero(pressure > 0.5 * pressure.max()) * self.area),
-            float(np.sqrt((variance * apart).sum()) / normal_force),
-            float(np.sqrt(variance.sum())),
+            position=position,
+            normal=normal,
+            force=shear - normal * normal_force,
+            normal_force=normal_force,
+            shear_force=float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan,
+            area=float(pressed * self.area),
+            position_uncertainty=float(np.sqrt((variance * lever).sum()) / normal_force),
+            force_uncertainty=float(np.sqrt(variance.sum())),
         )
 
-    def _pressure(self, values: Array) -> Array:
-        return -self._interpolate(values, self._columns)
-
-    def _shear(self, values: Array) -> Array:
-        return np.stack([self._interpolate(values, [column]) for column in SHEAR], axis=1)
-
-    def _interpolate(self, values: Array, columns: list[int]) -> Array:
-        """(M,) the first of the columns of values (cubes, 15) on all points; the others are its
-        gradient."""
-        known = np.isfinite(values)
-        if not known[:, columns[0]].any():
-            return np.full(len(self.points), np.nan)
-        weights = self._weights(known, columns)
-        scale = np.array([1.0, self._scale, self._scale])[: len(columns)]
-        value: Array = weights.matrix @ (np.where(known, values, 0)[:, columns] * scale).ravel()
-        value[np.repeat(weights.blank, value.size // weights.blank.size)] = np.nan
-        return value
-
-    def _weights(self, known: NDArray[np.bool_], columns: list[int]) -> Weights:
-        """Weights of these columns; they depend on what is known alone, and are solved anew where
-        that has changed."""
-        mine = known[:, columns]
-        if tuple(columns) not in self._solved:
-            self._solved[tuple(columns)] = Weights(self._near, len(self.points), ~mine)
-        solved = self._solved[tuple(columns)]
-        if not np.array_equal(mine, solved.known):
-            changed = np.flatnonzero((mine != solved.known)[self._near].any(axis=(1, 2)))
-            solved.data[changed], solved.doubt[changed] = self._solve(changed, mine)
-            solved.known, solved.blank = mine, ~mine[self._near, 0].any(axis=1)
-        return solved
-
-    def _solve(self, patches: NDArray[np.intp], known: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Weights (patches, points of a patch, neighbours × width) and relative uncertainty
-        (patches, points)."""
-        near, n, width = self._near[patches], len(patches), known.shape[1]
-        size = near.shape[1] * width
-        seen = known[near].reshape(n, size)
-        places = self.places.position[near] / self._scale
-        axes = np.swapaxes(self.places.rotation[:, :, : width - 1], 1, 2)[near]  # (n, k, 2 or 0, 3)
-        points = self.points.reshape(len(self._near), -1, 3)[patches] / self._scale
-        matrix = _covariance(places[:, :, None] - places[:, None], axes[:, :, None], axes[:, None])
-        matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
-        matrix *= seen[:, :, None] & seen[:, None]
-        matrix[:, np.arange(size), np.arange(size)] += np.where(seen, RIDGE, 1.0)
-        none = np.zeros((n, points.shape[1], 1, 0, 3))
-        to_points = _covariance(points[:, :, None] - places[:, None], none, axes[:, None])
-        to_points = to_points.reshape(n, -1, size) * seen[:, None]
-        weights = np.swapaxes(np.linalg.solve(matrix, np.swapaxes(to_points, 1, 2)), 1, 2)
-        return weights, np.sqrt(np.clip(1 - np.einsum("nqd,nqd->nq", weights, to_points), 0, 1))
+    def _shear_force(self, shear: Array, rotation: Array) -> Array:
+        """(3,) N from shear (2, patches, points) Pa in the frames rotation (patches, 3, 3)."""
+        along_x, along_y = (_weighted_sum(shear[k].sum(axis=1), rotation[:, :, k]) for k in (0, 1))
+        return (along_x + along_y) * self.area
 
 
-def _total(weights: Array, vectors: Array) -> Array:
-    """(3,) the sum of weights (...) times vectors (..., 3). Not by BLAS: its threads burn a second
-    core over this."""
-    result: Array = np.einsum("n,ni->i", weights.ravel(), vectors.reshape(-1, 3))
-    return result
+class _LoadedSurface(NamedTuple):
+    """What contacts are computed from, by patch: (cubes, points of a patch), in Pa.
 
-
-def _covariance(d: Array, u: Array, v: Array) -> Array:
-    """(..., 1 + A, 1 + B) covariances of value and derivatives along u (..., A, 3) with those along
-    v (..., B, 3).
-
-    d (..., 3) is the first place minus the second, over c.
+    shear: (2, cubes, points) σzx and σyz
+    moment_pressure: interpolated from values alone, as shear is
+    uncertainty: relative; sees_shear: some cube observes shear
     """
-    b = 1 + np.einsum("...i,...i->...", d, d)
-    f, f1, f2 = b**-2.5, -2.5 * b**-3.5, 8.75 * b**-4.5
-    du, dv = (np.einsum("...i,...ai->...a", d, axes) for axes in (u, v))
-    shape = (*b.shape, 1 + du.shape[-1], 1 + dv.shape[-1])
-    result = np.empty(shape)
-    result[..., 0, 0] = f
-    result[..., 0, 1:] = -2 * f1[..., None] * dv
-    result[..., 1:, 0] = 2 * f1[..., None] * du
-    straight = np.einsum("...ai,...bi->...ab", u, v)
-    result[..., 1:, 1:] = (
-        -2 * f1[..., None, None] * straight
-        - 4 * f2[..., None, None] * du[..., None] * dv[..., None, :]
-    )
+
+    pressure: Array
+    shear: Array
+    moment_pressure: Array
+    uncertainty: Array
+    sees_shear: bool
+
+
+def _patches(poses: CubePoses, spacing: float, side: int) -> Array:
+    """(cubes, side², 3) m: a square of points around each cube, in its x-y plane."""
+    line = (np.arange(side) - (side - 1) / 2) * spacing
+    x, y = np.meshgrid(line, line)
+    square = np.stack([x.ravel(), y.ravel(), np.zeros(side**2)], axis=1)
+    return poses.position[:, None] + np.einsum("nij,qj->nqi", poses.rotation, square)
+
+
+def _weighted_sum(weights: Array, vectors: Array) -> Array:
+    """(3,) the sum of weights (...) times vectors (..., 3).
+
+    Not by BLAS: its threads would burn a second core for this.
+    """
+    result: Array = np.einsum("n,ni->i", weights.ravel(), vectors.reshape(-1, 3))
     return result
