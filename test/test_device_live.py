@@ -298,10 +298,12 @@ def test_a_reader_that_fails_raises_its_error_in_the_iteration(
             return feed(self, data)  # the hub's own
 
         monkeypatch.setattr(Decoder, "feed", fail)
+        begun = time.monotonic()
         with pytest.raises(OSError, match="not foreseen") as raised:
             for _ in source:
                 pass
         assert raised.value is broken
+        assert time.monotonic() - begun < PROMPT_S
         with pytest.raises(OSError, match="not foreseen"):
             next(iter(source))
 

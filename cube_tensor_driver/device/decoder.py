@@ -1,7 +1,7 @@
 """From the bytes of a link to frames, whatever the bytes are.
 
-`Decoder.feed` never raises: every non-empty run of bytes closed by a zero becomes exactly one frame
-or is counted in exactly one counter of `Counters`.
+`Decoder.feed` never raises. Each non-empty run of bytes that a zero closes becomes one frame, or is
+counted in exactly one counter of `Counters`.
 """
 
 from __future__ import annotations
@@ -11,46 +11,47 @@ from dataclasses import dataclass
 
 import numpy as np
 from cobs import cobs  # type: ignore[import-untyped]
+from numpy.typing import NDArray
 
 from .protocol import HEADER, MAX_FRAME, OVERHEAD, REQUEST, UNPACK, VERSION, Frame
 
 MAX_RUN = MAX_FRAME + (MAX_FRAME + 253) // 254
-"""Longest run of bytes between two zeros that can be a frame: COBS adds at most one byte in 254."""
+"""Longest run of bytes between two zeros that can be a frame. COBS adds one byte to each 254."""
 MIN_RUN = OVERHEAD + REQUEST.size + 1
-"""Shortest run that can be a frame, of any version: to try shorter ones would let noise slow the
+"""Shortest run that can be a frame of any version. Trying shorter ones would let noise slow the
 decoder down."""
-SHORT_RUN, CROWD = 32, 32
-"""More runs in a feed than CROWD that are shorter than any SAMPLE are noise: see
-`Decoder._thinned`."""
-# CRC-32 over data followed by its own CRC is this constant: no slice, no second look at the frame's
-# end.
+SHORT_RUN = 32
+"""Any SAMPLE is longer."""
+MANY_RUNS = 32
+"""More short runs than this in one feed are taken for noise, and sorted out together."""
+# The CRC-32 of data followed by its own CRC is this constant, so the CRC need not be cut off.
 _CRC_RESIDUE = 0x2144DF1C
 
 
 @dataclass(slots=True)
 class Counters:
-    """What became of the bytes fed to a `Decoder`. All but `bytes` count frames or runs between
-    zeros."""
+    """What became of the bytes fed to a `Decoder`: numbers of bytes, of frames, and of runs that are
+    no frame."""
 
     bytes: int = 0
     frames: int = 0
     crc: int = 0  # checksum wrong
     framing: int = 0  # not COBS, or cut off by the end of the stream
     length: int = 0  # too short for a frame, or the length does not fit the contents
-    version: int = 0  # sound, but of another protocol version: see Decoder.other_version
-    unknown_type: int = 0  # sound, but of a type that version 1 does not have
-    overrun: int = 0  # longer than any frame can be, thrown away up to the next zero
+    version: int = 0  # checksum right, but another protocol version: see Decoder.other_version
+    unknown_type: int = 0  # checksum right, but a type that version 1 does not have
+    overrun: int = 0  # longer than any frame can be; thrown away up to the next zero
 
     def as_dict(self) -> dict[str, int]:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
 class Decoder:
-    """Bytes in, frames out. Holds at most MAX_RUN bytes between calls.
+    """Bytes in, frames out. Keeps at most MAX_RUN bytes between calls.
 
-    counters: `Counters`, growing for the life of the decoder.
-    other_version: the last version other than ours that a sound frame named, None if there was
-    none.
+    counters: `Counters` of all bytes since the decoder was made.
+    other_version: the last version other than ours in a frame with a right checksum; None if there
+    was none.
     """
 
     def __init__(self) -> None:
@@ -60,20 +61,18 @@ class Decoder:
         self._discarding = False
 
     def feed(self, data: bytes | bytearray) -> list[Frame]:
-        """Frames that `data` completes, in order. Never raises, whatever the bytes are."""
+        """The frames that `data` completes, in order. Never raises, whatever the bytes are."""
         self.counters.bytes += len(data)
         last = len(data) - 1
-        if (
-            last > MIN_RUN
-            and not data[0]
-            and data.find(0, 1) == last
-            and not (self._tail or self._discarding)
-        ):
-            # One frame and nothing else, as it mostly comes.
+        is_single_run = last > MIN_RUN and data[0] == 0 and data.find(0, 1) == last
+        if is_single_run and not (self._tail or self._discarding):
+            # The common case, and quick: one frame and nothing else.
             only = self._decode(data[1:last])
             return [] if only is None else [only]
         data = bytes(data)
-        runs = (self._thinned(data) if data.count(0) > CROWD else data).split(b"\0")
+        if data.count(0) > MANY_RUNS:
+            data = self._without_noise(data)
+        runs = data.split(b"\0")
         rest = runs.pop()
         frames: list[Frame] = []
         if runs:
@@ -97,48 +96,38 @@ class Decoder:
         return frames
 
     def reset(self) -> None:
-        """The stream ended: what is left of it is no frame (counted as framing). Counters go on."""
+        """The stream ended: the bytes of an unfinished frame are thrown away, and count as
+        framing."""
         self.counters.framing += bool(self._tail)
         self._tail.clear()
         self._discarding = False
 
-    def _thinned(self, data: bytes) -> bytes:
-        """Data without the short runs that can be no frame, where they are a crowd: counted without
-        a step each.
+    def _without_noise(self, data: bytes) -> bytes:
+        """The data without short runs that are no frame, if there are many; they are counted.
 
-        To decode each would take longer than good frames of the same size. A short frame with a
-        sound checksum but type or version 0, which no version has, counts as crc here.
+        Trying them one by one would take longer than decoding good frames of the same size. A short
+        run with a right checksum whose type or version is 0, which no version has, counts as crc
+        here.
         """
-        code = np.frombuffer(
-            data + b"\0", np.uint8
-        )  # one more, where what leads beyond the data ends
+        # One byte more, so that a code word that leads beyond the data leads to the last index.
+        code = np.frombuffer(data + b"\0", np.uint8)
         zeros = np.flatnonzero(code[:-1] == 0)
         length = np.diff(zeros) - 1
-        tiny = np.count_nonzero(length < MIN_RUN) - np.count_nonzero(length == 0)
+        n_tiny = np.count_nonzero(length < MIN_RUN) - np.count_nonzero(length == 0)
         kept = length >= MIN_RUN
         short = np.flatnonzero(kept & (length < SHORT_RUN))
-        if len(short) > CROWD:
-            # Each code word says where the next one is; a run is COBS where that leads to its end,
-            # a zero, which stays.
-            at = np.minimum(np.arange(len(code)) + code, len(code) - 1)
-            for _ in range((SHORT_RUN - 1).bit_length()):
-                at = at[at]
-            first, end, size = zeros[short] + 1, zeros[short + 1], length[short]
-            sound = at[first] == end
-            # The header's fourth byte, the high one of its length, is the only one of four that is
-            # 0.
-            hopeful = sound & (code[first] == 4) & (code[first + 3] == size - 1 - OVERHEAD)
-            kept[short] = hopeful
-            self.counters.framing += len(short) - int(np.count_nonzero(sound))
-            self.counters.crc += int(np.count_nonzero(sound)) - int(np.count_nonzero(hopeful))
-        elif tiny <= CROWD:
+        if len(short) > MANY_RUNS:
+            is_cobs, is_hopeful = _check_short_runs(code, zeros[short], zeros[short + 1])
+            kept[short] = is_hopeful
+            n_cobs, n_hopeful = int(is_cobs.sum()), int(is_hopeful.sum())
+            self.counters.framing += len(short) - n_cobs
+            self.counters.crc += n_cobs - n_hopeful
+        elif n_tiny <= MANY_RUNS:
             return data
-        self.counters.length += tiny
-        chosen = np.flatnonzero(kept)
-        runs = [
-            data[i:j]
-            for i, j in zip((zeros[chosen] + 1).tolist(), zeros[chosen + 1].tolist(), strict=True)
-        ]
+        self.counters.length += n_tiny
+        starts = (zeros[:-1][kept] + 1).tolist()
+        ends = zeros[1:][kept].tolist()
+        runs = [data[start:end] for start, end in zip(starts, ends, strict=True)]
         return b"\0".join([data[: zeros[0]], *runs, data[zeros[-1] + 1 :]])
 
     def _decode(self, run: bytes | bytearray) -> Frame | None:
@@ -169,3 +158,22 @@ class Decoder:
         else:
             counters.frames += 1
         return frame
+
+
+def _check_short_runs(
+    code: NDArray[np.uint8], before: NDArray[np.intp], end: NDArray[np.intp]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which runs between the zeros `before` and `end` are COBS, and which of these can be frames.
+
+    code: the bytes, and one more.
+    """
+    # Each code word tells where the next one is, and a run is COBS if following them leads to its
+    # end. A zero leads to itself. Each step below follows twice as many as the one before.
+    at = np.minimum(np.arange(len(code)) + code, len(code) - 1)
+    for _ in range((SHORT_RUN - 1).bit_length()):
+        at = at[at]
+    first = before + 1
+    is_cobs = at[first] == end
+    # Of a short frame's header only the fourth byte, the high one of the length, is 0.
+    has_length = code[first + 3] == end - first - 1 - OVERHEAD
+    return is_cobs, is_cobs & (code[first] == 4) & has_length

@@ -1,7 +1,7 @@
-"""A TCP connection made without ever blocking the caller.
+"""Makes a TCP connection without ever blocking the caller.
 
-pyserial's own ``socket://`` blocks up to 5 s in connect and in name look-up, which would hold up
-every other link of the reader thread; a plain non-blocking socket does not.
+The ``socket://`` of pyserial blocks for up to 5 s while it looks up the name and connects. That
+would hold up all other links of the reader's thread.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from urllib.parse import urlsplit
 from ..core.errors import LinkError
 
 CONNECT_TIMEOUT_S = 2.0
-"""Per address; a host that is switched off answers nothing at all."""
+"""For each address of the host. A host that is switched off does not answer at all."""
 
 
 def parse_url(url: str) -> tuple[str, int]:
-    """Host and port of ``socket://host:port`` (IPv6 hosts in brackets). LinkError `bad_port` if it
-    is none."""
+    """Host and port of ``socket://host:port``, IPv6 hosts in brackets. LinkError `bad_port`."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -40,8 +39,8 @@ def parse_url(url: str) -> tuple[str, int]:
 class Connecting:
     """One attempt to connect; call `poll` until it gives the socket.
 
-    Numeric hosts are taken at once. A name is looked up in a thread of its own that ends with the
-    look-up, because the system's resolver can block for half a minute and cannot be cancelled.
+    A name is looked up in a thread of its own, because the system's resolver can block for half a
+    minute and cannot be cancelled. Numeric hosts need no thread.
     """
 
     def __init__(self, url: str) -> None:
@@ -59,8 +58,10 @@ class Connecting:
             ).start()
 
     def poll(self) -> socket.socket | None:
-        """The connected, non-blocking socket, None while under way. LinkError when no address
-        answers."""
+        """The connected, non-blocking socket; None while the attempt is under way.
+
+        LinkError: no address answers.
+        """
         if self._addresses is None:
             if self._error:
                 raise self._error
@@ -86,7 +87,7 @@ class Connecting:
                     return None
 
     def close(self) -> None:
-        """Give up; safe to call twice."""
+        """Give up. Safe to call twice."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
