@@ -30,8 +30,8 @@ _CRC_RESIDUE = 0x2144DF1C
 
 @dataclass(slots=True)
 class Counters:
-    """What became of the bytes fed to a `Decoder`: numbers of bytes, of frames, and of runs that are
-    no frame."""
+    """What became of the bytes fed to a `Decoder`: how many bytes, frames, and runs that are no
+    frame."""
 
     bytes: int = 0
     frames: int = 0

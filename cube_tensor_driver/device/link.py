@@ -1,9 +1,8 @@
 """One link: a byte stream from and to a hub over a serial port, a pseudo-terminal or TCP.
 
-Nothing here blocks or waits, keeps a thread or knows a frame; `reader` drives it. Serial ports are
-opened by pyserial (``serial_for_url``) and read with ``os.read``, which takes all there is in one
-call per 4 kB. What goes wrong is a `LinkError` whose `kind` is one word and whose text names the
-fix:
+Nothing here blocks, has a thread or knows a frame; `reader.py` drives it. Serial ports are opened
+by pyserial (``serial_for_url``) and read with ``os.read``, which gives up to 4 kB per call. What
+goes wrong is a `LinkError`. Its `kind` is one word, its text names the fix:
 
     no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
     refused  no_answer  unreachable  unresolved                       opening a TCP link
@@ -33,11 +32,14 @@ from .protocol import Hello
 from .tcp import Connecting, parse_url
 
 READ_CHUNK = 1 << 16
-"""Bytes taken from one link at a time; a link that floods leaves the others their turn."""
+"""Bytes read from one link at a time, so that a link that floods does not hold up the others."""
 OUT_LIMIT = 4096
+"""Bytes that may wait to be sent."""
 BACKOFF_S = (0.25, 5.0)
+"""Shortest and longest pause between two attempts to open a link."""
 BACKOFF_TCP_S = 1.5
-"""Nothing announces that a TCP peer is back, so a longer pause would break "back within 2 s"."""
+"""Longest pause for TCP. Nothing announces that a TCP peer is back, and a link shall be back within
+2 s."""
 
 _NO_PERMISSION = (
     "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
@@ -59,7 +61,7 @@ _OPEN_ERRORS = {
 
 
 class LinkState(str, Enum):
-    """closed: not in use. waiting: not there yet, tried again with back-off. open: port open.
+    """closed: not in use. waiting: not open, tried again and again. open: the port is open.
     silent: open, but no sample for max(3 sample periods, 0.2 s) although samples were asked for."""
 
     CLOSED = "closed"
@@ -72,10 +74,11 @@ class LinkState(str, Enum):
 class LinkConfig:
     """Where a hub is.
 
-    port: device path, which may be a pattern such as ``/dev/ttyACM*`` (each match is tried in turn,
-    which finds a hub that comes back under another name), or ``socket://host:port``, or another URL
-    that pyserial opens. baud: ignored by USB and TCP. hub_uid: the hub that must answer, None for
-    any.
+    port: device path, ``socket://host:port``, or another URL that pyserial opens. A device path may
+    be a pattern such as ``/dev/ttyACM*``: its matches are tried one after the other, which finds a
+    hub that comes back under another name.
+    baud: ignored by USB and TCP.
+    hub_uid: the hub that must answer; None for any.
     """
 
     name: str
@@ -85,11 +88,14 @@ class LinkConfig:
 
 
 class Link:
-    """One link. `state` and `error` are set by the reader; `decoder`, `hello` (the hub's last, or
-    None) and `counters` outlive reconnects."""
+    """One link, opened and closed many times.
+
+    state, error: set by the reader.
+    decoder, hello, counters: kept over reconnects; hello is the hub's last, None before the first.
+    """
 
     def __init__(self, config: LinkConfig) -> None:
-        """LinkError `bad_port`: no port at all, or a TCP address that is none."""
+        """LinkError `bad_port`: an empty port, or a TCP address that cannot be read."""
         self.config = config
         self.state = LinkState.CLOSED
         self.error: LinkError | None = None
@@ -104,7 +110,7 @@ class Link:
         self._fd = -1
         self._out = bytearray()
         self._backoff = BACKOFF_S[0]
-        self._turn = 0
+        self._first_candidate = 0  # which match of the pattern to try first
         if self._tcp:
             parse_url(config.port)
         elif not config.port:
@@ -115,8 +121,10 @@ class Link:
 
     @property
     def counters(self) -> dict[str, int]:
-        """The decoder's counters and: opened, lost (while open), silences, before_hello (samples
-        not delivered because the hub had not said yet who it is), bytes_out."""
+        """The decoder's counters, and how often the link was opened, lost and silent.
+
+        before_hello: samples not delivered because the hub had not said yet who it is.
+        """
         names = ("opened", "lost", "silences", "before_hello", "bytes_out")
         return {**self.decoder.counters.as_dict(), **{name: getattr(self, name) for name in names}}
 
@@ -133,10 +141,10 @@ class Link:
         return self._fd
 
     def open(self) -> bool:
-        """Take one step towards open; True when open, False while a TCP connection is under way
-        (call again).
+        """Take one step towards an open link. True: it is open. False: a TCP connection is under
+        way; call again.
 
-        LinkError when this attempt failed.
+        LinkError: this attempt failed.
         """
         if self._tcp:
             self._open_tcp()
@@ -149,11 +157,11 @@ class Link:
         return True
 
     def read(self) -> bytes:
-        """What one call gives, up to READ_CHUNK; b"" if nothing. LinkError `lost` when the other
-        end is gone.
+        """The bytes that one call gives, at most READ_CHUNK; b"" if there are none.
 
-        A tty gives 4 kB at a time. To ask again at once would make us wait until the kernel has
-        moved up the next; while the other links are read that happens by itself.
+        A tty gives 4 kB at a time. Asking again at once would mean waiting until the kernel has
+        fetched the next 4 kB; it does so while the other links are read.
+        LinkError `lost`: the other end is gone.
         """
         try:
             data = os.read(self._fd, READ_CHUNK)
@@ -166,21 +174,22 @@ class Link:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send without waiting; what the kernel does not take now waits for `flush`.
+        """Send without blocking. Bytes that the kernel does not accept now wait for `flush`.
 
-        LinkError `overflow`: OUT_LIMIT bytes already wait, the hub does not read. LinkError `lost`.
+        LinkError `overflow`: more than OUT_LIMIT bytes would wait, because the hub does not read.
+        LinkError `lost`: the other end is gone.
         """
         if len(self._out) + len(data) > OUT_LIMIT:
             raise LinkError(
-                f"{self.path}: the hub has not taken the last {len(self._out)} bytes (limit {OUT_LIMIT}): "
-                "check flow control, or replug it",
+                f"{self.path}: the hub has not read the last {len(self._out)} bytes "
+                f"(limit {OUT_LIMIT}): check flow control, or replug it",
                 "overflow",
             )
         self._out += data
         self.flush()
 
     def flush(self) -> None:
-        """Send what waits, as far as the kernel takes it. LinkError `lost`."""
+        """Send bytes that wait, as many as the kernel accepts. LinkError `lost`."""
         try:
             while self._out:
                 sent = os.write(self._fd, self._out)
@@ -192,7 +201,7 @@ class Link:
             raise self._lost(error) from error
 
     def draining(self) -> bool:
-        """Whether bytes sent are still on their way out of this machine's serial port."""
+        """Whether bytes have not left this machine's serial port yet."""
         if self._tcp or self._stream is None:
             return False
         try:
@@ -202,14 +211,14 @@ class Link:
         return bool(self._out) or waiting > 0
 
     def close(self) -> None:
-        """Close at once, whatever the state; safe to call twice. A half-received frame is counted
-        as framing."""
+        """Close at once, in any state. Safe to call twice. An unfinished frame counts as
+        framing."""
         if self._connecting is not None:
             self._connecting.close()
             self._connecting = None
         if self._stream is not None:
             if self.draining():
-                # Else the kernel waits up to 30 s for a hub that does not read.
+                # Otherwise the kernel waits for up to 30 s for a hub that does not read.
                 with contextlib.suppress(termios.error):
                     termios.tcflush(self._fd, termios.TCOFLUSH)
             with contextlib.suppress(OSError):
@@ -226,17 +235,20 @@ class Link:
         return pause
 
     def reset_pause(self) -> None:
-        """The hub answered: the next loss starts at the shortest pause again."""
+        """The hub answered: after the next loss, begin with the shortest pause again."""
         self._backoff = BACKOFF_S[0]
 
     def next_candidate(self) -> None:
-        """The port opened is not the one wanted: begin with the next match of the pattern."""
-        self._turn += 1
+        """The port that was opened is not the right one: try the next match of the pattern
+        first."""
+        self._first_candidate += 1
 
     def fingerprint(self) -> tuple[object, ...]:
-        """What the port's path leads to now; a change means that trying again is worth it at
-        once."""
-        return () if self._tcp else tuple(_identity(path) for path in self._candidates())
+        """Which files the port's path leads to now. After a change, trying again at once is worth
+        it."""
+        if self._tcp:
+            return ()
+        return tuple(_identity(path) for path in self._candidates())
 
     def _candidates(self) -> list[str]:
         if not self.is_pattern:
@@ -249,10 +261,10 @@ class Link:
             f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port"
         )
         for i in range(len(paths)):
-            self.path = paths[(self._turn + i) % len(paths)]
+            self.path = paths[(self._first_candidate + i) % len(paths)]
             try:
                 self._stream = _open_port(self.path, self.config.baud)
-                self._turn += i
+                self._first_candidate += i
                 return
             except LinkError as failure:
                 error = failure
@@ -272,16 +284,17 @@ class Link:
     def _lost(self, error: OSError) -> LinkError:
         reason = error.strerror or str(error)
         return LinkError(
-            f"{self.path}: connection lost ({reason}): replug the hub, it is taken up again by itself",
+            f"{self.path}: connection lost ({reason}): replug the hub, "
+            "the link opens again by itself",
             "lost",
         )
 
 
 def open_error(path: str, error: BaseException) -> LinkError:
-    """What a failed attempt to open `path` means, in words: kinds of the module's first line."""
+    """The LinkError for a failed attempt to open `path`."""
     code = getattr(error, "errno", None)
     for source in (error, error.__context__):
-        # pyserial lets some errors of termios through and hides the number of others.
+        # pyserial passes on some errors of termios, and hides the number of others.
         if code is None and isinstance(source, termios.error):
             code = source.args[0]
     if code in _OPEN_ERRORS:
@@ -292,8 +305,8 @@ def open_error(path: str, error: BaseException) -> LinkError:
 
 def _open_port(path: str, baud: int) -> serial.SerialBase:
     try:
-        # inter_byte_timeout=0 is VMIN=1: reading nothing is then EAGAIN, and b"" only ever means
-        # unplugged.
+        # inter_byte_timeout=0 sets VMIN to 1: then reading an empty port gives EAGAIN, and b""
+        # always means unplugged.
         port = serial.serial_for_url(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
     except (OSError, termios.error) as error:
         raise open_error(path, error) from error
@@ -317,7 +330,7 @@ def _open_port(path: str, baud: int) -> serial.SerialBase:
 
 def _identity(path: str) -> tuple[object, ...] | None:
     try:
-        found = Path(path).stat()
+        status = Path(path).stat()
     except OSError:
         return None
-    return path, found.st_ino, found.st_rdev, found.st_mode, found.st_uid, found.st_gid
+    return path, status.st_ino, status.st_rdev, status.st_mode, status.st_uid, status.st_gid

@@ -1,15 +1,13 @@
-"""Wire protocol, version 1: the frames, and their bytes, without any I/O.
+"""Wire protocol, version 1: the frames and their bytes, without any I/O.
 
-A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian, `length` counting the
-payload, `crc` the CRC-32 of IEEE 802.3 over all before it. It travels COBS-encoded between two zero
-bytes. Layouts and
-one annotated hex dump per frame type: docs/protocol.md. The driver and the simulated hubs share
-this file.
+A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian. `length` is that of the
+payload, `crc` the CRC-32 of IEEE 802.3 of all bytes before it. On the wire a frame is COBS-encoded,
+between two zero bytes. docs/protocol.md has the fields and an annotated hex dump of each frame
+type. The driver and the simulated hubs share this file.
 
-Contracts
-    `encode` takes a frame and returns bytes, or raises `ProtocolError`. Arrays to encode must have
-    the dtype named in the frame's docstring; nothing is converted behind the caller's back. Arrays
-    of decoded frames are read-only, made when first asked for. For the way back see decoder.py.
+`encode` makes bytes of a frame, or raises `ProtocolError`. Arrays must have the dtype that the
+frame's docstring names; nothing is converted. decoder.py makes frames of bytes. The arrays of
+decoded frames are read-only, and made when they are first asked for.
 """
 
 from __future__ import annotations
@@ -48,13 +46,13 @@ _FREQUENCY = HEADER.size + _SAMPLE.size
 
 
 class Command(IntEnum):
-    """What a REQUEST asks for; the comment is the unit of its argument."""
+    """What a REQUEST asks for; the comment says what its argument is."""
 
     HELLO = 1  # 0
     START = 2  # 0
     STOP = 3  # 0
-    SET_PERIOD = 4  # µs
-    IDENTIFY = 5  # s, how long the hub shows itself
+    SET_PERIOD = 4  # sample period, µs
+    IDENTIFY = 5  # how long the hub shows itself, s
 
 
 class Result(IntEnum):
@@ -62,15 +60,19 @@ class Result(IntEnum):
 
     DONE = 0
     UNKNOWN = 1  # the hub does not know the request
-    REFUSED = 2  # argument outside what the hub can do; the ACK's argument is what is in force
+    REFUSED = 2  # the hub cannot do it; the ACK's argument is the value in force
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hello:
-    """Who the hub is. Sent at power-up, on request and then at 1 Hz.
+    """Who the hub is. Sent at power-up, on request, and once a second.
 
-    hub_uid u64; firmware u32; n_pads per cube u8; flags u8 (0 in version 1); period_us sample
-    period u32, µs; cube_uids (n_cubes,) uint64.
+    hub_uid: u64
+    firmware: u32
+    n_pads: per cube, u8
+    period_us: sample period in force, µs, u32
+    cube_uids: (n_cubes,) uint64
+    flags: u8, 0 in version 1
     """
 
     hub_uid: int
@@ -105,15 +107,15 @@ class Hello:
 
 
 class Sample:
-    """One reading of cubes first_cube .. first_cube + n_cubes − 1 of a hub, all at the same
-    instant.
+    """One reading of n_cubes cubes of a hub, first_cube and those after it, at the same instant.
 
-    sequence: u32, given when the sample is taken, so that a sample dropped in the hub leaves a gap;
-    wraps.
-    first_cube: index on the hub, u16. device_us: hub clock, µs, u64. shape: (n_cubes, n_pads).
-    frequency: (n_cubes, n_pads) uint32, mHz, 0 not measured.
-    pad_fault: (n_cubes,) uint32, bit p set = pad p reported faulty by the hub.
-    temperature: (n_cubes,) int16, 0.01 °C, −32768 unknown.
+    sequence: u32, wraps; given when the sample is taken, so that one dropped in the hub leaves a gap
+    first_cube: index on the hub, u16
+    device_us: hub clock, µs, u64
+    shape: (n_cubes, n_pads)
+    frequency: (n_cubes, n_pads) uint32, mHz; 0 not measured
+    pad_fault: (n_cubes,) uint32; bit p: the hub reports that pad p is faulty
+    temperature: (n_cubes,) int16, 0.01 °C; -32768 unknown
     """
 
     __slots__ = ("_arrays", "_raw", "device_us", "first_cube", "sequence", "shape")
@@ -146,18 +148,18 @@ class Sample:
 
     @property
     def frequency(self) -> NDArray[np.uint32]:
-        return self._made()[0]
+        return self._made_arrays()[0]
 
     @property
     def pad_fault(self) -> NDArray[np.uint32]:
-        return self._made()[1]
+        return self._made_arrays()[1]
 
     @property
     def temperature(self) -> NDArray[np.int16]:
-        return self._made()[2]
+        return self._made_arrays()[2]
 
-    def _made(self) -> _Arrays:
-        # Of decoded samples `join` mostly makes the arrays of several at once.
+    def _made_arrays(self) -> _Arrays:
+        # Made late, because `join` makes the arrays of several samples at once.
         if self._arrays is None:
             self._arrays = join([self])
         return self._arrays
@@ -191,22 +193,22 @@ class Sample:
 
 @lru_cache(maxsize=64)
 def _fields(n_cubes: int, n_pads: int) -> struct.Struct:
-    """Cuts a decoded SAMPLE into the bytes of its frequencies, faults and temperatures."""
+    """Splits a decoded SAMPLE into the bytes of its frequencies, faults and temperatures."""
     return struct.Struct(f"{_FREQUENCY}x{4 * n_cubes * n_pads}s{4 * n_cubes}s{2 * n_cubes}s4x")
 
 
 def join(samples: Sequence[Sample]) -> _Arrays:
-    """frequency (N, P), pad_fault (N,) and temperature (N,) of all cubes of samples with P pads,
-    one after the other.
+    """frequency (N, P), pad_fault (N,) and temperature (N,) of samples with P pads, one after the
+    other.
 
-    Decoded bytes become arrays once for all of them. Read-only where all were decoded.
+    The bytes of all decoded samples become arrays at once, which are read-only.
     """
     width = samples[0].n_pads
     parts: list[bytes] = []
     for sample in samples:
         if not sample._raw:
             frequency, pad_fault, temperature = zip(
-                *(sample._made() for sample in samples), strict=True
+                *(sample._made_arrays() for sample in samples), strict=True
             )
             return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
         parts += _fields(*sample.shape).unpack(sample._raw)
@@ -221,8 +223,12 @@ def join(samples: Sequence[Sample]) -> _Arrays:
 
 @dataclass(frozen=True, slots=True)
 class Stats:
-    """The hub's own book: uptime_ms u64; samples taken u32 and dropped in the hub u32, since
-    power-up, wrapping; supply_mv u16, mV, 0 unknown."""
+    """What the hub has counted.
+
+    uptime_ms: since power-up, u64
+    taken, dropped: samples taken, and dropped in the hub, since power-up; u32, wrap
+    supply_mv: mV, u16; 0 unknown
+    """
 
     uptime_ms: int
     taken: int
@@ -239,8 +245,11 @@ class Stats:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Host to hub: request u8 (a `Command`; other numbers pass, the hub answers UNKNOWN), argument
-    u32."""
+    """From host to hub.
+
+    request: a `Command`, u8; to other numbers the hub answers UNKNOWN
+    argument: u32
+    """
 
     request: int
     argument: int = 0
@@ -255,8 +264,12 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """Hub to host, one per REQUEST: its request u8, result u8 (a `Result`, 0 done), argument u32
-    now in force."""
+    """From hub to host, one for each REQUEST.
+
+    request: the one answered, u8
+    result: a `Result`, u8
+    argument: the value now in force, u32
+    """
 
     request: int
     result: int = 0
@@ -275,23 +288,22 @@ Frame = Hello | Sample | Stats | Request | Ack
 _TYPES: dict[int, type[Frame]] = {0x01: Hello, 0x02: Sample, 0x03: Stats, 0x10: Request, 0x11: Ack}
 _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
 UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
-    code: kind._unpack for code, kind in _TYPES.items()
+    code: frame_type._unpack for code, frame_type in _TYPES.items()
 }
 
 
 def encode(frame: Frame, version: int = VERSION) -> bytes:
     """Bytes of one frame: a zero, the COBS code of header, payload and CRC-32, a zero.
 
-    The leading zero ends whatever half frame or garbage came before, which would otherwise swallow
-    this frame. version: another one than ours, to try the other end with. ProtocolError: a field
-    out of its range, an array of the wrong dtype or shape, a payload over 65535 bytes.
+    The leading zero ends any unfinished frame before it, which would otherwise swallow this one.
+    version: another one than ours, for tests of the other end.
+    ProtocolError: a field out of its range, an array of the wrong dtype or shape, a payload of over
+    65535 bytes.
     """
     code = _CODES.get(type(frame))
     if code is None:
-        raise ProtocolError(
-            f"cannot encode {type(frame).__name__}; a frame is one of "
-            + ", ".join(k.__name__ for k in _CODES)
-        )
+        names = ", ".join(frame_type.__name__ for frame_type in _CODES)
+        raise ProtocolError(f"cannot encode {type(frame).__name__}; a frame is one of {names}")
     try:
         payload = frame._pack()
     except struct.error as error:
@@ -300,8 +312,8 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
         ) from error
     if len(payload) > MAX_PAYLOAD:
         raise ProtocolError(
-            f"{type(frame).__name__} payload has {len(payload)} bytes, the limit is {MAX_PAYLOAD}: "
-            "split the cubes over several frames with first_cube"
+            f"the payload of {type(frame).__name__} has {len(payload)} bytes, "
+            f"the limit is {MAX_PAYLOAD}: split the cubes over several frames with first_cube"
         )
     body = HEADER.pack(code, version, len(payload)) + payload
     code_words: bytes = cobs.encode(body + zlib.crc32(body).to_bytes(4, "little"))
@@ -309,13 +321,11 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
 
 
 def _array(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != shape:
-        found = (
-            f"{value.dtype} {value.shape}"
-            if isinstance(value, np.ndarray)
-            else type(value).__name__
-        )
-        raise ProtocolError(
-            f"{name} is {found}, must be an array of {dtype.name} {shape}; convert and round it first"
-        )
-    return value
+    if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape:
+        return value
+    actual = type(value).__name__
+    if isinstance(value, np.ndarray):
+        actual = f"{value.dtype} {value.shape}"
+    raise ProtocolError(
+        f"{name} is {actual}, must be an array of {dtype.name} {shape}; convert and round it first"
+    )
