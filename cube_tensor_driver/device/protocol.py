@@ -109,7 +109,7 @@ class Hello:
 class Sample:
     """One reading of n_cubes cubes of a hub, first_cube and those after it, at the same instant.
 
-    sequence: u32, wraps; given when the sample is taken, so that one dropped in the hub leaves a gap
+    sequence: u32, wraps; given when the sample is taken, so one dropped in the hub leaves a gap
     first_cube: index on the hub, u16
     device_us: hub clock, µs, u64
     shape: (n_cubes, n_pads)
