@@ -124,15 +124,6 @@ print(*tops - sys.stdlib_module_names)
     assert set(python(script).split()) <= {"cube_tensor_driver", "numpy", "transforms3d"}
 
 
-def test_no_exit_assert_or_bare_except_in_the_package():
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            place = f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}"
-            assert not isinstance(node, ast.Assert), f"{place}: assert as a guard"
-            if isinstance(node, ast.ExceptHandler):
-                assert node.type is not None, f"{place}: bare except"
-
-
 # Module -> wheel -> rosdep key, where the names differ. rosdep has no key for the last ones: the
 # commands that need them say so where they are missing.
 WHEELS = {
@@ -171,12 +162,6 @@ def test_every_dependency_is_declared_and_pinned():
         assert key is None or key in of_ros, f"package.xml does not name {key}"
         assert wheel in locked, f"requirements.lock does not pin {wheel}"
         assert wheel in of_pip, f"pyproject.toml does not name {wheel}"
-
-
-def test_every_locked_wheel_has_a_hash():
-    text = (ROOT / "tools/requirements.lock").read_text()
-    for block in re.split(r"\n(?=[a-z])", text.strip()):
-        assert "--hash=sha256:" in block, block.splitlines()[0]
 
 
 USES_ITS_DATA = """
@@ -266,8 +251,7 @@ def test_importing_the_package_imports_nothing_heavy():
     assert not heavy & set(loaded)
 
 
-def test_messages_say_unit_and_unknown():
-    """Every field of ours stands under a comment."""
+def test_every_field_of_a_message_stands_under_a_comment():
     for path in [*ROOT.glob("msg/*.msg"), *ROOT.glob("srv/*.srv")]:
         comment = False
         for line in path.read_text().splitlines():
