@@ -1,5 +1,7 @@
-"""All cubes of a skin file, on real hubs or simulated ones: driver, reconstruction, what there is
-to see and keep."""
+"""All cubes of a skin file, on real or simulated hubs.
+
+Starts driver and reconstruction, and on demand what shows and records the skin.
+"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -8,43 +10,33 @@ from launch.substitutions import LaunchConfiguration
 from cube_tensor_driver.ros.launching import start_skin, switch
 
 
+def text(name: str, description: str, default: str = "") -> DeclareLaunchArgument:
+    return DeclareLaunchArgument(name, default_value=default, description=description)
+
+
 def generate_launch_description() -> LaunchDescription:
     arguments = [
         DeclareLaunchArgument(
             "config", description="Skin file (YAML): links, cubes, poses, calibrations."
         ),
-        DeclareLaunchArgument(
-            "namespace", default_value="", description="Namespace of the nodes and their topics."
-        ),
-        DeclareLaunchArgument(
-            "rate",
-            default_value="0.0",
-            description="Samples per second; 0.0: as the skin file says.",
-        ),
-        DeclareLaunchArgument(
-            "publish_period",
-            default_value="0.0",
-            description="Time that one message covers, s; 0.0: one for each scan.",
-        ),
+        text("namespace", "Namespace of the nodes and their topics."),
+        text("rate", "Samples per second; 0.0: as in the skin file.", "0.0"),
+        text("publish_period", "Time that one message covers, s; 0.0: one for each scan.", "0.0"),
         switch(
             "simulate", "Simulate the skin's hubs on pseudo-terminals instead of opening its ports."
         ),
-        DeclareLaunchArgument(
-            "load",
-            default_value="",
-            description="Load script (YAML) of the simulated skin; empty: something wanders.",
-        ),
+        text("load", "Load script (YAML) for the simulated skin; empty: a load that wanders."),
         switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
         switch(
             "autostart",
-            "Nodes configure and activate themselves; false: by lifecycle transitions from elsewhere.",
-            "true",
+            "Nodes configure and activate themselves; false: others do it (lifecycle).",
+            default="true",
         ),
         switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),
         switch(
             "state_publisher",
-            "Publish the cubes' frames (robot_state_publisher, URDF of the skin file).",
+            "Publish the cubes' frames (robot_state_publisher with the URDF of the skin).",
         ),
         switch("record", "Record frequencies, stress and info into a bag with ros2 bag (mcap)."),
         switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),

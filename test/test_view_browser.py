@@ -137,7 +137,7 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         skin.start()
         stack.callback(skin.end)
-        url = children.said("view", "http://", 30).split()[0]
+        url = children.wait_for_line("view", "http://", 30).split()[0]
         port = urlparse(url).port
         sleeper = socket.socket()
         sleeper.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -148,7 +148,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
         for topic in counts:
             children.start(Process(topic, f"cube_tensor_driver.ros.{topic}"))
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-        url = children.said("view", "http://", START_S).split()[0]
+        url = children.wait_for_line("view", "http://", START_S).split()[0]
         counter = Counter(url)
         page = stack.enter_context(chromium(url, SHOWN)) if browser else None
         executor = make_executor()

@@ -106,5 +106,5 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
                     "./cube reprocess computes it from the frequencies"
                 )
             children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-            print(children.said("view", "http://", START_S), file=sys.stderr)
+            print(children.wait_for_line("view", "http://", START_S), file=sys.stderr)
         yield children

@@ -1,1 +1,4 @@
-"""Which processes a skin needs, and how they are started, watched and ended. ROS is not imported."""
+"""Which processes a skin needs, and child processes that are started, watched and ended.
+
+Nothing here imports ROS: nodes are started as commands. What a node does is in ros/.
+"""

@@ -1,4 +1,4 @@
-"""The processes of a skin as our own children: started, watched, and surely ended."""
+"""The processes of a skin as child processes: started, watched, and ended in every case."""
 
 from __future__ import annotations
 
@@ -9,29 +9,31 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..core.errors import CubeError
 from .skin_processes import Process, Value
 
 END_S = 1.2
-"""How long a process has to end by itself before it is killed: hung rclpy ignores SIGTERM."""
-
-
-LOOK_S = 0.05
-LEASH = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
-"""Runs a command so that the kernel ends it when the thread that started it is gone, even by
-SIGKILL; of util-linux."""
+"""How long a process has to end when asked; then it is killed. A hung rclpy ignores SIGTERM."""
+POLL_S = 0.05
+LOG_LINES = 10
+"""Of a process that ended are part of the error message."""
+END_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
+"""In front of a command: the kernel ends it when the thread that started it is gone, even by
+SIGKILL. setpriv is part of util-linux."""
 
 
 class ChildError(CubeError):
-    """A process of the skin ended by itself."""
+    """A process ended by itself, or did not come up in time."""
 
 
 class Children:
-    """Processes by executable name, each with its output in a log file; a context that ends them
-    all."""
+    """Child processes by the name of their executable; a context manager that ends them all.
+
+    Each writes its output to a log file in the folder `logs`.
+    """
 
     def __init__(self, logs: Path) -> None:
         self._logs = logs
@@ -44,11 +46,14 @@ class Children:
         self.end(list(self._processes))
 
     def start(self, process: Process) -> None:
-        """Start one. It has a session of its own: Ctrl-C reaches it through us, in order."""
-        command = [*LEASH, sys.executable, "-m", process.module, *process.arguments]
+        """Start a process, in a session of its own.
+
+        So Ctrl-C does not reach it directly: it is ended by `end`, after what depends on it.
+        """
+        command = [*END_WITH_PARENT, sys.executable, "-m", process.module, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]
-        with (self._logs / f"{process.executable}.log").open("wb") as log:
+        with self._log_file(process.executable).open("wb") as log:
             self._processes[process.executable] = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -58,14 +63,18 @@ class Children:
             )
 
     def pid(self, executable: str) -> int:
+        """The process id."""
         return self._processes[executable].pid
 
     def log(self, executable: str) -> str:
-        return (self._logs / f"{executable}.log").read_text(errors="replace")
+        """What the process has written so far."""
+        return self._log_file(executable).read_text(errors="replace")
 
-    def said(self, executable: str, text: str, seconds: float) -> str:
-        """The first line of its log with `text`, once it is there. ChildError: it ended before, or
-        takes too long."""
+    def wait_for_line(self, executable: str, text: str, seconds: float) -> str:
+        """The first line of the log that contains `text`, once it is there.
+
+        Raises ChildError if any process ends before, or if it takes longer than `seconds`.
+        """
         until = time.monotonic() + seconds
         while True:
             for line in self.log(executable).splitlines():
@@ -74,42 +83,49 @@ class Children:
             self.check()
             if time.monotonic() > until:
                 raise ChildError(
-                    f"the {executable} did not say {text!r} within {seconds:g} s:\n{self.log(executable)}"
+                    f"the {executable} did not say {text!r} within {seconds:g} s:\n"
+                    f"{self.log(executable)}"
                 )
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._processes[executable].wait(LOOK_S)
+                self._processes[executable].wait(POLL_S)
 
     def check(self) -> None:
-        """ChildError with the end of its log if one has ended."""
+        """Raise ChildError, with the end of its log, if a process has ended."""
         for executable, process in self._processes.items():
             if process.poll() is not None:
-                tail = "\n".join(self.log(executable).splitlines()[-10:])
-                raise ChildError(f"the {executable} ended with code {process.returncode}:\n{tail}")
+                end_of_log = "\n".join(self.log(executable).splitlines()[-LOG_LINES:])
+                raise ChildError(
+                    f"the {executable} ended with code {process.returncode}:\n{end_of_log}"
+                )
 
-    def end(self, executables: Sequence[str]) -> None:
-        """End these: asked first, killed after END_S."""
-        running = [self._processes.pop(name) for name in executables]
-        for process in running:
+    def end(self, executables: Iterable[str]) -> None:
+        """End these processes: ask all of them first, kill after END_S what is still there."""
+        ending = [self._processes.pop(name) for name in executables]
+        for process in ending:
             _signal(process, signal.SIGTERM)
         until = time.monotonic() + END_S
-        for process in running:
+        for process in ending:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(timeout=max(0.0, until - time.monotonic()))
-        for process in running:
+        for process in ending:
             if process.poll() is None:
                 _signal(process, signal.SIGKILL)
                 process.wait()
 
+    def _log_file(self, executable: str) -> Path:
+        return self._logs / f"{executable}.log"
+
 
 def ros_arguments(parameters: dict[str, Value]) -> list[str]:
-    """-p name:=value of each parameter, spelled as YAML so that a text stays a text."""
-    spelled = {
-        name: f"'{value}'" if isinstance(value, str) else str(value).lower()
-        for name, value in parameters.items()
-    }
-    return [word for name, value in spelled.items() for word in ("-p", f"{name}:={value}")]
+    """`-p name:=value` for each parameter. Values are written as YAML, so that a text stays one."""
+    words = []
+    for name, value in parameters.items():
+        written = f"'{value}'" if isinstance(value, str) else str(value).lower()
+        words += ["-p", f"{name}:={written}"]
+    return words
 
 
 def _signal(process: subprocess.Popen[bytes], number: int) -> None:
+    """To all processes of its session."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)

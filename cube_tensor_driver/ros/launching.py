@@ -1,5 +1,7 @@
-"""The processes of a skin as launch actions. Imports launch, which every ROS 2 machine has and the
-wheels lack."""
+"""The processes of a skin as actions of a launch file.
+
+Imports launch, which every ROS 2 installation has. The ROS 2 wheels lack it.
+"""
 
 from __future__ import annotations
 
@@ -31,83 +33,92 @@ def switch(name: str, description: str, default: str = "false") -> DeclareLaunch
 def start_skin(
     context: LaunchContext, **arguments: LaunchConfiguration
 ) -> list[LaunchDescriptionEntity]:
-    """For an OpaqueFunction: what `skin_processes` says as actions, and what else the arguments ask
-    for.
+    """The actions that start a skin, for an OpaqueFunction.
 
-    arguments: config and namespace; port, rate, publish_period, simulate, load, composed,
-    autostart, markers, contacts, record, rviz, state_publisher if the launch file has them.
-    ConfigError: skin file, load script or an argument is wrong.
+    arguments: config and namespace; also port, rate, publish_period, simulate, load, composed,
+    autostart, markers, contacts, record, rviz and state_publisher if the launch file has them.
+
+    Raises ConfigError if the skin file, the load script or an argument is wrong.
     """
     given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
-    path = Path(given["config"]).expanduser().resolve()
-    skin = read_skin(path)
+    config = _path(given["config"])
+    skin = read_skin(config)
     namespace = given["namespace"]
-    numbers = {}
-    for name, what in {"rate": "samples per second", "publish_period": "seconds"}.items():
-        try:
-            numbers[name] = float(given.get(name, 0))
-        except ValueError:
-            raise ConfigError(f"{name}:={given[name]}: must be a number of {what}") from None
-
-    load = Path(given["load"]).expanduser().resolve() if given.get("load") else None
-    if load is not None:
-        read_script(load)
-
-    def wanted(name: str) -> bool:
-        return given.get(name) == "true"
-
-    processes = skin_processes(
-        path,
-        port=given.get("port", ""),
-        rate=numbers["rate"],
-        publish_period=numbers["publish_period"],
-        composed=wanted("composed"),
-        autostart=given.get("autostart") != "false",
-        markers=wanted("markers") or wanted("rviz"),
-        contacts=wanted("contacts"),
-        simulated=SimulatedHubs(_port_folder(), load) if wanted("simulate") else None,
-    )
-    # Nodes first: where one cannot be started launch gives up, and leaves what it has started
-    # already.
+    rviz = given.get("rviz") == "true"
     actions = [
-        _action(process, namespace)
-        for process in sorted(processes, key=lambda process: not process.node)
+        _process_action(process, namespace) for process in _nodes_first(_processes(config, given))
     ]
-    if wanted("state_publisher") or wanted("rviz"):
+    if rviz or given.get("state_publisher") == "true":
         actions.append(_state_publisher(skin, namespace))
-    if wanted("record"):
+    if given.get("record") == "true":
         record = ExecuteProcess(cmd=record_command(skin.name, namespace), output="screen")
-        actions.append(_installed("ros2bag", record))
-    if wanted("rviz"):
+        actions.append(_if_installed("ros2bag", record))
+    if rviz:
         actions.append(_rviz(namespace))
     return actions
 
 
-def _port_folder() -> Path:
-    return Path(tempfile.mkdtemp(prefix="cube_ports_"))
+def _processes(config: Path, given: dict[str, str]) -> list[Process]:
+    def wanted(name: str) -> bool:
+        return given.get(name) == "true"
 
-
-def _action(process: Process, namespace: str) -> LaunchDescriptionEntity:
-    if process.node:
-        return Node(
-            package="cube_tensor_driver",
-            executable=process.executable,
-            # One executable may hold several nodes: they keep their own names.
-            name=None if process.executable == "composed" else process.executable,
-            namespace=namespace,
-            parameters=[process.parameters],
-            output="screen",
-            emulate_tty=True,
-        )
-    return ExecuteProcess(
-        cmd=[sys.executable, "-m", process.module, *process.arguments],
-        name=process.executable,
-        output="screen",
+    load = _path(given["load"]) if given.get("load") else None
+    if load is not None:
+        read_script(load)  # so that a mistake in it is told before anything starts
+    simulated = None
+    if wanted("simulate"):
+        simulated = SimulatedHubs(Path(tempfile.mkdtemp(prefix="cube_ports_")), load)
+    return skin_processes(
+        config,
+        port=given.get("port", ""),
+        rate=_number(given, "rate", "samples per second"),
+        publish_period=_number(given, "publish_period", "seconds"),
+        composed=wanted("composed"),
+        autostart=given.get("autostart") != "false",
+        markers=wanted("markers") or wanted("rviz"),
+        contacts=wanted("contacts"),
+        simulated=simulated,
     )
 
 
-def _installed(package: str, action: LaunchDescriptionEntity) -> LaunchDescriptionEntity:
-    """The action, or a line that says how to get its package."""
+def _nodes_first(processes: list[Process]) -> list[Process]:
+    """Where a node cannot be started, launch gives up and leaves running what it has started."""
+    return sorted(processes, key=lambda process: not process.node)
+
+
+def _path(text: str) -> Path:
+    return Path(text).expanduser().resolve()
+
+
+def _number(given: dict[str, str], name: str, unit: str) -> float:
+    try:
+        return float(given.get(name, 0))
+    except ValueError:
+        raise ConfigError(f"{name}:={given[name]}: must be a number of {unit}") from None
+
+
+def _process_action(process: Process, namespace: str) -> LaunchDescriptionEntity:
+    if not process.node:
+        return ExecuteProcess(
+            cmd=[sys.executable, "-m", process.module, *process.arguments],
+            name=process.executable,
+            output="screen",
+        )
+    # `composed` holds several nodes, which keep their own names.
+    name = None if process.executable == "composed" else process.executable
+    return Node(
+        package="cube_tensor_driver",
+        executable=process.executable,
+        name=name,
+        namespace=namespace,
+        parameters=[process.parameters],
+        output="screen",
+        emulate_tty=True,
+    )
+
+
+def _if_installed(package: str, action: LaunchDescriptionEntity) -> LaunchDescriptionEntity:
+    """The action; or, if its package is missing, a line that says how to install it."""
     try:
         get_package_prefix(package)
     except PackageNotFoundError:
@@ -120,21 +131,17 @@ def _installed(package: str, action: LaunchDescriptionEntity) -> LaunchDescripti
 
 def _state_publisher(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
     package = "robot_state_publisher"
-    parameters = [{"robot_description": skin_urdf(skin)}]
-    return _installed(
-        package,
-        Node(
-            package=package,
-            executable=package,
-            namespace=namespace,
-            parameters=parameters,
-            output="screen",
-        ),
+    node = Node(
+        package=package,
+        executable=package,
+        namespace=namespace,
+        parameters=[{"robot_description": skin_urdf(skin)}],
+        output="screen",
     )
+    return _if_installed(package, node)
 
 
 def _rviz(namespace: str) -> LaunchDescriptionEntity:
     arguments = ["-d", str(package_data() / "rviz" / "skin.rviz")]
-    return _installed(
-        "rviz2", Node(package="rviz2", executable="rviz2", namespace=namespace, arguments=arguments)
-    )
+    node = Node(package="rviz2", executable="rviz2", namespace=namespace, arguments=arguments)
+    return _if_installed("rviz2", node)

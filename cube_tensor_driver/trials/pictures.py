@@ -119,7 +119,7 @@ def _strongest(children: Children) -> MarkerArray:
 
 def _photograph(children: Children, path: Path) -> None:
     """The browser view. CubeError: no picture came."""
-    url = children.said("view", "http://", START_S).split()[0]
+    url = children.wait_for_line("view", "http://", START_S).split()[0]
     # A tool of the repository, not of the package: only it needs a browser's driver.
     command = [
         sys.executable,
