@@ -157,8 +157,8 @@ def test_defaults(computed):
 
 def test_every_flag_reaches_the_solver(computed):
     flags = (
-        "--plane stress --width 30 --height 20 --side 5 --young 1e5 --poisson 0.4 --rigid --symmetry mirrors "
-        "--pad 1.5 --pad-centre 1.25 --meshes 2 --neglect xx"
+        "--plane stress --width 30 --height 20 --side 5 --young 1e5 --poisson 0.4 --rigid "
+        "--symmetry mirrors --pad 1.5 --pad-centre 1.25 --meshes 2 --neglect xx"
     )
     assert cli.main(["fem", *flags.split()]) == 1
     body, layout, symmetry, meshes, _ = computed[0]

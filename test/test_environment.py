@@ -123,7 +123,10 @@ def test_a_failed_step_shows_the_end_of_its_log(tmp_path):
 
 def test_an_interrupted_step_leaves_no_process(tmp_path):
     # A step with a child of its own that ignores SIGTERM, as compilers under colcon may.
-    grandchild = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"
+    grandchild = (
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
+        "print('up', flush=True); time.sleep(600)"
+    )
     child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {grandchild!r}])"
     script = (
         f"import sys, signal; sys.path.insert(0, {str(ROOT / 'tools')!r})\n"

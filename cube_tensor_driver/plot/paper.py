@@ -1,4 +1,4 @@
-"""The pictures and numbers of docs/paper.md: the source paper's figure 4, its experiments, a rod."""
+"""Pictures and numbers of docs/paper.md: figure 4 of the source paper, its experiments, a rod."""
 
 from __future__ import annotations
 

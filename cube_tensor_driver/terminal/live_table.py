@@ -20,38 +20,42 @@ from ..core.rows import StressRows
 from ..core.status import STATUS
 
 REFRESH_S = 0.1
+"""How often the table is drawn."""
 RATE_S = 1.0
+"""Over how long rates are counted."""
 SHOWN = ("xx", "zz", "zx", "yz", "zz_x", "zz_y", "zz_z")
-"""Components with a column of their own where a cube observes them: normal stress, shear on the
-skin's surface, how the pressure varies."""
+"""Components with a column where a cube observes them: normal stress, shear on the skin's surface,
+the gradient of the pressure."""
+UNOBSERVED = "·"
 BAR = 12
+"""Length of the bar of the largest pressure."""
+PEAK_DECAY = 0.99
+"""Per drawing, of the pressure that a full bar shows."""
+OTHER_LINES = 8
+"""Of the terminal, which are not rows of cubes."""
 WIDEST = 1000
-"""Of a terminal, in columns."""
+"""Columns to measure the table's own width with."""
 
 
 class LiveTable:
-    """Last tensor and rate per cube, drawn ten times a second; a context that gives the terminal
-    back."""
+    """Last tensor and rate of each cube, drawn ten times a second; a context that gives the
+    terminal back."""
 
     def __init__(self, skin: Skin, show: bool) -> None:
-        self._skin = skin
         n = len(skin.cubes)
+        self.note = ""
+        self._skin = skin
         self._values = np.full((n, len(COMPONENTS)), np.nan)
         self._residual = np.full(n, np.nan)
         self._status = np.zeros(n, np.uint16)
         self._count = np.zeros(n, int)
-        self._rate_count, self._rate_at, self._rate = (
-            self._count.copy(),
-            time.monotonic(),
-            np.full(n, np.nan),
-        )
+        self._rate = np.full(n, np.nan)
+        self._rate_count = self._count.copy()
+        self._rate_at = time.monotonic()
         self._peak = 0.0
         self._drawn_at = 0.0
-        self.note = ""
         self._console = Console(stderr=True)
-        self._live = (
-            Live(console=self._console, auto_refresh=False, transient=False) if show else None
-        )
+        self._live = Live(console=self._console, auto_refresh=False) if show else None
 
     def __enter__(self) -> LiveTable:
         if self._live:
@@ -64,7 +68,7 @@ class LiveTable:
 
     @property
     def seen(self) -> int:
-        """Cubes that have had a tensor."""
+        """Number of cubes that have had a tensor."""
         return int(np.count_nonzero(self._count))
 
     @property
@@ -78,72 +82,85 @@ class LiveTable:
         np.add.at(self._count, cube, 1)
 
     def refresh(self) -> None:
-        """Draw if it is time to."""
+        """Count rates and draw, when it is time to."""
         now = time.monotonic()
         if now - self._rate_at >= RATE_S:
             self._rate = (self._count - self._rate_count) / (now - self._rate_at)
             self._rate_count, self._rate_at = self._count.copy(), now
         if self._live and now - self._drawn_at >= REFRESH_S:
             self._drawn_at = now
-            self._live.update(
-                self.draw(max(4, self._console.height - 8), self._console.width), refresh=True
-            )
+            rows = max(4, self._console.height - OTHER_LINES)
+            self._live.update(self.draw(rows, self._console.width), refresh=True)
 
     def draw(self, most: int, width: int) -> Table:
-        """The table for a terminal of `width`, of the `most` cubes under the greatest normal
-        stress."""
-        title = f"skin {self._skin.name}: {len(self._count)} cubes. Tension is positive; · is not observed"
-        table = Table(title=title + self.note)
-        table.add_column("cube")
-        table.add_column("pressure", width=BAR)
-        names = [
-            name for name in SHOWN if np.isfinite(self._values[:, COMPONENTS.index(name)]).any()
-        ]
-        for name in names:
-            unit = "kPa/mm" if "_" in name else "kPa"
-            label = f"∂{name[:2]}/∂{name[3]}" if "_" in name else name
-            table.add_column(f"{label}\n{unit}", justify="right", min_width=7)
-        table.add_column("residual", justify="right")
-        table.add_column("Hz", justify="right", min_width=4)
-        table.add_column("state")
+        """The table for a terminal of `width` columns.
+
+        Of more than `most` cubes it shows those under the greatest normal stress.
+        """
         pressure = np.nan_to_num(-self._values[:, 2])
-        self._peak = max(self._peak * 0.99, float(pressure.max()), 1.0)
+        self._peak = max(self._peak * PEAK_DECAY, float(pressure.max()), 1.0)
         shown = np.arange(len(pressure))
+        components = [name for name in SHOWN if np.isfinite(self._component(name)).any()]
+        table = self._empty_table(components)
         if len(shown) > most:
             shown = np.sort(np.argsort(-np.abs(pressure), kind="stable")[:most])
             table.caption = f"the {most} cubes under the greatest normal stress of {len(pressure)}"
-        columns = [COMPONENTS.index(name) for name in names]
         for number in shown.tolist():
             bar = "█" * int(BAR * min(1.0, max(0.0, pressure[number] / self._peak)))
-            values = [
-                _kilo(self._values[number, column], 1e-6 if column > 5 else 1e-3)
-                for column in columns
-            ]
-            words = [
-                word.lower().replace("_", " ")
-                for word, bit in STATUS.items()
-                if self._status[number] & bit
-            ]
-            state = (
-                Text(", ".join(words), "red")
-                if words
-                else Text("ok" if self._count[number] else "waiting", "green")
-            )
-            rate = "·" if np.isnan(self._rate[number]) else f"{self._rate[number]:.0f}"
-            residual = "·" if np.isnan(self._residual[number]) else f"{self._residual[number]:.2f}"
+            values = [_in_kpa(name, self._component(name)[number]) for name in components]
             table.add_row(
-                self._skin.cubes[number].name, Text(bar, "blue"), *values, residual, rate, state
+                self._skin.cubes[number].name,
+                Text(bar, "blue"),
+                *values,
+                _number(self._residual[number], ".2f"),
+                _number(self._rate[number], ".0f"),
+                self._state(number),
             )
-        if (
-            Measurement.get(
-                self._console, self._console.options.update(max_width=WIDEST), table
-            ).maximum
-            > width
-        ):
+        options = self._console.options.update(max_width=WIDEST)
+        if Measurement.get(self._console, options, table).maximum > width:
             # Without lines a planar skin fits into 80 columns.
             table.box, table.padding, table.show_edge = SIMPLE_HEAD, 0, False
         return table
 
+    def _empty_table(self, components: list[str]) -> Table:
+        cubes = len(self._count)
+        title = f"skin {self._skin.name}: {cubes} cubes. Tension is positive; "
+        table = Table(title=f"{title}{UNOBSERVED} is not observed{self.note}")
+        table.add_column("cube")
+        table.add_column("pressure", width=BAR)
+        for name in components:
+            label, unit = name, "kPa"
+            if is_gradient(name):
+                label, unit = f"∂{name[:2]}/∂{name[3]}", "kPa/mm"
+            table.add_column(f"{label}\n{unit}", justify="right", min_width=7)
+        table.add_column("residual", justify="right")
+        table.add_column("Hz", justify="right", min_width=4)
+        table.add_column("state")
+        return table
 
-def _kilo(value: float, scale: float) -> str:
-    return "·" if np.isnan(value) else f"{value * scale:+.2f}"
+    def _component(self, name: str) -> NDArray[np.float64]:
+        """Of all cubes, Pa or Pa/m."""
+        return self._values[:, COMPONENTS.index(name)]
+
+    def _state(self, number: int) -> Text:
+        """Words of the status bits that are set."""
+        bits = self._status[number]
+        words = [word.lower().replace("_", " ") for word, bit in STATUS.items() if bits & bit]
+        if words:
+            return Text(", ".join(words), "red")
+        return Text("ok" if self._count[number] else "waiting", "green")
+
+
+def is_gradient(component: str) -> bool:
+    """zz_x is the slope of zz along x."""
+    return "_" in component
+
+
+def _in_kpa(component: str, value: float) -> str:
+    """Pa in kPa, Pa/m in kPa/mm."""
+    scale = 1e-6 if is_gradient(component) else 1e-3
+    return _number(value * scale, "+.2f")
+
+
+def _number(value: float, form: str) -> str:
+    return UNOBSERVED if np.isnan(value) else f"{value:{form}}"

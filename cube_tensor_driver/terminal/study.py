@@ -13,8 +13,8 @@ def show_study(result: LayoutStudy) -> None:
     rows = result.trusted()
     console = Console(highlight=False)
     console.print(
-        "narrowest indenter, mm, from which on the error stays below 20 % of the component's range; "
-        f"cube's centre {1e3 * result.depth:g} mm deep",
+        "narrowest indenter, mm, from which on the error stays below 20 % "
+        f"of the component's range; cube's centre {1e3 * result.depth:g} mm deep",
         soft_wrap=True,
     )
     table = Table("", box=SIMPLE_HEAD, pad_edge=False)
