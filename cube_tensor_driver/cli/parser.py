@@ -109,7 +109,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Exit with 2. What is wrong in one line, where the help is in another."""
         message = self._prefix() + message.removeprefix("argument ")
-        self.exit(2, f"{message}\n      {self.prog} --help shows what is possible\n")
+        self.exit(2, f"{message}\n      {self.prog} --help lists what is possible\n")
 
     def _prefix(self) -> str:
         name = self.prog.partition(" ")[2]
