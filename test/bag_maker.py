@@ -13,6 +13,7 @@ from cube_tensor_driver.bags.write import BagWriter, quality
 from cube_tensor_driver.config.calibration import calibration_text
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STUCK
 
 START_NS = 1_700_000_000_000_000_000
@@ -90,7 +91,10 @@ def stress_of(source: object, pipeline: Pipeline, left_out: np.ndarray) -> objec
     """Message by message, as the node does; left_out: pads that it found stuck."""
     n = len(source.cube)
     rows = pipeline.process(
-        source.cube, source.frequency.reshape(n, -1), left_out, source.temperature
+        FrequencyRows.of(
+            source.cube, source.frequency.reshape(n, -1), temperature=source.temperature
+        ),
+        left_out,
     )
     rows.status[:] |= np.where(left_out > 0, STUCK, 0).astype(np.uint16)
     return message(

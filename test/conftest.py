@@ -14,7 +14,10 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from cube_tensor_driver.core.rows import FrequencyRows
 
 # A shell that starts us in the background has SIGINT ignored, in all that we start too.
 # On every processor there is a worker, or a node: threads of a matrix product only get in the way.
@@ -150,3 +153,18 @@ class Ros:
         wait(answered)
         self.node.destroy_client(client)
         return next(future.result() for future in futures if future.done())
+
+
+def samples(cube, frequency, pad_fault=0, temperature=None) -> FrequencyRows:
+    """Rows without a time."""
+    known = np.nan if temperature is None else temperature
+    fault = 0 if pad_fault is None else pad_fault
+    return FrequencyRows.of(cube, frequency, pad_fault=fault, temperature=known)
+
+
+def stamped(cube, frequency, pad_fault, stamp_ns, temperature=None) -> FrequencyRows:
+    """Rows with a time."""
+    known = np.nan if temperature is None else temperature
+    return FrequencyRows.of(
+        cube, frequency, pad_fault=pad_fault, stamp_ns=stamp_ns, temperature=known
+    )

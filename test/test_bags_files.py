@@ -35,7 +35,7 @@ from cube_tensor_driver.config.yaml import parse_yaml, read_yaml, write_yaml
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import PAD_FAULT, Pipeline
-from cube_tensor_driver.core.rows import StressRows
+from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import STUCK
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
@@ -241,7 +241,9 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
     reprocess(Job(tmp_path / "bag", tmp_path / "out", "bag", Change()))
     for k, record in enumerate(stress(tmp_path / "out").values()):
         of = pipeline if k < 50 else tared
-        expected = of.process(record.cube, loads(pipeline, 0.01 * k).astype(np.float32))
+        expected = of.process(
+            FrequencyRows.of(record.cube, loads(pipeline, 0.01 * k).astype(np.float32))
+        )
         np.testing.assert_array_equal(record.stress, expected.stress, err_msg=str(k))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from conftest import stamped
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.health import Health
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -30,21 +31,29 @@ def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
     temperature = np.full((count, n), np.nan, np.float32)
     single, many = Health(pipeline), Health(pipeline)
     expected = [
-        single.update(cube, *one)
+        single.update(stamped(cube, *one))
         for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)
     ]
     found = [
-        many.update_many(cube, frequency[part], pad_fault[part], stamp_ns[part], temperature[part])
+        many.update(
+            stamped(
+                np.tile(cube, len(part)),
+                frequency[part].reshape(-1, pipeline.n_pads),
+                pad_fault[part].ravel(),
+                stamp_ns[part].ravel(),
+                temperature[part].ravel(),
+            )
+        )
         for part in np.array_split(np.arange(count), 9)
     ]
     for of_many, of_single in zip(
         zip(*found, strict=True), zip(*expected, strict=True), strict=True
     ):
-        np.testing.assert_array_equal(np.concatenate(of_many), of_single)
+        np.testing.assert_array_equal(np.concatenate(of_many), np.concatenate(of_single))
     assert bool(np.any([mask for mask, _ in expected])) == faults
     assert many.closed == single.closed
     for a, b in zip(many.history, single.history, strict=True):
         for one, other in zip(a, b, strict=True):
             np.testing.assert_array_equal(one, other)
-    for name in ("state", "mask", "status", "still", "last", "rows", "newest_ns"):
+    for name in ("state", "mask", "still", "last", "newest_ns"):
         np.testing.assert_array_equal(getattr(many, name), getattr(single, name), err_msg=name)

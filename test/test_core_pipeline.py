@@ -8,12 +8,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from conftest import samples, stamped
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import CalibrationError, CubeError, LayoutError
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.health import Health
 from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency, pad_stress
-from cube_tensor_driver.core.pipeline import Pipeline, StressRows
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE
 
 DTYPES = [(np.float64, 1e-9), (np.float32, 3e-5)]
@@ -84,7 +86,7 @@ def test_recovers_the_applied_fields(layout, make, dtype, tolerance):
     )
     states = states_of(c, 50)
     rows = Pipeline([c] * 50, dtype).process(
-        np.arange(50), frequencies(c, states), np.zeros(50, np.uint32)
+        samples(np.arange(50), frequencies(c, states), np.zeros(50, np.uint32))
     )
     check_rows(rows, truth(c, states), tolerance)
     assert rows.status.tolist() == [0] * 50
@@ -110,13 +112,13 @@ def test_cubes_of_all_kinds_in_one_batch(dtype, tolerance):
         frequency[i, : kinds[k].layout.n_pads] = frequencies(kinds[k], states)
         expected[i] = truth(kinds[k], states)
     for _ in range(2):  # the second time from what is kept
-        rows = pipeline.process(cube, frequency)
+        rows = pipeline.process(samples(cube, frequency))
         check_rows(rows, expected, tolerance)
         assert not rows.status.any()
     assert np.isnan(rows.residual[cube == 4]).all() and np.all(
         rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1
     )
-    pads = pipeline.pad_stress(cube, frequency)
+    pads = pipeline.pad_stress(samples(cube, frequency))
     assert np.isnan(pads[0, 4:]).all() and np.isfinite(pads[2]).all()
     k = kinds[0]
     np.testing.assert_allclose(
@@ -132,7 +134,7 @@ def test_pads_without_parasitic_capacitance(dtype, tolerance):
     states = states_of(c, 20)
     frequency = frequencies(c, states)
     frequency[19, 0] = np.inf
-    rows = Pipeline([c] * 20, dtype).process(np.arange(20), frequency)
+    rows = Pipeline([c] * 20, dtype).process(samples(np.arange(20), frequency))
     check_rows(rows, truth(c, states), tolerance)
     assert rows.status.tolist() == [0] * 19 + [PAD_FAULT]
 
@@ -151,7 +153,7 @@ def test_bad_pads_are_left_out(dtype, tolerance):
     )
     fault = np.zeros(8, np.uint32)
     fault[5], fault[6] = 0b11, 0xFFFFFFFF
-    rows = Pipeline([c] * 8, dtype).process(np.arange(8), frequency, fault)
+    rows = Pipeline([c] * 8, dtype).process(samples(np.arange(8), frequency, fault))
     check_rows(rows, truth(c, states), tolerance * 10)
     assert rows.status.tolist() == [PAD_FAULT] * 6 + [PAD_FAULT | INVALID, 0]
     assert rows.observed.tolist() == [0x7FFF] * 6 + [0, 0x7FFF]
@@ -164,7 +166,7 @@ def test_one_bad_frequency_alone_is_found(value, dtype):
     c = illustrative("cube")
     frequency = np.full((3, 24), 1e5)
     frequency[1, 2] = value
-    rows = Pipeline([c] * 3, dtype).process(np.arange(3), frequency)
+    rows = Pipeline([c] * 3, dtype).process(samples(np.arange(3), frequency))
     assert rows.status.tolist() == [0, PAD_FAULT, 0]
     np.testing.assert_allclose(joined(rows), 0, atol=1e-6)
 
@@ -173,7 +175,7 @@ def test_what_the_remaining_pads_cannot_see_is_not_invented():
     c = illustrative("planar")
     frequency = frequencies(c, states_of(c, 1))
     for bits in range(256):
-        rows = Pipeline([c]).process(np.array([0]), frequency, np.array([bits]))
+        rows = Pipeline([c]).process(samples(np.array([0]), frequency, np.array([bits])))
         missing = [p for p in range(8) if bits >> p & 1]
         alone = make_estimator(c.response, c.noise, c.modes, missing)
         assert rows.observed[0] == sum(1 << i for i in range(15) if alone.observed[i])
@@ -185,17 +187,17 @@ def test_strange_rows_end_in_their_status_never_in_an_error():
     c = illustrative("planar")
     pipeline = Pipeline([c] * 3)
     good = frequencies(c, states_of(c, 1))[0]
-    rows = pipeline.process(np.array([0, -1, 3, 2]), np.tile(good, (4, 1)))
+    rows = pipeline.process(samples(np.array([0, -1, 3, 2]), np.tile(good, (4, 1))))
     assert rows.status.tolist() == [0, INVALID, INVALID, 0] and np.isnan(joined(rows)[1:3]).all()
     rng = np.random.default_rng(0)
     wild = rng.choice([0, -1, np.nan, np.inf, -np.inf, 1e300, 1e-300, 1e5, 4.4e5], size=(500, 8))
     with np.errstate(all="raise"):
         for dtype in (np.float32, np.float64):
             rows = Pipeline([c] * 3, dtype).process(
-                rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500)
+                samples(rng.integers(-5, 9, 500), wild, rng.integers(0, 2**32, 500))
             )
             assert not np.isinf(joined(rows)).any()
-    empty = pipeline.process(np.empty(0, int), np.empty((0, 8)), np.empty(0, np.uint32))
+    empty = pipeline.process(samples(np.empty(0, int), np.empty((0, 8)), np.empty(0, np.uint32)))
     assert (
         empty.stress.shape == (0, 6)
         and empty.gradient.shape == (0, 9)
@@ -207,7 +209,7 @@ def test_wrong_shapes_and_settings_are_errors():
     c = illustrative("planar")
     pipeline = Pipeline([c] * 2)
     with pytest.raises(LayoutError, match=r"\(2, 4\).*\(N, 8\)"):
-        pipeline.process(np.arange(2), np.ones((2, 4)))
+        pipeline.process(samples(np.arange(2), np.ones((2, 4))))
     with pytest.raises(CalibrationError, match="no calibrations"):
         Pipeline([])
     with pytest.raises(CubeError, match="float16"):
@@ -223,14 +225,16 @@ def test_the_residual_rings_for_what_no_field_explains():
     v = states_of(c, 2) @ c.response.T
     v[1, 0] += 30 * c.noise[0]
     frequency = pad_frequency(v, 1e5, c.beta, c.modulus)
-    rows = Pipeline([c]).process(np.zeros(2, int), frequency)
+    rows = Pipeline([c]).process(samples(np.zeros(2, int), frequency))
     assert rows.status.tolist() == [0, RESIDUAL]
     assert rows.residual[1] == pytest.approx(30 / np.sqrt(8))  # all eight pads check it alike
     cube = illustrative("cube")
     v = states_of(cube, 2) @ cube.response.T
     v[1, 5] += 50 * cube.noise[5]
     pipeline = Pipeline([cube])
-    marked = pipeline.suspects(np.zeros(2, int), pad_frequency(v, 1e5, cube.beta, cube.modulus))
+    marked = pipeline.suspects(
+        samples(np.zeros(2, int), pad_frequency(v, 1e5, cube.beta, cube.modulus))
+    )
     assert not marked[0].any() and {cube.layout.pads[i] for i in np.flatnonzero(marked[1])} == {
         "+x+z",
         "-x-z",
@@ -241,7 +245,7 @@ def test_false_alarms_are_as_stated():
     c = illustrative("planar")
     rng = np.random.default_rng(2)
     frequency = 1e5 * (1 + 8e-6 * rng.normal(size=(200_000, 8)))
-    rows = Pipeline([c], np.float64).process(np.zeros(200_000, int), frequency)
+    rows = Pipeline([c], np.float64).process(samples(np.zeros(200_000, int), frequency))
     assert np.mean(rows.status == RESIDUAL) == pytest.approx(1e-3, abs=4 * np.sqrt(1e-3 / 2e5))
     assert np.sqrt(np.mean(rows.residual**2)) == pytest.approx(1, rel=0.01)
     stated = np.sqrt(np.diag(Pipeline([c]).covariance(0)))
@@ -254,10 +258,12 @@ def test_tare_moves_the_rest_frequency():
     c = illustrative("planar")
     pipeline = Pipeline([c] * 2)
     drifted = np.array([[1e5] * 8, np.linspace(1.01e5, 1.02e5, 8)])
-    assert np.abs(pipeline.process(np.arange(2), drifted).stress[1, 2]) > 1e3
+    assert np.abs(pipeline.process(samples(np.arange(2), drifted)).stress[1, 2]) > 1e3
     pipeline.rest_frequency = drifted
     np.testing.assert_array_equal(pipeline.rest_frequency, drifted)
-    np.testing.assert_allclose(pipeline.process(np.arange(2), drifted).stress[:, 2], 0, atol=1e-9)
+    np.testing.assert_allclose(
+        pipeline.process(samples(np.arange(2), drifted)).stress[:, 2], 0, atol=1e-9
+    )
 
 
 def test_the_temperature_model_is_taken_out():
@@ -271,10 +277,10 @@ def test_the_temperature_model_is_taken_out():
     frequency = frequencies(c, states)
     frequency[[0, 3]] *= model.factor(warm[[0, 3]])
     pipeline = Pipeline([c, plain])
-    rows = pipeline.process(np.array([0, 0, 0, 0]), frequency, None, warm)
+    rows = pipeline.process(samples(np.array([0, 0, 0, 0]), frequency, None, warm))
     check_rows(rows, truth(c, states), 1e-9)
     assert rows.status.tolist() == [0, TEMPERATURE, 0, 0]
-    mixed = pipeline.process(np.array([1, 0]), frequencies(c, states[:2]))
+    mixed = pipeline.process(samples(np.array([1, 0]), frequencies(c, states[:2])))
     assert mixed.status.tolist() == [0, TEMPERATURE]
     factor = pipeline.temperature_factor(np.array([0, 1]), np.array([40.0, 40.0]))
     np.testing.assert_allclose(factor, [model.factor([40.0])[0], np.ones(8)])
@@ -303,24 +309,22 @@ def mixed_skin(kinds: int, count: int = 60):
 
 @pytest.mark.parametrize("kinds", [3, 12])
 @pytest.mark.parametrize("bad", [False, True])
-def test_scans_at_once_and_in_turn_are_one_by_one_to_the_bit(kinds, bad):
-    """As recorded batches, and as a message of several turns: with few and many calibrations, with
-    bad pads."""
+def test_scans_at_once_are_the_scans_one_by_one_to_the_bit(kinds, bad):
+    """With few and many calibrations, with and without bad pads."""
     pipeline, cube, frequency = mixed_skin(kinds)
     pad_fault = np.zeros(frequency.shape[:2], np.uint32)
     if bad:
         frequency[:, 7, 1], frequency[2, 30, 0], pad_fault[4:, 11] = np.nan, 1e9, 2
     singly = [
-        pipeline.process(cube, f, fault) for f, fault in zip(frequency, pad_fault, strict=True)
+        pipeline.process(samples(cube, f, fault))
+        for f, fault in zip(frequency, pad_fault, strict=True)
     ]
-    at_once = pipeline.process(cube, frequency, pad_fault)
-    in_turn = pipeline.process(
-        np.tile(cube, 7), frequency.reshape(-1, pipeline.n_pads), pad_fault.ravel()
+    at_once = pipeline.process(
+        samples(np.tile(cube, 7), frequency.reshape(-1, pipeline.n_pads), pad_fault.ravel())
     )
-    for name, *several in zip(StressRows._fields, at_once, in_turn, strict=True):
-        expected = np.concatenate([getattr(rows, name) for rows in singly])
-        for found in several:
-            np.testing.assert_array_equal(found, expected, err_msg=name)
+    for field in dataclasses.fields(StressRows):
+        expected = np.concatenate([getattr(rows, field.name) for rows in singly])
+        np.testing.assert_array_equal(getattr(at_once, field.name), expected, err_msg=field.name)
     assert bool(np.any(at_once.status & PAD_FAULT)) == bad
 
 
@@ -328,15 +332,12 @@ def test_one_cube_alone_is_the_same_cube_among_many_scans():
     """numpy multiplies a single row by another routine."""
     for layout in ("quad", "planar", "cube"):
         pipeline = Pipeline([individual(layout, 1)], np.float32)
-        f = (
-            pipeline.rest_frequency
-            * (1 - 0.01 * np.random.default_rng(1).random((50, 1, pipeline.n_pads)))
-        ).astype("f4")
-        cube = np.zeros(1, np.uint16)
-        at_once = pipeline.process(cube, f)
-        np.testing.assert_array_equal(
-            at_once.stress, [pipeline.process(cube, one).stress[0] for one in f]
-        )
+        load = 0.01 * np.random.default_rng(1).random((50, pipeline.n_pads))
+        f = (pipeline.rest_frequency * (1 - load)).astype(np.float32)
+        at_once = pipeline.process(samples(np.zeros(50, np.uint16), f))
+        one = np.zeros(1, np.uint16)
+        singly = [pipeline.process(samples(one, row[None])).stress[0] for row in f]
+        np.testing.assert_array_equal(at_once.stress, singly)
 
 
 def python_calls(function: Callable[[], object]) -> int:
@@ -364,8 +365,8 @@ def test_absent_pads_are_no_bad_pads():
         )
         cube = np.arange(1024, dtype=np.uint16)
         f = (0.99 * pipeline.rest_frequency).astype(np.float32)
-        assert not np.any(pipeline.process(cube, f).status & PAD_FAULT)
-        return python_calls(lambda: pipeline.process(cube, f))
+        assert not np.any(pipeline.process(samples(cube, f)).status & PAD_FAULT)
+        return python_calls(lambda: pipeline.process(samples(cube, f)))
 
     assert calls(["planar", "cube"]) < 1.5 * calls(["cube"])
 
@@ -379,8 +380,8 @@ def test_no_loop_over_rows():
         cube = np.arange(count) % 4
         f = np.full((count, 8), 1e5)
         f[::3, 0] = np.nan
-        pipeline.process(cube, f)
-        return python_calls(lambda: pipeline.process(cube, f))
+        pipeline.process(samples(cube, f))
+        return python_calls(lambda: pipeline.process(samples(cube, f)))
 
     assert calls(1200) == calls(120)
 
@@ -395,8 +396,8 @@ def test_messages_of_ever_other_cubes_fill_no_memory():
     for number in range(100):
         cube = np.arange(number, number + 100, dtype=np.uint16)
         f, none = np.full((100, 8), 1e5, np.float32), np.zeros(100, np.uint32)
-        health.update(cube, f, none, np.full(100, 10**18 + 1000 * number))
-        pipeline.process(cube, f, none)
+        health.update(stamped(cube, f, none, np.full(100, 10**18 + 1000 * number)))
+        pipeline.process(samples(cube, f, none))
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert held[-1] - held[20] < 0.2 * (held[20] - held[0]), held[::20]

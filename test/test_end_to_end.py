@@ -221,7 +221,7 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     for message in raw:
         rows = decoded(message).rows
         if tuple(rows.sequence) in stored:
-            again = replay.process(rows.cube, rows.frequency, rows.pad_fault, rows.temperature)
+            again = replay.process(rows)
             np.testing.assert_array_equal(again.stress, stored[tuple(rows.sequence)].stress)
             compared += 1
     assert compared > 40

@@ -14,6 +14,7 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.protocol import Hello, Sample, Stats
 from cube_tensor_driver.device.sequence import Account, Arrival
@@ -285,7 +286,7 @@ def judged(
             continue
         frequency = reckoning._table[(k + 1) % INSTANTS].copy()
         sequence, stamp = np.full(4, k, np.uint32), np.full(4, (k + 1) * PERIOD_US * 1000 + 10_000)
-        rows = pipeline.process(cube, frequency)
+        rows = pipeline.process(FrequencyRows.of(cube, frequency))
         spoil(k, sequence, stamp, frequency, rows)
         reckoning.frequencies(cube, sequence, stamp, frequency)
         reckoning.stress(cube, sequence, stamp, rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from conftest import stamped
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core import status
@@ -12,6 +13,8 @@ from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.health import Health
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.reconstructor import Reconstructor
+from cube_tensor_driver.core.statistics import WINDOW_S
 from cube_tensor_driver.core.status import (
     DRIFT,
     NOISY,
@@ -23,7 +26,6 @@ from cube_tensor_driver.core.status import (
     SHORT,
     STUCK,
 )
-from cube_tensor_driver.core.window import WINDOW_S
 from cube_tensor_driver.simulation.cubes import SimulatedCubes
 from cube_tensor_driver.simulation.load import Load, default_script
 
@@ -36,8 +38,8 @@ class Skin:
     """Cubes under a load that moves (or rests), with their health."""
 
     def __init__(self, cubes: int = 6, moving: bool = True, noise: float = NOISE) -> None:
-        self.pipeline = Pipeline([CALIBRATION] * cubes, np.float32)
-        self.health = Health(self.pipeline)
+        self.reconstructor = Reconstructor([CALIBRATION] * cubes)
+        self.pipeline, self.health = self.reconstructor.pipeline, self.reconstructor.health
         self.cube = np.arange(cubes, dtype=np.uint16)
         self._moving, self._noise, self._random = moving, noise, np.random.default_rng(1)
         self.row = 0
@@ -63,9 +65,8 @@ class Skin:
             faults = np.zeros(len(self.cube), np.uint32)
             faults[2] = pad_fault
             stamp_ns = np.full(len(self.cube), self.row * PERIOD_NS)
-            mask, _ = self.health.update(self.cube, frequency.astype(np.float32), faults, stamp_ns)
-            rows = self.pipeline.process(self.cube, frequency, mask)
-            self.health.residual(self.cube, rows.status)
+            rows = stamped(self.cube, frequency.astype(np.float32), faults, stamp_ns)
+            mask = self.reconstructor.process(rows).left_out
             self.row += 1
         return mask
 
@@ -75,7 +76,9 @@ def test_last_is_the_newest_row():
     skin = Skin()
     for n in range(1, 20):
         frequency = np.full((6, 8), 100e3 + n, np.float32)
-        skin.health.update(skin.cube, frequency, np.zeros(6, np.uint32), np.full(6, n * PERIOD_NS))
+        skin.health.update(
+            stamped(skin.cube, frequency, np.zeros(6, np.uint32), np.full(6, n * PERIOD_NS))
+        )
         frequency += 1  # the caller's own, to fill again
         if n % 3 == 0:
             assert (skin.health.last == 100e3 + n).all()
@@ -101,7 +104,7 @@ def test_a_load_that_moves_fast_is_no_noise(frequency):
         v = stress * np.sin(2e-9 * np.pi * frequency * row * PERIOD_NS)
         f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
         f = (f * (1 + NOISE * random.standard_normal(f.shape))).astype(np.float32)
-        health.update(cube, f, np.zeros(8, np.uint32), np.full(8, row * PERIOD_NS))
+        health.update(stamped(cube, f, np.zeros(8, np.uint32), np.full(8, row * PERIOD_NS)))
     assert not health.collect()[0].any()
 
 
@@ -121,7 +124,7 @@ def test_a_load_that_moves_while_hubs_stall_is_no_noise():
         for row in range(begin, end):
             stamp = np.full(16, 2_000_000 * row)
             health.update(
-                cube, table[row % 1000].astype(np.float32), np.zeros(16, np.uint32), stamp
+                stamped(cube, table[row % 1000].astype(np.float32), np.zeros(16, np.uint32), stamp)
             )
         begin = end + int(random.integers(0, 99))
     assert not health.collect()[0].any()
@@ -147,7 +150,9 @@ class Press:
             f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
             f = (f * (1 + noise[cube] * self._random.standard_normal(f.shape))).astype(np.float32)
             jitter = self._random.integers(0, PERIOD_NS // 10, len(cube))
-            self.health.update(cube, f, np.zeros(len(cube), np.uint32), row * PERIOD_NS + jitter)
+            self.health.update(
+                stamped(cube, f, np.zeros(len(cube), np.uint32), row * PERIOD_NS + jitter)
+            )
         return self.health.collect()[0]
 
 
@@ -292,14 +297,15 @@ def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
     frequency = (100e3 * (1 + 1e-5 * generator.standard_normal((6, 8)))).astype(np.float32)
     together, singly = (Health(Pipeline([CALIBRATION] * 6, np.float32)) for _ in range(2))
     none = np.zeros(6, np.uint32)
-    together.update(cube, frequency, none, np.zeros(6))
+    together.update(stamped(cube, frequency, none, 0))
     for row in range(6):
-        singly.update(cube[row : row + 1], frequency[row : row + 1], none[:1], np.zeros(1))
+        one = slice(row, row + 1)
+        singly.update(stamped(cube[one], frequency[one], none[one], 0))
     for one, other in zip(
         (together.last, *together.window()), (singly.last, *singly.window()), strict=True
     ):
         np.testing.assert_array_equal(one, other)
-    assert together.rows.tolist() == [1, 2, 0, 0, 3, 0]
+    assert together.collect()[2].tolist() == [1, 2, 0, 0, 3, 0]
 
 
 def test_a_batch_of_several_scans_is_the_scans_one_after_the_other():
@@ -311,10 +317,12 @@ def test_a_batch_of_several_scans_is_the_scans_one_after_the_other():
         frequency[4, 3, 2] = np.nan
         faults = np.zeros((10, 6), np.uint32)
         of_batch = together.health.update(
-            np.tile(singly.cube, 10), frequency.reshape(-1, 8), faults.ravel(), stamp_ns.ravel()
+            stamped(
+                np.tile(singly.cube, 10), frequency.reshape(-1, 8), faults.ravel(), stamp_ns.ravel()
+            )
         )
         one_by_one = [
-            singly.health.update(singly.cube, *one)
+            singly.health.update(stamped(singly.cube, *one))
             for one in zip(frequency, faults, stamp_ns, strict=True)
         ]
         for whole, parts in zip(of_batch, zip(*one_by_one, strict=True), strict=True):
@@ -332,7 +340,7 @@ def test_a_jump_back_in_time_begins_a_new_window():
     skin = Skin()
     skin.play(1.2)
     before = skin.health.closed
-    skin.health.residual(skin.cube, np.full(6, RESIDUAL, np.uint16))
+    skin.health.count_residuals(skin.cube, np.full(6, RESIDUAL, np.uint16))
     skin.row = 0
     skin.play(0.1)
     assert skin.health.window().rows.tolist() == [10] * 6
@@ -346,7 +354,7 @@ def test_mixed_layouts_and_pads_that_do_not_exist():
     watch = Health(pipeline)
     frequency = np.full((2, 8), 100e3, np.float32)
     frequency[0, 4:] = np.nan
-    watch.update(np.arange(2), frequency, np.array([0xF0, 0], np.uint32), np.zeros(2))
+    watch.update(stamped(np.arange(2), frequency, np.array([0xF0, 0], np.uint32), np.zeros(2)))
     assert not watch.state.any()
 
 
@@ -365,9 +373,7 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
     from cube_tensor_driver.ros.cube_health import CubeHealth
 
     skin = Skin(16)
-    words = CubeHealth(
-        read_skin(package_data() / "config" / "skin_demo.yaml"), skin.pipeline, skin.health
-    )
+    words = CubeHealth(read_skin(package_data() / "config" / "skin_demo.yaml"), skin.reconstructor)
     said = []
     for harm in (
         lambda frequency, row: None,

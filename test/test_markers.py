@@ -22,19 +22,9 @@ def places(n: int = 3, turn: np.ndarray | None = None) -> CubePoses:
     )
 
 
-def rows(values: np.ndarray, status: object = 0) -> StressRows:
-    n = len(values)
-    return StressRows(
-        cube=np.arange(n, dtype=np.uint16),
-        sequence=np.zeros(n, np.uint32),
-        stamp_ns=np.zeros(n, np.int64),
-        stress=values[:, :6],
-        gradient=values[:, 6:],
-        residual=np.ones(n),
-        status=np.full(n, status, np.uint16),
-        observed=np.zeros(n, np.uint16),
-        left_out=np.zeros(n, np.uint32),
-    )
+def rows(values: np.ndarray, status: object = 0, cube: object = None) -> StressRows:
+    cubes = np.arange(len(values)) if cube is None else cube
+    return StressRows.of(cubes, values[:, :6], values[:, 6:], residual=1.0, status=status)
 
 
 def test_traction_pushes_to_the_face_and_pulls_away_from_it():
@@ -89,9 +79,9 @@ def test_automatic_range_rises_at_once_and_falls_slowly():
 def test_health_says_doubtful_no_tensor_and_stale():
     newest = Newest(4)
     values = np.zeros((3, 15))
-    newest.update(np.array([0, 1, 2, 9]), rows(np.zeros((4, 15))), 10.0)  # cube 9 is not ours
-    newest.update(np.array([1]), rows(values[:1], PAD_FAULT), 10.5)
-    newest.update(np.array([2]), rows(values[:1], INVALID | PAD_FAULT), 10.5)
+    newest.update(rows(np.zeros((4, 15)), cube=np.array([0, 1, 2, 9])), 10.0)  # cube 9 is not ours
+    newest.update(rows(values[:1], PAD_FAULT, cube=np.array([1])), 10.5)
+    newest.update(rows(values[:1], INVALID | PAD_FAULT, cube=np.array([2])), 10.5)
     assert newest.health(10.6, 1.0).tolist() == [
         scene.FINE,
         scene.DOUBTFUL,
@@ -121,16 +111,16 @@ def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
         now, chance = step / 50, np.full(n, 0.01)
         chance[7] = 0.9 if 2 <= now < 4 else 0.01
         newest.update(
-            np.arange(n), rows(np.zeros((n, 15)), random.binomial(1, chance) * RESIDUAL), now
+            rows(np.zeros((n, 15)), random.binomial(1, chance) * RESIDUAL, cube=np.arange(n)), now
         )
         health = newest.health(now, 1.0)
         assert (np.delete(health, 7) == scene.FINE).all()
         if not (2 < now < 3 or 4 < now < 5):
             assert health[7] == (scene.DOUBTFUL if 3 <= now <= 4 else scene.FINE), now
     newest.update(
-        np.arange(n), rows(np.zeros((n, 15)), np.full(n, PAD_FAULT)), -100.0
+        rows(np.zeros((n, 15)), np.full(n, PAD_FAULT), cube=np.arange(n)), -100.0
     )  # a bag plays again
-    newest.update(np.arange(n), rows(np.zeros((n, 15))), -99.0)
+    newest.update(rows(np.zeros((n, 15)), cube=np.arange(n)), -99.0)
     assert (newest.health(-99.0, 1.0) == scene.FINE).all()
 
 

@@ -9,14 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from conftest import samples, stamped
 from cube_tensor_driver.config.tare import read_tare, remove_tare, tare_path, write_tare
 from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.conditions import HOLD
 from cube_tensor_driver.core.errors import ConfigError, TareError
-from cube_tensor_driver.core.health import HOLD, Health
+from cube_tensor_driver.core.health import Health
 from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.statistics import WINDOW_S
 from cube_tensor_driver.core.tare import DriftTracker, measure_rest
-from cube_tensor_driver.core.window import WINDOW_S
 
 CALIBRATION = illustrative("planar")
 NAMES = ["a", "b", "c"]
@@ -43,7 +45,9 @@ class Skin:
             windows = self.health.closed
             faults = np.array([0, fault, 0], np.uint32)
             stamp_ns = np.full(3, round(self.seconds * 1e9))
-            self.health.update(np.arange(3), f.astype(np.float32), faults, stamp_ns, temperature)
+            self.health.update(
+                stamped(np.arange(3), f.astype(np.float32), faults, stamp_ns, temperature)
+            )
             if time_constant and self.health.closed != windows:
                 self.tracker.step(time_constant)
             self.seconds += 1 / RATE
@@ -68,7 +72,7 @@ def test_tare_is_the_mean_and_only_of_the_cubes_named():
     # 40 rows or more of 8 ppm average to 1.3 ppm; six times that leaves no false alarm
     np.testing.assert_allclose(rest[[0, 2]], pads()[[0, 2]], rtol=8e-6)
     np.testing.assert_array_equal(rest[1], before[1])
-    rows = skin.pipeline.process(np.arange(3), pads())
+    rows = skin.pipeline.process(samples(np.arange(3), pads()))
     assert np.nanmax(np.abs(rows.stress[0])) < 20 < np.nanmax(np.abs(rows.stress[1]))
 
 
@@ -142,7 +146,7 @@ def test_a_cube_that_is_silent_is_refused_and_bad_pads_keep_their_rest():
     for _ in range(3 * RATE):
         f = pads()[:1].astype(np.float32)
         skin.health.update(
-            np.arange(1), f, np.zeros(1, np.uint32), np.array([round(skin.seconds * 1e9)])
+            stamped(np.arange(1), f, np.zeros(1, np.uint32), np.array([round(skin.seconds * 1e9)]))
         )
         skin.seconds += 1 / RATE
     with pytest.raises(TareError, match="cube b: no data"):
@@ -166,8 +170,8 @@ def test_a_steady_load_survives_an_hour_of_drift_tracking_and_drift_does_not():
     skin.play(hour, frequency, time_constant=60.0)
     rest, now = skin.pipeline.rest_frequency, frequency(skin.seconds)
     np.testing.assert_allclose(rest[0], 100e3, rtol=3 * NOISE)
-    stress = skin.pipeline.pad_stress(np.arange(3), now)
-    true = Skin().pipeline.pad_stress(np.arange(3), np.tile(100e3 * (1 + load), (3, 1)))[0]
+    stress = skin.pipeline.pad_stress(samples(np.arange(3), now))
+    true = Skin().pipeline.pad_stress(samples(np.arange(3), np.tile(100e3 * (1 + load), (3, 1))))[0]
     np.testing.assert_allclose(stress[0], true, atol=3 * 3.2)  # the pads' noise is 3.1 Pa
     # a follower of time constant τ lags behind a ramp by rate · τ = 20 ppm
     np.testing.assert_allclose(rest[1], now[1] * (1 - 20e-6), rtol=10e-6)

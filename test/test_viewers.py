@@ -270,16 +270,15 @@ def test_the_live_table_of_planar_cubes_is_whole_in(width):
     console = pytest.importorskip("rich.console", reason="needs rich: run this with ./cube test")
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
-    from cube_tensor_driver.core.pipeline import StressRows
+    from cube_tensor_driver.core.rows import StressRows
     from cube_tensor_driver.terminal.live_table import LiveTable
 
     skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     n = len(skin.cubes)
     stress, gradient = np.full((n, 6), np.nan, np.float32), np.full((n, 9), np.nan, np.float32)
     stress[:, [0, 2, 4]], gradient[:, [6, 8]] = -123e3, -12e6
-    none = np.zeros(n, np.uint16)
     table = LiveTable(skin, show=False)
-    table.update(np.arange(n), StressRows(stress, gradient, np.ones(n, np.float32), none, none))
+    table.update(StressRows.of(np.arange(n), stress, gradient, residual=1.0))
     shown = console.Console(width=width, record=True, file=io.StringIO())
     shown.print(table.draw(n, width))
     text = shown.export_text()

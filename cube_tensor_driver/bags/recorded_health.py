@@ -10,18 +10,20 @@ import numpy as np
 
 from ..config.skin import Skin, SkinCube, SkinLink
 from ..core.errors import BagError
-from ..core.health import Health
 from ..core.pipeline import Pipeline
+from ..core.reconstructor import Reconstructor, Verdicts
+from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
 from .read import Bag
 from .reprocess import Recording
 
 
-class RecordedHealth(Health):
-    """Health under which replayed frequencies give the recorded stress.
+class RecordedReconstruction:
+    """What a recording says about its own reconstruction, so that replayed frequencies give the
+    recorded stress.
 
     Rest frequencies follow the recording's; pads that were left out are left out again. What the
-    recording does not have is found anew.
+    recording does not have is decided when the rows come.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,34 +38,24 @@ class RecordedHealth(Health):
                 f"{path}: the calibrations change within the recording: reprocess it instead"
             )
         self.skin = recorded_skin(self._recording.infos[-1], first)
-        self.pipeline = Pipeline(first.calibrations, np.float32)
-        self.pipeline.rest_frequency = first.rest_frequency
-        self._number = 0
-        super().__init__(self.pipeline)
+        self._number: int | None = None
 
     def close(self) -> None:
         """Close the bag."""
         self._bag.__exit__()
 
-    def update(
-        self,
-        cube: np.ndarray,
-        frequency: np.ndarray,
-        pad_fault: np.ndarray,
-        stamp_ns: np.ndarray,
-        temperature: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """As `Health.update`."""
-        newest_ns = int(stamp_ns.max(initial=0))
+    def verdicts(self, rows: FrequencyRows, reconstructor: Reconstructor) -> Verdicts:
+        """What was decided about the rows of one message; sets the rest frequencies of their time."""
+        newest_ns = int(rows.stamp_ns.max(initial=0))
         number = self._recording.number(newest_ns)
         if number != self._number:
             self._number = number
-            self.pipeline.rest_frequency = self._recording.pipelines[number].rest_frequency
-            self.refresh()
-        anew = super().update(cube, frequency, pad_fault, stamp_ns, temperature)
+            reconstructor.rest_frequency = self._recording.pipelines[number].rest_frequency
         # A message is stamped with its earliest row.
-        found = self._recording.found.of(stamp_ns.min(initial=newest_ns)[None], cube[None])
-        return (found.left_out[0], found.bits[0]) if found.known[0] else anew
+        stamp_ns = rows.stamp_ns.min(initial=newest_ns)[None]
+        found = self._recording.found.of(stamp_ns, rows.cube[None])
+        known = np.repeat(found.known, len(rows))
+        return Verdicts(known, found.left_out[0], found.bits[0])
 
 
 def recorded_skin(info: Any, pipeline: Pipeline) -> Skin:

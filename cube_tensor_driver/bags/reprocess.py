@@ -17,9 +17,10 @@ from ..config.calibration import calibration_text
 from ..config.skin import Skin
 from ..core.calibration import Calibration
 from ..core.errors import BagError, CalibrationError, CubeError
-from ..core.health import Health
+from ..core.pattern import count_repeats
 from ..core.pipeline import Pipeline
-from ..core.rows import FrequencyRows, StressRows
+from ..core.reconstructor import Reconstructor, Verdicts
+from ..core.rows import FrequencyRows, StressRows, concatenate
 from .mcap import HEAD
 from .message_codec import SECOND, Decoded, stress_codec
 from .read import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, damage, pipeline, typestore
@@ -79,7 +80,7 @@ class Recording:
         infos = [info for info in infos if info.sender == "reconstruction"] or infos
         infos.sort(key=lambda info: _stamp_ns(info))
         self.infos = infos
-        self._now: tuple[int, Pipeline, Health] | None = None
+        self._now: tuple[int, Reconstructor] | None = None
         self._since = np.array([_stamp_ns(info) for info in infos])
         with damage(bag.path):
             self.pipelines = [self._changed(info, change) for info in infos]
@@ -99,8 +100,8 @@ class Recording:
             # the last row before.
             newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
             which = np.maximum(np.searchsorted(self._since, newest_ns, side="right") - 1, 0)
-            known, left_out, bits = self.found.of(messages.stamp_ns, cube)
-            changed = (cube[1:] != cube[:-1]).any(axis=1) | (np.diff(2 * which + known) != 0)
+            found = self.found.of(messages.stamp_ns, cube)
+            changed = (cube[1:] != cube[:-1]).any(axis=1) | (np.diff(which) != 0)
             ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(cube)]
             n = cube.shape[1]
             for run in map(slice, ends[:-1], ends[1:]):
@@ -109,8 +110,12 @@ class Recording:
                     messages.stamp_ns[run],
                     messages.frame_id,
                 )
-                found = (left_out[run], bits[run]) if known[run.start] else None
-                yield part, recorded_ns[run], self._process(int(which[run.start]), part, found)
+                verdicts = Verdicts(
+                    np.repeat(found.known[run], n),
+                    found.left_out[run].ravel(),
+                    found.bits[run].ravel(),
+                )
+                yield part, recorded_ns[run], self._process(int(which[run.start]), part, verdicts)
 
     def number(self, newest_ns: int) -> int:
         """Which info holds for a message whose newest row was sampled then."""
@@ -121,48 +126,37 @@ class Recording:
         return [_info(info, made) for info, made in zip(self.infos, self.pipelines, strict=True)]
 
     def _process(
-        self,
-        number: int,
-        messages: Decoded[FrequencyRows],
-        found: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None,
+        self, number: int, messages: Decoded[FrequencyRows], verdicts: Verdicts
     ) -> StressRows:
         """Stress of all rows of messages of the same cubes, as the node makes it message by
-        message.
-
-        found: pads left out and status bits as the node found them, None to find them anew.
-        """
-        of, health = self._use(number)
-        rows = messages.rows
-        cube = messages.by_message(rows.cube)
-        frequency = messages.by_message(rows.frequency)
-        temperature = messages.by_message(rows.temperature)
-        pad_fault = messages.by_message(rows.pad_fault)
-        stamp_ns = messages.by_message(rows.stamp_ns)
+        message."""
+        reconstructor, rows = self._use(number), messages.rows
+        n = len(rows) // len(messages)
         try:
-            left_out, bits = found or health.update_many(
-                cube[0], frequency, pad_fault, stamp_ns, temperature
+            if count_repeats(rows.cube[:n]) or len(messages) == 1:
+                return reconstructor.process(rows, verdicts)
+            # Cubes in another order: only message by message are the bits the node's.
+            parts = [slice(k, k + n) for k in range(0, len(rows), n)]
+            return concatenate(
+                [reconstructor.process(rows.select(p), verdicts.select(p)) for p in parts]
             )
-            made = of.process(cube[0], frequency, left_out, temperature)
         except CubeError as error:
             raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
-        made.status[:] |= bits.ravel()
-        return StressRows(rows.cube, rows.sequence, rows.stamp_ns, *made, left_out.ravel())
 
-    def _use(self, number: int) -> tuple[Pipeline, Health]:
-        """The pipeline under an info, and the health that goes with it: a tare changes rest
-        frequencies only."""
+    def _use(self, number: int) -> Reconstructor:
+        """The reconstructor under an info: a tare changes rest frequencies only."""
+        wanted = self.pipelines[number]
         if self._now is None or [c.id for c in self._now[1].calibrations] != [
-            c.id for c in self.pipelines[number].calibrations
+            c.id for c in wanted.calibrations
         ]:
-            made = Pipeline(self.pipelines[number].calibrations, np.float32)
-            made.rest_frequency = self.pipelines[number].rest_frequency
-            self._now = number, made, Health(made)
+            made = Reconstructor(wanted.calibrations)
         elif self._now[0] != number:
-            _, made, health = self._now
-            made.rest_frequency = self.pipelines[number].rest_frequency
-            health.refresh()
-            self._now = number, made, health
-        return self._now[1:]
+            made = self._now[1]
+        else:
+            return self._now[1]
+        made.rest_frequency = wanted.rest_frequency
+        self._now = number, made
+        return made
 
     def _changed(self, info: Any, change: Change) -> Pipeline:
         recorded = pipeline(info)

@@ -6,7 +6,7 @@ do the rows of several scans: then all rows of the first, all of the second, and
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, TypeVar
 
@@ -50,6 +50,28 @@ class FrequencyRows(_Rows):
     temperature: NDArray[np.float32]
     pad_fault: NDArray[np.uint32]
 
+    @classmethod
+    def of(
+        cls,
+        cube: Any,
+        frequency: Any,
+        *,
+        stamp_ns: Any = 0,
+        sequence: Any = 0,
+        temperature: Any = np.nan,
+        pad_fault: Any = 0,
+    ) -> FrequencyRows:
+        """Rows from plain numbers: cube (N,), frequency (N, P), the others (N,) or one for all."""
+        cube = np.asarray(cube)
+        return cls(
+            cube=cube,
+            sequence=_column(cube, sequence, np.uint32),
+            stamp_ns=_column(cube, stamp_ns, np.int64),
+            frequency=np.asarray(frequency),
+            temperature=_column(cube, temperature, np.float32),
+            pad_fault=_column(cube, pad_fault, np.uint32),
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StressRows(_Rows):
@@ -74,6 +96,50 @@ class StressRows(_Rows):
     status: NDArray[np.uint16]
     observed: NDArray[np.uint16]
     left_out: NDArray[np.uint32]
+
+    @classmethod
+    def of(
+        cls,
+        cube: Any,
+        stress: Any,
+        gradient: Any,
+        *,
+        residual: Any = np.nan,
+        status: Any = 0,
+        observed: Any = 0,
+        stamp_ns: Any = 0,
+        sequence: Any = 0,
+        left_out: Any = 0,
+    ) -> StressRows:
+        """Rows from plain numbers: cube (N,), stress (N, 6), gradient (N, 9), the others (N,) or
+        one for all."""
+        cube = np.asarray(cube)
+        return cls(
+            cube=cube,
+            sequence=_column(cube, sequence, np.uint32),
+            stamp_ns=_column(cube, stamp_ns, np.int64),
+            stress=np.asarray(stress),
+            gradient=np.asarray(gradient),
+            residual=_column(cube, residual, np.float32),
+            status=_column(cube, status, np.uint16),
+            observed=_column(cube, observed, np.uint16),
+            left_out=_column(cube, left_out, np.uint32),
+        )
+
+
+def concatenate(parts: Sequence[_Kind]) -> _Kind:
+    """All rows of one or more parts, in order."""
+    kind = type(parts[0])
+    columns = (
+        np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(kind)  # type: ignore[arg-type]
+    )
+    return kind(*columns)
+
+
+def _column(cube: NDArray[Any], values: Any, dtype: type) -> NDArray[Any]:
+    """(N,) of values, or of one value for all rows."""
+    return np.array(np.broadcast_to(values, cube.shape), dtype)
 
 
 class Source(Protocol):

@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .diagnosis import still_strained
 from .modes import COMPONENTS, STRESS
 from .rows import StressRows
+from .statistics import WINDOW_S
 from .status import INVALID, RESIDUAL
 from .tensor import principal_stresses, quaternion_from_rotation
-from .window import WINDOW_S, still_strained
 
 # viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both
 # read in grey.
@@ -84,12 +85,12 @@ class Newest:
         self._window = -np.inf, np.zeros(n, np.int64)  # when it began, and `count` then
         self._over = np.zeros(n, np.int64)  # rows of the window with RESIDUAL
 
-    def update(self, cube: np.ndarray, rows: StressRows, now: float) -> None:
-        """Take rows; of several rows of a cube the last stays, rows of cubes that we do not have
-        are left out."""
-        ours = cube < len(self.status)
-        if not ours.all():
-            cube, rows = cube[ours], rows.select(ours)
+    def update(self, rows: StressRows, now: float) -> None:
+        """Take rows; of several rows of a cube the last stays. Rows of unknown cubes are ignored."""
+        known = rows.cube < len(self.status)
+        if not known.all():
+            rows = rows.select(known)
+        cube = rows.cube
         self.values[cube, : len(STRESS)], self.values[cube, len(STRESS) :] = (
             rows.stress,
             rows.gradient,

@@ -13,11 +13,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .diagnosis import MIN_COUNT
 from .errors import TareError
 from .health import HISTORY, Health
 from .pipeline import Pipeline
+from .statistics import WINDOW_S
 from .status import LEFT_OUT
-from .window import MIN_COUNT, WINDOW_S
 
 MOVED = 12.0
 """Times the calibration's noise, peak to peak, above which a pad moved: noise alone spans 9 in
@@ -47,9 +48,9 @@ def measure_rest(
     TareError: a cube's signal moves, is noisy, too far from its calibration, too short, or all its
     pads are bad.
     """
-    steps = math.ceil(duration / WINDOW_S - 1e-9)
-    if not 1 <= steps <= HISTORY:
+    if not 0 < duration <= HISTORY * WINDOW_S:
         raise TareError(f"tare over {duration:g} s; allowed: above 0 to {HISTORY * WINDOW_S:g} s")
+    steps = math.ceil(duration / WINDOW_S - 1e-9)
     if len(health.history) < steps:
         raise TareError(
             f"only {len(health.history) * WINDOW_S:g} s of data since the start; tare takes {duration:g} s: wait"

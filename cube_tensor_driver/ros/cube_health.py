@@ -9,8 +9,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from ..config.skin import Skin
-from ..core.health import Health
-from ..core.pipeline import Pipeline
+from ..core.reconstructor import Reconstructor
+from ..core.rows import FrequencyRows
 from ..core.status import LEFT_OUT, WORDS
 from .diagnostics import make_status
 
@@ -22,8 +22,9 @@ nobody."""
 class CubeHealth:
     """Turns what `Health` found since the last time into words."""
 
-    def __init__(self, skin: Skin, pipeline: Pipeline, health: Health) -> None:
-        self._skin, self._pipeline, self._health = skin, pipeline, health
+    def __init__(self, skin: Skin, reconstructor: Reconstructor) -> None:
+        self._skin, self._pipeline = skin, reconstructor.pipeline
+        self._health = reconstructor.health
         self._came = np.zeros(len(skin.cubes), bool)
         self._words: dict[int, str] = {}
 
@@ -97,7 +98,7 @@ class CubeHealth:
                 + (
                     f"pad {' or '.join(named)} may be bad"
                     if named
-                    else "a pad is bad or the load is none it can tell"
+                    else "a pad is bad, or the load is outside the modes of this layout"
                 )
             )
         return "; ".join(texts)
@@ -108,9 +109,8 @@ class CubeHealth:
         if not len(cubes):
             return {}
         health = self._health
-        found = self._pipeline.suspects(
-            cubes, health.last[cubes], health.mask[cubes], health.temperature[cubes]
-        )
+        newest = FrequencyRows.of(cubes, health.last[cubes], temperature=health.temperature[cubes])
+        found = self._pipeline.suspects(newest, health.mask[cubes])
         return {
             cube: [
                 self._skin.cubes[cube].calibration.layout.pads[pad] for pad in np.flatnonzero(row)

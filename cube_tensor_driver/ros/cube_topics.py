@@ -1,5 +1,7 @@
-"""The topics of single cubes, `cubes/<name>/stress` and `cubes/<name>/wrench`: sent only while
-somebody listens."""
+"""The topics of single cubes, `cubes/<name>/stress` and `cubes/<name>/wrench`.
+
+They are sent only while somebody listens.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ from std_msgs.msg import Header
 from cube_tensor_driver.msg import StressTensorStamped
 
 from ..config.skin import Skin
-from ..core.pipeline import Pipeline
-from ..core.rows import FrequencyRows, StressRows
+from ..core.reconstructor import Reconstructor
+from ..core.rows import StressRows
 from ..core.status import INVALID
 from ..core.tensor import contact_wrench
 from .messages import tensor_message, to_time, wrench_message
@@ -32,9 +34,9 @@ class CubeTopics:
     own."""
 
     def __init__(
-        self, node: LifecycleNode, skin: Skin, pipeline: Pipeline, side: float | None
+        self, node: LifecycleNode, skin: Skin, reconstructor: Reconstructor, side: float | None
     ) -> None:
-        self._node, self._skin, self._pipeline = node, skin, pipeline
+        self._node, self._skin, self._reconstructor = node, skin, reconstructor
         self._sides = np.array([side or 2 * cube.calibration.half_side for cube in skin.cubes])
         self._covariances: dict[tuple[int, int], NDArray[np.float64]] = {}
         self._tensors: dict[int, Any] = {}
@@ -59,14 +61,12 @@ class CubeTopics:
             )
         self._listened = (_heard(self._tensors), _heard(self._wrenches))
 
-    def publish(
-        self, times: FrequencyRows, rows: StressRows, pad_fault: NDArray[np.uint32]
-    ) -> None:
+    def publish(self, rows: StressRows) -> None:
         """Send the rows of cubes that somebody listens to; wrenches of valid ones only."""
         tensors, wrenches = self._listened
         if wrenches:
-            chosen = np.flatnonzero(np.isin(times.cube, wrenches) & (rows.status & INVALID == 0))
-            cubes = times.cube[chosen].tolist()
+            chosen = np.flatnonzero(np.isin(rows.cube, wrenches) & (rows.status & INVALID == 0))
+            cubes = rows.cube[chosen].tolist()
             forces, torques = contact_wrench(
                 rows.stress[chosen], rows.gradient[chosen], self._sides[cubes][:, None]
             )
@@ -74,13 +74,13 @@ class CubeTopics:
                 chosen.tolist(), cubes, forces, torques, strict=True
             ):
                 self._wrenches[cube].publish(
-                    wrench_message(self._header(times, row, cube), force, torque)
+                    wrench_message(self._header(rows, row, cube), force, torque)
                 )
         if tensors:
-            for row in np.flatnonzero(np.isin(times.cube, tensors)).tolist():
-                cube = int(times.cube[row])
-                covariance = self._covariance(cube, int(pad_fault[row]))
-                header = self._header(times, row, cube)
+            for row in np.flatnonzero(np.isin(rows.cube, tensors)).tolist():
+                cube = int(rows.cube[row])
+                covariance = self._covariance(cube, int(rows.left_out[row]))
+                header = self._header(rows, row, cube)
                 self._tensors[cube].publish(tensor_message(header, rows, row, covariance))
 
     def close(self) -> None:
@@ -92,16 +92,16 @@ class CubeTopics:
             kind, publishers, number = self._wanted.pop(name)
             publishers[number] = self._node.create_publisher(kind, name, DEPTH)
 
-    def _header(self, times: FrequencyRows, row: int, cube: int) -> Header:
-        stamp = to_time(int(times.stamp_ns[row]))
+    def _header(self, rows: StressRows, row: int, cube: int) -> Header:
+        stamp = to_time(int(rows.stamp_ns[row]))
         return Header(stamp=stamp, frame_id=self._skin.frame(self._skin.cubes[cube]))
 
-    def _covariance(self, cube: int, pad_fault: int) -> NDArray[np.float64]:
-        key = cube, pad_fault
+    def _covariance(self, cube: int, left_out: int) -> NDArray[np.float64]:
+        key = cube, left_out
         if key not in self._covariances:
             if len(self._covariances) >= COVARIANCES_KEPT:
                 self._covariances.clear()
-            self._covariances[key] = self._pipeline.covariance(cube, pad_fault)
+            self._covariances[key] = self._reconstructor.covariance(cube, left_out)
         return self._covariances[key]
 
 

@@ -87,7 +87,7 @@ class SkinSubscriber:
         except MessageError as error:
             self._node.get_logger().error(str(error), throttle_duration_sec=ERROR_PERIOD_S)
             return
-        self.skin.newest.update(message.rows.cube, message.rows, self.now())
+        self.skin.newest.update(message.rows, self.now())
         self.skin.messages += 1
         self.skin.stamp_ns = int(message.stamp_ns[0])
 

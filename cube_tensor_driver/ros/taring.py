@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from cube_tensor_driver.msg import SkinInfo
@@ -20,9 +19,8 @@ from cube_tensor_driver.srv import Tare
 from ..config.skin import Skin
 from ..config.tare import read_tare, remove_tare, write_tare
 from ..core.errors import ConfigError, CubeError, TareError
-from ..core.health import Health
-from ..core.pipeline import Pipeline
-from ..core.tare import measure_rest
+from ..core.reconstructor import Reconstructor
+from .node import CubeNode
 
 STALE_S = 1.0
 """Data older than this is not the present load."""
@@ -36,33 +34,36 @@ def tare_folder(parameter: str) -> Path:
 
 
 class Taring:
-    """The services of one reconstruction. changed: called when rest frequencies have changed; lock:
-    held meanwhile.
+    """The services of one reconstruction, and the files behind them.
 
-    folder: None keeps and restores nothing."""
+    uids: of the cubes, by their index in the skin, as far as they are known
+    created: when the tare of a cube was taken
+    """
 
     def __init__(
         self,
-        node: Node,
+        node: CubeNode,
         skin: Skin,
-        pipeline: Pipeline,
-        health: Health,
+        reconstructor: Reconstructor,
         folder: Path | None,
-        duration: Callable[[], float],
-        changed: Callable[[], None],
         lock: AbstractContextManager[Any],
+        on_change: Callable[[], None],
     ) -> None:
-        self._node, self._skin, self._pipeline, self._health = node, skin, pipeline, health
-        self._folder, self._duration, self._changed, self._lock = folder, duration, changed, lock
-        self._names = [cube.name for cube in skin.cubes]
-        self._calibrated = Pipeline(pipeline.calibrations).rest_frequency
+        """folder: where tares are kept, None: nowhere; lock: held while the reconstructor is used;
+        on_change: called, with the lock, when rest frequencies have changed."""
+        self._node, self._reconstructor = node, reconstructor
+        self._skin, self._folder = skin, folder
+        self._lock, self._on_change = lock, on_change
         self.uids: dict[int, int] = {}
         self.created: dict[int, datetime] = {}
+        # Uids of the skin file are known at once; nobody has seen the rest frequencies yet.
+        restored = self._restore({n: cube.uid for n, cube in enumerate(skin.cubes) if cube.uid})
+        if restored is not None:
+            reconstructor.rest_frequency = restored
         self._services = [
             node.create_service(Tare, "~/tare", self._on_tare),
             node.create_service(Trigger, "~/clear_tare", self._on_clear),
         ]
-        self._learn({number: cube.uid for number, cube in enumerate(skin.cubes) if cube.uid})
 
     def close(self) -> None:
         for service in self._services:
@@ -71,8 +72,11 @@ class Taring:
     def on_info(self, message: SkinInfo) -> None:
         """The driver's `info`: uids of cubes that the skin file does not name. Our own says nothing
         new."""
-        if message.name == self._skin.name and len(message.cubes) == len(self._names):
-            self._learn({number: cube.uid for number, cube in enumerate(message.cubes) if cube.uid})
+        if message.name != self._skin.name or len(message.cubes) != len(self._skin.cubes):
+            return
+        restored = self._restore({n: cube.uid for n, cube in enumerate(message.cubes) if cube.uid})
+        if restored is not None:
+            self._set(restored)
 
     def age(self) -> dict[str, str]:
         """For diagnostics: how many cubes are tared, and since when."""
@@ -81,49 +85,45 @@ class Taring:
         oldest = (datetime.now(timezone.utc) - min(self.created.values())).total_seconds()
         return {"cubes tared": str(len(self.created)), "oldest tare s": f"{oldest:.0f}"}
 
-    def _learn(self, uids: Mapping[int, int]) -> None:
-        """Cubes are known now: restore what is kept of them; a cube that was exchanged starts as
-        calibrated."""
-        fresh = {number: uid for number, uid in uids.items() if self.uids.get(number) != uid}
-        rest = self._pipeline.rest_frequency
+    def _restore(self, uids: Mapping[int, int]) -> np.ndarray | None:
+        """Learn who the cubes are; returns the rest frequencies if that changes them: the tare that
+        is kept of a cube; the calibration's of a cube that was exchanged."""
+        rest = self._reconstructor.rest_frequency
         before = rest.copy()
-        for number, uid in fresh.items():
+        for number, uid in uids.items():
+            if self.uids.get(number) == uid:
+                continue
             if number in self.uids:
                 self._forget(number, rest)
             self.uids[number] = uid
-            calibration = self._skin.cubes[number].calibration
-            try:
-                stored = read_tare(self._folder, uid, calibration) if self._folder else None
-            except ConfigError as error:
-                self._node.get_logger().warning(
-                    f"cube {self._names[number]}: tare not restored: {error}"
-                )
-                continue
-            if stored is not None:
-                rest[number, : calibration.layout.n_pads] = stored.rest_frequency
-                self.created[number] = stored.created
-                self._node.get_logger().info(
-                    f"cube {self._names[number]}: tare of {stored.created} restored"
-                )
-        if not np.array_equal(before, rest, equal_nan=True):
-            self._set(rest)
+            self._restore_cube(number, uid, rest)
+        return None if np.array_equal(before, rest, equal_nan=True) else rest
+
+    def _restore_cube(self, number: int, uid: int, rest: np.ndarray) -> None:
+        """Read the tare of one cube into its row of the rest frequencies."""
+        cube, log = self._skin.cubes[number], self._node.get_logger()
+        try:
+            stored = read_tare(self._folder, uid, cube.calibration) if self._folder else None
+        except ConfigError as error:
+            log.warning(f"cube {cube.name}: tare not restored: {error}")
+            return
+        if stored is not None:
+            rest[number, : cube.calibration.layout.n_pads] = stored.rest_frequency
+            self.created[number] = stored.created
+            log.info(f"cube {cube.name}: tare of {stored.created} restored")
 
     def _on_tare(self, request: Tare.Request, response: Tare.Response) -> Tare.Response:
         try:
             cubes = self._find(request.cubes)
             now_ns = self._node.get_clock().now().nanoseconds
+            duration = request.duration or float(self._node.value("tare_duration"))
             with self._lock:
-                if now_ns - self._health.newest_ns > 1e9 * STALE_S:
+                if now_ns - self._reconstructor.health.newest_ns > 1e9 * STALE_S:
                     raise TareError("no data now: see the diagnostics of the links")
-                rest = measure_rest(
-                    self._pipeline,
-                    self._health,
-                    cubes,
-                    request.duration or self._duration(),
-                    self._names,
-                )
-                moved = np.nanmax(np.abs(rest / self._pipeline.rest_frequency - 1)[cubes])
-            self._set(rest)
+                before = self._reconstructor.rest_frequency
+                rest = self._reconstructor.tare(cubes, duration)
+                self._on_change()
+            moved = np.nanmax(np.abs(rest / before - 1)[cubes])
             response.message = (
                 f"{len(cubes)} cubes, rest frequencies moved by up to {1e6 * moved:.0f} ppm"
             )
@@ -135,29 +135,30 @@ class Taring:
         return response
 
     def _on_clear(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        rest = self._pipeline.rest_frequency
         response.success, response.message = True, "rest frequencies are the calibrations' again"
+        with self._lock:
+            self._reconstructor.clear_tare()
+            self._on_change()
+        self.created.clear()
         try:
-            for number in range(len(self._names)):
-                self._forget(number, rest)
             if self._folder is not None:
                 for uid in self.uids.values():
                     remove_tare(self._folder, uid)
         except ConfigError as error:
             response.success, response.message = False, str(error)
-        self._set(rest)
         self._node.get_logger().info(f"clear_tare: {response.message}")
         return response
 
     def _find(self, names: list[str]) -> list[int]:
-        unknown = [name for name in names if name not in self._names]
+        """Indices of cubes by name; of all cubes if none is named."""
+        index = {name: number for number, name in enumerate(self._skin.names)}
+        unknown = [name for name in names if name not in index]
         if unknown:
             raise TareError(
-                f"no cube {', '.join(map(repr, unknown))} in the skin; its cubes: {', '.join(self._names)}"
+                f"no cube {', '.join(map(repr, unknown))} in the skin; "
+                f"its cubes: {', '.join(self._skin.names)}"
             )
-        return (
-            [self._names.index(name) for name in names] if names else list(range(len(self._names)))
-        )
+        return [index[name] for name in names] if names else list(index.values())
 
     def _keep(self, cubes: list[int], rest: np.ndarray) -> str:
         """Write files; returns what the answer should say about it."""
@@ -165,34 +166,26 @@ class Taring:
         self.created.update(dict.fromkeys(cubes, created))
         if self._folder is None:
             return "; not kept"
-        nameless = []
+        without_uid = [self._skin.names[number] for number in cubes if number not in self.uids]
         for number in cubes:
             if number not in self.uids:
-                nameless.append(self._names[number])
                 continue
             calibration = self._skin.cubes[number].calibration
+            of_cube = rest[number, : calibration.layout.n_pads]
             try:
-                write_tare(
-                    self._folder,
-                    self.uids[number],
-                    calibration,
-                    rest[number, : calibration.layout.n_pads],
-                    created,
-                )
+                write_tare(self._folder, self.uids[number], calibration, of_cube, created)
             except ConfigError as error:
                 return f"; in force, but not kept: {error}"
-        return (
-            f"; not kept, since their uid is not known: {', '.join(nameless)}"
-            if nameless
-            else "; kept on disk"
-        )
+        if without_uid:
+            return f"; not kept, since their uid is not known: {', '.join(without_uid)}"
+        return "; kept on disk"
 
     def _forget(self, number: int, rest: np.ndarray) -> None:
-        rest[number] = self._calibrated[number]
+        calibration = self._skin.cubes[number].calibration
+        rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
         self.created.pop(number, None)
 
     def _set(self, rest: np.ndarray) -> None:
         with self._lock:
-            self._pipeline.rest_frequency = rest
-            self._health.refresh()
-            self._changed()
+            self._reconstructor.rest_frequency = rest
+            self._on_change()

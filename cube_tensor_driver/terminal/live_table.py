@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.live import Live
@@ -75,8 +73,9 @@ class LiveTable:
     def seen_all(self) -> bool:
         return self.seen == len(self._count)
 
-    def update(self, cube: NDArray[Any], rows: StressRows) -> None:
+    def update(self, rows: StressRows) -> None:
         """Take the rows of a stress message; of several rows of a cube the last stays."""
+        cube = rows.cube
         self._values[cube, :6], self._values[cube, 6:] = rows.stress, rows.gradient
         self._residual[cube], self._status[cube] = rows.residual, rows.status
         np.add.at(self._count, cube, 1)

@@ -30,6 +30,7 @@ from ..core.calibration import illustrative
 from ..core.errors import CubeError
 from ..core.oscillator import pad_frequency
 from ..core.pipeline import Pipeline
+from ..core.rows import FrequencyRows
 from ..plot.scale import draw_scale
 from ..plot.style import save
 from ..processes.children import Children
@@ -54,6 +55,7 @@ def bench_pipeline(cubes: int, json_path: Path | None) -> int:
         state = rng.normal(0, 5e3, (cubes, 7))
         law = calibration.rest_frequency, calibration.beta, calibration.modulus
         frequency = pad_frequency(state @ calibration.response.T, *law).astype(dtype)
+        rows = FrequencyRows.of(cube, frequency)
         rest = np.tile(calibration.rest_frequency, (cubes, 1)).astype(dtype)
         matrix = rng.normal(size=(8, 16)).astype(dtype)
         beta = dtype(calibration.beta[0])
@@ -64,8 +66,8 @@ def bench_pipeline(cubes: int, json_path: Path | None) -> int:
             ratio = frequency / rest
             ((ratio - 1) / (1 + beta * (1 - ratio))) @ matrix
 
-        def ours(pipeline: Any = pipeline, cube: Any = cube, frequency: Any = frequency) -> None:
-            pipeline.process(cube, frequency)
+        def ours(pipeline: Any = pipeline, rows: Any = rows) -> None:
+            pipeline.process(rows)
 
         ours_us, floor_us = _interleaved(ours, floor)
         result[np.dtype(dtype).name] = {

@@ -152,7 +152,7 @@ def _run(
                 return
             if options.duration is not None:
                 judge.stress(rows.cube, rows.sequence, rows.stamp_ns, rows, received_ns)
-            table.update(rows.cube, rows)
+            table.update(rows)
 
         def on_frequencies(data: bytes) -> None:
             try:

@@ -1,0 +1,135 @@
+"""Statistics of every pad over a window of half a second.
+
+    first difference     d[n] = f[n] - f[n-1]
+    second difference    e[n] = d[n] - r d[n-1],   r = (t[n] - t[n-1]) / (t[n-1] - t[n-2])
+    noise                sqrt(mean(w e²) / 6),     w = 6 / (1 + (1 + r)² + r²)
+    roughness            sum(w e²) / sum(d²)
+
+Second differences of white noise with variance s² have variance 6 s² (r = 1). A load that moves
+slowly leaves nothing in them, also where rows are missing. Each term w e² is bounded, so that one
+jump does not look like noise. r is 1 while two intervals are equal within EVEN, because stamps
+jitter; w is 0 across a gap. Roughness is 3 for noise, and (2 pi F T)² for a load that moves with
+frequency F, sampled with period T.
+
+All arrays are (cubes, pads); nothing loops over cubes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+WINDOW_S = 0.5
+ROUGH = 0.3
+"""Roughness below which a load moves and no pad becomes noisy: below 9 Hz at 100 rows a second."""
+GAP_NS = 50_000_000
+"""What a load did across a longer gap is not known. At MIN_COUNT rows a window, rows come twice as
+often."""
+EVEN = 1.5
+"""Two intervals count as equal up to this ratio: stamps jitter, but a missing row makes it 2."""
+
+
+class Window(NamedTuple):
+    """What is kept of a window.
+
+    rows: (cubes,) how many came
+    mean, lowest, highest, noise: (cubes, P) Hz; NaN where nothing was measured
+    rough: (cubes, P) bool, rougher than a load that moves
+    """
+
+    rows: np.ndarray
+    mean: np.ndarray
+    lowest: np.ndarray
+    highest: np.ndarray
+    noise: np.ndarray
+    rough: np.ndarray
+
+
+class WindowStatistics:
+    """Sums over the window that is not over yet; differences go on from window to window."""
+
+    def __init__(self, rest_frequency: np.ndarray) -> None:
+        """rest_frequency: (cubes, P) Hz, NaN where a cube has no such pad; sums are of what is
+        above it, so that float32 is enough."""
+        self._pads = np.full((9, *rest_frequency.shape), np.nan, np.float32)
+        (
+            self.last,
+            self._difference,
+            self._first_squares,
+            self._second_squares,
+            self._sum,
+            self._lowest,
+            self._highest,
+            self._base,
+            self.bound,
+        ) = self._pads
+        self._base[:] = np.nan_to_num(rest_frequency)
+        self._count = np.zeros(len(rest_frequency), int)
+        # When the newest row of each cube came, and how long after the one before: 0 is unknown.
+        self._time_ns, self._interval_ns = np.zeros((2, len(rest_frequency)), np.int64)
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin a window."""
+        for total in (self._first_squares, self._second_squares, self._sum, self._count):
+            total[:] = 0
+        self._lowest[:] = self._highest[:] = np.nan
+
+    def add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
+        """B scans of the same N cubes: frequency (B, N, P) Hz, stamp_ns (B, N).
+
+        Sums go scan by scan, so their bits do not depend on how many scans are added at a time.
+        """
+        chosen = self._pads[:, cubes]  # a view for a slice, a copy for an index
+        last, difference, first_squares, second_squares, total, lowest, highest, base, bound = (
+            chosen
+        )
+        ratio, weight = self._pace(cubes, stamp_ns)
+        first = np.diff(np.concatenate([last[None], frequency]), axis=0)
+        second = first - ratio * np.concatenate([difference[None], first[:-1]])
+        second *= second
+        second *= weight
+        np.minimum(second, bound, out=second)
+        _add_in_order(second_squares, second)
+        _add_in_order(first_squares, first * first)
+        _add_in_order(total, frequency - base)
+        np.fmin(lowest, np.fmin.reduce(frequency, axis=0), out=lowest)
+        np.fmax(highest, np.fmax.reduce(frequency, axis=0), out=highest)
+        difference[:], last[:] = first[-1], frequency[-1]
+        if not isinstance(cubes, slice):
+            self._pads[:, cubes] = chosen
+        self._count[cubes] += len(frequency)
+
+    def window(self) -> Window:
+        """The statistics so far."""
+        count = np.maximum(self._count, 1)[:, None]
+        with np.errstate(invalid="ignore"):
+            mean = np.where(self._count[:, None] > 0, self._base + self._sum / count, np.nan)
+        return Window(
+            rows=self._count.copy(),
+            mean=mean,
+            lowest=self._lowest.copy(),
+            highest=self._highest.copy(),
+            noise=np.sqrt(self._second_squares / count / 6),
+            rough=self._second_squares > ROUGH * self._first_squares,
+        )
+
+    def _pace(
+        self, cubes: slice | np.ndarray, stamp_ns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """r and w of B scans, (B, N, 1) each, from the intervals between the rows of a cube."""
+        interval = np.diff(np.concatenate([self._time_ns[cubes][None], stamp_ns]), axis=0)
+        before = np.concatenate([self._interval_ns[cubes][None], interval[:-1]])
+        self._time_ns[cubes], self._interval_ns[cubes] = stamp_ns[-1], interval[-1]
+        known = (np.minimum(interval, before) > 0) & (np.maximum(interval, before) < GAP_NS)
+        even = (interval < EVEN * before) & (before < EVEN * interval)
+        ratio = np.where(known & ~even, interval / np.where(known, before, 1), 1.0)
+        weight = known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
+        return ratio.astype(np.float32)[..., None], weight.astype(np.float32)[..., None]
+
+
+def _add_in_order(total: np.ndarray, terms: np.ndarray) -> None:
+    """Add (B, N, P) terms to a total (N, P), one after the other."""
+    for term in terms:
+        total += term
