@@ -81,7 +81,7 @@ def hubs(folder: Path) -> Iterator[None]:
 def test_blocks_of_the_page_run_in_their_order(folder, hubs, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    make_bag(folder / "run1", folder / "skin.yaml", 100)
+    make_bag(folder / "run1", folder / "skin.yaml", 100, tare=(50, 1.01))
     there: dict = {"__name__": "page"}
     for block in blocks(PAGE, "python"):
         if "import rclpy" not in block:
@@ -90,6 +90,8 @@ def test_blocks_of_the_page_run_in_their_order(folder, hubs, monkeypatch):
     assert len(there["stress"]) > 0 and len(recorded) == 100 * len(skin.cubes)
     assert set(simulated.cube) == set(range(len(skin.cubes)))
     # A planar cube does not see yy, yz and xy; the load of the simulated skin does reach the cubes.
+    tared = there["reconstruct"].rest_frequency
+    assert np.allclose(tared, 1.01 * ctd.Reconstructor(skin).rest_frequency)
     assert not there["observed"][:, [1, 3, 5]].any() and there["observed"][:, [0, 2, 4]].all()
     assert np.nanmin(simulated.stress[:, 2]) < -100.0
     assert there["table"].num_rows == len(simulated)
