@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pytest
@@ -25,20 +26,60 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parents[1]
+# Any files that are there: it is their locks that count.
+DOOR, LOCK = ROOT / "pyproject.toml", ROOT / "package.xml"
 # Domains up to 101 leave the ports of the system alone.
 _domains = itertools.cycle(range(1, 101))
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_cmdline_main(config: pytest.Config) -> None:
-    """The whole suite runs on all processors, part of it in this process; -n says otherwise."""
-    options, is_worker = config.option, hasattr(config, "workerinput")
-    if is_worker or not config.pluginmanager.hasplugin("xdist") or options.usepdb:
-        return
-    whole = all(Path(argument).is_dir() for argument in config.args)
-    if whole and options.numprocesses is None:
-        options.numprocesses = len(os.sched_getaffinity(0))
-        options.dist = "loadgroup"
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that run alone do so one after the other."""
+    for item in items:
+        if is_alone(item):
+            item.add_marker(pytest.mark.xdist_group("alone"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> object:
+    """No test of another worker runs beside one that is marked `alone`."""
+    if not hasattr(item.config, "workerinput"):
+        return (yield)
+    _quiet.acquire(is_alone(item))
+    try:
+        return (yield)
+    finally:
+        if not (is_alone(item) and nextitem is not None and is_alone(nextitem)):
+            _quiet.release()
+
+
+def is_alone(item: pytest.Item) -> bool:
+    return item.get_closest_marker("alone") is not None
+
+
+class _Quiet:
+    """A lock of all workers of a checkout: many share it, or one has it alone.
+
+    Who wants it holds the door until the lock is his: so nobody overtakes whoever wants it alone.
+    """
+
+    def __init__(self) -> None:
+        self._lock: IO[str] | None = None
+
+    def acquire(self, alone: bool) -> None:
+        if self._lock is None:
+            with DOOR.open() as door:
+                fcntl.flock(door, fcntl.LOCK_EX)
+                self._lock = LOCK.open()
+                fcntl.flock(self._lock, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+
+    def release(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
+_quiet = _Quiet()
 
 
 @pytest.fixture

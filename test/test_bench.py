@@ -33,6 +33,7 @@ KEYS = {
 }
 
 
+@pytest.mark.alone
 def test_skin_counts_what_was_sent(domain, tmp_path):
     """In batches of two, where a message is as long as the latency of its first rows at least."""
     # pauses and a second floor are for figures only

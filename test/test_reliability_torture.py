@@ -28,6 +28,7 @@ KEYS = {
 }
 
 
+@pytest.mark.alone
 def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(domain, tmp_path):
     path = tmp_path / "torture.json"
     command = ["torture", "--duration", "8", "--seed", "3", "--json", str(path)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import sys
 
@@ -17,5 +18,11 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """The whole suite on all processors, or what the words say, in one process."""
+    words = options.words
+    if not words:
+        words = ["test"]
+        if importlib.util.find_spec("xdist") is not None:
+            words += ["-n", str(len(os.sched_getaffinity(0))), "--dist", "loadgroup"]
     os.chdir(ROOT)
-    os.execv(sys.executable, [sys.executable, "-m", "pytest", *(options.words or ["test"])])
+    os.execv(sys.executable, [sys.executable, "-m", "pytest", *words])
