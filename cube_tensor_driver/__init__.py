@@ -1,8 +1,65 @@
-"""Driver for the cubic stress tensor sensor: pad frequencies in, stress tensors and gradients
-out."""
+"""Driver for the cubic stress tensor sensor: pad frequencies in, stress tensors and gradients out.
+
+    import cube_tensor_driver as ctd
+
+    skin = ctd.read_skin("skin.yaml")
+    reconstruct = ctd.Reconstructor(skin)
+    with ctd.open_links(skin) as source:  # or ctd.open_bag("bag"), ctd.simulate(skin)
+        for rows in source:
+            print(reconstruct(rows).stress[:, 2])
+
+Sources yield `FrequencyRows`, a `Reconstructor` makes `StressRows` of them, and whoever asked for
+them takes those. docs/python.md goes on from here.
+"""
+
+from __future__ import annotations
 
 import pkgutil
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .bags.source import open_bag
+    from .config.skin import read_skin
+    from .core.errors import CubeError
+    from .core.reconstructor import Reconstructor
+    from .core.rows import FrequencyRows, StressRows
+    from .device.live import open_links
+    from .simulation.source import simulate
+
+__all__ = [
+    "CubeError",
+    "FrequencyRows",
+    "Reconstructor",
+    "StressRows",
+    "open_bag",
+    "open_links",
+    "read_skin",
+    "simulate",
+]
 
 # The generated messages live in the install space, the sources may be elsewhere: one package sees
 # both.
 __path__ = pkgutil.extend_path(__path__, __name__)
+
+# Loaded when somebody asks for them: a node needs no bags, and a notebook no serial ports.
+_HOMES = {
+    "CubeError": ".core.errors",
+    "FrequencyRows": ".core.rows",
+    "Reconstructor": ".core.reconstructor",
+    "StressRows": ".core.rows",
+    "open_bag": ".bags.source",
+    "open_links": ".device.live",
+    "read_skin": ".config.skin",
+    "simulate": ".simulation.source",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name], __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -168,7 +168,7 @@ class Pipeline:
             pattern, v, bad = law.pattern, law.v, law.bad
             out = self._products(pattern, v)
             limit = pattern.limit
-            observed = np.tile(pattern.observed, len(v))
+            observed = np.concatenate([pattern.observed] * len(v))
             if bad is not None:
                 limit = np.tile(pattern.limit, (len(v), 1))
                 self._correct_bad_rows(pattern, v, bad, out, limit, observed)

@@ -86,7 +86,7 @@ class WindowStatistics:
             chosen
         )
         ratio, weight = self._pace(cubes, stamp_ns)
-        first = np.diff(np.concatenate([last[None], frequency]), axis=0)
+        first = _differences(last, frequency)
         second = first - ratio * np.concatenate([difference[None], first[:-1]])
         second *= second
         second *= weight
@@ -118,15 +118,23 @@ class WindowStatistics:
     def _pace(
         self, cubes: slice | np.ndarray, stamp_ns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """r and w of B scans, (B, N, 1) each, from the intervals between the rows of a cube."""
-        interval = np.diff(np.concatenate([self._time_ns[cubes][None], stamp_ns]), axis=0)
+        """r and w of B scans, (B, N, 1) each or one for all, from the intervals between the rows of a cube."""
+        interval = _differences(self._time_ns[cubes], stamp_ns)
         before = np.concatenate([self._interval_ns[cubes][None], interval[:-1]])
         self._time_ns[cubes], self._interval_ns[cubes] = stamp_ns[-1], interval[-1]
         known = (np.minimum(interval, before) > 0) & (np.maximum(interval, before) < GAP_NS)
         even = (interval < EVEN * before) & (before < EVEN * interval)
+        if (known & even).all():  # as it mostly is: saves a third of the time of `add`
+            return np.ones((1, 1, 1), np.float32), np.ones((1, 1, 1), np.float32)
         ratio = np.where(known & ~even, interval / np.where(known, before, 1), 1.0)
         weight = known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
         return ratio.astype(np.float32)[..., None], weight.astype(np.float32)[..., None]
+
+
+def _differences(before: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(B, ...) of each value to the one before it; `before` is the one before the first."""
+    row = np.concatenate([before[None], values])
+    return row[1:] - row[:-1]
 
 
 def _add_in_order(total: np.ndarray, terms: np.ndarray) -> None:
