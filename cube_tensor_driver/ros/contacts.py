@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from cube_tensor_driver.msg import SkinContacts
 
-from ..core.defaults import CONTACT_PRESSURE, SURFACE_DEPTH
 from ..elastic.surface import Contact, Surface
 from .messages import to_time
 from .node import run
+from .parameters import CONTACTS
 from .skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 
@@ -22,19 +22,7 @@ class Contacts(SkinSubscriberNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("contacts", SkinContacts, 10)
-        self.declare(
-            "depth",
-            SURFACE_DEPTH,
-            "From the cubes' centres to the skin's surface, m.",
-            (1e-5, 1.0),
-        )
-        self.declare(
-            "least",
-            CONTACT_PRESSURE,
-            "Pressure at the cubes that counts as contact, Pa.",
-            (0.0, 1e9),
-        )
+        super().__init__("contacts", CONTACTS, SkinContacts, 10)
 
     def set_up(self, skin: FollowedSkin) -> None:
         self._surface = Surface(skin.poses, self.value("depth"))

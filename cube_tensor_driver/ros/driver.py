@@ -18,6 +18,7 @@ from .frequencies_publisher import FrequenciesPublisher
 from .link_statuses import LinkStatuses
 from .messages import info_message
 from .node import LATCHED, CubeNode, NodeClock, queue, run, scans_per_message
+from .parameters import DRIVER
 
 
 class Driver(CubeNode):
@@ -27,36 +28,12 @@ class Driver(CubeNode):
     def __init__(self, on_rows: Callable[[FrequencyRows], None] | None = None) -> None:
         """on_rows: called in the reader's thread with the rows of each message, which are valid
         until it returns. Messages are then sent only while somebody subscribes to them."""
-        super().__init__("driver")
+        super().__init__("driver", DRIVER)
         self._on_rows = on_rows
         self._node_clock = NodeClock(self)
         self._links: LiveLinks | None = None
         self._is_active = False
         self._diagnostics = Diagnostics(self, self._statuses)
-        self.declare_autostart()
-        self.declare("config", "", "Skin file (YAML).")
-        self.declare(
-            "port", "", "Port instead of the one in the skin file, for a skin with one link."
-        )
-        self.declare(
-            "port_directory",
-            "",
-            "Folder with the links' ports under the links' names: simulated hubs.",
-        )
-        self.declare(
-            "rate",
-            0.0,
-            "Samples per second to ask of the hubs; 0: as the skin file says.",
-            (0.0, 10_000.0),
-            live=True,
-        )
-        self.declare(
-            "publish_period",
-            0.0,
-            "Time that one message covers, s; 0: a message for each scan.",
-            (0.0, 1.0),
-        )
-        self.declare_reliability()
 
     @property
     def failure(self) -> Exception | None:

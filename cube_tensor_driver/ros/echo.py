@@ -14,6 +14,7 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
 from .messages import packed
 from .node import CubeNode, queue, run
+from .parameters import ECHO
 
 PADS, STRESS, GRADIENT = 8, 6, 9
 
@@ -22,10 +23,7 @@ class Source(CubeNode):
     """Publishes `frequencies` of n cubes at a rate: a timer thread as lean as can be."""
 
     def __init__(self) -> None:
-        super().__init__("source")
-        self.declare("autostart", True, "Begin at once.")
-        self.declare("cubes", 64, "Rows of a message.")
-        self.declare("rate", 1000.0, "Messages per second.")
+        super().__init__("source", ECHO)
 
     def configure(self) -> None:
         n, rate = int(self.value("cubes")), float(self.value("rate"))
@@ -56,10 +54,7 @@ class Echo(CubeNode):
     """Answers each `frequencies` with a `stress` of as many rows, always the same values."""
 
     def __init__(self) -> None:
-        super().__init__("echo")
-        self.declare("autostart", True, "Begin at once.")
-        self.declare("cubes", 64, "Rows of a message.")
-        self.declare("rate", 1000.0, "Messages per second.")
+        super().__init__("echo", ECHO)
 
     def configure(self) -> None:
         n, quality = int(self.value("cubes")), queue(float(self.value("rate")))

@@ -13,6 +13,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ..core import scene
 from ..core.errors import ConfigError
 from .node import run
+from .parameters import MARKERS
 from .serialised_markers import SerialisedMarkers
 from .skin_subscriber import FollowedSkin, SkinSubscriberNode
 
@@ -58,14 +59,7 @@ class Markers(SkinSubscriberNode):
     over cubes that are not fine."""
 
     def __init__(self) -> None:
-        super().__init__("markers", MarkerArray, 2)
-        self.declare(
-            "quantity", "pressure", "What the colours mean.", choices=", ".join(scene.QUANTITIES)
-        )
-        self.declare(
-            "range", 0.0, "Top of the colours' range, SI; 0: follows what is there.", (0.0, 1e9)
-        )
-        self.declare("crosses", False, "Draw the principal stresses of each cube as a cross.")
+        super().__init__("markers", MARKERS, MarkerArray, 2)
 
     def configure(self) -> None:
         name = self.value("quantity")

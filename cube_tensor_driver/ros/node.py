@@ -24,6 +24,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 
 from ..core.errors import ConfigError, CubeError
+from .parameters import Parameter
 
 PAUSE_S = 2.0
 """The longest pause of a reader that no message is lost in: queue depths are rate times this."""
@@ -76,49 +77,26 @@ class CubeNode(LifecycleNode):
     """A lifecycle node whose errors are one line in the log and a transition that fails, never a
     traceback."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         super().__init__(name)
         self.configured = False
-        self._choices: dict[str, str] = {}
-        self._live: set[str] = set()
+        self._parameters_by_name = {parameter.name: parameter for parameter in parameters}
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
+        for parameter in parameters:
+            self._declare(parameter)
 
-    def declare(
-        self,
-        name: str,
-        default: Any,
-        description: str,
-        span: tuple[float, float] | None = None,
-        choices: str = "",
-        live: bool = False,
-    ) -> None:
-        """Declare a parameter; span bounds a number, choices (words separated by commas) a text.
-
-        live: it may change while the node is configured, see `changed`; others are refused then.
-        """
-        self._choices[name] = choices
-        if live:
-            self._live.add(name)
+    def _declare(self, parameter: Parameter) -> None:
+        choices = parameter.choices
         descriptor = ParameterDescriptor(
-            description=description, additional_constraints=choices and f"one of: {choices}"
+            description=parameter.description,
+            additional_constraints=choices and f"one of: {choices}",
         )
-        descriptor.read_only = False
-        if span is not None:
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)
-            ]
-        self.declare_parameter(name, default, descriptor)
-
-    def declare_autostart(self) -> None:
-        """Declare the parameter that says whether `run` brings the node up."""
-        text = "Configure and activate at once; false waits for lifecycle transitions."
-        self.declare("autostart", True, text)
-
-    def declare_reliability(self) -> None:
-        """Declare the reliability that `queue` takes."""
-        text = "Reliability of the batch topics."
-        self.declare("qos_reliability", "reliable", text, choices="reliable, best_effort")
+        if parameter.span is not None:
+            low, high = parameter.span
+            bounds = FloatingPointRange(from_value=low, to_value=high, step=0.0)
+            descriptor.floating_point_range = [bounds]
+        self.declare_parameter(parameter.name, parameter.default, descriptor)
 
     def config(self) -> Path:
         """The skin file of parameter config. ConfigError: not given."""
@@ -134,21 +112,29 @@ class CubeNode(LifecycleNode):
 
     def _check_parameters(self, parameters: list[Any]) -> SetParametersResult:
         for parameter in parameters:
-            name, choices = parameter.name, self._choices.get(parameter.name, "")
-            if choices and parameter.value not in choices.split(", "):
-                reason = f"parameter {name} is {parameter.value!r}, allowed: {choices}"
-                return SetParametersResult(successful=False, reason=reason)
-            if isinstance(parameter.value, float) and not math.isfinite(parameter.value):
-                reason = f"parameter {name} is {parameter.value}, allowed: a finite number"
-                return SetParametersResult(successful=False, reason=reason)
-            if self.configured and name in self._choices and name not in self._live:
-                reason = f"parameter {name} cannot change while the node is configured: clean it up first (lifecycle)"
+            reason = self._refusal(parameter.name, parameter.value)
+            if reason:
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
+    def _refusal(self, name: str, value: Any) -> str:
+        """Why a parameter cannot have a value now; empty if it can."""
+        known = self._parameters_by_name.get(name)
+        if known is not None and known.choices and value not in known.choices.split(", "):
+            return f"parameter {name} is {value!r}, allowed: {known.choices}"
+        if isinstance(value, float) and not math.isfinite(value):
+            return f"parameter {name} is {value}, allowed: a finite number"
+        if self.configured and known is not None and not known.live:
+            return (
+                f"parameter {name} cannot change while the node is configured: "
+                "clean it up first (lifecycle)"
+            )
+        return ""
+
     def _take_parameters(self, parameters: list[Any]) -> None:
         for parameter in parameters:
-            if self.configured and parameter.name in self._live:
+            known = self._parameters_by_name.get(parameter.name)
+            if self.configured and known is not None and known.live:
                 self.changed(parameter.name)
 
     def attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from ..core.defaults import CONTACT_PRESSURE, SURFACE_DEPTH
+from ..core.scene import QUANTITIES
+
 
 class Parameter(NamedTuple):
     """A parameter: its default, what `ros2 param describe` says, and what it allows.
@@ -28,6 +31,30 @@ RELIABILITY = Parameter(
     "reliable",
     "Reliability of the batch topics.",
     choices="reliable, best_effort",
+)
+DRIVER = (
+    AUTOSTART,
+    Parameter("config", "", "Skin file (YAML)."),
+    Parameter("port", "", "Port instead of the one in the skin file, for a skin with one link."),
+    Parameter(
+        "port_directory",
+        "",
+        "Folder with the links' ports under the links' names: simulated hubs.",
+    ),
+    Parameter(
+        "rate",
+        0.0,
+        "Samples per second to ask of the hubs; 0: as the skin file says.",
+        span=(0.0, 10_000.0),
+        live=True,
+    ),
+    Parameter(
+        "publish_period",
+        0.0,
+        "Time that one message covers, s; 0: a message for each scan.",
+        span=(0.0, 1.0),
+    ),
+    RELIABILITY,
 )
 RECONSTRUCTION = (
     AUTOSTART,
@@ -69,4 +96,39 @@ RECONSTRUCTION = (
         span=(0.0, 1e6),
         live=True,
     ),
+)
+SKIN_SUBSCRIBER = (
+    AUTOSTART,
+    Parameter("rate", 20.0, "Most messages per second.", span=(0.1, 100.0)),
+)
+MARKERS = (
+    *SKIN_SUBSCRIBER,
+    Parameter("quantity", "pressure", "What the colours mean.", choices=", ".join(QUANTITIES)),
+    Parameter(
+        "range",
+        0.0,
+        "Top of the colours' range, SI; 0: it follows the values.",
+        span=(0.0, 1e9),
+    ),
+    Parameter("crosses", False, "Draw the principal stresses of each cube as a cross."),
+)
+CONTACTS = (
+    *SKIN_SUBSCRIBER,
+    Parameter(
+        "depth",
+        SURFACE_DEPTH,
+        "From the cubes' centres to the skin's surface, m.",
+        span=(1e-5, 1.0),
+    ),
+    Parameter(
+        "least",
+        CONTACT_PRESSURE,
+        "Pressure at the cubes that counts as contact, Pa.",
+        span=(0.0, 1e9),
+    ),
+)
+ECHO = (
+    AUTOSTART,
+    Parameter("cubes", 64, "Rows of a message."),
+    Parameter("rate", 1000.0, "Messages per second."),
 )

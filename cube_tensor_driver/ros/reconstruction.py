@@ -35,10 +35,8 @@ class Reconstruction(CubeNode):
 
     def __init__(self, subscribes: bool = True) -> None:
         """subscribes: False when a driver in the same process calls `on_rows`."""
-        super().__init__("reconstruction")
+        super().__init__("reconstruction", RECONSTRUCTION)
         self._subscribes = subscribes
-        for parameter in RECONSTRUCTION:
-            self.declare(*parameter)
         self._active = False
         # In one process with the driver, its thread calls `on_rows`; services run in the main one.
         self._lock = threading.Lock()

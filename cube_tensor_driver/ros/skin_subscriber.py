@@ -5,7 +5,7 @@ For nodes that show the skin, or make something of its newest rows now and then.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +21,7 @@ from ..core.errors import MessageError
 from ..core.scene import CubePoses, Newest
 from ..core.tensor import rotation_from_quaternion
 from .node import CubeNode
+from .parameters import Parameter
 
 DEPTH = 10
 """A viewer wants the newest messages, not all of them. So its queue is short and it asks for best
@@ -98,19 +99,15 @@ class SkinSubscriberNode(CubeNode):
     It publishes at most `rate` messages a second, and only while somebody listens.
     """
 
-    def __init__(self, name: str, message_type: type, depth: int) -> None:
+    def __init__(
+        self, name: str, parameters: Sequence[Parameter], message_type: type, depth: int
+    ) -> None:
         """depth: of the queue of the topic."""
-        super().__init__(name)
+        super().__init__(name, parameters)
         self._message_type = message_type
         self._depth = depth
         self._active = False
         self._configured = ExitStack()
-        self.declare(
-            "autostart",
-            True,
-            "Configure and activate at once; false waits for lifecycle transitions.",
-        )
-        self.declare("rate", 20.0, "Most messages per second.", (0.1, 100.0))
 
     def set_up(self, skin: FollowedSkin) -> None:
         """Prepare for a skin: there is one, or another one."""
