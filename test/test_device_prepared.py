@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cube_tensor_driver.device.protocol import Sample, encode
-from cube_tensor_driver.simulation.prepared_frames import Prepared
+from cube_tensor_driver.simulation.prepared_frames import PreparedFrame
 
 LOWEST = {"with zeros": 0, "without a zero byte": 0x01010101}
 """Of frequencies, faults and temperatures: COBS codes long runs without a zero another way."""
@@ -35,7 +35,7 @@ def test_the_same_bytes_as_encode(lowest, n_cubes, n_pads, seed, numbers):
     sample = Sample(
         7, 3, 11, some((n_cubes, n_pads), "<u4"), some(n_cubes, "<u4"), some(n_cubes, "<i2")
     )
-    prepared = Prepared(sample)
+    prepared = PreparedFrame(sample)
     for sequence, device_us in numbers:
         again = Sample(
             sequence, 3, device_us, sample.frequency, sample.pad_fault, sample.temperature

@@ -101,7 +101,7 @@ def test_ended_demo_leaves_no_process(domain, number):
     ("arguments", "words"),
     [
         (["--config", "none.yaml"], ["none.yaml", "No such file"]),
-        (["--cubes", "0"], ["--cubes is 0", "1 to 4096"]),
+        (["--cubes", "5000"], ["--cubes is 5000", "1 to 4096"]),
         (["--headless", "--json", "/nowhere/x.json"], ["/nowhere/x.json", "can be written"]),
     ],
 )

@@ -1,26 +1,30 @@
-"""The fault injector does what it says, and its judge is not easily pleased."""
+"""The fault injector does what it says, and the verification of torture finds what is wrong."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError
-from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.protocol import Hello, Sample, Stats
 from cube_tensor_driver.device.sequence import Account, Arrival
-from cube_tensor_driver.simulation.faults import FRAME, KINDS, Fault, Injector, parse_faults
+from cube_tensor_driver.simulation.faults import FRAME_FAULTS, KINDS, Fault, parse_faults
 from cube_tensor_driver.simulation.hub import SimulatedHub
 from cube_tensor_driver.simulation.inject import inject
+from cube_tensor_driver.simulation.injector import Injector, SimulatedLink
+from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
 from cube_tensor_driver.simulation.torture_verification import TortureVerification
 from cube_tensor_driver.trials.torture import CUTS, failures, schedule
 
@@ -29,9 +33,10 @@ VALUES = np.arange(1, 17, dtype="<u4").reshape(2, 8) * 1_000_000
 
 
 @dataclass
-class Wire:
+class KeptLine:
     """A line that keeps what it is given."""
 
+    port: Path = Path("/tmp/hub0")
     plugged: bool = True
     held_until_us: int = 0
     burst_until_us: int = 0
@@ -48,24 +53,22 @@ class Wire:
         self.plugged, self.port = True, port
 
 
-class Bench:
-    def __init__(self):
-        self.name = "hub0"
-        self.hub = SimulatedHub(1, [10, 11], 8, period_us=PERIOD_US, started=True)
-        self.line = Wire()
-        from pathlib import Path
+class FaultyLink(SimulatedLink):
+    """A link under faults."""
 
-        self.line.port = Path("/tmp/hub0")
+    def __init__(self, *faults):
+        hub = SimulatedHub(1, [10, 11], 8, period_us=PERIOD_US, started=True)
+        super().__init__("hub0", hub, KeptLine())
+        self.injector = Injector([self], [Fault(**fault) for fault in faults], seed=3)
 
-    def play(self, injector, samples):
+    def play(self, samples):
         """Samples through the injector into a decoder; returns the decoder and its frames."""
         decoder, frames = Decoder(), []
         for _ in range(samples):
-            injector.step(self.hub.next_us)
+            self.injector.step(self.hub.next_us)
             if self.hub.started:
-                data = injector.frame(
-                    self, self.hub.sample(injector.values(self, VALUES, self.hub.next_us))
-                )
+                measured = self.injector.measured(self, VALUES, self.hub.next_us)
+                data = self.injector.transmitted(self, self.hub.sample(measured))
                 self.line.send(data, self.hub.next_us)
             else:
                 self.hub.next_us += PERIOD_US
@@ -74,18 +77,13 @@ class Bench:
         return decoder, [frame for frame in frames if isinstance(frame, Sample)]
 
 
-def faulty(*faults):
-    bench = Bench()
-    return bench, Injector([bench], [Fault(**fault) for fault in faults], seed=3)
-
-
-@pytest.mark.parametrize("kind", FRAME)
+@pytest.mark.parametrize("kind", FRAME_FAULTS)
 def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
-    bench, injector = faulty({"kind": kind, "at": 0.01, "count": 20})
-    decoder, samples = bench.play(injector, 100)
+    link = FaultyLink({"kind": kind, "at": 0.01, "count": 20})
+    decoder, samples = link.play(100)
     account = Account()
     arrivals = [account.sample(sample) for sample in samples]
-    account.stats(Stats(10_000, bench.hub.sequence, 0))
+    account.stats(Stats(10_000, link.hub.sequence, 0))
     counters = account.counters()
     assert not account.contradictions()
     assert counters["taken"] == 100 == counters["delivered"] + counters["lost_on_the_way"]
@@ -106,10 +104,10 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
     assert all(expected[kind]), (counters, noise)
 
 
-def test_stats_close_the_book_and_tell_drops_from_loss():
+def test_stats_complete_the_account_and_tell_drops_from_loss():
     account = Account()
-    bench, injector = faulty()
-    _, samples = bench.play(injector, 10)
+    link = FaultyLink()
+    _, samples = link.play(10)
     for sample in samples[:6]:
         account.sample(sample)
     account.stats(Stats(20, 10, 3))
@@ -122,14 +120,14 @@ def test_stats_close_the_book_and_tell_drops_from_loss():
 
 
 def test_faults_of_pads_and_hub_change_what_the_hub_says():
-    bench, injector = faulty(
+    link = FaultyLink(
         {"kind": "short", "at": 0.01, "seconds": 0.01, "cube": 1, "pad": 2},
         {"kind": "stuck", "at": 0.03, "seconds": 0.01, "cube": 0, "pad": 0},
         {"kind": "pads", "at": 0.05, "seconds": 0.01},
         {"kind": "version", "at": 0.07, "seconds": 0.01},
         {"kind": "temperature", "at": 0.09, "seconds": 0.002, "value": 10.0},
     )
-    decoder, samples = bench.play(injector, 60)
+    decoder, samples = link.play(60)
     by_time = {sample.device_us: sample for sample in samples}
     assert by_time[12_000].frequency[1, 2] == 0 and by_time[22_000].frequency[1, 2] == VALUES[1, 2]
     assert by_time[52_000].n_pads == 9 and by_time[62_000].n_pads == 8
@@ -137,40 +135,41 @@ def test_faults_of_pads_and_hub_change_what_the_hub_says():
     warm = by_time[100_000]
     np.testing.assert_allclose(warm.frequency, VALUES * (1 + 10 * 50e-6), rtol=1e-6)
     assert warm.temperature[0] == 3500
-    assert [(fault["kind"], start, end) for start, end, _, fault in injector.book][:2] == [
+    records = link.injector.records[:2]
+    assert [(one.fault.kind, one.start_us, one.end_us) for one in records] == [
         ("short", 10_000, 20_000),
         ("stuck", 30_000, 40_000),
     ]
 
 
 def test_restart_wrap_and_clock():
-    bench, injector = faulty(
+    link = FaultyLink(
         {"kind": "drift", "at": 0.01, "value": 100.0},
         {"kind": "step", "at": 0.02, "value": 1.5},
         {"kind": "wrap", "at": 0.03, "count": 2},
     )
-    _, samples = bench.play(injector, 12)
+    _, samples = link.play(12)
     times = [sample.device_us for sample in samples]
     assert times[5] - times[4] == 2000 and times[10] - times[9] == 2000 + 1_500_000
-    bench.hub.started, bench.hub.next_us = (
+    link.hub.started, link.hub.next_us = (
         True,
-        bench.hub.next_us + (-bench.hub.next_us % PERIOD_US),
+        link.hub.next_us + (-link.hub.next_us % PERIOD_US),
     )
-    bench.play(injector, 5)
-    bench.hub.started = True
-    _, samples = bench.play(injector, 4)
+    link.play(5)
+    link.hub.started = True
+    _, samples = link.play(4)
     assert [sample.sequence for sample in samples] == [2**32 - 2, 2**32 - 1, 0, 1]
-    assert [run.boot for run in bench.hub.runs] == [0, 1]
-    assert bench.hub.runs[1].first == 2**32 - 2
+    assert [run.boot for run in link.hub.runs] == [0, 1]
+    assert link.hub.runs[1].first == 2**32 - 2
 
 
 def test_unplug_takes_the_power_and_rename_comes_back_elsewhere():
-    bench, injector = faulty({"kind": "rename", "at": 0.01, "seconds": 0.02})
-    bench.play(injector, 6)
-    assert not bench.line.plugged and not bench.hub.started and bench.hub.boots == 0
-    bench.play(injector, 12)
-    assert bench.line.plugged and bench.hub.boots == 1 and bench.line.port.name == "hub0_1"
-    assert isinstance(Decoder().feed(bench.hub.hello())[0], Hello)
+    link = FaultyLink({"kind": "rename", "at": 0.01, "seconds": 0.02})
+    link.play(6)
+    assert not link.line.plugged and not link.hub.started and link.hub.boots == 0
+    link.play(12)
+    assert link.line.plugged and link.hub.boots == 1 and link.line.port.name == "hub0_1"
+    assert isinstance(Decoder().feed(link.hub.hello())[0], Hello)
 
 
 @pytest.mark.parametrize(
@@ -210,8 +209,7 @@ def test_a_fault_that_is_none_is_told(text, words):
 def test_any_data_is_faults_or_our_error(data):
     try:
         faults = parse_faults(data, "x")
-        bench = Bench()
-        Injector([bench], faults)
+        Injector([FaultyLink()], faults)
     except ConfigError:
         return
     assert all(fault.kind in KINDS for fault in faults)
@@ -224,7 +222,7 @@ def test_the_wrong_link_cube_or_pad():
         {"kind": "short", "pad": 8},
     ):
         with pytest.raises(ConfigError, match="allowed"):
-            faulty(fault)
+            FaultyLink(fault)
 
 
 def test_inject_speaks_to_the_pipe_or_says_that_nobody_listens(tmp_path):
@@ -245,7 +243,7 @@ def test_inject_speaks_to_the_pipe_or_says_that_nobody_listens(tmp_path):
 
 def test_a_long_torture_has_every_fault_and_the_same_seed_the_same_mix():
     mix = list(schedule(120.0, 5))
-    assert {fault["kind"] for _, fault in mix} == set(FRAME) | set(CUTS) | {
+    assert {fault["kind"] for _, fault in mix} == set(FRAME_FAULTS) | set(CUTS) | {
         "open",
         "short",
         "stuck",
@@ -262,99 +260,104 @@ INSTANTS, COUNT = 40, 200
 
 @pytest.fixture(scope="module")
 def skin(tmp_path_factory):
-    from cube_tensor_driver.config.grid import grid
-
     path = tmp_path_factory.mktemp("skin") / "skin.yaml"
-    write_yaml(path, grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0, port="/dev/null{}"))
+    write_yaml(path, grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0))
     return read_skin(path)
 
 
-def judged(
+def verified(
     skin,
-    spoil=lambda k, sequence, stamp, frequency, rows: None,
+    spoil=lambda k, sent, made: (sent, made),
     skip=(),
     faults=(),
     counted=0,
     published=0,
 ):
-    """What the judge says of COUNT samples of both hubs, after `spoil` had its hands on them."""
-    reckoning = TortureVerification(skin, INSTANTS)
-    pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
-    cube = np.arange(4, dtype=np.uint16)
+    """Figures of COUNT samples of both hubs; `spoil` may replace the rows of a sample."""
+    verification = TortureVerification(skin, INSTANTS)
+    reconstruct = Reconstructor(skin)
     for k in range(COUNT):
         if k in skip:
             continue
-        frequency = reckoning._table[(k + 1) % INSTANTS].copy()
-        sequence, stamp = np.full(4, k, np.uint32), np.full(4, (k + 1) * PERIOD_US * 1000 + 10_000)
-        rows = pipeline.process(FrequencyRows.of(cube, frequency))
-        spoil(k, sequence, stamp, frequency, rows)
-        reckoning.frequencies(cube, sequence, stamp, frequency)
-        reckoning.stress(cube, sequence, stamp, rows)
-    run = {"first": 0, "last": COUNT - 1, "start_us": PERIOD_US, "period_us": PERIOD_US, "boot": 0}
-    links = {name: {"runs": [run], "dropped": 0, "cubes": []} for name in ("hub0", "hub1")}
-    return reckoning.close(
-        {"start_time_ns": 0, "links": links, "faults": list(faults)}, 10**12, counted, published
-    )
+        rows = FrequencyRows(
+            cube=np.arange(4, dtype=np.uint16),
+            sequence=np.full(4, k, np.uint32),
+            stamp_ns=np.full(4, (k + 1) * PERIOD_US * 1000 + 10_000),
+            frequency=verification.table[(k + 1) % INSTANTS].copy(),
+            temperature=np.full(4, np.nan, np.float32),
+            pad_fault=np.zeros(4, np.uint32),
+        )
+        frequencies, stress = spoil(k, rows, reconstruct(rows))
+        verification.frequencies(frequencies)
+        verification.stress(stress)
+    run = SampleRun(first=0, last=COUNT - 1, start_us=PERIOD_US, period_us=PERIOD_US)
+    links = LinkLog("hub0", (0, 1), 0, (run,)), LinkLog("hub1", (2, 3), 0, (run,))
+    log = SampleLog(0, links, tuple(faults))
+    return verification.result(log, 10**12, counted=counted, published=published)
 
 
-def test_the_judge_finds_nothing_where_nothing_is(skin):
-    result = judged(skin)
+def test_nothing_is_found_where_nothing_is_wrong(skin):
+    result = verified(skin)
     assert result["samples_sent"] == result["delivered"] == 4 * COUNT
     figures = ("unaccounted", "wrong", "wrong_tensors", "false_alarms", "lost_with_power")
     assert [result[name] for name in figures] == [0] * 5
-    assert judged(skin, skip=[50, 51], counted=8)["unaccounted"] == 0
+    assert verified(skin, skip=[50, 51], counted=8)["unaccounted"] == 0
 
 
-def test_the_judge_finds_what_is_wrong(skin):
-    assert judged(skin, skip=[50, 51])["unaccounted"] == 8
-    assert judged(skin, counted=3)["unaccounted"] == 3
-    # what the driver published and the judge did not hear is the judge's fault, not the driver's
-    starved = judged(skin, skip=[50, 51], published=4 * COUNT)
+def test_what_is_missing_is_found(skin):
+    assert verified(skin, skip=[50, 51])["unaccounted"] == 8
+    assert verified(skin, counted=3)["unaccounted"] == 3
+    # What the driver published and the verification did not receive is no fault of the driver.
+    starved = verified(skin, skip=[50, 51], published=4 * COUNT)
     assert (starved["unaccounted"], starved["missed_by_judge"]) == (0, 8)
 
-    def bit(k, sequence, stamp, frequency, rows):
+
+def noisy(pad):
+    fault = Fault("noisy", link="hub0", cube=1, pad=pad, value=1e-3, seconds=0.1)
+    return [FaultRecord(60_000, 160_000, fault)]
+
+
+def test_one_wrong_bit_is_found_unless_a_fault_of_that_pad_explains_it(skin):
+    def bit(k, sent, made):
         if k == 70:
-            frequency[1, 4] = np.nextafter(frequency[1, 4], np.float32(0))
+            sent.frequency[1, 4] = np.nextafter(sent.frequency[1, 4], np.float32(0))
+        return sent, made
 
-    assert judged(skin, bit)["wrong"] == 1
-    fault = [
-        60_000,
-        160_000,
-        "hub0",
-        {"kind": "noisy", "cube": 1, "pad": 4, "value": 1e-3, "seconds": 0.1},
-    ]
-    assert judged(skin, bit, faults=[fault])["wrong"] == 0
-    other = [
-        60_000,
-        160_000,
-        "hub0",
-        {"kind": "noisy", "cube": 1, "pad": 5, "value": 1e-3, "seconds": 0.1},
-    ]
-    assert judged(skin, bit, faults=[other])["wrong"] == 1
+    assert verified(skin, bit)["wrong"] == 1
+    assert verified(skin, bit, faults=noisy(pad=4))["wrong"] == 0
+    assert verified(skin, bit, faults=noisy(pad=5))["wrong"] == 1
 
-    def tensor(k, sequence, stamp, frequency, rows):
+
+def test_a_wrong_tensor_and_a_false_alarm_are_found(skin):
+    def tensor(k, sent, made):
         if k == 70:
-            rows.stress[2, 2] += 0.01 * 10e3
+            made.stress[2, 2] += 0.01 * 10e3
+        return sent, made
 
-    assert judged(skin, tensor)["wrong_tensors"] == 1
+    assert verified(skin, tensor)["wrong_tensors"] == 1
 
-    def status(k, sequence, stamp, frequency, rows):
+    def status(k, sent, made):
         if k == 70:
-            rows.status[3] = 2
+            made.status[3] = 2
+        return sent, made
 
-    assert judged(skin, status)["false_alarms"] == 1
+    assert verified(skin, status)["false_alarms"] == 1
 
-    def twice(k, sequence, stamp, frequency, rows):
+
+def test_a_sample_twice_and_one_that_was_never_taken_are_found(skin):
+    def twice(k, sent, made):
         if k == 70:
-            sequence[:], stamp[:] = 69, stamp - PERIOD_US * 1000
+            sent.sequence[:], sent.stamp_ns[:] = 69, sent.stamp_ns - PERIOD_US * 1000
+        return sent, made
 
-    assert judged(skin, twice)["wrong"] > 0
+    assert verified(skin, twice)["wrong"] > 0
 
-    def never_taken(k, sequence, stamp, frequency, rows):
+    def never_taken(k, sent, made):
         if k == 70:
-            sequence[:] = 5000
+            sent.sequence[:] = 5000
+        return sent, made
 
-    assert judged(skin, never_taken)["wrong"] > 0
+    assert verified(skin, never_taken)["wrong"] > 0
 
 
 def test_limits_of_the_figures():

@@ -8,7 +8,6 @@ one to the other, is off, as it is between real machines.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -27,6 +26,7 @@ from cube_tensor_driver.bags.read import STRESS, Bag
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.processes.children import ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.simulation.sample_log import SampleLog
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 CUBES, RATE = 16, 100
@@ -169,22 +169,20 @@ def lost_on_the_way(path: Path) -> int:
     return said[-1]
 
 
-def sampled(book: dict) -> dict[tuple[int, int], int]:
+def sampled(log: SampleLog) -> dict[tuple[int, int], int]:
     """When each row was sampled, ns of the wall clock, by cube and sequence number."""
     return {
-        (cube, run["first"] + k): book["start_time_ns"]
-        + 1000 * (run["start_us"] + k * run["period_us"])
-        for link in book["links"].values()
-        for run in link["runs"]
-        for k in range(run["last"] - run["first"] + 1)
-        for cube in link["cubes"]
+        (cube, run.first + k): time_ns
+        for link, run, times_ns in log.samples()
+        for k, time_ns in enumerate(times_ns.tolist())
+        for cube in link.members
     }
 
 
 def test_a_cut_cable_costs_what_queues_do_not_hold_and_that_is_counted(hosts, tmp_path):
-    bag, book = tmp_path / "bag", tmp_path / "book.json"
+    bag, log = tmp_path / "bag", tmp_path / "log.json"
     for process in skin_processes(
-        SKIN, simulated=SimulatedHubs(tmp_path / "ports", sample_log=book, instants=16)
+        SKIN, simulated=SimulatedHubs(tmp_path / "ports", sample_log=log, instants=16)
     ):
         hosts.start("desk" if process.executable == "reconstruction" else "robot", process)
     recording = ("record", "-o", str(bag), "--topics", "stress", "/diagnostics")
@@ -211,13 +209,13 @@ def test_a_cut_cable_costs_what_queues_do_not_hold_and_that_is_counted(hosts, tm
     flows()
     flows()
     hosts.end("simulator")
-    wait(book.exists)
+    wait(log.exists)
     hosts.end("recorder", "reconstruction", "driver")
 
     cube, sequence, arrival = rows(bag)
     came = set(zip(cube.tolist(), sequence.tolist(), strict=True))
     assert len(came) == len(cube)  # nothing twice
-    times = sampled(json.loads(book.read_text()))
+    times = sampled(SampleLog.read(log))
     first, last = min(times[one] for one in came), max(times[one] for one in came)
     gone = np.array(
         [time_ns for one, time_ns in times.items() if first < time_ns < last and one not in came]

@@ -113,7 +113,7 @@ def test_few_points_from_afar_are_as_good(tmp_path):
         sources, forces = getattr(contact, "hertz" if shape == "sphere" else shape)(
             press.radius, press.force, order=24
         )
-        below = places - [*press.place[:2], H]
+        below = places - [*press.position[:2], H]
         for ours, truth in zip(found, contact.field(below, sources, forces, 0.5), strict=True):
             assert np.abs(ours - truth).max() < 1e-3 * np.abs(truth).max()
 
@@ -144,7 +144,7 @@ def test_a_slide_is_a_press_moved(tmp_path):
     np.testing.assert_allclose(roll.total(1.0)[0], [0, 0, -3], atol=1e-12)
     np.testing.assert_allclose(roll.total(1.0)[1], [0.005, 0.02, 0])
     # at rest at both ends
-    np.testing.assert_allclose(slide.presses(1e-6)[0].place, [-0.01, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(slide.presses(1e-6)[0].position, [-0.01, 0, 0], atol=1e-9)
 
 
 def test_taps_presses_and_the_time_between(tmp_path):

@@ -92,16 +92,31 @@ def run(options: argparse.Namespace) -> int:
     if options.what == "decode":
         from ..trials.bench_decode import bench_decode
 
-        return bench_decode(options.json)
+        return bench_decode(json_path=options.json)
     from ..trials import bench
 
     if options.what == "pipeline":
-        return bench.bench_pipeline(options.cubes, options.json)
-    timing = (options.rate, options.duration)
+        return bench.bench_pipeline(cubes=options.cubes, json_path=options.json)
     if options.what == "echo":
-        return bench.bench_echo(options.cubes, *timing, options.json)
+        return bench.bench_echo(
+            cubes=options.cubes,
+            rate=options.rate,
+            duration=options.duration,
+            json_path=options.json,
+        )
     if options.what == "scale":
-        return bench.bench_scale(options.counts, *timing, options.json, options.figure)
+        return bench.bench_scale(
+            counts=options.counts,
+            rate=options.rate,
+            duration=options.duration,
+            json_path=options.json,
+            figure=options.figure,
+        )
     return bench.bench_skin(
-        options.cubes, *timing, options.publish_period, options.composed, options.json
+        cubes=options.cubes,
+        rate=options.rate,
+        duration=options.duration,
+        publish_period=options.publish_period,
+        composed=options.composed,
+        json_path=options.json,
     )

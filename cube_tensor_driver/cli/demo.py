@@ -53,21 +53,19 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..trials.demo import Options, run_demo
+    from ..trials.demo import run_demo
 
     duration = options.duration
     if duration is None and (options.headless or options.json or options.figure):
         duration = MEASURE_S
     return run_demo(
-        Options(
-            config=options.config,
-            cubes=options.cubes,
-            rate=options.rate,
-            duration=duration,
-            headless=options.headless,
-            json=options.json,
-            view=options.view,
-            load=options.load,
-            figure=options.figure,
-        )
+        config=options.config,
+        cubes=options.cubes,
+        load=options.load,
+        rate=options.rate,
+        duration=duration,
+        headless=options.headless,
+        view=options.view,
+        json_path=options.json,
+        figure=options.figure,
     )

@@ -26,6 +26,6 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..trials.torture import Options, run_torture
+    from ..trials.torture import run_torture
 
-    return run_torture(Options(duration=options.duration, seed=options.seed, json=options.json))
+    return run_torture(duration=options.duration, seed=options.seed, json_path=options.json)

@@ -51,7 +51,7 @@ class SimulatedHubs:
         if self.load is not None:
             arguments += ["--load", str(self.load)]
         if self.sample_log is not None:
-            arguments += ["--book", str(self.sample_log)]
+            arguments += ["--log", str(self.sample_log)]
         if self.instants is not None:
             arguments += ["--instants", str(self.instants)]
         module = "cube_tensor_driver.simulation.main"

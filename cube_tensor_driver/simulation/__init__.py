@@ -1,4 +1,6 @@
-"""Hubs that exist only in software: loads, pads, hubs, lines, faults, and the log of what they sent.
+"""Hubs that exist only in software: loads, pads, hubs, lines and faults.
 
-Verification against that log is here too. ROS is not imported.
+Also here is the log of what these hubs sampled, and what compares it with what arrived. A simulated
+skin is a source of frequencies in this process (`source`), or a process with ports (`main`). ROS is
+not imported.
 """

@@ -1,10 +1,10 @@
-"""A simulated hub: answers requests, takes samples, keeps its book. No I/O and no clock, as on the
-wire so here."""
+"""A simulated hub: answers requests, takes samples and logs them. Like the protocol code it has no
+I/O and no clock: its caller says what time it is."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,35 +22,35 @@ from ..device.protocol import (
     Stats,
     encode,
 )
-from .prepared_frames import Prepared
+from .prepared_frames import PreparedFrame
+from .sample_log import SampleRun
 
 FIRMWARE = 0x00010000
 PERIOD_LIMITS_US = (100, 10_000_000)
 
 
 @dataclass
-class Run:
-    """Samples first … last (from power-up) were taken at start_us, start_us + period_us, … of
-    simulated time.
-
-    boot: how often the hub had restarted by then.
-    """
-
-    first: int
-    last: int
-    start_us: int
-    period_us: int
-    boot: int = 0
-
-
-@dataclass
 class SimulatedHub:
     """The device side of the protocol.
 
-    boot_us: what the hub's clock shows at simulated time 0; period_us: sample period; next_us:
-    simulated time of the next sample; runs: the book of what was sampled; dropped: samples taken
-    that found no room on the line, since power-up; boots: restarts. For faults: drift_ppm, version,
-    false_uid, extra_pads, celsius (0.01 °C).
+    uid, cube_uids, n_pads: what it says in HELLO
+    boot_us: what its clock shows at simulated time 0
+    period_us: sample period
+    started: whether it takes samples
+    next_us: simulated time of the next sample
+    sequence: number of the next sample since the last restart, counted on beyond 2^32
+    dropped: samples that found no room on the line since the last restart
+    runs: the samples that were taken
+    decoder: of the requests that come in
+    boots: restarts so far
+
+    Set by faults:
+
+    drift_ppm: how much too fast its clock runs
+    version: protocol version of its frames
+    false_uid: what it says instead of its uid
+    extra_pads: pads that it says it has beyond n_pads
+    celsius: temperature in 0.01 °C
     """
 
     uid: int
@@ -62,7 +62,7 @@ class SimulatedHub:
     next_us: int = 0
     sequence: int = 0
     dropped: int = 0
-    runs: list[Run] = field(default_factory=list)
+    runs: list[SampleRun] = field(default_factory=list)
     decoder: Decoder = field(default_factory=Decoder)
     boots: int = 0
     drift_ppm: float = 0.0
@@ -71,7 +71,7 @@ class SimulatedHub:
     extra_pads: int = 0
     celsius: int = TEMPERATURE_UNKNOWN
     _drift_since_us: int = 0
-    _prepared: dict[int, tuple[NDArray[np.uint32], Prepared]] = field(default_factory=dict)
+    _prepared: dict[int, tuple[NDArray[np.uint32], PreparedFrame]] = field(default_factory=dict)
 
     def hello(self) -> bytes:
         """Bytes of the HELLO frame."""
@@ -119,39 +119,44 @@ class SimulatedHub:
         return b"".join(answers)
 
     def prepare(self, frequency: NDArray[np.uint32]) -> None:
-        """Encode now what will be the same in every SAMPLE of these very frequencies."""
-        n = len(frequency)
-        plain = Sample(
-            0, 0, 0, frequency, np.zeros(n, "<u4"), np.full(n, TEMPERATURE_UNKNOWN, "<i2")
-        )
-        self._prepared[id(frequency)] = frequency, Prepared(plain)
+        """Encode now what will be the same in every SAMPLE of this very array of frequencies."""
+        sample = self._sample(0, 0, frequency, TEMPERATURE_UNKNOWN)
+        self._prepared[id(frequency)] = frequency, PreparedFrame(sample)
 
     def sample(self, frequency: NDArray[np.uint32]) -> bytes:
         """Take the sample of next_us: bytes of its SAMPLE frame. frequency: (cubes, pads) in
         mHz."""
-        run = self.runs[-1] if self.runs else None
-        if (
-            run
-            and run.boot == self.boots
-            and run.period_us == self.period_us
-            and self.next_us == run.start_us + (run.last + 1 - run.first) * run.period_us
-        ):
-            run.last = self.sequence
-        else:
-            self.runs.append(
-                Run(self.sequence, self.sequence, self.next_us, self.period_us, self.boots)
-            )
+        self._log()
         sequence, device_us = self.sequence & 0xFFFFFFFF, max(0, self.device_us(self.next_us))
         self.sequence += 1
         self.next_us += self.period_us
         _, prepared = self._prepared.get(id(frequency), (None, None))
         if prepared is not None and self.celsius == TEMPERATURE_UNKNOWN and self.version == VERSION:
             return prepared.encode(sequence, device_us)
+        return encode(self._sample(sequence, device_us, frequency, self.celsius), self.version)
+
+    @staticmethod
+    def _sample(
+        sequence: int, device_us: int, frequency: NDArray[np.uint32], celsius: int
+    ) -> Sample:
         n = len(frequency)
-        temperature = np.full(n, self.celsius, "<i2")
-        return encode(
-            Sample(sequence, 0, device_us, frequency, np.zeros(n, "<u4"), temperature), self.version
-        )
+        pad_fault, temperature = np.zeros(n, "<u4"), np.full(n, celsius, "<i2")
+        return Sample(sequence, 0, device_us, frequency, pad_fault, temperature)
+
+    def _log(self) -> None:
+        """The sample of next_us goes on with the last run or begins a new one."""
+        run = self.runs[-1] if self.runs else None
+        if (
+            run is not None
+            and run.boot == self.boots
+            and run.period_us == self.period_us
+            and run.end_us == self.next_us
+        ):
+            self.runs[-1] = replace(run, last=self.sequence)
+        else:
+            self.runs.append(
+                SampleRun(self.sequence, self.sequence, self.next_us, self.period_us, self.boots)
+            )
 
     def skip(self, now_us: int) -> None:
         """Take the next sample after now_us; those before are never taken."""

@@ -1,4 +1,4 @@
-"""./cube inject: a fault for simulated hubs that run in another process."""
+"""Sends a fault to simulated hubs that run in another process: `./cube inject`."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from pathlib import Path
 from ..config.yaml import parse_yaml, to_yaml
 from ..core.errors import ConfigError
 from .faults import Fault
-from .simulator import CONTROL
+from .simulator import FAULT_PIPE
 
 
 def inject(ports: Path | None, words: Sequence[str]) -> None:
-    """Send the fault that key=value words describe to the simulator with this folder of ports, or
-    the newest demo's.
+    """Send the fault that words such as kind=unplug describe to a simulator.
 
+    ports: its folder of ports; None: that of the demo that was started last.
     ConfigError: no such fault, or no simulator there.
     """
     unclear = [word for word in words if "=" not in word]
     if unclear:
         raise ConfigError(
-            f"fault: found {unclear[0]!r}, allowed: key=value, as in kind=unplug link=hub0 seconds=2"
+            f"fault: found {unclear[0]!r}, allowed: key=value, as in kind=unplug link=hub0 "
+            "seconds=2"
         )
     pairs = dict(word.split("=", 1) for word in words)
     fault = {
@@ -31,22 +32,30 @@ def inject(ports: Path | None, words: Sequence[str]) -> None:
         for key, value in pairs.items()
     }
     Fault.parse(fault, "fault")
-    if ports is None:
-        demos = sorted(
-            Path(tempfile.gettempdir()).glob(f"cube_demo_*/ports/{CONTROL}"), key=os.path.getmtime
-        )
-        if not demos:
-            raise ConfigError(
-                "no demo runs here; start ./cube demo, or name the folder of the ports with --ports"
-            )
-        ports = demos[-1].parent
+    pipe = (ports or _newest_demo()) / FAULT_PIPE
     try:
-        # Without a reader, opening a pipe to write would wait for ever.
-        pipe = os.open(ports / CONTROL, os.O_WRONLY | os.O_NONBLOCK)
+        # Without O_NONBLOCK, opening a pipe that nobody reads would wait for ever.
+        writer = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
     except OSError as error:
         reason = "no simulator reads it" if error.errno == errno.ENXIO else error.strerror
         raise ConfigError(
-            f"{ports / CONTROL}: {reason}; name the ports' folder of a running simulator"
+            f"{pipe}: {reason}; name the ports' folder of a running simulator"
         ) from None
-    with os.fdopen(pipe, "w") as control:
-        control.write(to_yaml(fault).replace("\n", " ").strip() + "\n")
+    with os.fdopen(writer, "w") as stream:
+        stream.write(fault_line(fault))
+
+
+def fault_line(fault: dict[str, object]) -> str:
+    """A fault as one line for the pipe of a simulator."""
+    return to_yaml(fault).replace("\n", " ").strip() + "\n"
+
+
+def _newest_demo() -> Path:
+    """The folder of ports of the demo that was started last. ConfigError: none runs."""
+    pipes = Path(tempfile.gettempdir()).glob(f"cube_demo_*/ports/{FAULT_PIPE}")
+    newest = max(pipes, key=os.path.getmtime, default=None)
+    if newest is None:
+        raise ConfigError(
+            "no demo runs here; start ./cube demo, or name the folder of the ports with --ports"
+        )
+    return newest.parent

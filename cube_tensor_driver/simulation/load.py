@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from ..config.load_script import Action, Indenter, Script, between, read_script
 from ..config.package_data import package_data
@@ -17,32 +16,38 @@ from ..core.errors import ConfigError
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..elastic import contact
+from .spline import CubicSpline
 
 Array = NDArray[np.float64]
 SLOW = 1e-3
-"""Speed at which friction has reached 0.7 of its full size, m/s: it turns round smoothly where a
-slide does."""
+"""Speed at which friction has reached 0.7 of its full size, m/s: so it changes direction smoothly
+where a slide does."""
 WIDEST = 12
-"""Contact's radius over the cubes' depth at most: wider ones take more points than anybody can wait
-for."""
-_STEPS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
-"""Orders of quadrature in use: few different ones, so that cubes are computed together."""
+"""Radius of a contact over the depth of the cubes, at most: wider ones need so many points that
+nobody can wait for them."""
+KEPT_BYTES = 64 << 20
+"""What the fields that are kept may take."""
+_ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
+"""Orders of quadrature in use: few, so that many cubes are computed together."""
 
 
 def default_script() -> Script:
-    """The script of those who name none: something wanders over the whole skin."""
+    """The shipped script, for any skin: an indenter wanders over all of it."""
     return read_script(package_data() / "config" / "load_demo.yaml")
 
 
 class Press(NamedTuple):
     """What one indenter does at one time, in the skin's parent frame.
 
-    place (3,) m, normal (3,) out of the skin there, force (3,) N on the skin, radius of the contact
-    in m.
+    shape: disc or sphere
+    position: (3,) m, centre of the contact
+    normal: (3,) out of the skin there
+    force: (3,) N on the skin
+    radius: of the contact, m
     """
 
     shape: str
-    place: Array
+    position: Array
     normal: Array
     force: Array
     radius: float
@@ -51,14 +56,16 @@ class Press(NamedTuple):
 class Load:
     """A script on a skin: the same at the same time in every process.
 
-    Each cube sees the half space whose surface lies `script.depth` above it, across its own z axis,
-    with the load at the foot of its perpendicular; a cube that is turned away from the load by an
-    angle sees the angle's cosine of it, beyond a right angle nothing. A sphere's contact is
-    Hertz's: a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a slide is friction × normal force
-    along its velocity v, times v / √(v² + SLOW²).
+    Each cube sees a half space whose surface lies `script.depth` above it, across its own z axis,
+    with the load at the foot of its perpendicular. A cube that is tilted away from the load by an
+    angle sees the load times the angle's cosine, and nothing beyond a right angle. A sphere's
+    contact is Hertz's: a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a slide is friction ×
+    normal force along its velocity v, times v / √(v² + SLOW²).
 
     Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz), 7.1 (sliding), 8.1 (rolling with
     traction).
+
+    poses: of the cubes; period: of the script, or its length if it plays once, s.
     """
 
     def __init__(self, skin: Skin, script: Script) -> None:
@@ -67,62 +74,54 @@ class Load:
         self.script = script
         self.period = script.period or script.end
         self._position = np.array([cube.xyz for cube in skin.cubes])
-        self._turn = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
+        self._rotation = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
         half = np.array([cube.calibration.half_side for cube in skin.cubes])
-        low, high = (
-            (self._position - half[:, None]).min(axis=0),
-            (self._position + half[:, None]).max(axis=0),
-        )
-        self._centre, self._span = (low + high) / 2, (high - low) / 2
-        self.places = CubePoses(self._position, self._turn, half)
-        self._pitch = self.places.pitch
-        self._paths = {id(a): self._path(a) for i in script.indenters for a in i.actions}
+        low = (self._position - half[:, None]).min(axis=0)
+        high = (self._position + half[:, None]).max(axis=0)
+        self._centre, self._half_extent = (low + high) / 2, (high - low) / 2
+        self.poses = CubePoses(self._position, self._rotation, half)
+        self._paths = {
+            id(action): self._path(action)
+            for indenter in script.indenters
+            for action in indenter.actions
+        }
         for indenter in script.indenters:
-            most = max(action.force.max() for action in indenter.actions)
-            if (radius := self._radius(indenter, most)) > indenter.radius:
-                raise ConfigError(
-                    f"{indenter.name}: under {most:g} N the contact's radius is {1e3 * radius:.3g} mm, the sphere's "
-                    f"only {1e3 * indenter.radius:g} mm; take less force or a larger radius"
-                )
-            if radius > WIDEST * script.depth:
-                raise ConfigError(
-                    f"{indenter.name}: the contact's radius is {1e3 * radius:g} mm, the cubes' depth "
-                    f"{1e3 * script.depth:g} mm; take several contacts of at most {WIDEST} times the depth"
-                )
+            self._check(indenter)
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
         the cubes' frames."""
-        stress, gradient = np.zeros((len(self._turn), 6)), np.zeros((len(self._turn), 6, 3))
+        n = len(self._position)
+        stress, gradient = np.zeros((n, 6)), np.zeros((n, 6, 3))
+        below = np.array([[0.0, 0.0, -self.script.depth]])
         for press in self.presses(seconds):
-            local = np.einsum("nij,ni->nj", self._turn, press.place - self._position)
-            away = np.hypot(local[:, 0], local[:, 1])
-            facing = np.maximum(self._turn[:, :, 2] @ press.normal, 0.0)
-            force = np.einsum("nij,i->nj", self._turn, press.force) * facing[:, None]
-            orders = _orders(press.shape, press.radius, self.script.depth, away)
+            local = np.einsum("nij,ni->nj", self._rotation, press.position - self._position)
+            distance = np.hypot(local[:, 0], local[:, 1])
+            facing = np.maximum(self._rotation[:, :, 2] @ press.normal, 0.0)
+            force = np.einsum("nij,i->nj", self._rotation, press.force) * facing[:, None]
+            orders = _orders(press.shape, press.radius, self.script.depth, distance)
+            # Cubes with the same order of quadrature are computed together.
             for order in np.unique(orders[facing > 0]).tolist():
                 rows = np.flatnonzero((orders == order) & (facing > 0))
-                points, share_of = _points(press.shape, order)
+                points, weights = _points(press.shape, order)
                 sources = local[rows, None, :] * (1.0, 1.0, 0.0) + press.radius * points
-                below = np.array([[0.0, 0.0, -self.script.depth]])
-                found = contact.field(
-                    below, sources, force[rows, None, :] * share_of, self.script.poisson
-                )
-                stress[rows] += found[0][:, 0]
-                gradient[rows] += found[1][:, 0]
+                forces = force[rows, None, :] * weights
+                field = contact.field(below, sources, forces, self.script.poisson)
+                stress[rows] += field[0][:, 0]
+                gradient[rows] += field[1][:, 0]
         return stress, gradient
 
     def presses(self, seconds: float) -> list[Press]:
-        """Of each indenter that touches the skin at this time, what it does."""
+        """What each indenter does that touches the skin at this time."""
         if self.script.period is not None:
             seconds %= self.script.period
-        found = []
-        for indenter in self.script.indenters:
-            for action in indenter.actions:
-                if action.start <= seconds < action.end:
-                    press = self._press(indenter, action, seconds)
-                    found += [press] if press.force.any() else []
-        return found
+        presses = [
+            self._press(indenter, action, seconds)
+            for indenter in self.script.indenters
+            for action in indenter.actions
+            if action.start <= seconds < action.end
+        ]
+        return [press for press in presses if press.force.any()]
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
         """Sum (3,) of all forces on the skin in N, their centre of pressure (3,) in m and the mean
@@ -131,43 +130,51 @@ class Load:
         Without load centre and normal are NaN.
         """
         presses = self.presses(seconds)
-        weight = np.array([-press.force @ press.normal for press in presses])
         if not presses:
             return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
-        centre = weight @ np.array([press.place for press in presses]) / weight.sum()
+        weight = np.array([-press.force @ press.normal for press in presses])
+        force = np.sum([press.force for press in presses], axis=0)
+        centre = weight @ np.array([press.position for press in presses]) / weight.sum()
         normal = weight @ np.array([press.normal for press in presses])
-        return (
-            np.sum([press.force for press in presses], axis=0),
-            centre,
-            normal / np.linalg.norm(normal),
-        )
+        return force, centre, normal / np.linalg.norm(normal)
+
+    def _check(self, indenter: Indenter) -> None:
+        """ConfigError: the contact is too wide for what is computed."""
+        force = max(action.force.max() for action in indenter.actions)
+        radius = self._radius(indenter, force)
+        if radius > indenter.radius:
+            raise ConfigError(
+                f"{indenter.name}: under {force:g} N the contact's radius is "
+                f"{1e3 * radius:.3g} mm, the sphere's only {1e3 * indenter.radius:g} mm; "
+                "take less force or a larger radius"
+            )
+        if radius > WIDEST * self.script.depth:
+            raise ConfigError(
+                f"{indenter.name}: the contact's radius is {1e3 * radius:g} mm, the cubes' depth "
+                f"{1e3 * self.script.depth:g} mm; take several contacts of at most {WIDEST} times "
+                "the depth"
+            )
 
     def _press(self, indenter: Indenter, action: Action, seconds: float) -> Press:
+        """when: from 0 at the action's start to 1 at its end."""
         when = (seconds - action.start) / (action.end - action.start)
         path = self._paths[id(action)]
-        place = path(when) if path else self._place(action.path[0])
-        normal = self._normal(place)
+        position = path.position(when) if path else self._in_metres(action.path[0])
+        normal = self._normal(position)
         size = float(between(action.force, when))
         if path and action.kind == "slide":
-            velocity = path(when, 1) / (action.end - action.start)
+            velocity = path.velocity(when) / (action.end - action.start)
             velocity -= normal * (velocity @ normal)
-            shear = (
-                indenter.friction
-                * size
-                * velocity
-                / math.hypot(float(np.linalg.norm(velocity)), SLOW)
-            )
+            speed = float(np.linalg.norm(velocity))
+            shear = indenter.friction * size * velocity / math.hypot(speed, SLOW)
         else:
-            steady = len(action.shear) == 1
-            shear = (
-                action.shear[0] * size / action.force.max()
-                if steady
-                else between(action.shear, when)
-            )
+            if len(action.shear) == 1:
+                shear = action.shear[0] * size / action.force.max()
+            else:
+                shear = between(action.shear, when)
             shear = shear - normal * (shear @ normal)
-        return Press(
-            indenter.shape, place, normal, shear - size * normal, self._radius(indenter, size)
-        )
+        force = shear - size * normal
+        return Press(indenter.shape, position, normal, force, self._radius(indenter, size))
 
     def _radius(self, indenter: Indenter, force: float) -> float:
         if indenter.shape == "disc":
@@ -175,49 +182,71 @@ class Load:
         stiffness = self.script.young / (1 - self.script.poisson**2)
         return float(np.cbrt(3 * force * indenter.radius / (4 * stiffness)))
 
-    def _place(self, place: Array) -> Array:
-        return self._centre + place * self._span if self.script.relative else place
+    def _in_metres(self, position: Array) -> Array:
+        """A position of the script in m in the skin's parent frame."""
+        if not self.script.relative:
+            return position
+        return self._centre + position * self._half_extent
 
     def _path(self, action: Action) -> CubicSpline | None:
-        """Through all places at equal intervals; at rest at both ends, unless it is closed."""
+        """Through all positions at equal intervals; at rest at both ends, unless it is closed."""
         if len(action.path) == 1:
             return None
         closed = len(action.path) > 2 and np.array_equal(action.path[0], action.path[-1])
-        when = np.linspace(0, 1, len(action.path))
-        return CubicSpline(
-            when, self._place(action.path), bc_type="periodic" if closed else "clamped"
-        )
+        return CubicSpline(self._in_metres(action.path), closed=closed)
 
-    def _normal(self, place: Array) -> Array:
-        """(3,) out of the skin: the mean of the cubes' z axes, near ones first."""
-        square = ((self._position - place) ** 2).sum(axis=1)
-        weight = np.exp((square.min() - square) / (2 * self._pitch**2))
-        normal = weight @ self._turn[:, :, 2]
+    def _normal(self, position: Array) -> Array:
+        """(3,) out of the skin: the mean of the cubes' z axes, weighted by how near they are."""
+        square = ((self._position - position) ** 2).sum(axis=1)
+        weight = np.exp((square.min() - square) / (2 * self.poses.pitch**2))
+        normal = weight @ self._rotation[:, :, 2]
         length = np.linalg.norm(normal)
-        return normal / length if length > 0 else self._turn[np.argmin(square), :, 2]
+        return normal / length if length > 0 else self._rotation[np.argmin(square), :, 2]
 
 
-def _orders(shape: str, radius: float, depth: float, away: Array) -> NDArray[np.int64]:
-    """Order of quadrature for each cube, `away` m from the contact's axis: few points for those who
-    see it from afar.
+class LoadMemory:
+    """The fields of a load at whole microseconds. Those of a periodic script are kept for the next
+    time that it comes by there: each costs a contact problem for every cube."""
 
-    Stress and gradient are within 1e-3 of their greatest value; what point forces make is in
-    balance in any case.
+    def __init__(self, load: Load) -> None:
+        self._load = load
+        period = load.script.period
+        self._period_us = None if period is None else round(1e6 * period)
+        self._fields: dict[int, tuple[Array, Array]] = {}
+
+    def at(self, time_us: int) -> tuple[Array, Array]:
+        """As `Load.at`."""
+        if self._period_us is not None:
+            time_us %= self._period_us
+        field = self._fields.get(time_us)
+        if field is None:
+            field = self._load.at(time_us * 1e-6)
+            if (len(self._fields) + 1) * sum(part.nbytes for part in field) > KEPT_BYTES:
+                self._fields.clear()
+            self._fields[time_us] = field
+        return field
+
+
+def _orders(shape: str, radius: float, depth: float, distance: Array) -> NDArray[np.int64]:
+    """Order of quadrature for each cube, `distance` m from the contact's axis: few points for cubes
+    that see the contact from afar.
+
+    Stress and gradient are within 1e-3 of their greatest value; any sum of point forces satisfies
+    equilibrium.
     """
-    near = radius / np.hypot(depth, np.maximum(away - radius, 0.0))
+    near = radius / np.hypot(depth, np.maximum(distance - radius, 0.0))
     wanted = 5 * near + 1 if shape == "sphere" else 3.3 * near + 0.5
-    return np.where(near < 0.15, 1, _STEPS[np.searchsorted(_STEPS, wanted)])
+    return np.where(near < 0.15, 1, _ORDERS[np.searchsorted(_ORDERS, wanted)])
 
 
 @lru_cache(maxsize=64)
 def _points(shape: str, order: int) -> tuple[Array, Array]:
-    """Points (L, 3) of a contact of radius 1 and each one's share (L, 1) of the force."""
+    """Points (L, 3) of a contact of radius 1 and the part (L, 1) of the force on each of them."""
     if shape == "sphere" and order > 1:
-        points, share_of = contact.hertz(1.0, (0.0, 0.0, 1.0), order=order)
+        points, forces = contact.hertz(1.0, (0.0, 0.0, 1.0), order=order)
     else:
         # Seen from afar a sphere's contact is a disc with the same second moment: 2/5 a² against
         # 1/2 a².
-        points, share_of = contact.disc(
-            math.sqrt(0.8) if shape == "sphere" else 1.0, (0.0, 0.0, 1.0), order=order
-        )
-    return points, share_of[:, 2:]
+        radius = math.sqrt(0.8) if shape == "sphere" else 1.0
+        points, forces = contact.disc(radius, (0.0, 0.0, 1.0), order=order)
+    return points, forces[:, 2:]

@@ -1,15 +1,14 @@
-"""The simulator: one process that plays all hubs of a skin on pseudo-terminals, under the load of a
+"""The simulator as a process: it plays all hubs of a skin on pseudo-terminals, under the load of a
 script.
 
-Each link's port appears as PORTS/<link name>; with --tcp, links that the skin file has on TCP are
-played there. On SIGINT or SIGTERM it ends and writes its book: what was sampled when, so that
-others can tell what should have arrived.
+The port of each link appears as PORTS/<link name>; with --tcp, links that the skin file has on TCP
+are played there. On SIGINT or SIGTERM it ends and writes its sample log, from which others can tell
+what should have arrived.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from ..config.yaml import read_yaml
 from ..core.errors import CubeError
 from .faults import parse_faults
 from .load import Load, default_script
-from .simulator import Simulator, Stop
+from .simulator import Simulator, StopSignal
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -40,25 +39,28 @@ def main(arguments: list[str] | None = None) -> int:
         "--drift", type=float, default=0.0, help="relative drift of the rest frequencies per second"
     )
     parser.add_argument(
-        "--book", type=Path, help="file for the book of what was sampled (JSON), written at the end"
+        "--log", type=Path, help="file for the log of what was sampled (JSON), written at the end"
     )
     parser.add_argument(
         "--load",
         type=Path,
-        help="load script; docs/simulation.md (default: something that wanders)",
+        help="load script; docs/simulation.md (default: an indenter that wanders over the skin)",
     )
     parser.add_argument(
-        "--instants", type=int, help="compute the load at so many instants only, and go round them"
+        "--instants",
+        type=int,
+        default=0,
+        help="compute the load at so many times only, and repeat them",
     )
     parser.add_argument(
-        "--faults", type=Path, help="faults to carry out: YAML, a list, see simulation/faults.py"
+        "--faults", type=Path, help="faults to carry out: YAML, a list, see docs/reliability.md"
     )
     parser.add_argument("--seed", type=int, default=0, help="of what is random in the faults")
     parser.add_argument(
         "--tcp", action="store_true", help="play links whose port is socket://host:port there"
     )
     options = parser.parse_args(arguments)
-    stop = Stop()
+    stop = StopSignal()
     try:
         faults = (
             parse_faults(read_yaml(options.faults), str(options.faults)) if options.faults else []
@@ -69,12 +71,12 @@ def main(arguments: list[str] | None = None) -> int:
             skin,
             load,
             options.ports,
-            options.noise,
-            options.drift,
-            options.instants,
-            faults,
-            options.seed,
-            options.tcp,
+            noise=options.noise,
+            drift=options.drift,
+            instants=options.instants,
+            faults=faults,
+            seed=options.seed,
+            tcp=options.tcp,
         )
     except CubeError as error:
         print(f"simulator: {error}", file=sys.stderr)
@@ -83,10 +85,12 @@ def main(arguments: list[str] | None = None) -> int:
         simulator.run(stop)
     finally:
         simulator.close()
-    if options.book:
-        unfinished = options.book.with_suffix(".part")
-        unfinished.write_text(json.dumps(simulator.book()))
-        unfinished.replace(options.book)
+    if options.log:
+        try:
+            simulator.log().write(options.log)
+        except CubeError as error:
+            print(f"simulator: {error}", file=sys.stderr)
+            return 1
     return 0
 
 

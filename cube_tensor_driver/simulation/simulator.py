@@ -1,272 +1,234 @@
-"""Plays all hubs of a skin in one process, on pseudo-terminals or TCP, under a load, and keeps the
-book of it."""
+"""Plays all hubs of a skin in one process, on pseudo-terminals or TCP, under a load and faults, and
+logs what they sampled."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import selectors
 import signal
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..config.skin import Skin
 from ..config.yaml import parse_yaml
 from ..core.errors import ConfigError
-from .cubes import SimulatedCubes
-from .faults import Fault, Injector
+from .cubes import HubCubes, hub_cubes
+from .faults import Fault
 from .hub import SimulatedHub
+from .injector import Injector, SimulatedLink
 from .line import Line, TcpLine
-from .load import Load
+from .load import Load, LoadMemory
+from .sample_log import ABSENT, LinkLog, SampleLog
 
-ABSENT = -1
 FIRST_UID = 0xC0BE_0000_0000_0001
+"""Uid of the skin's first cube, of those that have none in the skin file."""
+ABSENT_UID = FIRST_UID + 0xFFFF
+"""Uid of the first cube of a hub that the skin does not have; the others have lower ones."""
+FIRST_BOOT_US = 1_000_003
+"""Clock of the first hub at simulated time 0; the second one's shows twice that, and so on: clocks
+of real hubs start at different times, too."""
 LATE_US = 500_000
-"""A simulator that cannot keep up lets a hub miss samples rather than take them ever later."""
-KEPT_BYTES = 64 << 20
-CONTROL = ".faults"
+"""A hub that is so late leaves samples out: a simulator that cannot keep up would fall behind
+without limit."""
+SECOND_US = 1_000_000
+FAULT_PIPE = ".faults"
 """A pipe in the folder of the ports: each line written to it is a fault, as YAML."""
 
 
-@dataclasses.dataclass
-class Bench:
-    """A hub on its line. members: (hub cubes,) index in the skin of each cube of the hub, ABSENT
-    where it has none."""
+@dataclass
+class PlayedLink(SimulatedLink):
+    """A link with the cubes of the skin that its hub carries.
 
-    name: str
-    hub: SimulatedHub
-    line: Line
-    members: np.ndarray
-    cubes: SimulatedCubes
-    prepared: list[np.ndarray] = dataclasses.field(default_factory=list)
+    prepared: what the cubes measure at each instant, (hub cubes, pads) in mHz, where that is
+    computed beforehand.
+    """
+
+    carried: HubCubes
+    prepared: list[NDArray[np.uint32]] = field(default_factory=list)
 
 
 class Simulator:
-    """All hubs of a skin. noise and drift as in `SimulatedCubes`."""
+    """All hubs of a skin. start_time_ns: wall clock at simulated time 0."""
 
     def __init__(
         self,
         skin: Skin,
         load: Load,
         ports: Path,
+        *,
         noise: float = 0.0,
         drift: float = 0.0,
-        instants: int | None = None,
+        instants: int = 0,
         faults: Sequence[Fault] = (),
         seed: int = 0,
         tcp: bool = False,
     ) -> None:
-        """instants: compute the load at so many instants of its script beforehand and go round
-        them, one a sample.
+        """ports: folder in which the ports appear, each under the name of its link.
 
-        faults: to carry out; seed: of what is random in them; tcp: play links whose port is
-        socket://host:port there.
+        noise, drift: of the pads, as in `SimulatedCubes`
+        instants: compute the load at so many times of its script beforehand and repeat them, one
+            for each sample; 0: compute it as time goes on, with noise and drift
+        faults: to carry out; seed: of what is random in them
+        tcp: play links whose port is socket://host:port there
+
         ConfigError: cubes of one hub have different numbers of pads, the folder for the ports or a
-        TCP address cannot be used, or a fault is of what there is not.
+        TCP address cannot be used, or there is no such link, cube or pad as a fault names.
         """
-        self._load = load
         self._ports = ports
-        self._fields: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._load = LoadMemory(load)
         self._start_ns = time.monotonic_ns()
         self.start_time_ns = time.time_ns()
-        self.benches: list[Bench] = []
+        self._links: list[PlayedLink] = []
         try:
             ports.mkdir(parents=True, exist_ok=True)
-            for number, link in enumerate(skin.links):
-                members = hub_members(skin, link.name)
-                cubes = [skin.cubes[member] for member in members if member != ABSENT]
-                if not cubes:
-                    continue
-                widths = {cube.calibration.layout.n_pads for cube in cubes}
-                if len(widths) > 1:
-                    raise ConfigError(
-                        f"link {link.name}: its cubes have {sorted(widths)} pads; a hub carries one kind only"
-                    )
-                uids = [
-                    skin.cubes[m].uid or FIRST_UID + int(m)
-                    if m != ABSENT
-                    else FIRST_UID + 0xFFFF - i
-                    for i, m in enumerate(members)
-                ]
-                # Clocks that started at different times, as those of real hubs.
-                hub = SimulatedHub(
-                    link.hub_uid or number + 1, uids, widths.pop(), boot_us=1_000_003 * (number + 1)
-                )
-                simulated = SimulatedCubes(
-                    [cube.calibration for cube in cubes], noise, drift, seed=number
-                )
-                line = (
-                    TcpLine(link.port)
-                    if tcp and link.port.startswith("socket://")
-                    else Line(ports / link.name)
-                )
-                self.benches.append(Bench(link.name, hub, line, members, simulated))
-            control = ports / CONTROL
-            control.unlink(missing_ok=True)
-            os.mkfifo(control)
-            self._control = os.open(control, os.O_RDWR | os.O_NONBLOCK)
+            for carried in hub_cubes(skin, noise=noise, drift=drift):
+                self._links.append(_connect(skin, carried, ports, tcp))
+            self._fault_pipe = _open_pipe(ports / FAULT_PIPE)
         except OSError as error:
             raise ConfigError(
-                f"{ports}: {error.strerror}; name a folder that can be written for the simulated ports"
+                f"{ports}: {error.strerror}; name a folder that can be written for the simulated "
+                "ports"
             ) from None
-        self._injector = Injector(self.benches, faults, seed)
-        self._prepare(instants or 0)
-        for bench in self.benches:
-            bench.line.send(bench.hub.hello(), 0)
-
-    def _prepare(self, instants: int) -> None:
+        self._injector = Injector(self._links, faults, seed)
         for number in range(instants):
-            stress, gradient = self._load.at(number * self._load.period / instants)
-            for bench in self.benches:
-                bench.prepared.append(self._frequency(bench, stress, gradient, 0.0))
-                bench.hub.prepare(bench.prepared[-1])
+            stress, gradient = load.at(number * load.period / instants)
+            for link in self._links:
+                link.prepared.append(link.carried.frequency(stress, gradient, 0.0))
+                link.hub.prepare(link.prepared[-1])
+        for link in self._links:
+            link.line.send(link.hub.hello(), 0)
 
     def now_us(self) -> int:
         """Simulated time: µs since the start."""
         return (time.monotonic_ns() - self._start_ns) // 1000
 
-    def run(self, stop: Stop) -> None:
+    def run(self, stop: StopSignal) -> None:
         """Play the hubs until `stop` is set: HELLO and STATS at 1 Hz, samples when asked for."""
-        with selectors.SelectSelector() as selector:  # epoll counts in ms
+        # SelectSelector, because epoll counts time in ms.
+        with selectors.SelectSelector() as selector:
             watched: dict[str, int] = {}
             selector.register(stop.fd, selectors.EVENT_READ, None)
-            selector.register(self._control, selectors.EVENT_READ, self._take_orders)
-            second_us = 1_000_000
+            selector.register(self._fault_pipe, selectors.EVENT_READ, self._read_faults)
+            second_us = SECOND_US
             while not stop.requested:
-                for bench in self.benches:
-                    self._watch(selector, watched, bench)
+                for link in self._links:
+                    self._watch(selector, watched, link)
                 due = self._due_us(second_us)
                 for key, _ in selector.select(max(0.0, (due - self.now_us()) * 1e-6)):
                     if key.data is not None:
                         key.data()
                 now = self.now_us()
-                for bench in self.benches:
-                    if (
-                        bench.hub.started
-                        and not bench.prepared
-                        and now - bench.hub.next_us > LATE_US
-                    ):
-                        bench.hub.skip(now)
-                behind = True
-                while behind and not stop.requested:
-                    # One of each hub in turn: where this loop comes late no hub falls silent behind
-                    # the others.
-                    behind = False
-                    for bench in self.benches:
-                        if bench.hub.started and bench.hub.next_us <= now:
-                            # Faults fall between the samples where they belong, however late this
-                            # loop comes.
-                            self._injector.step(bench.hub.next_us)
-                            if bench.hub.started:
-                                self._sample(bench, now)
-                            behind |= bench.hub.started and bench.hub.next_us <= now
-                for bench in self.benches:
-                    bench.line.flush(now)
-                    if bench.hub.started and not bench.prepared:
-                        self._field_at(
-                            bench.hub.next_us
-                        )  # before it is due: a hub does not compute its load
+                self._skip_late(now)
+                self._take_samples(now, stop)
+                for link in self._links:
+                    link.line.flush(now)
+                    if link.hub.started and not link.prepared:
+                        # Computed before it is due: real hubs do not compute their load.
+                        self._load.at(link.hub.next_us)
                 self._injector.step(now)
                 if now >= second_us:
-                    second_us += 1_000_000
-                    for bench in self.benches:
-                        if bench.line.plugged:
-                            bench.line.send(bench.hub.hello() + bench.hub.stats(now), now)
+                    second_us += SECOND_US
+                    for link in self._links:
+                        if link.line.plugged:
+                            link.line.send(link.hub.hello() + link.hub.stats(now), now)
+
+    def log(self) -> SampleLog:
+        """What the hubs did so far."""
+        links = tuple(
+            LinkLog(
+                name=link.name,
+                cubes=tuple(link.carried.members.tolist()),
+                dropped=link.hub.dropped,
+                runs=tuple(link.hub.runs),
+            )
+            for link in self._links
+        )
+        return SampleLog(self.start_time_ns, links, tuple(self._injector.records))
+
+    def close(self) -> None:
+        """The ports vanish."""
+        for link in self._links:
+            link.line.unplug()
+        os.close(self._fault_pipe)
+        (self._ports / FAULT_PIPE).unlink(missing_ok=True)
+        # The folder stays when somebody else put something there.
+        with contextlib.suppress(OSError):
+            self._ports.rmdir()
 
     def _due_us(self, second_us: int) -> int:
         """When something is to be done next."""
         now = self.now_us()
         times: list[int | None] = [second_us, self._injector.due_us()]
-        times += [bench.hub.next_us for bench in self.benches if bench.hub.started]
-        times += [bench.line.due_us(now) for bench in self.benches]
+        times += [link.hub.next_us for link in self._links if link.hub.started]
+        times += [link.line.due_us(now) for link in self._links]
         return min(time for time in times if time is not None)
 
+    def _skip_late(self, now_us: int) -> None:
+        """Leave samples out where a hub is far behind; prepared ones cost too little for that."""
+        for link in self._links:
+            if link.hub.started and not link.prepared and now_us - link.hub.next_us > LATE_US:
+                link.hub.skip(now_us)
+
+    def _take_samples(self, now_us: int, stop: StopSignal) -> None:
+        """All samples that are due, one of each hub in turn: when this loop is late, no hub falls
+        silent behind the others."""
+        behind = True
+        while behind and not stop.requested:
+            behind = False
+            for link in self._links:
+                if link.hub.started and link.hub.next_us <= now_us:
+                    # Faults fall between the samples where they belong, however late this loop is.
+                    self._injector.step(link.hub.next_us)
+                    if link.hub.started:
+                        self._take_sample(link, now_us)
+                    behind |= link.hub.started and link.hub.next_us <= now_us
+
+    def _take_sample(self, link: PlayedLink, now_us: int) -> None:
+        time_us = link.hub.next_us
+        if link.prepared:
+            frequency = link.prepared[time_us // link.hub.period_us % len(link.prepared)]
+        else:
+            stress, gradient = self._load.at(time_us)
+            frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
+        frame = link.hub.sample(self._injector.measured(link, frequency, time_us))
+        if not link.line.send(self._injector.transmitted(link, frame), now_us):
+            link.hub.dropped += 1
+
     def _watch(
-        self, selector: selectors.BaseSelector, watched: dict[str, int], bench: Bench
+        self, selector: selectors.BaseSelector, watched: dict[str, int], link: PlayedLink
     ) -> None:
-        """Listen to the line as it is plugged now."""
-        fd = bench.line.fd
-        if watched.get(bench.name, -1) != fd:
-            if watched.get(bench.name, -1) >= 0:
-                selector.unregister(watched[bench.name])
-            if fd >= 0:
-                selector.register(fd, selectors.EVENT_READ, partial(self._answer, bench))
-            watched[bench.name] = fd
+        """Wait for bytes on the line as it is plugged now. watched: by link, what is registered."""
+        fd, before = link.line.fd, watched.get(link.name, -1)
+        if fd == before:
+            return
+        if before >= 0:
+            selector.unregister(before)
+        if fd >= 0:
+            selector.register(fd, selectors.EVENT_READ, partial(self._answer, link))
+        watched[link.name] = fd
 
-    def _answer(self, bench: Bench) -> None:
+    def _answer(self, link: PlayedLink) -> None:
         now = self.now_us()
-        bench.line.send(bench.hub.receive(bench.line.read(), now), now)
+        link.line.send(link.hub.receive(link.line.read(), now), now)
 
-    def _take_orders(self) -> None:
-        """Faults that somebody wrote into the control pipe."""
-        for line in os.read(self._control, 65536).decode(errors="replace").splitlines():
+    def _read_faults(self) -> None:
+        """Carry out the faults that somebody wrote into the pipe."""
+        for line in os.read(self._fault_pipe, 65536).decode(errors="replace").splitlines():
             try:
                 self._injector.add(Fault.parse(parse_yaml(line, "fault"), "fault"), self.now_us())
             except ConfigError as error:
                 print(f"simulator: {error}", file=sys.stderr, flush=True)
 
-    def _sample(self, bench: Bench, now_us: int) -> None:
-        hub = bench.hub
-        if bench.prepared:
-            frequency = bench.prepared[hub.next_us // hub.period_us % len(bench.prepared)]
-        else:
-            stress, gradient = self._field_at(hub.next_us)
-            frequency = self._frequency(bench, stress, gradient, hub.next_us * 1e-6)
-        frame = hub.sample(self._injector.values(bench, frequency, hub.next_us))
-        data = self._injector.frame(bench, frame)
-        if not bench.line.send(data, now_us):
-            hub.dropped += 1
 
-    def _field_at(self, time_us: int) -> tuple[np.ndarray, np.ndarray]:
-        """The field at a time, kept for the next time that the script comes by there."""
-        if self._load.script.period is not None:
-            time_us %= round(1e6 * self._load.script.period)
-        if time_us not in self._fields:
-            stress, gradient = self._load.at(time_us * 1e-6)
-            if (len(self._fields) + 1) * (stress.nbytes + gradient.nbytes) > KEPT_BYTES:
-                self._fields.clear()
-            self._fields[time_us] = stress, gradient
-        return self._fields[time_us]
-
-    def _frequency(
-        self, bench: Bench, stress: np.ndarray, gradient: np.ndarray, seconds: float
-    ) -> np.ndarray:
-        there = bench.members != ABSENT
-        frequency = np.zeros((len(there), bench.hub.n_pads), "<u4")
-        cubes = bench.members[there]
-        frequency[there] = bench.cubes.frequency(stress[cubes], gradient[cubes], seconds)
-        return frequency
-
-    def book(self) -> dict[str, object]:
-        """What was sampled: start_time_ns (wall clock at simulated time 0), per link runs, dropped,
-        members; faults."""
-        links = {
-            bench.name: {
-                "runs": [dataclasses.asdict(run) for run in bench.hub.runs],
-                "dropped": bench.hub.dropped,
-                "cubes": bench.members.tolist(),
-            }
-            for bench in self.benches
-        }
-        return {"start_time_ns": self.start_time_ns, "links": links, "faults": self._injector.book}
-
-    def close(self) -> None:
-        for bench in self.benches:
-            bench.line.unplug()
-        os.close(self._control)
-        (self._ports / CONTROL).unlink(missing_ok=True)
-        # Ours to remove when nobody else put anything there.
-        with contextlib.suppress(OSError):
-            self._ports.rmdir()
-
-
-class Stop:
+class StopSignal:
     """Set by SIGINT and SIGTERM; its fd wakes a selector."""
 
     def __init__(self) -> None:
@@ -281,27 +243,26 @@ class Stop:
         self.requested = True
 
 
-def hub_members(skin: Skin, link: str) -> np.ndarray:
-    """(hub cubes,) index in the skin of each cube that a simulated hub on this link carries, ABSENT
-    for none.
+def _connect(skin: Skin, carried: HubCubes, ports: Path, tcp: bool) -> PlayedLink:
+    """A link, its hub and its line."""
+    link = carried.link
+    number = skin.links.index(link) + 1
+    uids = []
+    for place, cube in enumerate(carried.members.tolist()):
+        if cube == ABSENT:
+            uids.append(ABSENT_UID - place)
+        else:
+            uids.append(skin.cubes[cube].uid or FIRST_UID + cube)
+    hub = SimulatedHub(
+        link.hub_uid or number, uids, carried.cubes.n_pads, boot_us=FIRST_BOOT_US * number
+    )
+    bridged = tcp and link.port.startswith("socket://")
+    line = TcpLine(link.port) if bridged else Line(ports / link.name)
+    return PlayedLink(link.name, hub, line, carried)
 
-    Cubes that are known by uid alone take the free places; without a link they sit on the first
-    one.
-    """
-    fixed = {
-        cube.index: number
-        for number, cube in enumerate(skin.cubes)
-        if cube.link == link and cube.index is not None
-    }
-    first = skin.links[0].name
-    loose = [
-        number
-        for number, cube in enumerate(skin.cubes)
-        if cube.index is None and (cube.link or first) == link
-    ]
-    size = max([len(fixed) + len(loose), *(index + 1 for index in fixed)], default=0)
-    members = np.full(size, ABSENT)
-    members[list(fixed)] = list(fixed.values())
-    free = np.flatnonzero(members == ABSENT)[: len(loose)]
-    members[free] = loose
-    return members
+
+def _open_pipe(path: Path) -> int:
+    """A new named pipe, open for reading; open for writing too, so that it never ends."""
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    return os.open(path, os.O_RDWR | os.O_NONBLOCK)

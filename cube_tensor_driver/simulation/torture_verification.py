@@ -1,46 +1,84 @@
-"""Judges a tortured skin: every row that came against what the hubs measure and the book of what
-was done to them.
+"""Checks every row of a tortured skin against what the hubs measured and the faults that were
+carried out.
 
-Simulated hubs go round a table of instants, one a sample; where in it a hub stands is found from
-the values themselves and later checked against the book. What differs from the table must be
-explained by a fault in the book.
+Simulated hubs repeat a table of instants, one for each sample. A sample's instant is found from its
+values, and checked later against the sample log. What differs from the table must be explained by a
+fault of the log.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..config.skin import Skin
-from ..core.rows import StressRows
-from .cubes import SimulatedCubes, true_components
-from .faults import PAD
+from ..core.rows import FrequencyRows, StressRows
+from .cubes import SimulatedCubes, skin_components
+from .faults import PAD_FAULTS
 from .load import Load, default_script
+from .sample_log import NEVER, FaultRecord, LinkLog, SampleLog
+from .verification import Arrivals, Comparison, compare, percentile
 
 TOLERANCE = 1e-3
 """Of a component's range: float32 leaves 1e-6, a wrong sample 1e-1."""
 SETTLE_S = 10.0
-"""After a restart or a jump of a hub's clock, until its stamps are judged."""
+"""After a restart or a jump of a hub's clock, until its stamps are checked."""
+BEFORE_S = 0.1
+"""How much earlier than its record a fault may show: stamps are not exact."""
 HOLD_S = 6.0
 """How long a pad that works again may still be left out: 2 s of rows, and its link may be cut for 2
 s meanwhile."""
-INDEX_KEPT = 40_000
-"""Samples remembered until their tensors come: 20 s of 4 hubs at 500 Hz, more than queues hold."""
-CLOCK = ("reset", "wrap", "unplug", "rename", "step", "drift")
-CUT = ("unplug", "rename")
-UNKNOWN = 3
-"""Kind of an odd tensor whose frequencies did not come."""
+INSTANTS_KEPT = 40_000
+"""Samples whose instants are remembered until their tensors come: 20 s of 4 hubs at 500 Hz, more
+than queues hold."""
+NEAR_ZERO = 1 << 20
+"""A hub that begins to count above this has been made to wrap: its first samples are not counted
+from 0."""
+CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "step", "drift")
+"""What makes the driver fit a hub's clock anew."""
+RECONNECT_FAULTS = ("unplug", "rename")
+NOT_FOUND = -1
+"""Instant of a sample that is like none of the table."""
+
+
+class What(IntEnum):
+    """What of a row is not as it would be without faults."""
+
+    FREQUENCY = 0
+    TENSOR = 1
+    STATUS = 2
+    TENSOR_ALONE = 3
+    """A tensor whose frequencies did not come."""
+
+
+DEVIATION = np.dtype([("cube", "i8"), ("pads", "i8"), ("stamp_ns", "i8"), ("what", "i8")])
+"""A row that differs; pads: bit p: pad p differs."""
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """How many rows no fault explains, and (cube, s after the start) of some of them."""
+
+    frequencies: int
+    tensors: int
+    statuses: int
+    examples: list[tuple[int, float]]
 
 
 class TortureVerification:
-    """Takes rows as they come; `close` compares with the book. All hubs carry the same number of
-    cubes, in order."""
+    """Collects rows as they come; `result` compares them with the log.
+
+    All hubs carry the same number of cubes, in the order of the skin.
+    rows, tensors: of frequencies and of stress that came
+    table: (instants, cubes, pads) Hz that sound pads measure
+    """
 
     def __init__(self, skin: Skin, instants: int) -> None:
-        n, hubs = len(skin.cubes), len(skin.links)
-        self._hubs, self._each = hubs, n // hubs
+        self._each = len(skin.cubes) // len(skin.links)
         load = Load(skin, default_script())
         cubes = SimulatedCubes([cube.calibration for cube in skin.cubes])
         table, truth = [], []
@@ -48,269 +86,246 @@ class TortureVerification:
             stress, gradient = load.at(number * load.period / instants)
             millihertz = cubes.frequency(stress, gradient, 0.0)
             table.append((millihertz * 1e-3).astype(np.float32))
-            truth.append(true_components(skin.cubes[0].calibration, stress, gradient))
-        self._table, self._truth = np.array(table), np.array(truth)
-        self._span = np.ptp(self._truth, axis=(0, 1))
-        self._offset = np.zeros(hubs, np.int64)
-        self._index: dict[
-            int, int
-        ] = {}  # of the last samples: hub << 32 | sequence -> index in the table
-        self._samples: list[
-            NDArray[np.int64]
-        ] = []  # (k, 4): hub, sequence, stamp, index in the table or -1
-        self._odd: list[
-            NDArray[np.int64]
-        ] = []  # (k, 4): cube, bits of the pads that differ, stamp, kind
-        self.rows = self.tensors = 0
+            truth.append(skin_components(skin, stress, gradient))
+        self.table, self._truth = np.array(table), np.array(truth)
+        self._range = np.ptp(self._truth, axis=(0, 1))
+        # Instant of a hub's sample 0, as far as it is known.
+        self._offset = np.zeros(len(skin.links), np.int64)
+        self._instant_of: dict[int, int] = {}  # by sample (see `_sample`), of the newest ones
+        self._arrivals = Arrivals(skin, one_per_hub=True)
+        self._instants: list[NDArray[np.int64]] = []  # of the rows that `_arrivals` keeps
+        self._deviations: list[NDArray[Any]] = []
+        self.tensors = 0
 
-    def frequencies(
-        self,
-        cube: NDArray[Any],
-        sequence: NDArray[Any],
-        stamp_ns: NDArray[Any],
-        frequency: NDArray[np.float32],
-    ) -> None:
-        """Rows of one frequencies message."""
-        self.rows += len(cube)
-        hub, number = cube.astype(int) // self._each, sequence.astype(np.int64)
-        index = (number + self._offset[hub]) % len(self._table)
-        same = self._table[index, cube] == frequency
-        first = np.flatnonzero(np.diff(hub << 32 | number, prepend=-1))
+    @property
+    def rows(self) -> int:
+        return self._arrivals.rows
+
+    def frequencies(self, rows: FrequencyRows) -> None:
+        """Rows of whole samples, in the order in which they arrived."""
+        cube, sample = rows.cube.astype(np.int64), self._sample(rows)
+        start = np.flatnonzero(np.diff(sample, prepend=-1))
+        end = np.append(start[1:], len(rows))
+        hub, sequence = cube // self._each, rows.sequence.astype(np.int64)
+        instant = (sequence + self._offset[hub]) % len(self.table)
+        same = self.table[instant, cube] == rows.frequency
         if not same.all():
-            share = np.add.reduceat(same.mean(axis=1), first) / np.diff(first, append=len(cube))
-            ends = np.append(first[1:], len(cube))
-            for start, end in np.stack([first, ends], axis=1)[share < 0.5].tolist():
-                part = slice(start, end)
-                index[part] = self._find(
-                    int(hub[start]), int(number[start]), cube[part], frequency[part]
-                )
-                same[part] = (index[part] >= 0)[:, None] & (
-                    self._table[index[part], cube[part]] == frequency[part]
-                )
+            matching = np.add.reduceat(same.mean(axis=1), start) / (end - start)
+            for number in np.flatnonzero(matching < 0.5).tolist():
+                part = slice(start[number], end[number])
+                found = self._find(rows.select(part))
+                instant[part] = found
+                same[part] = self.table[found, cube[part]] == rows.frequency[part]
+                same[part] &= found != NOT_FOUND
             bad = np.flatnonzero(~same.all(axis=1))
-            bits = (~same[bad]) @ (1 << np.arange(same.shape[1]))
-            self._odd.append(
-                np.stack([cube[bad], bits, stamp_ns[bad], np.zeros(len(bad), int)], axis=1)
-            )
-        keys = hub[first] << 32 | number[first]
-        for key, place in zip(keys.tolist(), index[first].tolist(), strict=True):
-            self._index.pop(
-                key, None
-            )  # a number given again counts as new, else it were forgotten with the old
-            self._index[key] = place
-        if len(self._index) > 2 * INDEX_KEPT:
-            self._index = dict(list(self._index.items())[-INDEX_KEPT:])
-        self._samples.append(
-            np.stack([hub[first], number[first], stamp_ns[first], index[first]], axis=1)
-        )
+            pads = (~same[bad]) @ (1 << np.arange(same.shape[1]))
+            self._deviate(rows.select(bad), pads, np.full(len(bad), What.FREQUENCY))
+        for key, found in zip(sample[start].tolist(), instant[start].tolist(), strict=True):
+            # A number that is given again goes to the end: the oldest are forgotten first.
+            self._instant_of.pop(key, None)
+            self._instant_of[key] = found
+        if len(self._instant_of) > 2 * INSTANTS_KEPT:
+            self._instant_of = dict(list(self._instant_of.items())[-INSTANTS_KEPT:])
+        self._arrivals.add(rows)
+        self._instants.append(instant[self._arrivals.keeps(rows.cube)])
 
-    def stress(
-        self, cube: NDArray[Any], sequence: NDArray[Any], stamp_ns: NDArray[Any], rows: StressRows
-    ) -> None:
-        """Rows of one stress message; give it some time after its frequencies."""
-        self.tensors += len(cube)
+    def stress(self, rows: StressRows) -> None:
+        """Rows of whole samples whose frequencies came before."""
+        self.tensors += len(rows)
         values = np.concatenate([rows.stress, rows.gradient], axis=1)
-        hub, number = cube.astype(int) // self._each, sequence.astype(np.int64)
-        key = hub << 32 | number
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        found = np.array([self._index.get(each, -1) for each in key[first].tolist()])
-        index = np.repeat(found, np.diff(first, append=len(key)))
-        want = self._truth[index, cube]
-        near = np.abs(values - want) <= TOLERANCE * self._span
-        right = (near | (rows.observed[:, None] >> np.arange(15) & 1 == 0)).all(axis=1) & (
-            index >= 0
-        )
-        # A healthy cube tells all its components and has no status.
+        sample = self._sample(rows)
+        start = np.flatnonzero(np.diff(sample, prepend=-1))
+        found = [self._instant_of.get(key, NOT_FOUND) for key in sample[start].tolist()]
+        instant = np.repeat(found, np.diff(start, append=len(rows)))
+        near = np.abs(values - self._truth[instant, rows.cube]) <= TOLERANCE * self._range
+        not_observed = rows.observed[:, None] >> np.arange(values.shape[1]) & 1 == 0
+        right = (near | not_observed).all(axis=1) & (instant != NOT_FOUND)
+        # A sound cube has a status of 0.
         bad = np.flatnonzero(~right | (rows.status != 0))
-        if len(bad):
-            kind = np.where(index[bad] < 0, UNKNOWN, 1 + right[bad])
-            self._odd.append(
-                np.stack([cube[bad], np.zeros(len(bad), int), stamp_ns[bad], kind], axis=1)
-            )
+        what = np.where(right[bad], What.STATUS, What.TENSOR)
+        what[instant[bad] == NOT_FOUND] = What.TENSOR_ALONE
+        self._deviate(rows.select(bad), np.zeros(len(bad), np.int64), what)
 
-    def _find(
-        self, hub: int, number: int, cube: NDArray[Any], frequency: NDArray[np.float32]
-    ) -> int:
-        """Where in the table a hub stands now, -1 if nowhere."""
-        known = (number + int(self._offset[hub])) % len(self._table)
-        if (self._table[known, cube] == frequency).mean() >= 0.5:  # found for a sample before
-            return known
-        share = (self._table[:, cube] == frequency).mean(axis=(1, 2))
-        best = int(share.argmax())
-        if share[best] < 0.5:
-            return -1
-        self._offset[hub] = best - number
-        return best
-
-    def close(
-        self, book: dict[str, Any], end_ns: int, counted: int, published: int
+    def result(
+        self, log: SampleLog, end_ns: int, *, counted: int, published: int
     ) -> dict[str, Any]:
-        """Figures of all samples taken before end_ns (wall clock).
+        """Figures of all samples taken before end_ns (wall clock); counts are in rows.
 
-        counted: rows the driver says it did not deliver; published: rows it says it did. Counts are
-        in rows (one cube, one sample). missed_by_judge: rows published that did not come here,
-        because whoever calls got no processor for
-        longer than queues last: of these nothing can be said. lost_with_power: rows a hub took last
-        before it lost its power or restarted, which nobody can count; all others must be delivered
-        or counted.
+        counted: rows the driver says it did not deliver
+        published: rows it says it published
+
+        missed_by_judge are rows published that did not come here, because this process got no
+        processor for longer than queues last: nothing can be said of them. lost_with_power are the
+        last rows that a hub took before it lost its power or restarted, which nobody can count. All
+        others must be delivered or counted.
         """
-        start_ns = book["start_time_ns"]
-        samples = np.concatenate(self._samples) if self._samples else np.empty((0, 4), np.int64)
-        odd = np.concatenate(self._odd) if self._odd else np.empty((0, 4), np.int64)
+        comparison = compare(log, self._arrivals, log.start_time_ns, end_ns, counted=counted)
+        last = self._lost_with_power(log, comparison, end_ns)
         missed = max(0, published - self.rows)
-        if missed:  # tensors of rows that did not come cannot be judged; else they are of rows that never were
-            odd = odd[odd[:, 3] != UNKNOWN]
-        faults = book["faults"]
-        sent = delivered = last = invented = misplaced = 0
-        errors: list[NDArray[np.float64]] = []
-        gaps: list[float] = []
-        for hub, (name, link) in enumerate(book["links"].items()):
-            mine = samples[samples[:, 0] == hub]
-            true_ns, boot = _true_times(mine, link["runs"], start_ns)
-            in_time = (true_ns >= 0) & (true_ns < end_ns)
-            invented += int(np.count_nonzero(true_ns < 0))
-            once = len(np.unique(true_ns[in_time]))
-            delivered += once
-            invented += int(np.count_nonzero(in_time)) - once
-            placed = mine[:, 3] >= 0
-            period_us = link["runs"][0]["period_us"]
-            misplaced += int(
-                np.count_nonzero(
-                    placed
-                    & (true_ns >= 0)
-                    & (((true_ns - start_ns) // 1000 // period_us) % len(self._table) != mine[:, 3])
-                )
-            )
-            taken, tail = _taken(link["runs"], start_ns, end_ns, true_ns[in_time], boot[in_time])
-            sent, last = sent + taken, last + tail
-            sane = in_time.copy()
-            for begin_us, end_us, where, fault in faults:
-                if where != name:
-                    continue
-                if fault["kind"] in CLOCK:
-                    since = (true_ns - start_ns) * 1e-9
-                    sane &= ~((since >= begin_us * 1e-6 - 0.1) & (since < end_us * 1e-6 + SETTLE_S))
-                after = true_ns[in_time & (true_ns >= start_ns + 1000 * end_us)]
-                if fault["kind"] in CUT and len(after):
-                    gaps.append(float(after.min() - start_ns) * 1e-9 - end_us * 1e-6)
-            sane &= true_ns - start_ns > SETTLE_S * 1e9 + (
-                true_ns[in_time].min(initial=end_ns) - start_ns
-            )
-            errors.append(np.abs(mine[sane, 2] - true_ns[sane]) * 1e-6)
-        unexplained = self._unexplained(odd, faults, start_ns)
-        error = np.concatenate(errors) if errors else np.empty(0)
-        left = sent * self._each - delivered * self._each - counted
+        missing = comparison.missing
+        invented = comparison.never_taken + comparison.repeated
+        misplaced = self._misplaced(log, comparison)
+        unexplained = self._unexplained(log, missed > 0)
+        gaps = self._reconnects(log, comparison)
+        errors = self._stamp_errors(log, comparison)
         return {
-            "samples_sent": sent * self._each,
-            "delivered": delivered * self._each,
+            "samples_sent": comparison.sent,
+            "delivered": comparison.received,
             "counted": counted,
             "missed_by_judge": missed,
-            "unaccounted": max(0, left - last * self._each - missed) + max(0, -left),
-            "lost_with_power": max(0, min(left, last * self._each)),
-            "wrong": unexplained[0] + (invented + misplaced) * self._each,
-            "wrong_tensors": unexplained[1],
-            "false_alarms": unexplained[2],
-            "unexplained": unexplained[3],
+            "unaccounted": max(0, missing - last - missed) + max(0, -missing),
+            "lost_with_power": max(0, min(missing, last)),
+            "wrong": unexplained.frequencies + invented + misplaced,
+            "wrong_tensors": unexplained.tensors,
+            "false_alarms": unexplained.statuses,
+            "unexplained": unexplained.examples,
             "tensors": self.tensors,
             "reconnects": len(gaps),
             "worst_reconnect_s": round(max(gaps, default=0.0), 3),
-            "stamp_error_p99_ms": round(float(np.percentile(error, 99)), 3) if len(error) else None,
-            "stamps_judged": len(error),
+            "stamp_error_p99_ms": percentile(errors, 99) if len(errors) else None,
+            "stamps_judged": len(errors),
         }
 
-    def _unexplained(
-        self, odd: NDArray[np.int64], faults: list[Any], start_ns: int
-    ) -> tuple[int, int, int, list[Any]]:
-        """How many odd rows no fault explains: of frequencies, of tensors, of status alone; and
-        cube and s of some."""
-        open_bits = odd[:, 1].copy()
-        explained = np.zeros(len(odd), bool)
-        seconds = (odd[:, 2] - start_ns) * 1e-9
-        for begin_us, end_us, where, fault in faults:
-            hub = int(where.removeprefix("hub"))
-            begin, end = begin_us * 1e-6 - 0.1, end_us * 1e-6 + HOLD_S
-            if fault["kind"] == "temperature":
-                # It lasts until the next one of its link, which may be back to 0.
-                later = [
-                    b * 1e-6
-                    for b, _, w, f in faults
-                    if w == where and f["kind"] == "temperature" and b > begin_us
-                ]
-                end = min(later, default=np.inf) + HOLD_S
+    def _sample(self, rows: FrequencyRows | StressRows) -> NDArray[np.int64]:
+        """(N,) hub and sequence number of each row in one number."""
+        hub = rows.cube.astype(np.int64) // self._each
+        return hub << 32 | rows.sequence.astype(np.int64)
+
+    def _find(self, rows: FrequencyRows) -> int:
+        """Which instant one sample is of."""
+        hub, sequence = int(rows.cube[0]) // self._each, int(rows.sequence[0])
+        known = (sequence + int(self._offset[hub])) % len(self.table)
+        if (self.table[known, rows.cube] == rows.frequency).mean() >= 0.5:
+            return known
+        matching = (self.table[:, rows.cube] == rows.frequency).mean(axis=(1, 2))
+        best = int(matching.argmax())
+        if matching[best] < 0.5:
+            return NOT_FOUND
+        self._offset[hub] = best - sequence
+        return best
+
+    def _deviate(
+        self, rows: FrequencyRows | StressRows, pads: NDArray[Any], what: NDArray[Any]
+    ) -> None:
+        deviations = np.empty(len(rows), DEVIATION)
+        columns = (rows.cube, pads, rows.stamp_ns, what)
+        for name, column in zip(DEVIATION.names or (), columns, strict=True):
+            deviations[name] = column
+        self._deviations.append(deviations)
+
+    def _of_link(self, link: LinkLog) -> NDArray[np.bool_]:
+        """(N,) which rows that arrived are of a link."""
+        return np.isin(self._arrivals.columns()[0], link.members)
+
+    def _lost_with_power(self, log: SampleLog, comparison: Comparison, end_ns: int) -> int:
+        """Rows taken before end_ns that nobody can know of: those after the last one delivered
+        before a restart and, where the count did not begin at 0, those before the first one."""
+        rows = 0
+        delivered = np.zeros(len(comparison.taken_ns), bool)
+        delivered[comparison.first] = True
+        for link in log.links:
+            mine = self._of_link(link) & delivered
+            last_boot = max(run.boot for run in link.runs)
+            for boot in sorted({run.boot for run in link.runs}):
+                runs = [run for run in link.runs if run.boot == boot]
+                times = np.concatenate([log.times_ns(run) for run in runs])
+                times = times[times < end_ns]
+                arrived = comparison.taken_ns[mine & (comparison.boot == boot)]
+                unknown = np.zeros(len(times), bool)
+                if boot != last_boot:
+                    unknown |= times > arrived.max(initial=0)
+                if len(arrived) and runs[0].first > NEAR_ZERO:
+                    unknown |= times < arrived.min()
+                rows += len(link.members) * int(np.count_nonzero(unknown))
+        return rows
+
+    def _misplaced(self, log: SampleLog, comparison: Comparison) -> int:
+        """Rows with the values of another instant than the log says."""
+        if not self._instants:
+            return 0
+        instant, taken_ns = np.concatenate(self._instants), comparison.taken_ns
+        rows = 0
+        for link in log.links:
+            time_us = (taken_ns - log.start_time_ns) // 1000
+            expected = time_us // link.runs[0].period_us % len(self.table)
+            wrong = (instant != expected) & (instant != NOT_FOUND) & (taken_ns != NEVER)
+            rows += len(link.members) * int(np.count_nonzero(wrong & self._of_link(link)))
+        return rows
+
+    def _reconnects(self, log: SampleLog, comparison: Comparison) -> list[float]:
+        """How long after each hub was plugged in again its first sample was taken that came, s."""
+        gaps = []
+        for link in log.links:
+            taken_ns = comparison.taken_ns[comparison.first]
+            taken_ns = taken_ns[self._of_link(link)[comparison.first]]
+            for record in log.faults:
+                back_ns = log.start_time_ns + 1000 * record.end_us
+                after = taken_ns[taken_ns >= back_ns]
+                if record.fault.link == link.name and record.fault.kind in RECONNECT_FAULTS:
+                    gaps += [1e-9 * float(after.min() - back_ns)] if len(after) else []
+        return gaps
+
+    def _stamp_errors(self, log: SampleLog, comparison: Comparison) -> NDArray[np.float64]:
+        """(K,) ms, of samples whose hub's clock has been undisturbed for a while."""
+        seconds = 1e-9 * (comparison.taken_ns[comparison.first] - log.start_time_ns)
+        settled = np.zeros(len(seconds), bool)
+        for link in log.links:
+            mine = self._of_link(link)[comparison.first]
+            begin = seconds[mine].min(initial=np.inf)
+            settled |= mine & (seconds > begin + SETTLE_S)
+            for record in log.faults:
+                if record.fault.link == link.name and record.fault.kind in CLOCK_FAULTS:
+                    settled &= ~(mine & _during(record, seconds, SETTLE_S))
+        return comparison.stamp_error_ms[settled]
+
+    def _unexplained(self, log: SampleLog, some_missed: bool) -> Unexplained:
+        """What no fault explains."""
+        deviations = np.concatenate([np.empty(0, DEVIATION), *self._deviations])
+        if some_missed:
+            # Then nobody can say whether these tensors are of rows that never were.
+            deviations = deviations[deviations["what"] != What.TENSOR_ALONE]
+        pads = deviations["pads"].copy()
+        explained = np.zeros(len(deviations), bool)
+        seconds = (deviations["stamp_ns"] - log.start_time_ns) * 1e-9
+        cubes = {link.name: link.members for link in log.links}
+        for record in log.faults:
+            fault = record.fault
+            if fault.kind == "temperature":
+                mine = np.isin(deviations["cube"], cubes[fault.link])
+                until = _next_temperature_s(record, log.faults) + HOLD_S
                 explained |= (
-                    (odd[:, 0] // self._each == hub) & (seconds >= begin) & (seconds <= end)
+                    mine & (seconds >= 1e-6 * record.start_us - BEFORE_S) & (seconds <= until)
                 )
-            elif fault["kind"] in PAD:
-                near = (
-                    (odd[:, 0] == hub * self._each + fault["cube"])
-                    & (seconds >= begin)
-                    & (seconds <= end)
-                )
-                open_bits[near] &= ~(1 << fault["pad"])
-                explained |= near & (open_bits == 0)
-        left = np.flatnonzero(~explained)
-        kinds = ((0,), (1, UNKNOWN), (2,))
-        frequency, tensor, status = (int(np.isin(odd[left, 3], kind).sum()) for kind in kinds)
-        some = [
-            (int(odd[row, 0]), round(float(seconds[row]), 3))
-            for row in left[:: max(1, len(left) // 8)][:8]
-        ]
-        return frequency, tensor, status, some
-
-
-def _true_times(
-    samples: NDArray[np.int64], runs: list[dict[str, int]], start_ns: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """When samples (k, 4) were taken, wall clock ns, and the hub's boot; -1 of what was never
-    taken.
-
-    A number may have been given again after a restart: the run nearest to the stamp is meant.
-    """
-    best = np.full(len(samples), -1, np.int64)
-    boot = np.full(len(samples), -1, np.int64)
-    for run in runs:
-        ahead = (samples[:, 1] - run["first"]) % 2**32
-        time_ns = start_ns + 1000 * (run["start_us"] + ahead * run["period_us"])
-        there = ahead <= run["last"] - run["first"]
-        nearer = there & (
-            (best < 0) | (np.abs(time_ns - samples[:, 2]) < np.abs(best - samples[:, 2]))
+            elif fault.kind in PAD_FAULTS:
+                mine = deviations["cube"] == cubes[fault.link][fault.cube]
+                near = mine & _during(record, seconds, HOLD_S)
+                pads[near] &= ~(1 << fault.pad)
+                explained |= near & (pads == 0)
+        left, times = deviations[~explained], seconds[~explained]
+        count = np.bincount(left["what"], minlength=len(What)).tolist()
+        some = slice(None, None, max(1, len(left) // 8))
+        examples = zip(left["cube"][some].tolist(), times[some].round(3).tolist(), strict=True)
+        return Unexplained(
+            frequencies=count[What.FREQUENCY],
+            tensors=count[What.TENSOR] + count[What.TENSOR_ALONE],
+            statuses=count[What.STATUS],
+            examples=list(examples)[:8],
         )
-        best[nearer], boot[nearer] = time_ns[nearer], run["boot"]
-    return best, boot
 
 
-def _taken(
-    runs: list[dict[str, int]],
-    start_ns: int,
-    end_ns: int,
-    true_ns: NDArray[np.int64],
-    boot: NDArray[np.int64],
-) -> tuple[int, int]:
-    """Samples taken before end_ns, and how many of them nobody can know of.
+def _during(record: FaultRecord, seconds: NDArray[Any], after_s: float) -> NDArray[np.bool_]:
+    """Whether times (s) are within a fault, or at most so long after it."""
+    begin, end = 1e-6 * record.start_us, 1e-6 * record.end_us
+    return (seconds >= begin - BEFORE_S) & (seconds <= end + after_s)
 
-    Those are the ones after the last delivered of each boot but the last, and, where the count did
-    not begin at 0, before the first.
-    """
-    taken = unknown = 0
-    last_boot = max(run["boot"] for run in runs)
-    for number in sorted({run["boot"] for run in runs}):
-        parts = [run for run in runs if run["boot"] == number]
-        times = np.concatenate(
-            [
-                start_ns
-                + 1000
-                * (run["start_us"] + np.arange(run["last"] - run["first"] + 1) * run["period_us"])
-                for run in parts
-            ]
-        )
-        times = times[times < end_ns]
-        taken += len(times)
-        mine = true_ns[boot == number]
-        if not len(mine):
-            unknown += len(times) if number != last_boot else 0
-            continue
-        if number != last_boot:
-            unknown += int(np.count_nonzero(times > mine.max()))
-        if parts[0]["first"] > 2**20:
-            unknown += int(np.count_nonzero(times < mine.min()))
-    return taken, unknown
+
+def _next_temperature_s(record: FaultRecord, records: tuple[FaultRecord, ...]) -> float:
+    """When the next temperature of the link came, which may be back to 0; inf if none did."""
+    later = [
+        1e-6 * other.start_us
+        for other in records
+        if other.fault.kind == "temperature"
+        and other.fault.link == record.fault.link
+        and other.start_us > record.start_us
+    ]
+    return min(later, default=np.inf)

@@ -1,29 +1,26 @@
-"""./cube bench: what the core and the whole chain cost, against bare floors measured in the same
-run."""
+"""`./cube bench`: what reconstruction and the whole chain cost, beside a bare floor measured in the
+same run."""
 
 from __future__ import annotations
 
 import gc
-import json
 import math
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
-import rclpy
-from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 from rich.progress import Progress
 
 from cube_tensor_driver.msg import SkinStress
 
+from ..bags.message_codec import stress_codec
 from ..config.grid import grid
-from ..config.output_files import write_json
 from ..config.skin import read_skin
 from ..config.yaml import write_yaml
 from ..core.calibration import illustrative
@@ -35,16 +32,40 @@ from ..plot.scale import draw_scale
 from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
-from ..ros.node import make_executor, queue
-from ..simulation.arrival_count import Tally
+from ..ros.node import queue
+from ..simulation.verification import Arrivals, compare, percentile
+from .running import Observer, Usage, end_simulator, report, ros
 
-CALIBRATION, LAYOUT, PITCH, CUBES_PER_HUB, INSTANTS = "planar", "planar", 0.012, 80, 16
+LAYOUT, PITCH, CUBES_PER_HUB = "planar", 0.012, 80
+INSTANTS = 16
+"""Instants of the load that the simulator repeats: it must cost little here."""
 ROUNDS = 400
 FIRST_S, SETTLE_S, DRAIN_S, ECHO_S = 30.0, 3.0, 1.0, 15.0
-SAMPLE_S, LONG_S, BLOCKS = 0.5, 60.0, 8
+"""s: until the first tensor at most; until it is measured; for what is still on its way; of the
+floor at most."""
+SAMPLE_S = 0.5
+"""How often memory is looked at."""
+LONG_S, BLOCKS = 60.0, 8
+"""From what duration growth of memory is given, and of how many mean values."""
 
 
-def bench_pipeline(cubes: int, json_path: Path | None) -> int:
+@dataclass(frozen=True)
+class Measurement:
+    """What processes used from start_ns to end_ns of the wall clock.
+
+    cpu_percent: of one core, by process
+    memory_mb: twice a second, by process
+    first_tensor_s: from the start of the processes to the first message of stress
+    """
+
+    start_ns: int
+    end_ns: int
+    cpu_percent: dict[str, float]
+    memory_mb: dict[str, list[float]]
+    first_tensor_s: float
+
+
+def bench_pipeline(*, cubes: int, json_path: Path | None = None) -> int:
     """Time the pipeline and the same law and matrix product in bare numpy, in turn."""
     calibration = illustrative(LAYOUT)
     rng = np.random.default_rng(0)
@@ -75,7 +96,7 @@ def bench_pipeline(cubes: int, json_path: Path | None) -> int:
             "floor_us": floor_us,
             "ratio": ours_us / floor_us,
         }
-    _report(result, json_path)
+    report(result, json_path)
     return 0
 
 
@@ -90,50 +111,59 @@ def _interleaved(first: Callable[[], None], second: Callable[[], None]) -> tuple
     return statistics.median(times[0]), statistics.median(times[1])
 
 
-def bench_echo(cubes: int, rate: float, duration: float, json_path: Path | None) -> int:
-    """The bare floor alone: source → echo → receive."""
-    with _ros(), _progress() as progress:
+def bench_echo(*, cubes: int, rate: float, duration: float, json_path: Path | None = None) -> int:
+    """Measure the bare floor alone: a source of messages, an echo and a receiver."""
+    with ros(), _progress() as progress:
         result = _echo(cubes, rate, duration, progress)
-    _report({"cubes": cubes, "rate_hz": rate, "duration_s": duration, **result}, json_path)
+    report({"cubes": cubes, "rate_hz": rate, "duration_s": duration, **result}, json_path)
     return 0
 
 
 def bench_skin(
+    *,
     cubes: int,
     rate: float,
     duration: float,
-    publish_period: float,
-    composed: bool,
-    json_path: Path | None,
+    publish_period: float = 0.0,
+    composed: bool = False,
+    json_path: Path | None = None,
 ) -> int:
-    """The whole chain, the floor before and after it in the same run."""
-    with _ros(), _progress() as progress:
-        result = _skin_and_echo(cubes, rate, duration, progress, publish_period, composed)
-    _report(result, json_path)
+    """Measure the whole chain, and the floor before and after it.
+
+    rate: samples per second; duration: s of measurement
+    publish_period: s that one message covers, 0: one message for each scan
+    composed: driver and reconstruction in one process
+    """
+    with ros(), _progress() as progress:
+        result = _skin_and_echo(
+            cubes, rate, duration, progress, publish_period=publish_period, composed=composed
+        )
+    report(result, json_path)
     return 0
 
 
 def bench_scale(
-    counts: list[int], rate: float, duration: float, json_path: Path | None, figure: Path
+    *,
+    counts: list[int],
+    rate: float,
+    duration: float,
+    figure: Path,
+    json_path: Path | None = None,
 ) -> int:
-    """CPU and latency per frame for growing skins, as table and picture."""
-    with _ros(), _progress() as progress:
+    """CPU and latency for each of these numbers of cubes, as figures and as a picture."""
+    with ros(), _progress() as progress:
         rows = [_skin_and_echo(cubes, rate, duration, progress) for cubes in counts]
-    _report({"rate_hz": rate, "duration_s": duration, "skins": rows}, json_path)
+    report({"rate_hz": rate, "duration_s": duration, "skins": rows}, json_path)
     save(draw_scale(rows), figure)
     return 0
 
 
 def _skin_and_echo(
-    cubes: int,
-    rate: float,
-    duration: float,
-    progress: Progress,
-    publish_period: float = 0.0,
-    composed: bool = False,
+    cubes: int, rate: float, duration: float, progress: Progress, **chain: Any
 ) -> dict[str, Any]:
+    """chain: publish_period and composed, as `bench_skin`."""
     before = _echo(cubes, rate, min(duration / 2, ECHO_S), progress)
-    skin = _skin(cubes, rate, duration, progress, publish_period, composed)
+    skin = _skin(cubes, rate, duration, progress, **chain)
     after = _echo(cubes, rate, min(duration / 2, ECHO_S), progress)
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     total = sum(
@@ -154,48 +184,42 @@ def _skin(
     rate: float,
     duration: float,
     progress: Progress,
-    publish_period: float,
-    composed: bool,
+    *,
+    publish_period: float = 0.0,
+    composed: bool = False,
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
-        path = folder / "skin.yaml"
-        hubs = math.ceil(cubes / CUBES_PER_HUB)
-        write_yaml(
-            path,
-            grid(
-                nx=cubes,
-                ny=1,
-                pitch=PITCH,
-                links=hubs,
-                calibration=CALIBRATION,
-                layout=LAYOUT,
-                rate=rate,
-            ),
-        )
-        book = folder / "book.json"
+        path, log = folder / "skin.yaml", folder / "log.json"
+        links = math.ceil(cubes / CUBES_PER_HUB)
+        write_yaml(path, grid(nx=cubes, ny=1, pitch=PITCH, links=links, rate=rate))
+        hubs = SimulatedHubs(folder / "ports", sample_log=log, instants=INSTANTS)
         processes = skin_processes(
-            path,
-            publish_period=publish_period,
-            composed=composed,
-            simulated=SimulatedHubs(folder / "ports", sample_log=book, instants=INSTANTS),
+            path, publish_period=publish_period, composed=composed, simulated=hubs
         )
-        tally = Tally(read_skin(path))
+        arrivals = Arrivals(read_skin(path), one_per_hub=True)
+
+        def receive(data: bytes) -> None:
+            arrivals.add(stress_codec.decode(data).rows, time.time_ns())
+
         with Children(folder) as children:
-            begun = time.monotonic()
-            cpu, memory, span = _measure(
-                processes, children, tally, rate, duration, progress, f"skin of {cubes} cubes"
+            measured = _measure(
+                processes, children, receive, rate, duration, progress, f"skin of {cubes} cubes"
             )
-            started = span[2] - begun
-            children.end(["simulator"])
-            result = tally.result(json.loads(book.read_text()), span[0], span[1])
-        names = [process.executable for process in processes]
-        return {
-            **result,
-            **{f"cpu_{executable}_percent": round(cpu[executable], 1) for executable in names},
-            **_memory(memory),
-            "first_tensor_s": round(started, 2),
-        }
+            sample_log = end_simulator(children, log)
+    comparison = compare(sample_log, arrivals, measured.start_ns, measured.end_ns)
+    cpu = measured.cpu_percent
+    return {
+        "samples_sent": comparison.sent,
+        "tensors_received": comparison.received,
+        "lost": comparison.missing,
+        "skipped": sample_log.dropped,
+        "latency_p50_ms": percentile(comparison.latency_ms, 50),
+        "latency_p99_ms": percentile(comparison.latency_ms, 99),
+        **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
+        **_memory(measured.memory_mb),
+        "first_tensor_s": round(measured.first_tensor_s, 2),
+    }
 
 
 def _echo(cubes: int, rate: float, duration: float, progress: Progress) -> dict[str, float]:
@@ -204,90 +228,72 @@ def _echo(cubes: int, rate: float, duration: float, progress: Progress) -> dict[
         Process(role, "cube_tensor_driver.ros.echo", parameters=parameters, arguments=(role,))
         for role in ("echo", "source")
     ]
-
-    class Count:
-        rows = 0
-
-        def take(self, data: bytes) -> None:
-            self.rows += 1
-
     with (
         tempfile.TemporaryDirectory(prefix="cube_bench_") as name,
         Children(Path(name)) as children,
     ):
-        count = Count()
-        cpu, _, _ = _measure(
-            processes, children, count, rate, duration, progress, f"echo of {cubes} cubes"
-        )
-    return {"echo_cpu_percent": round(cpu["echo"] + cpu["source"], 1)}
+        what = f"echo of {cubes} cubes"
+        measured = _measure(processes, children, lambda data: None, rate, duration, progress, what)
+    return {"echo_cpu_percent": round(sum(measured.cpu_percent.values()), 1)}
 
 
 def _measure(
     processes: list[Process],
     children: Children,
-    tally: Any,
+    receive: Callable[[bytes], None],
     rate: float,
     duration: float,
     progress: Progress,
     what: str,
-) -> tuple[dict[str, float], dict[str, list[float]], tuple[int, int, float]]:
-    """Start processes, wait for the first tensors, let them settle, measure for `duration`.
+) -> Measurement:
+    """Start processes, wait for the first tensors, let them settle, measure for `duration` s.
 
-    Returns CPU in percent and memory in MB, twice a second, per process, and (start ns, end ns,
-    monotonic time of the first tensor).
+    receive: is given each message of stress, serialised: a receiver must not cost what is measured.
+    what: for the progress bar. CubeError: no tensor came.
     """
-    # Nothing of ours may hold up what we measure.
+    # Garbage collection must not hold up the receiver.
     gc.collect()
     gc.freeze()
+    begun = time.monotonic()
     for process in processes:
         children.start(process)
-    node = rclpy.create_node("bench")
-    executor = make_executor()
-    node.create_subscription(SkinStress, "stress", tally.take, queue(rate), raw=True)
-    executor.add_node(node)
+    messages = 0
+
+    def on_stress(data: bytes) -> None:
+        nonlocal messages
+        messages += 1
+        receive(data)
+
+    names = [process.executable for process in processes]
     task = progress.add_task(what, total=duration)
-
-    def spin(seconds: float, done: Callable[[], bool] = lambda: False) -> None:
-        until = time.monotonic() + seconds
-        while not done() and (left := until - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=min(left, 0.2))
-
-    try:
-        spin(FIRST_S, lambda: tally.rows > 0)
-        children.check()
-        if not tally.rows:
-            logs = "\n".join(children.log(process.executable)[-800:] for process in processes)
+    with Observer("bench", children) as observer:
+        observer.listen(SkinStress, "stress", on_stress, queue(rate))
+        observer.spin(FIRST_S, lambda: messages > 0)
+        if not messages:
+            logs = "\n".join(children.log(name)[-800:] for name in names)
             raise CubeError(f"{what}: no tensor after {FIRST_S:g} s\n{logs}")
-        first = time.monotonic()
-        spin(SETTLE_S)
-        watched = {p.executable: psutil.Process(children.pid(p.executable)) for p in processes}
-        cpu = {name: _cpu(process) for name, process in watched.items()}
-        memory: dict[str, list[float]] = {name: [] for name in watched}
+        first_tensor_s = time.monotonic() - begun
+        observer.spin(SETTLE_S)
+        usage = Usage(children, names)
+        memory: dict[str, list[float]] = {name: [] for name in names}
         start_ns, start = time.time_ns(), time.monotonic()
-        while time.monotonic() - start < duration:
-            spin(min(SAMPLE_S, duration - (time.monotonic() - start)))
+        while (left := duration - (time.monotonic() - start)) > 0:
+            observer.spin(min(SAMPLE_S, left))
             progress.update(task, completed=time.monotonic() - start)
-            for name, one in watched.items():
-                memory[name].append(one.memory_info().rss / 2**20)
-        children.check()
-        end_ns, seconds = time.time_ns(), time.monotonic() - start
-        used = {
-            name: 100 * (_cpu(process) - cpu[name]) / seconds for name, process in watched.items()
-        }
-        spin(DRAIN_S)
-    finally:
-        executor.remove_node(node)
-        node.destroy_node()
-        progress.remove_task(task)
-    return used, memory, (start_ns, end_ns, first)
+            for name, value in usage.memory_mb().items():
+                memory[name].append(value)
+        end_ns, cpu = time.time_ns(), usage.cpu_percent()
+        observer.spin(DRAIN_S)
+    progress.remove_task(task)
+    return Measurement(start_ns, end_ns, cpu, memory, first_tensor_s)
 
 
 def _memory(memory: dict[str, list[float]]) -> dict[str, float]:
-    """Most MB of any process; over a minute or more how fast the fastest grows after the first
-    fifth, and the error.
+    """Most MB of any process but the simulator; over a minute or more also how fast the fastest
+    grows after the first fifth, with the standard error.
 
-    A line through the means of blocks: allocators grow in steps, so neighbours in time are not
-    independent.
+    It is a line through the means of blocks: allocators grow in steps, so neighbours in time are
+    not independent.
     """
     nodes = [np.array(values) for name, values in memory.items() if name != "simulator"]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
@@ -303,27 +309,6 @@ def _memory(memory: dict[str, list[float]]) -> dict[str, float]:
     return result
 
 
-def _cpu(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
-
-
 def _progress() -> Progress:
-    """Drawn once a second: drawing keeps whoever measures from receiving."""
+    """Drawn once a second: drawing keeps the receiver from receiving."""
     return Progress(console=Console(stderr=True), refresh_per_second=1)
-
-
-class _ros:
-    """rclpy for the length of a block."""
-
-    def __enter__(self) -> None:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-
-    def __exit__(self, *_: object) -> None:
-        rclpy.try_shutdown()
-
-
-def _report(result: dict[str, Any], path: Path | None) -> None:
-    print(json.dumps(result, indent=2))
-    if path is not None:
-        write_json(path, result)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from ..config.output_files import write_json
 from ..device.decoder import Decoder
 from ..device.protocol import Sample, encode
+from .running import report
 
 BYTES = 500_000
 READ = 4096
@@ -66,7 +65,7 @@ NOISE: dict[str, Callable[[int], bytes]] = {
 """Bytes that are no frames, or few, each made for a size in bytes."""
 
 
-def bench_decode(json_path: Path | None) -> int:
+def bench_decode(*, json_path: Path | None = None) -> int:
     """Time clean frames and each noise in turn; the best of some rounds, in ns per byte.
 
     Other processes only ever add to a time, so the best is nearest to the work itself.
@@ -83,9 +82,7 @@ def bench_decode(json_path: Path | None) -> int:
             "clean_ns": round(clean_ns, 2),
             "ratio": round(noise_ns / clean_ns, 2),
         }
-    print(json.dumps(result, indent=2))
-    if json_path is not None:
-        write_json(json_path, result)
+    report(result, json_path)
     return 0
 
 

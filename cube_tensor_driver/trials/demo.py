@@ -1,5 +1,5 @@
-"""./cube demo: simulated hubs, driver and reconstruction in real processes, watched over DDS,
-judged against truth."""
+"""`./cube demo`: simulated hubs, driver and reconstruction in processes of their own, watched over
+DDS. What arrives is compared with what was sent, and tensors with the load."""
 
 from __future__ import annotations
 
@@ -8,17 +8,10 @@ import math
 import os
 import signal
 import tempfile
-import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import psutil
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.signals import SignalHandlerOptions
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
@@ -34,57 +27,111 @@ from ..plot.skin_force import draw_forces
 from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
-from ..ros.node import make_executor, queue
+from ..ros.node import queue
 from ..simulation.load import Load, default_script
-from ..simulation.verification import Judge
+from ..simulation.load_verification import LoadVerification
 from ..terminal.live_table import LiveTable
+from .running import Interrupted, Observer, Usage, end_simulator, interruption, ros
 
 FIRST_TENSORS_S = 20.0
 LAST_TENSORS_S = 2.0
-CALIBRATION, LAYOUT, PITCH, RATE, CUBES_PER_HUB = "planar", "planar", 0.012, 100.0, 8
+MOST_CUBES = 4096
+PITCH, RATE, CUBES_PER_HUB = 0.012, 100.0, 8
+NODES = ("driver", "reconstruction")
 
 
-@dataclass(frozen=True)
-class Options:
-    """As on the command line; None: not given. duration in s, None: until Ctrl-C."""
+def run_demo(
+    *,
+    config: Path | None = None,
+    cubes: int | None = None,
+    load: Path | None = None,
+    rate: float | None = None,
+    duration: float | None = None,
+    headless: bool = False,
+    view: bool = False,
+    json_path: Path | None = None,
+    figure: Path | None = None,
+) -> int:
+    """Run a simulated skin and show it; returns the exit code.
 
-    config: Path | None
-    cubes: int | None
-    rate: float | None
-    duration: float | None
-    headless: bool
-    json: Path | None
-    view: bool = False
-    load: Path | None = None
-    figure: Path | None = None
+    config: skin file; None: the shipped one, or a grid of so many `cubes`
+    load: load script; None: the shipped one
+    rate: samples per second; None: the skin's, 100 where it has none
+    duration: s to measure, after which figures are given; None: until Ctrl-C, without figures
+    headless: without the live table
+    view: show it in the browser too
+    json_path: file for the figures, which are printed otherwise
+    figure: picture of the reconstructed force and centre of pressure beside the script's
+
+    CubeError: something does not start, or another skin publishes here.
+    """
+    interrupted = interruption(signal.SIGHUP)
+    try:
+        with ros(), tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
+            folder = Path(name)
+            path = config.resolve() if config else _skin_file(folder, cubes, rate or RATE)
+            skin = read_skin(path)
+            rate = rate or skin.rate or RATE
+            applied = Load(skin, read_script(load) if load else default_script())
+            log = folder / "log.json"
+            hubs = SimulatedHubs(folder / "ports", load=load, sample_log=log)
+            with LiveTable(skin, show=not headless) as table, Children(folder) as children:
+                for process in skin_processes(path, rate=rate, simulated=hubs):
+                    children.start(process)
+                if view:
+                    children.start(
+                        Process("view", "cube_tensor_driver.cli", False, arguments=("view",))
+                    )
+                with Observer(
+                    "demo", children, interrupted=interrupted, on_step=table.refresh
+                ) as observer:
+                    verification = LoadVerification(skin, applied) if duration else None
+                    demo = _Demo(skin, rate, children, table, observer, verification)
+                    demo.wait_for_tensors()
+                    if view:
+                        demo.note_address()
+                    if duration is None or verification is None:
+                        observer.spin(math.inf)
+                        return 0
+                    figures = demo.measure(duration, log)
+            result = {
+                "cubes": len(skin.cubes),
+                "rate_hz": rate,
+                "duration_s": duration,
+                **figures,
+            }
+            if figure is not None:
+                forces = verification.forces()
+                result |= forces.figures()
+                picture = draw_forces(
+                    seconds=forces.seconds,
+                    force=forces.force,
+                    measured_force=forces.measured_force,
+                    centre=forces.centre,
+                    measured_centre=forces.measured_centre,
+                    cubes=applied.poses.position,
+                )
+                save(picture, figure)
+    except Interrupted:
+        # Without a duration Ctrl-C is how it ends.
+        return 0 if duration is None else 130
+    if json_path is None:
+        print(json.dumps(result, indent=2))
+    else:
+        write_json(json_path, result)
+    return 0
 
 
-class Interrupted(CubeError):
-    """Ctrl-C, or asked to end."""
-
-
-def demo_skin(options: Options, folder: Path) -> Path:
-    """The skin file to run: the given one, the shipped one, or a grid of as many cubes as asked
-    for."""
-    if options.config is not None:
-        return options.config.resolve()
-    if options.cubes is None:
+def _skin_file(folder: Path, cubes: int | None, rate: float) -> Path:
+    """The shipped skin file, or that of a grid of so many cubes."""
+    if cubes is None:
         return package_data() / "config" / "skin_demo.yaml"
-    if not 1 <= options.cubes <= 4096:
-        raise ConfigError(f"--cubes is {options.cubes}, allowed: 1 to 4096")
-    nx = math.ceil(math.sqrt(options.cubes))
-    skin = grid(
-        "skin",
-        nx=nx,
-        ny=math.ceil(options.cubes / nx),
-        pitch=PITCH,
-        links=math.ceil(options.cubes / CUBES_PER_HUB),
-        calibration=CALIBRATION,
-        layout=LAYOUT,
-        rate=options.rate or RATE,
-        port="/dev/ttyACM{}",
-    )
-    skin["cubes"] = skin["cubes"][: options.cubes]
+    if not 1 <= cubes <= MOST_CUBES:
+        raise ConfigError(f"--cubes is {cubes}, allowed: 1 to {MOST_CUBES}")
+    nx = math.ceil(math.sqrt(cubes))
+    ny, links = math.ceil(cubes / nx), math.ceil(cubes / CUBES_PER_HUB)
+    skin = grid(nx=nx, ny=ny, pitch=PITCH, links=links, rate=rate)
+    skin["cubes"] = skin["cubes"][:cubes]
     used = {cube["link"] for cube in skin["cubes"]}
     skin["links"] = [link for link in skin["links"] if link["name"] in used]
     path = folder / "skin.yaml"
@@ -92,196 +139,106 @@ def demo_skin(options: Options, folder: Path) -> Path:
     return path
 
 
-def run_demo(options: Options) -> int:
-    """Run until the duration is over or Ctrl-C; returns the exit code."""
-    interrupted = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: interrupted.set())
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
-            folder = Path(name)
-            path = demo_skin(options, folder)
-            return _run(options, path, read_skin(path), folder, interrupted)
-    except Interrupted:
-        # Without a duration Ctrl-C is how it ends.
-        return 0 if options.duration is None else 130
-    finally:
-        rclpy.try_shutdown()
+class _Demo:
+    """What is received of the running skin. verification: None where nothing is measured."""
 
-
-def _run(
-    options: Options, path: Path, skin: Skin, folder: Path, interrupted: threading.Event
-) -> int:
-    rate = options.rate or skin.rate or RATE
-    book = folder / "book.json"
-    script = read_script(options.load) if options.load else default_script()
-    load = Load(skin, script)
-    judge = Judge(skin, load)
-    with LiveTable(skin, show=not options.headless) as table, Children(folder) as children:
-        for process in skin_processes(
-            path,
-            rate=rate,
-            simulated=SimulatedHubs(folder / "ports", load=options.load, sample_log=book),
-        ):
-            children.start(process)
-        if options.view:
-            children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-        node = rclpy.create_node("demo", automatically_declare_parameters_from_overrides=False)
-
-        strangers = threading.Event()
-
-        def alone() -> None:
-            """CubeError: another skin publishes here."""
-            if strangers.is_set() or node.count_publishers("stress") > 1:
-                raise CubeError(
-                    f"another skin publishes stress in DDS domain {os.environ.get('ROS_DOMAIN_ID', 0)}: end it, or set "
-                    "another ROS_DOMAIN_ID for this one"
-                )
-
-        def on_stress(data: bytes) -> None:
-            received_ns = time.time_ns()
-            try:
-                rows = stress_codec.decode(data).rows
-            except MessageError as error:
-                judge.contradictions += 1
-                node.get_logger().error(str(error))
-                return
-            if int(rows.cube.max(initial=0)) >= len(skin.cubes):
-                strangers.set()
-                return
-            if options.duration is not None:
-                judge.stress(rows.cube, rows.sequence, rows.stamp_ns, rows, received_ns)
-            table.update(rows)
-
-        def on_frequencies(data: bytes) -> None:
-            try:
-                rows = frequency_codec.decode(data).rows
-            except MessageError as error:
-                judge.contradictions += 1
-                node.get_logger().error(str(error))
-                return
-            judge.frequencies(rows.cube, rows.sequence)
-
-        crc: dict[str, int] = {}
-
-        def on_diagnostics(message: DiagnosticArray) -> None:
-            for status in message.status:
-                counted = [int(pair.value) for pair in status.values if pair.key == "crc"]
-                if counted:
-                    crc[status.name] = counted[0]
-
-        node.create_subscription(SkinStress, "stress", on_stress, queue(rate), raw=True)
-        if options.duration is not None:
-            node.create_subscription(
-                SkinFrequencies, "frequencies", on_frequencies, queue(rate), raw=True
+    def __init__(
+        self,
+        skin: Skin,
+        rate: float,
+        children: Children,
+        table: LiveTable,
+        observer: Observer,
+        verification: LoadVerification | None,
+    ) -> None:
+        self._cubes = len(skin.cubes)
+        self._children, self._table, self._observer = children, table, observer
+        self._verification = verification
+        self._another_skin = False
+        self._crc_errors: dict[str, int] = {}
+        observer.listen(SkinStress, "stress", self._on_stress, queue(rate))
+        if verification is not None:
+            observer.listen(SkinFrequencies, "frequencies", self._on_frequencies, queue(rate))
+            observer.node.create_subscription(
+                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
             )
-            node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
-        executor = make_executor()
-        executor.add_node(node)
-        spin = _spinner(executor, children, table, interrupted)
+
+    def wait_for_tensors(self) -> None:
+        """Until every cube has a tensor. What is measured begins when every topic has reached us:
+        discovery takes up to seconds. CubeError: they did not come."""
+
+        def ready() -> bool:
+            if self._another_skin:
+                return True
+            if self._verification is None:
+                return self._table.seen_all
+            return self._table.seen_all and self._verification.sampled and bool(self._crc_errors)
+
+        self._observer.spin(FIRST_TENSORS_S, ready)
+        self._check_alone()
+        if not self._table.seen_all:
+            logs = "\n".join(self._children.log(name)[-1500:] for name in NODES)
+            raise CubeError(
+                f"after {FIRST_TENSORS_S:g} s only {self._table.seen} of {self._cubes} cubes have "
+                f"a tensor.\n{logs}"
+            )
+
+    def note_address(self) -> None:
+        """Write the address of the browser view above the table."""
+        self._observer.spin(FIRST_TENSORS_S, lambda: "http://" in self._children.log("view"))
+        address = self._children.log("view").strip().splitlines()[-1].split()[0]
+        self._table.note = f"\n{address} shows it"
+
+    def measure(self, duration: float, log: Path) -> dict[str, object]:
+        """Figures of so many seconds; the simulator ends with it."""
+        spin, verification = self._observer.spin, self._verification
+        if verification is None:
+            raise ValueError("nothing is collected: this demo was made without a verification")
+        spin(0.1)
+        start_ns, usage = time.time_ns(), Usage(self._children, NODES)
+        spin(duration)
+        self._check_alone()
+        cpu, memory = usage.cpu_percent(), usage.memory_mb()
+        end_ns = start_ns + round(duration * 1e9)
+        # On a busy machine the simulator takes its samples late.
+        spin(LAST_TENSORS_S, lambda: verification.beyond(end_ns))
+        verification.compare(end_simulator(self._children, log), start_ns, end_ns)
+        spin(LAST_TENSORS_S, verification.complete)
+        return {
+            **verification.result(),
+            "crc_errors": sum(self._crc_errors.values()),
+            **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
+            **{f"rss_{name}_mb": round(value, 1) for name, value in memory.items()},
+        }
+
+    def _check_alone(self) -> None:
+        """CubeError: another skin publishes here."""
+        if self._another_skin or self._observer.node.count_publishers("stress") > 1:
+            raise CubeError(
+                f"another skin publishes stress in DDS domain {os.environ.get('ROS_DOMAIN_ID', 0)}:"
+                " end it, or set another ROS_DOMAIN_ID for this one"
+            )
+
+    def _on_stress(self, data: bytes) -> None:
+        received_ns = time.time_ns()
         try:
-            # What is measured starts when every topic has reached us: discovery takes up to
-            # seconds.
-            live = options.duration is None
-            spin(
-                FIRST_TENSORS_S,
-                lambda: (
-                    strangers.is_set()
-                    or (table.seen_all and (live or (judge.sampled and bool(crc))))
-                ),
-            )
-            alone()
-            if not table.seen_all:
-                raise CubeError(
-                    f"after {FIRST_TENSORS_S:g} s only {table.seen} of {len(skin.cubes)} cubes have a tensor.\n"
-                    + "\n".join(children.log(name)[-1500:] for name in ("driver", "reconstruction"))
-                )
-            if options.view:
-                spin(FIRST_TENSORS_S, lambda: "http://" in children.log("view"))
-                table.note = (
-                    f"\n{children.log('view').strip().splitlines()[-1].split()[0]} shows it"
-                )
-            if live:
-                spin(math.inf, lambda: False)
-            spin(0.1, lambda: False)
-            start_ns, processes = time.time_ns(), _processes(children)
-            cpu = {name: _cpu(process) for name, process in processes.items()}
-            spin(options.duration or 0.0, lambda: False)
-            alone()
-            seconds = (time.time_ns() - start_ns) * 1e-9
-            used = {
-                name: 100 * (_cpu(process) - cpu[name]) / seconds
-                for name, process in processes.items()
-            }
-            memory = {
-                name: process.memory_info().rss / 2**20 for name, process in processes.items()
-            }
-            end_ns = start_ns + round((options.duration or 0) * 1e9)
-            # Where the machine is busy the simulator takes its samples late.
-            spin(LAST_TENSORS_S, lambda: judge.beyond(end_ns))
-            children.end(["simulator"])
-            if not book.exists():
-                raise CubeError(
-                    f"the simulator did not end as asked:\n{children.log('simulator')[-1500:]}"
-                )
-            judge.read_book(json.loads(book.read_text()), start_ns, end_ns)
-            spin(LAST_TENSORS_S, judge.complete)
-        finally:
-            executor.remove_node(node)
-            node.destroy_node()
-    result = {
-        "cubes": len(skin.cubes),
-        "rate_hz": rate,
-        "duration_s": options.duration,
-        **judge.result(),
-        "crc_errors": sum(crc.values()),
-        **{f"cpu_{name}_percent": round(value, 1) for name, value in used.items()},
-        **{f"rss_{name}_mb": round(value, 1) for name, value in memory.items()},
-    }
-    if options.figure is not None:
-        forces = judge.forces()
-        result |= forces.figures()
-        picture = draw_forces(
-            seconds=forces.seconds,
-            force=forces.force,
-            measured_force=forces.found_force,
-            centre=forces.centre,
-            measured_centre=forces.found_centre,
-            cubes=load.places.position,
-        )
-        save(picture, options.figure)
-    _report(result, options)
-    return 0
+            rows = stress_codec.decode(data).rows
+        except MessageError as error:
+            self._observer.node.get_logger().error(str(error))
+            return
+        if int(rows.cube.max(initial=0)) >= self._cubes:
+            self._another_skin = True
+            return
+        if self._verification is not None:
+            self._verification.stress(rows, received_ns)
+        self._table.update(rows.cube, rows)
 
+    def _on_frequencies(self, data: bytes) -> None:
+        if self._verification is not None:
+            self._verification.frequencies(frequency_codec.decode(data).rows)
 
-def _spinner(
-    executor: Any, children: Children, table: LiveTable, interrupted: threading.Event
-) -> Callable[[float, Callable[[], bool]], None]:
-    def spin(seconds: float, done: Callable[[], bool]) -> None:
-        """Spin for so long or until done. Interrupted: Ctrl-C. ChildError: a process ended."""
-        until = time.monotonic() + seconds
-        while not done() and (left := until - time.monotonic()) > 0:
-            if interrupted.is_set():
-                raise Interrupted("interrupted")
-            executor.spin_once(timeout_sec=min(left, 0.05))
-            children.check()
-            table.refresh()
-
-    return spin
-
-
-def _processes(children: Children) -> dict[str, psutil.Process]:
-    return {name: psutil.Process(children.pid(name)) for name in ("driver", "reconstruction")}
-
-
-def _cpu(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
-
-
-def _report(result: dict[str, object], options: Options) -> None:
-    if options.json is None:
-        print(json.dumps(result, indent=2))
-    else:
-        write_json(options.json, result)
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            for pair in status.values:
+                if pair.key == "crc":
+                    self._crc_errors[status.name] = int(pair.value)

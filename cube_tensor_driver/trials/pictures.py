@@ -59,7 +59,13 @@ def make_pictures(folder: Path) -> None:
                 "no view.png: it needs Chromium, apt-get install chromium chromium-driver",
                 file=sys.stderr,
             )
-    bench_scale(COUNTS, RATE, MEASURE_S, folder / "scale.json", folder / "scale.png")
+    bench_scale(
+        counts=COUNTS,
+        rate=RATE,
+        duration=MEASURE_S,
+        json_path=folder / "scale.json",
+        figure=folder / "scale.png",
+    )
     a, _, b, _, c, _ = experiments()
     save(draw_prototype([a, b, c]), folder / "prototype.png")
     save(draw_field(field_example()), folder / "field.png")

@@ -1,0 +1,126 @@
+"""A simulated skin as a source of frequencies in this process: no ports, no threads, no waiting."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..config.load_script import read_script
+from ..config.skin import Skin
+from ..core.errors import ConfigError
+from ..core.rows import FrequencyRows
+from ..device.protocol import NOT_MEASURED
+from .cubes import hub_cubes
+from .hub import PERIOD_LIMITS_US, SimulatedHub
+from .load import Load, LoadMemory, default_script
+from .sample_log import SEQUENCE_RANGE
+
+
+def simulate(
+    skin: Skin,
+    load: Load | Path | str | None = None,
+    *,
+    rate: float | None = None,
+    duration: float | None = None,
+    noise: float = 0.0,
+    drift: float = 0.0,
+) -> SimulatedSource:
+    """The frequencies that hubs of this skin would send under a load, scan by scan.
+
+    load: what presses on the skin, or the file of a load script; None: the shipped script, an
+        indenter that wanders over the skin
+    rate: samples per second; None: the skin's, 100 where it has none
+    duration: s of simulated time; None: without end
+    noise: standard deviation of a frequency relative to itself (8e-6 is usual)
+    drift: relative change of every rest frequency per second
+
+    ConfigError: a rate that hubs refuse, a duration that is not greater than 0, an unusable load
+    script, or cubes of one hub with different numbers of pads.
+    """
+    if not isinstance(load, Load):
+        script = default_script() if load is None else read_script(Path(load))
+        load = Load(skin, script)
+    if rate is None:
+        rate = skin.rate or 1e6 / SimulatedHub.period_us
+    low, high = (1e6 / limit for limit in reversed(PERIOD_LIMITS_US))
+    if not low <= rate <= high:
+        raise ConfigError(f"rate is {rate!r}, allowed: {low:g} to {high:g} samples per second")
+    if duration is not None and not duration > 0:
+        raise ConfigError(f"duration is {duration!r}, allowed: a time greater than 0 s, or None")
+    source = SimulatedSource(skin, load, round(1e6 / rate), duration, noise, drift)
+    hub_cubes(skin)
+    return source
+
+
+@dataclass
+class SimulatedSource:
+    """A `core.rows.Source`: each time it is iterated the same skin begins anew at time 0.
+
+    One scan has a row of every cube, in the order in which the driver delivers them: link by link.
+    All rows of scan k have sequence k and stamp_ns = k × period: simulated time 0 is the start of
+    the load script. Values are what the driver makes of a hub's: a whole number of mHz in float32
+    Hz; NaN for pads that a cube does not have or whose oscillator stopped; temperature unknown.
+    """
+
+    skin: Skin
+    load: Load
+    period_us: int
+    duration: float | None = None
+    noise: float = 0.0
+    drift: float = 0.0
+    scans: int = 0
+
+    @property
+    def is_live(self) -> bool:
+        return False
+
+    def statistics(self) -> dict[str, object]:
+        """Scans and rows that were given since the last iteration began, and s of simulated
+        time."""
+        return {
+            "scans": self.scans,
+            "rows": self.scans * len(self.skin.cubes),
+            "seconds": 1e-6 * self.scans * self.period_us,
+        }
+
+    def __iter__(self) -> Iterator[FrequencyRows]:
+        hubs = hub_cubes(self.skin, noise=self.noise, drift=self.drift)
+        members = [hub.skin_cubes for hub in hubs]
+        cube = np.concatenate(members).astype(np.uint16)
+        n_pads = max(hub.cubes.n_pads for hub in hubs)
+        fields = LoadMemory(self.load)
+        self.scans = 0
+        for number in itertools.count():
+            time_us = number * self.period_us
+            if self.duration is not None and time_us >= round(1e6 * self.duration):
+                return
+            stress, gradient = fields.at(time_us)
+            millihertz = np.full((len(cube), n_pads), NOT_MEASURED, np.uint32)
+            start = 0
+            for hub, cubes in zip(hubs, members, strict=True):
+                end = start + len(cubes)
+                millihertz[start:end, : hub.cubes.n_pads] = hub.cubes.frequency(
+                    stress[cubes], gradient[cubes], 1e-6 * time_us
+                )
+                start = end
+            frequency = (millihertz * 1e-3).astype(np.float32)
+            frequency[millihertz == NOT_MEASURED] = np.nan
+            self.scans += 1
+            yield FrequencyRows(
+                cube=cube,
+                sequence=np.full(len(cube), number % SEQUENCE_RANGE, np.uint32),
+                stamp_ns=np.full(len(cube), 1000 * time_us),
+                frequency=frequency,
+                temperature=np.full(len(cube), np.nan, np.float32),
+                pad_fault=np.zeros(len(cube), np.uint32),
+            )
+
+    def __enter__(self) -> SimulatedSource:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Nothing is held open."""
