@@ -231,7 +231,7 @@ class _Demo:
             return
         if self._verification is not None:
             self._verification.stress(rows, received_ns)
-        self._table.update(rows.cube, rows)
+        self._table.update(rows)
 
     def _on_frequencies(self, data: bytes) -> None:
         if self._verification is not None:
