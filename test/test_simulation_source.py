@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from itertools import islice
 
 import numpy as np
@@ -15,14 +18,18 @@ from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.oscillator import pad_frequency, stress_slope
 from cube_tensor_driver.core.reconstructor import Reconstructor
+from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.device.decoder import Decoder
+from cube_tensor_driver.device.live import open_links
 from cube_tensor_driver.device.protocol import Sample
 from cube_tensor_driver.simulation.cubes import hub_cubes, skin_components, true_state
 from cube_tensor_driver.simulation.hub import SimulatedHub
 from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.source import simulate
 
-SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
+FILE = package_data() / "config" / "skin_demo.yaml"
+SKIN = read_skin(FILE)
 
 
 def test_the_load_comes_out_again():
@@ -76,12 +83,34 @@ def test_values_are_those_that_a_hub_sends():
         assert np.isnan(rows.temperature).all() and not rows.pad_fault.any()
 
 
+def test_values_are_those_of_a_live_link(tmp_path):
+    """To the bit what `open_links` gives of the simulator in another process, at the same times."""
+    ports, log = tmp_path / "ports", tmp_path / "log.json"
+    command = [sys.executable, "-m", "cube_tensor_driver.simulation.main", "--config", str(FILE)]
+    command += ["--ports", str(ports), "--log", str(log)]
+    process = subprocess.Popen(command)
+    try:
+        with open_links(SKIN, port_directory=ports) as source:
+            live = concatenate(list(islice(source, 100)))
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+    sampled = SampleLog.read(log)
+    time_ns, _ = sampled.taken_ns(live.cube, live.sequence, live.stamp_ns)
+    number = (time_ns - sampled.start_time_ns) // 10_000_000
+    scans = [rows.frequency for rows in islice(simulate(SKIN), int(number.max()) + 1)]
+    np.testing.assert_array_equal(live.frequency, np.array(scans)[number, live.cube])
+    assert set(live.cube.tolist()) == set(range(16)) and len(live) > 1000
+
+
 def test_it_is_a_source_that_begins_anew_each_time(tmp_path):
     with simulate(SKIN, duration=0.05, noise=1e-5) as source:
         assert source.skin is SKIN and not source.is_live
         first, second = list(source), list(source)
     assert len(first) == 5
-    assert source.statistics() == {"scans": 5, "rows": 80, "seconds": pytest.approx(0.05)}
+    given = {"rows given": 80, "scans given": 5, "simulated seconds": pytest.approx(0.05)}
+    assert source.statistics() == given
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one.frequency, other.frequency)
     script = tmp_path / "load.yaml"

@@ -79,12 +79,11 @@ class SimulatedSource:
         return False
 
     def statistics(self) -> dict[str, object]:
-        """Scans and rows that were given since the last iteration began, and s of simulated
-        time."""
+        """What was given since the last iteration began, and s of simulated time."""
         return {
-            "scans": self.scans,
-            "rows": self.scans * len(self.skin.cubes),
-            "seconds": 1e-6 * self.scans * self.period_us,
+            "rows given": self.scans * len(self.skin.cubes),
+            "scans given": self.scans,
+            "simulated seconds": 1e-6 * self.scans * self.period_us,
         }
 
     def __iter__(self) -> Iterator[FrequencyRows]:
