@@ -82,8 +82,8 @@ class _Quiet:
 _quiet = _Quiet()
 
 
-@pytest.fixture
-def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+@contextlib.contextmanager
+def free_domain() -> Iterator[int]:
     """A DDS domain that no other test uses, of no other suite either, in the environment of this
     process and below."""
     for number in itertools.islice(_domains, 100):
@@ -92,11 +92,19 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
                 fcntl.flock(mine, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
-            monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-            monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-            yield number
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv("ROS_DOMAIN_ID", str(number))
+                patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+                yield number
             return
     pytest.fail("all 100 domains are in use: end the other suites")
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """`free_domain` for one test."""
+    with free_domain() as number:
+        yield number
 
 
 def end(process: subprocess.Popen) -> None:
@@ -109,8 +117,8 @@ def end(process: subprocess.Popen) -> None:
         process.wait()
 
 
-@pytest.fixture
-def ros(domain: int) -> Iterator[Ros]:
+@contextlib.contextmanager
+def observer_node(domain: int) -> Iterator[Ros]:
     """A node in this process to look at the others with."""
     rclpy = pytest.importorskip("rclpy")
     from rclpy.signals import SignalHandlerOptions
@@ -122,6 +130,13 @@ def ros(domain: int) -> Iterator[Ros]:
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+@pytest.fixture
+def ros(domain: int) -> Iterator[Ros]:
+    """`observer_node` for one test."""
+    with observer_node(domain) as node:
+        yield node
 
 
 @pytest.fixture

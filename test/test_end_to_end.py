@@ -6,13 +6,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
-import tty
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -24,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from played_hub import REST, SINGLE, PlayedHub, greeting, sample
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from conftest import ROOT, decoded
@@ -31,15 +29,12 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
-from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.device.decoder import Decoder
-from cube_tensor_driver.device.protocol import Hello, Request, Sample, encode
+from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
 from cube_tensor_driver.processes.children import Children, ros_arguments
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
-SINGLE = package_data() / "config" / "cube.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -187,7 +182,7 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     np.testing.assert_array_equal([normal.x, normal.y, normal.z, shear.x, shear.y, shear.z], stress)
     np.testing.assert_array_equal(tensor.tensor.normal_gradient, gradient)
     assert tensor.header.frame_id == "skin_c05"
-    expected = Pipeline([cube.calibration for cube in skin.cubes]).covariance(5)
+    expected = Reconstructor(skin).covariance(5)
     np.testing.assert_allclose(
         np.reshape(tensor.tensor.covariance, (15, 15)), expected, rtol=1e-5
     )  # noise in float32
@@ -215,13 +210,13 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     calibrations = [
         Calibration.from_dict(parse_yaml(texts[cube.calibration_id], "info")) for cube in info.cubes
     ]
-    replay = Pipeline(calibrations, np.float32)
+    reconstruct = Reconstructor(calibrations)
     stored = {tuple(rows.sequence): rows for rows in (decoded(one).rows for one in batches)}
     compared = 0
     for message in raw:
         rows = decoded(message).rows
         if tuple(rows.sequence) in stored:
-            again = replay.process(rows)
+            again = reconstruct(rows)
             np.testing.assert_array_equal(again.stress, stored[tuple(rows.sequence)].stress)
             compared += 1
     assert compared > 40
@@ -243,154 +238,13 @@ def test_driver_waits_for_a_port_that_is_not_there_yet(ros, tmp_path):
         assert "Traceback" not in children.log("driver")
 
 
-class Hub:
-    """A hub under the test's control: the near end of a pseudo-terminal whose far end is the
-    driver's port."""
-
-    def __init__(self, folder: Path, name: str) -> None:
-        folder.mkdir(exist_ok=True)
-        self.fd, self._far = os.openpty()
-        tty.setraw(self._far)
-        os.set_blocking(self.fd, False)
-        (folder / name).symlink_to(os.ttyname(self._far))
-        self._decoder = Decoder()
-        self.requests: list[int] = []
-
-    def send(self, data: bytes) -> None:
-        os.write(self.fd, data)
-
-    def listen(self) -> list[int]:
-        with contextlib.suppress(BlockingIOError):
-            frames = self._decoder.feed(os.read(self.fd, 65536))
-            self.requests += [frame.request for frame in frames if isinstance(frame, Request)]
-        return self.requests
-
-    def close(self) -> None:
-        os.close(self.fd)
-        os.close(self._far)
-
-
-@pytest.fixture
-def hub(tmp_path):
-    hub = Hub(tmp_path / "ports", "hub0")
-    yield hub
-    hub.close()
-
-
-def one_sample(sequence: int, hertz: float = 100_000.0, n_pads: int = 8) -> bytes:
-    frequency = np.full((1, n_pads), round(hertz * 1e3), "<u4")
-    return encode(
-        Sample(
-            sequence, 0, 10_000 * sequence, frequency, np.zeros(1, "<u4"), np.full(1, -32768, "<i2")
-        )
-    )
-
-
-def greet(n_pads: int = 8) -> bytes:
-    return encode(Hello(0xAB, 1, n_pads, 10_000, np.array([0xCD], "<u8")))
-
-
-def sequences(frequencies: list) -> list[int]:
-    return [number for message in frequencies for number in message.sequence]
-
-
-def start_single(children: Children, tmp_path: Path) -> None:
-    for process in skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path / "ports"))[1:]:
-        children.start(process)
-
-
-def link_status(diagnostics: list) -> dict[str, str]:
-    """The newest diagnostics of link hub0: its values, and its message under ''."""
-    for array in reversed(diagnostics):
-        for status in array.status:
-            if status.name == "/driver: link hub0":
-                return {pair.key: pair.value for pair in status.values} | {"": status.message}
-    return {}
-
-
-def test_damaged_bytes_are_counted_and_the_next_good_frame_arrives(ros, hub, tmp_path):
-    frequencies = ros.listen(SkinFrequencies, "frequencies")
-    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
-    flipped = bytearray(one_sample(1001))
-    flipped[20] ^= 0x10
-    with Children(tmp_path) as children:
-        start_single(children, tmp_path)
-        ros.wait(lambda: 1 in hub.listen())
-        hub.send(greet())
-        ros.wait(lambda: 2 in hub.listen())
-        first = itertools.count()
-
-        def arrived() -> bool:
-            hub.send(one_sample(next(first)))
-            return bool(frequencies)
-
-        ros.wait(arrived)
-        for data in (
-            bytes(flipped),
-            b"\x07garbage\x00\xff\xff",
-            one_sample(1002),
-            one_sample(1003)[:-9],
-            one_sample(1004),
-        ):
-            hub.send(data)
-        ros.wait(lambda: 1004 in sequences(frequencies))
-        assert [number for number in sequences(frequencies) if number > 1000] == [1002, 1004]
-        ros.wait(lambda: int(link_status(diagnostics).get("crc", 0)) >= 1)
-        counted = link_status(diagnostics)
-        # the flipped frame; the garbage, the run before the next zero, and the frame cut short
-        assert sum(int(counted[name]) for name in ("crc", "framing", "length")) == 4
-        children.check()
-
-
-def test_beyond_the_law_is_a_fault_and_no_number(ros, hub, tmp_path):
-    batches = ros.listen(SkinStress, "stress")
-    with Children(tmp_path) as children:
-        start_single(children, tmp_path)
-        ros.wait(lambda: 1 in hub.listen())
-        hub.send(greet())
-        ros.wait(lambda: 2 in hub.listen())
-        ros.wait(
-            lambda: (
-                ros.node.count_publishers("stress") and ros.node.count_subscribers("frequencies")
-            )
-        )
-        frequency = np.full((1, 8), 100_000_000, "<u4")
-        frequency[0, 3] = 0  # not measured
-        frequency[0, 5] = 4_000_000_000  # 4 MHz; the law ends at f0 (1 + β)/β = 433 kHz
-        sequence = itertools.count()
-
-        def arrived() -> bool:
-            number = next(sequence)
-            hub.send(
-                encode(
-                    Sample(
-                        number,
-                        0,
-                        10_000 * number,
-                        frequency,
-                        np.zeros(1, "<u4"),
-                        np.zeros(1, "<i2"),
-                    )
-                )
-            )
-            return bool(batches)
-
-        ros.wait(arrived)
-        rows = decoded(batches[0]).rows
-        assert rows.status[0] & SkinStress.PAD_FAULT
-        # six pads cannot tell seven unknowns apart: something is missing, and what is there is at
-        # rest
-        assert np.isnan(rows.stress[0]).any()
-        seen = rows.stress[0][np.isfinite(rows.stress[0])]
-        assert np.abs(seen).max(initial=0) < 1e-3
-
-
-def test_one_process_sends_frequencies_to_who_listens(ros, hub, tmp_path):
+def test_one_process_sends_frequencies_to_who_listens(ros, tmp_path):
+    hub = PlayedHub(tmp_path / "ports", "hub0")
     stress = ros.listen(SkinStress, "stress")
     numbers = itertools.count()
 
     def sent() -> bool:
-        hub.send(one_sample(next(numbers)))
+        hub.send(sample(next(numbers), REST))
         return True
 
     with Children(tmp_path) as children:
@@ -398,7 +252,7 @@ def test_one_process_sends_frequencies_to_who_listens(ros, hub, tmp_path):
             skin_processes(SINGLE, composed=True, simulated=SimulatedHubs(tmp_path / "ports"))[1]
         )
         ros.wait(lambda: 1 in hub.listen())
-        hub.send(greet())
+        hub.send(greeting())
         ros.wait(lambda: 2 in hub.listen())
         ros.wait(lambda: sent() and stress)
         frequencies = ros.listen(SkinFrequencies, "frequencies")
@@ -407,82 +261,7 @@ def test_one_process_sends_frequencies_to_who_listens(ros, hub, tmp_path):
         newest = {message.sequence[-1]: message.header.stamp for message in stress}
         assert newest[frequencies[-1].sequence[-1]] == frequencies[-1].header.stamp
         children.check()
-
-
-def test_another_number_of_pads_is_an_error_that_names_both(ros, hub, tmp_path):
-    frequencies = ros.listen(SkinFrequencies, "frequencies")
-    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
-    with Children(tmp_path) as children:
-        start_single(children, tmp_path)
-        ros.wait(lambda: 1 in hub.listen())
-        hub.send(greet(n_pads=4))
-        ros.wait(lambda: 2 in hub.listen())
-        hub.send(one_sample(0, n_pads=4))
-        ros.wait(lambda: "reports 4 pads, its layout has 8" in link_status(diagnostics).get("", ""))
-        assert "reports 4 pads, its layout has 8" in children.log("driver")
-        assert not frequencies
-        children.check()
-
-
-def test_a_hub_with_more_cubes_than_the_skin_gives_those_it_has(ros, hub, tmp_path):
-    frequencies = ros.listen(SkinFrequencies, "frequencies")
-    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
-    with Children(tmp_path) as children:
-        start_single(children, tmp_path)
-        ros.wait(lambda: 1 in hub.listen())
-        hub.send(encode(Hello(0xAB, 1, 8, 10_000, np.array([0xCD, 0xCD, 0xEF], "<u8"))))
-        ros.wait(lambda: 2 in hub.listen())
-        sequence = itertools.count()
-
-        def arrived() -> bool:
-            number = next(sequence)
-            frequency = np.full((3, 8), 100_000_000, "<u4")
-            hub.send(
-                encode(
-                    Sample(
-                        number,
-                        0,
-                        10_000 * number,
-                        frequency,
-                        np.zeros(3, "<u4"),
-                        np.zeros(3, "<i2"),
-                    )
-                )
-            )
-            return bool(frequencies)
-
-        ros.wait(arrived)
-        ros.wait(lambda: link_status(diagnostics).get(""))
-        text = link_status(diagnostics)[""]
-        assert "cube 1 (uid 0xcd) left out: an earlier one has the same uid" in text
-        assert "cube 2 (uid 0xef) not in the skin file: add it there" in text
-        assert all(set(message.cube) == {0} for message in frequencies)
-        children.check()
-
-
-def test_another_protocol_version_is_an_error_that_names_both(ros, hub, tmp_path):
-    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
-    with Children(tmp_path) as children:
-        start_single(children, tmp_path)
-        ros.wait(lambda: 1 in hub.listen())
-        hub.send(of_version(2))
-        ros.wait(
-            lambda: (
-                "protocol version 2, this driver version 1" in link_status(diagnostics).get("", "")
-            )
-        )
-        ros.wait(lambda: "protocol version 2, this driver version 1" in children.log("driver"))
-        children.check()
-
-
-def of_version(version: int) -> bytes:
-    """A sound STATS frame of another protocol version."""
-    import zlib
-
-    from cobs import cobs
-
-    body = bytes([3, version, 5, 0]) + bytes(5)
-    return b"\0" + cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
+    hub.close()
 
 
 @pytest.mark.parametrize("executable", ["driver", "reconstruction"])

@@ -23,11 +23,11 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from played_hub import SINGLE, PlayedHub
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
-from test_end_to_end import SINGLE, Hub
 
 from conftest import decoded
 from cube_tensor_driver.config.package_data import package_data
@@ -50,7 +50,7 @@ class Scene3D:
 
     def __init__(self, ros, tmp_path, children):
         self.ros, self.folder, self.children = ros, tmp_path, children
-        self.hub = Hub(tmp_path / "ports", "hub0")
+        self.hub = PlayedHub(tmp_path / "ports", "hub0")
         self.pads = np.full(8, 100e3)
         self.stress = ros.listen(SkinStress, "stress")
         self.infos = ros.listen(SkinInfo, "info", LATCHED)
