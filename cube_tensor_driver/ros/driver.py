@@ -17,7 +17,7 @@ from .diagnostics import Diagnostics
 from .frequencies_publisher import FrequenciesPublisher
 from .link_statuses import LinkStatuses
 from .messages import info_message
-from .node import LATCHED, CubeNode, NodeClock, queue, run, scans_per_message
+from .node import LATCHED, CubeNode, NodeClock, batch_queue, run, scans_per_message
 from .parameters import DRIVER
 
 
@@ -45,11 +45,7 @@ class Driver(CubeNode):
         rate = self._rate()
         scans = scans_per_message(self.value("publish_period"), rate)
         links = link_configs(skin, self.value("port"), self.value("port_directory"))
-        quality = queue(
-            None if rate is None else rate / scans,
-            self.value("qos_reliability"),
-            scans * len(skin.cubes),
-        )
+        quality = batch_queue(self, rate, len(skin.cubes))
         self._frequencies = FrequenciesPublisher(
             self, skin.parent_frame, quality, always=self._on_rows is None
         )

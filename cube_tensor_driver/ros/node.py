@@ -73,6 +73,14 @@ def scans_per_message(publish_period: float, rate: float | None) -> int:
     return max(1, round(publish_period * (rate or UNKNOWN_RATE)))
 
 
+def batch_queue(node: CubeNode, rate: float | None, n_cubes: int) -> QoSProfile:
+    """Quality of service of the batch topics of a node with parameters publish_period and
+    qos_reliability; rate: samples per second of each of so many cubes, None: not known."""
+    scans = scans_per_message(node.value("publish_period"), rate)
+    messages = None if rate is None else rate / scans
+    return queue(messages, node.value("qos_reliability"), scans * n_cubes)
+
+
 class CubeNode(LifecycleNode):
     """A lifecycle node whose errors are one line in the log and a transition that fails, never a
     traceback."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from contextlib import ExitStack
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -18,16 +18,12 @@ from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows
 from .diagnostics import Diagnostics
 from .messages import info_message
-from .node import LATCHED, CubeNode, queue, run, scans_per_message
+from .node import LATCHED, CubeNode, batch_queue, run
 from .parameters import RECONSTRUCTION
-from .reconstruction_diagnostics import ReconstructionDiagnostics
+from .reconstruction_diagnostics import ReconstructionDiagnostics, log_changes
+from .recorded import open_recording
 from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
-
-if TYPE_CHECKING:
-    from ..bags.recorded_health import RecordedReconstruction
-
-BAGS = (".mcap", ".db3")
 
 
 class Reconstruction(CubeNode):
@@ -40,29 +36,29 @@ class Reconstruction(CubeNode):
         self._active = False
         # In one process with the driver, its thread calls `on_rows`; services run in the main one.
         self._lock = threading.Lock()
+        self._configured = ExitStack()
         self._updater = Diagnostics(self, self._statuses)
 
     def configure(self) -> None:
-        path = self.config()
-        recorded = self._recorded = _recorded(path)
-        skin = self._skin = recorded.skin if recorded else read_skin(path)
-        self._reconstructor = Reconstructor(skin)
-        self._reconstructor.drift_time = float(self.value("drift_time"))
-        self._rest_published = self._reconstructor.rest_changes
-        scans = scans_per_message(self.value("publish_period"), skin.rate)
-        rate = None if skin.rate is None else skin.rate / scans
-        quality = queue(rate, self.value("qos_reliability"), scans * len(skin.cubes))
+        made = self._configured
+        self._recorded = open_recording(self.config())
+        if self._recorded is not None:
+            made.callback(self._recorded.close)
+        skin = self._skin = self._recorded.skin if self._recorded else read_skin(self.config())
+        reconstructor = self._reconstructor = Reconstructor(skin)
+        reconstructor.drift_time = float(self.value("drift_time"))
+        quality = batch_queue(self, skin.rate, len(skin.cubes))
         side = self.value("wrench_side") or None
-        self._publisher = StressPublisher(self, skin, self._reconstructor, quality, side)
+        self._publisher = StressPublisher(self, skin, reconstructor, quality, side)
+        made.callback(self._publisher.close)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
-        folder = None if recorded else tare_folder(self.value("tare_folder"))
-        self._taring = Taring(
-            self, skin, self._reconstructor, folder, self._lock, self._publish_info
-        )
-        self._diagnostics = ReconstructionDiagnostics(skin, self._reconstructor, self._taring)
-        self._listening = [
-            self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
-        ]
+        made.callback(self.destroy_publisher, self._info)
+        folder = None if self._recorded else tare_folder(self.value("tare_folder"))
+        self._taring = Taring(self, skin, reconstructor, folder, self._lock, self._publish_info)
+        made.callback(self._taring.close)
+        self._diagnostics = ReconstructionDiagnostics(skin, reconstructor, self._taring)
+        uids = self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
+        made.callback(self.destroy_subscription, uids)
         if self._subscribes:
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
             frequencies = self.create_subscription(
@@ -73,7 +69,7 @@ class Reconstruction(CubeNode):
                 raw=True,
                 event_callbacks=lost,
             )
-            self._listening.append(frequencies)
+            made.callback(self.destroy_subscription, frequencies)
         self._publish_info()
 
     def changed(self, name: str) -> None:
@@ -86,15 +82,7 @@ class Reconstruction(CubeNode):
         self._active = False
 
     def cleanup(self) -> None:
-        if not self.configured:
-            return
-        for subscription in self._listening:
-            self.destroy_subscription(subscription)
-        self._publisher.close()
-        self._taring.close()
-        self.destroy_publisher(self._info)
-        if self._recorded is not None:
-            self._recorded.close()
+        self._configured.close()
 
     def _on_frequencies(self, data: bytes) -> None:
         """One message, serialised."""
@@ -107,8 +95,9 @@ class Reconstruction(CubeNode):
 
     def on_rows(self, rows: FrequencyRows) -> None:
         """Rows of a driver in the same process, as it would put them into one message."""
-        frame_id = self._skin.parent_frame.encode() + b"\0"
-        self._publish(rows, int(rows.stamp_ns.min()), frame_id)
+        if self._active:
+            frame_id = self._skin.parent_frame.encode() + b"\0"
+            self._publish(rows, int(rows.stamp_ns.min()), frame_id)
 
     def _publish(self, rows: FrequencyRows, stamp_ns: int, frame_id: bytes) -> None:
         """Publish the stress of the rows of one message; stamp and frame of the message are kept."""
@@ -148,24 +137,9 @@ class Reconstruction(CubeNode):
         if not self.configured:
             return []
         with self._lock:
-            statuses, lines = self._diagnostics.statuses()
-        for line, bad in lines:
-            # rclpy ties a level to a line of code.
-            if bad:
-                self.get_logger().warning(line)
-            else:
-                self.get_logger().info(line)
+            statuses, changes = self._diagnostics.statuses()
+        log_changes(self.get_logger(), changes)
         return statuses
-
-
-def _recorded(path: Path) -> RecordedReconstruction | None:
-    """What a bag says about its reconstruction; None for a skin file. BagError: no bag."""
-    if not path.is_dir() and path.suffix not in BAGS:
-        return None
-    # Imported here because it loads much that a node does not need otherwise.
-    from ..bags.recorded_health import RecordedReconstruction
-
-    return RecordedReconstruction(path)
 
 
 def main() -> None:

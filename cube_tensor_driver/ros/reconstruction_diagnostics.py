@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -57,3 +57,13 @@ class ReconstructionDiagnostics:
         text = f"{lost} messages lost on the way: check the network" if lost > 0 else ""
         level = DiagnosticStatus.WARN if self.bad_messages or text else DiagnosticStatus.OK
         return [make_status("rows", self._skin.name, level, text, values), *cubes], lines
+
+
+def log_changes(logger: Any, changes: list[tuple[str, bool]]) -> None:
+    """A line for each; bad news are warnings."""
+    for line, bad in changes:
+        # rclpy ties a level to a line of code.
+        if bad:
+            logger.warning(line)
+        else:
+            logger.info(line)
