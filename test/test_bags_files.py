@@ -25,7 +25,8 @@ from cube_tensor_driver.bags.mcap import HEAD, BagReader
 from cube_tensor_driver.bags.message_codec import upgrade_stress
 from cube_tensor_driver.bags.read import FREQUENCIES, INFO, STRESS, Bag, typestore
 from cube_tensor_driver.bags.repair import repair
-from cube_tensor_driver.bags.reprocess import Change, Job, Recording, reprocess
+from cube_tensor_driver.bags.reprocess import Overrides, ReprocessJob, reconstruct, reprocess
+from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.calibration import read_calibration, write_calibration
@@ -194,7 +195,7 @@ def test_type_hashes_are_those_of_ros():
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_reprocessed_is_recorded_to_the_bit(tmp_path, storage):
     path = make_bag(tmp_path / "bag", SKIN, storage=storage)
-    done = reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    done = reprocess(ReprocessJob(path, tmp_path / "out", "bag"))
     assert done.messages == 300 and done.rows == 300 * 16
     assert all_differing_bits(stress(path), stress(tmp_path / "out")) == 0
     with Bag(path) as one, Bag(tmp_path / "out") as other:
@@ -204,7 +205,7 @@ def test_reprocessed_is_recorded_to_the_bit(tmp_path, storage):
 def test_reprocess_needs_no_ros(bag, tmp_path):
     script = (
         "import sys; from pathlib import Path; from cube_tensor_driver.bags.reprocess import *\n"
-        "reprocess(Job(Path(sys.argv[1]), Path(sys.argv[2]), 'bag', Change()))\n"
+        "reprocess(ReprocessJob(Path(sys.argv[1]), Path(sys.argv[2]), 'bag'))\n"
         "found = {'rclpy', 'cube_tensor_driver.msg', 'matplotlib'} & set(sys.modules)\n"
         "sys.exit(f'imported {found}' if found else 0)"
     )
@@ -238,7 +239,7 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
                 START_NS + 10_000_000 * k,
                 bytes(store.serialize_cdr(raw, FREQUENCIES)),
             )
-    reprocess(Job(tmp_path / "bag", tmp_path / "out", "bag", Change()))
+    reprocess(ReprocessJob(tmp_path / "bag", tmp_path / "out", "bag"))
     for k, record in enumerate(stress(tmp_path / "out").values()):
         of = pipeline if k < 50 else tared
         expected = of.process(
@@ -256,17 +257,17 @@ def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
         150,
         left_out=lambda k: np.where(np.arange(16) == 3, 1 << 2, 0) * (k < 80),
     )
-    reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    reprocess(ReprocessJob(path, tmp_path / "out", "bag"))
     recorded = stress(path)
     assert all_differing_bits(recorded, stress(tmp_path / "out")) == 0
     assert [int(one.left_out[3]) for one in recorded.values()] == [4] * 80 + [0] * 70
     assert recorded[START_NS].status[3] == PAD_FAULT | STUCK
-    reprocess(Job(path, tmp_path / "bag.parquet", "parquet", Change()))
+    reprocess(ReprocessJob(path, tmp_path / "bag.parquet", "parquet"))
     table = pyarrow.parquet.read_table(tmp_path / "bag.parquet")
     assert table["left_out"].to_numpy()[:16].tolist() == [0, 0, 0, 4] + [0] * 12
     # another tare judges anew, and does not find it
-    with Bag(path) as bag:
-        ((_, _, rows), *_) = Recording(bag, "/frequencies", Change(tare=(0.0, 0.1))).batches()
+    with open_bag(path) as source:
+        ((_, rows), *_) = reconstruct(source, Overrides(tare=(0.0, 0.1)))
     assert not rows.left_out.any() and (rows.status & STUCK == 0).all()
 
 
@@ -285,7 +286,7 @@ def test_stress_of_version_1_is_made_one_of_today():
 
 def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
     for form in ("parquet", "csv"):
-        reprocess(Job(bag, tmp_path / f"bag.{form}", form, Change()))
+        reprocess(ReprocessJob(bag, tmp_path / f"bag.{form}", form))
     parquet = pyarrow.parquet.read_table(tmp_path / "bag.parquet")
     csv = pyarrow.csv.read_csv(tmp_path / "bag.csv")
     assert parquet.column_names == csv.column_names
@@ -472,7 +473,7 @@ def test_random_damage_is_one_message_or_no_harm(tmp_path):
         else:
             target.write_bytes(data)
         try:
-            reprocess(Job(path, tmp_path / f"out{number}", "bag", Change()))
+            reprocess(ReprocessJob(path, tmp_path / f"out{number}", "bag"))
         except BagError as error:
             outcomes["refused"] += 1
             assert str(path.name) in str(error) and "\n" not in str(error), str(error)
@@ -520,7 +521,7 @@ def test_an_unknown_version_is_refused(tmp_path):
 def test_the_kept_bag_of_each_version_can_be_read(tmp_path, version):
     """That of version 2 was recorded while a pad was stuck, which had been found before."""
     kept = ROOT / "test" / "data" / f"bag_v{version}"
-    reprocess(Job(kept, tmp_path / "out", "bag", Change()))
+    reprocess(ReprocessJob(kept, tmp_path / "out", "bag"))
     recorded, again = stress(kept), stress(tmp_path / "out")
     common = recorded.keys() & again.keys()
     assert len(common) > 100

@@ -25,7 +25,7 @@ from test_bags_files import all_differing_bits, differing_bits, stress
 from conftest import ROOT, decoded
 from cube_tensor_driver.bags.read import FREQUENCIES, Bag
 from cube_tensor_driver.bags.repair import repair
-from cube_tensor_driver.bags.reprocess import Change, Job, reprocess
+from cube_tensor_driver.bags.reprocess import ReprocessJob, reprocess
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
@@ -145,12 +145,12 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     first, last = stamps.index(recorded[0]), stamps.index(recorded[-1])
     assert recorded == stamps[first : last + 1] and len(recorded) > 50
     assert len(set(recorded) & set(frequency_stamps(tmp_path / "other"))) > 50
-    reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    reprocess(ReprocessJob(path, tmp_path / "out", "bag"))
     live, again = stress(path), stress(tmp_path / "out")
     common = live.keys() & again.keys()
     assert len(common) > 50
     assert all_differing_bits({k: live[k] for k in common}, {k: again[k] for k in common}) == 0
-    assert all(again[k]["left_out"][again[k]["cube"] == 10].all() for k in common)
+    assert all(again[k].left_out[again[k].cube == 10].all() for k in common)
 
 
 @needs_ros2_bag
@@ -175,7 +175,7 @@ def test_ros2_bag_records_what_is_published(running, tmp_path):
     )
     with Bag(path) as bag:
         assert {info.sender for info in bag.infos("/info")} == {"driver", "reconstruction"}
-    reprocess(Job(path, tmp_path / "out", "bag", Change()))
+    reprocess(ReprocessJob(path, tmp_path / "out", "bag"))
     live, again = stress(path), stress(tmp_path / "out")
     common = live.keys() & again.keys()
     assert len(common) > 50

@@ -41,6 +41,7 @@ HOMES = {
     "rich": {"terminal", "trials"},
     "matplotlib": {"plot"},
     "rosbags": {"bags"},
+    "mcap": {"bags"},
     "pyarrow": {"bags"},
     "distributed": {"bags"},
     "skfem": {"elastic", "research"},

@@ -20,7 +20,7 @@ from ..core.symmetry import default_modes
 from .message_codec import SECOND
 from .read import STRESS as BATCH_TYPE
 from .read import Bag
-from .reprocess import Recording
+from .source import open_bag
 
 WRENCH, TENSOR = "geometry_msgs/msg/WrenchStamped", "cube_tensor_driver/msg/StressTensorStamped"
 GAP = 5.0
@@ -41,9 +41,10 @@ def bag_loads(
     interpolated linearly.
     BagError: no such cube or topic, another layout, no time in common.
     """
-    with Bag(path) as bag:
-        recording = Recording(bag, f"{bag.skin()}frequencies")
-        names = [cube.name for cube in recording.infos[-1].cubes]
+    with open_bag(path) as source:
+        bag = source.bag
+        settings = source.recording.settings[-1]
+        names = [cube.name for cube in source.skin.cubes]
         if name is None and len(names) > 1:
             raise BagError(
                 f"{path}: {len(names)} cubes; say which one with --cube: {', '.join(names[:20])}"
@@ -51,12 +52,11 @@ def bag_loads(
         if name is not None and name not in names:
             raise BagError(f"{path}: no cube {name!r}; there are {', '.join(names[:20])}")
         number = 0 if name is None else names.index(name)
-        calibration, n_pads = recording.pipelines[-1].calibrations[number], layout.n_pads
+        calibration, n_pads = settings.calibrations[number], layout.n_pads
         calibration.check(layout)
-        rest = recording.pipelines[-1].rest_frequency[number, :n_pads]
+        rest = settings.rest_frequency[number, :n_pads]
         parts = []
-        for messages, _ in bag.frequencies(recording.topic):
-            rows = messages.rows
+        for rows in source:
             rows = rows.select((rows.cube == number) & (rows.pad_fault == 0))
             parts.append((rows.stamp_ns, rows.frequency[:, :n_pads], rows.temperature))
         times, frequency, temperature = (

@@ -24,11 +24,11 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, ReaderError
-from rosbags.rosbag2.enums import CompressionMode
-from rosbags.rosbag2.reader import DirectoryReader
-from rosbags.rosbag2.storage_mcap import (
+from rosbags.rosbag2 import CompressionMode, Reader, ReaderError
+
+from .rosbags_storage import (
     ChunkInfo,
+    DirectoryReader,
     McapReader,
     McapWriter,
     PendingChunk,

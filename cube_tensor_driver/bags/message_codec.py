@@ -109,6 +109,13 @@ class Decoded(Generic[AnyRows]):
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
+    def select(self, chosen: slice) -> Decoded[AnyRows]:
+        """Some of the messages, neighbours."""
+        rows = len(self.rows) // len(self.stamp_ns)
+        begin, end, _ = chosen.indices(len(self))
+        part = self.rows.select(slice(begin * rows, end * rows))
+        return Decoded(part, self.stamp_ns[chosen], self.frame_id)
+
     def by_message(self, column: NDArray[Any]) -> NDArray[Any]:
         """(M, rows, ...) a column of `rows`, message by message."""
         rows = len(self.rows) // len(self.stamp_ns)

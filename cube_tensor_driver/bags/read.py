@@ -14,17 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import ReaderError
-from rosbags.rosbag2.storage_mcap import zstd
-from rosbags.rosbag2.storage_sqlite3 import apsw
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from ..config.package_data import package_data
-from ..config.yaml import parse_yaml
-from ..core.calibration import Calibration
-from ..core.errors import BagError, CalibrationError, ConfigError, CubeError, MessageError
-from ..core.pipeline import Pipeline
+from ..core.errors import BagError, CubeError, MessageError
 from ..core.rows import FrequencyRows, StressRows
 from .mcap import BagReader
 from .message_codec import (
@@ -35,6 +29,7 @@ from .message_codec import (
     stress_codec,
     stress_codec_1,
 )
+from .rosbags_storage import Sqlite3Error, Typestore, ZstdError
 
 PACKAGE = "cube_tensor_driver"
 FREQUENCIES, STRESS, INFO = (
@@ -51,8 +46,8 @@ DAMAGE = (
     ReaderError,
     SerdeError,
     TypesysError,
-    apsw.Error,
-    zstd.ZstdError,
+    Sqlite3Error,
+    ZstdError,
     struct.error,
     ValueError,
     LookupError,
@@ -120,12 +115,19 @@ class Bag:
             self._reader = BagReader(path)
 
     def __enter__(self) -> Bag:
-        with damage(self.path):
-            self._reader.open()
-            self._types = self._own_types()
+        self.open()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """BagError: damaged."""
+        with damage(self.path):
+            self._reader.open()
+            self._types = self._own_types()
+
+    def close(self) -> None:
         self._reader.close()
 
     @property
@@ -261,42 +263,3 @@ class Bag:
         store = get_typestore(Stores.ROS2_JAZZY)
         store.register({name: types[name] for name in types if name.startswith(PACKAGE)})
         return store
-
-
-def calibrations(info: Any) -> list[Calibration]:
-    """The calibration of each cube of a SkinInfo, of rclpy or of a bag. BagError: missing, or
-    damaged."""
-    texts = dict(zip(info.calibration_ids, info.calibrations, strict=False))
-    known: dict[str, Calibration] = {}
-    try:
-        for name in {cube.calibration_id for cube in info.cubes}:
-            known[name] = Calibration.from_dict(parse_yaml(texts[name], f"calibration {name}"))
-    except (CalibrationError, ConfigError) as error:
-        raise BagError(f"info of the skin {info.name}: {error}") from None
-    except KeyError as error:
-        raise BagError(
-            f"info of the skin {info.name}: no calibration {error}, which a cube uses"
-        ) from None
-    return [known[cube.calibration_id] for cube in info.cubes]
-
-
-def pipeline(info: Any) -> Pipeline:
-    """The pipeline that made the stress under a SkinInfo, rest frequencies as they were after
-    tare."""
-    made = Pipeline(calibrations(info), np.float32)
-    made.rest_frequency = rest_frequency(info, made)
-    return made
-
-
-def rest_frequency(info: Any, of: Pipeline) -> np.ndarray:
-    """(cubes, P) in Hz of a SkinInfo. BagError: not one per pad."""
-    rest = of.rest_frequency
-    for row, cube, calibration in zip(rest, info.cubes, of.calibrations, strict=True):
-        if len(cube.rest_frequency) != calibration.layout.n_pads:
-            raise BagError(
-                f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} rest "
-                f"frequencies, its layout {calibration.layout.name} has {calibration.layout.n_pads} "
-                "pads"
-            )
-        row[: len(cube.rest_frequency)] = cube.rest_frequency
-    return rest

@@ -1,9 +1,9 @@
-"""What the reconstruction found bad while a bag was recorded: pads left out and status bits,
-message by message.
+"""What the reconstruction found bad while a bag was recorded: pads left out and status bits, row by
+row.
 
 `Health` remembers more than a bag holds: what it saw before the recording began, and where its
-windows begin. So what it found stands in the recorded stress, and whoever makes the same stress
-again takes it from there.
+windows begin. So its verdicts are taken from the recorded stress, and whoever makes the same stress
+again uses them.
 """
 
 from __future__ import annotations
@@ -15,112 +15,111 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.rows import StressRows
+from ..core.reconstructor import Verdicts
+from ..core.rows import FrequencyRows, StressRows
 from ..core.status import WORDS
-from .message_codec import SECOND, Decoded
+from .message_codec import SECOND
 from .read import STRESS, Bag
 
 AHEAD_NS = SECOND
 """How far stress is read ahead of frequencies: messages may stand in a bag a little out of
 order."""
-BITS = np.uint16(sum(WORDS))
+HEALTH_BITS = np.uint16(sum(WORDS))
+"""The status bits that `Health` sets."""
 
 
-class Verdict(NamedTuple):
-    """Of B messages: whether their stress is recorded (B,); pads left out and status bits, (B,
-    rows)."""
-
-    known: NDArray[np.bool_]
-    left_out: NDArray[np.uint32]
-    bits: NDArray[np.uint16]
-
-
-class _Batch(NamedTuple):
-    """Messages of stress by stamp. begin_ns, end_ns: of the first and the last."""
+class _Part(NamedTuple):
+    """Rows of stress that were read together. begin_ns, end_ns: earliest and latest stamp."""
 
     begin_ns: int
     end_ns: int
     stamp_ns: NDArray[np.int64]
     cube: NDArray[np.uint16]
     left_out: NDArray[np.uint32]
-    bits: NDArray[np.uint16]
+    status: NDArray[np.uint16]
 
 
-class RecordedVerdicts:
-    """Reads the stress beside the frequencies `topic` of a bag; from the start again when time
-    jumps back."""
+class VerdictReader:
+    """Reads the stress beside the frequencies on a topic of a bag, and starts again when time jumps
+    back."""
 
-    def __init__(self, bag: Bag, topic: str, wanted: bool = True) -> None:
-        """wanted: False finds nothing."""
-        stress = topic.removesuffix("frequencies") + "stress"
-        self._bag, self._topic = bag, stress
-        self._asked_ns: int
-        self._newest_ns: int
-        self._there = wanted and bag.version > 1 and stress in bag.topics(STRESS)
-        self._begin()
+    def __init__(self, bag: Bag, topic: str) -> None:
+        self._bag = bag
+        self._topic = topic.removesuffix("frequencies") + "stress"
+        # Stress of version 1 does not say which pads were left out.
+        self._available = bag.version > 1 and self._topic in bag.topics(STRESS)
+        self._asked_ns = 0
+        self._newest_ns = 0
+        self._parts: deque[_Part] = deque()
+        self._unread = self._read()
 
-    def of(self, stamp_ns: NDArray[np.int64], cube: NDArray[np.uint16]) -> Verdict:
-        """What was found of messages of frequencies by their stamps (B,) and cubes (B, rows), which
-        tell them apart."""
-        found = Verdict(
-            np.zeros(len(cube), bool),
-            np.zeros(cube.shape, np.uint32),
-            np.zeros(cube.shape, np.uint16),
-        )
-        if not self._there or not cube.size:
-            return found
-        begin_ns, end_ns = int(stamp_ns.min()), int(stamp_ns.max())
+    def of(self, rows: FrequencyRows) -> Verdicts:
+        """The verdicts about rows, which their cubes and stamps identify."""
+        known = np.zeros(len(rows), bool)
+        left_out = np.zeros(len(rows), np.uint32)
+        status = np.zeros(len(rows), np.uint16)
+        if self._available and len(rows):
+            for part in self._near(int(rows.stamp_ns.min()), int(rows.stamp_ns.max())):
+                if np.array_equal(part.stamp_ns, rows.stamp_ns) and np.array_equal(
+                    part.cube, rows.cube
+                ):
+                    return Verdicts(np.ones(len(rows), bool), part.left_out, part.status)
+                at, same = _find(part, rows)
+                known |= same
+                left_out[same] = part.left_out[at[same]]
+                status[same] = part.status[at[same]]
+                if known.all():
+                    break
+        return Verdicts(known, left_out, status)
+
+    def _near(self, begin_ns: int, end_ns: int) -> Iterator[_Part]:
+        """Stress of a time. The bag is read on only as far as the caller asks for more."""
         if end_ns < self._asked_ns - AHEAD_NS:
-            self._begin()
+            self._newest_ns = 0
+            self._parts.clear()
+            self._unread = self._read()
         self._asked_ns = end_ns
-        while self._waiting and self._waiting[0].end_ns < begin_ns - AHEAD_NS:
-            self._waiting.popleft()
-        for batch in self._near(end_ns + AHEAD_NS):
-            if (
-                batch.begin_ns > end_ns
-                or batch.end_ns < begin_ns
-                or batch.left_out.shape[1] != cube.shape[1]
-            ):
-                continue
-            if np.array_equal(batch.stamp_ns, stamp_ns) and np.array_equal(batch.cube, cube[:, 0]):
-                return Verdict(np.ones(len(cube), bool), batch.left_out, batch.bits)
-            place = np.minimum(np.searchsorted(batch.stamp_ns, stamp_ns), len(batch.stamp_ns) - 1)
-            same = (batch.stamp_ns[place] == stamp_ns) & (batch.cube[place] == cube[:, 0])
-            found.known[same] = True
-            found.left_out[same], found.bits[same] = (
-                batch.left_out[place[same]],
-                batch.bits[place[same]],
-            )
-            if found.known.all():
-                break
-        return found
+        while self._parts and self._parts[0].end_ns < begin_ns - AHEAD_NS:
+            self._parts.popleft()
+        for part in self._kept_and_unread(end_ns + AHEAD_NS):
+            if part.begin_ns <= end_ns and part.end_ns >= begin_ns:
+                yield part
 
-    def _near(self, until_ns: int) -> Iterator[_Batch]:
-        """Stress read before, and what stands behind it, read on until then."""
-        yield from tuple(self._waiting)
-        while self._newest_ns < until_ns and (read := next(self._unread, None)) is not None:
-            if len(read[0].rows):
-                self._take(read[0])
-                yield self._waiting[-1]
+    def _kept_and_unread(self, until_ns: int) -> Iterator[_Part]:
+        yield from tuple(self._parts)
+        while self._newest_ns < until_ns:
+            part = next(self._unread, None)
+            if part is None:
+                return
+            self._newest_ns = max(self._newest_ns, part.end_ns)
+            self._parts.append(part)
+            yield part
 
-    def _begin(self) -> None:
-        self._asked_ns = self._newest_ns = 0
-        self._waiting: deque[_Batch] = deque()
-        self._unread: Iterator[Any] = self._bag.stress(self._topic) if self._there else iter(())
+    def _read(self) -> Iterator[_Part]:
+        for messages, _ in self._bag.stress(self._topic):
+            rows: StressRows = messages.rows
+            if len(rows):
+                yield _Part(
+                    int(rows.stamp_ns.min()),
+                    int(rows.stamp_ns.max()),
+                    rows.stamp_ns,
+                    rows.cube,
+                    rows.left_out,
+                    rows.status & HEALTH_BITS,
+                )
 
-    def _take(self, messages: Decoded[StressRows]) -> None:
-        order = np.argsort(messages.stamp_ns, kind="stable")
-        stamp_ns, rows = messages.stamp_ns[order], messages.rows
-        begin_ns, end_ns = int(stamp_ns[0]), int(stamp_ns[-1])
-        self._newest_ns = max(self._newest_ns, end_ns)
-        # Copies: the messages themselves need not be kept.
-        self._waiting.append(
-            _Batch(
-                begin_ns,
-                end_ns,
-                stamp_ns,
-                messages.by_message(rows.cube)[order, 0],
-                messages.by_message(rows.left_out)[order],
-                messages.by_message(rows.status)[order] & BITS,
-            )
-        )
+
+def _find(part: _Part, rows: FrequencyRows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Where in a part the rows are, (N,), and whether they are there, (N,)."""
+    # One number for stamp and cube; stamps are taken from the part's begin on, so that both fit.
+    keys = _key(part, part.begin_ns)
+    wanted = _key(rows, part.begin_ns)
+    order = np.argsort(keys, kind="stable")
+    at = order[np.minimum(np.searchsorted(keys[order], wanted), len(order) - 1)]
+    same = (part.stamp_ns[at] == rows.stamp_ns) & (part.cube[at] == rows.cube)
+    return at, same
+
+
+def _key(rows: Any, begin_ns: int) -> NDArray[np.int64]:
+    key: NDArray[np.int64] = (rows.stamp_ns - begin_ns) * 65536 + rows.cube
+    return key

@@ -1,9 +1,13 @@
 """Recordings that were cut off (killed, disk full, power lost) made readable again, where they
-stand.
+are.
 
-A chunk of an mcap file with its index is complete or it is not; what stands behind the last
-complete one is cut off and the summary that readers look for is written anew. An sqlite3 file
-undoes by itself what was not committed.
+An mcap file is a sequence of records. A chunk record with its index records is complete or it is
+not. What follows the last complete one is cut off, and the summary that readers look for is written
+anew. An sqlite3 file undoes by itself what was not committed.
+
+The records themselves are read and written by the library `mcap`. Its StreamReader is not used: it
+trusts the lengths inside a record, so behind the first damaged one it finds nothing any more. Here
+the next record begins where the length in front of the record says.
 """
 
 from __future__ import annotations
@@ -11,30 +15,42 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import struct
-from collections import defaultdict
+from collections import Counter
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-from rosbags.rosbag2.storage_mcap import (
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
     Channel,
-    McapWriter,
-    PendingChunk,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
     Schema,
-    decompress,
-    read_bytes,
-    read_string,
+    Statistics,
+    SummaryOffset,
 )
 
 from ..config.yaml import to_yaml
 from ..core.errors import BagError
-from .mcap import CHUNK, INDEX, in_summary
 from .read import DAMAGE, damage
-from .write import METADATA_VERSION, SUFFIXES, describe, describe_file, move_up, write_metadata
+from .rosbags_storage import decompress
+from .write import SUFFIXES, describe, describe_file, move_up, write_metadata
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, DATA_END = 1, 2, 3, 4, 15
 REST = ".rest"
+SALVAGE_ERRORS = (*DAMAGE, McapError)
+"""What the libraries raise where bytes are not what they should be."""
+_HEAD = struct.Struct("<BQ")
+"""Of a record: its opcode, and the length of what follows."""
 
 
 class Repaired(NamedTuple):
@@ -76,150 +92,171 @@ def repair(folder: Path, keep_rest: bool = True) -> Repaired:
 
 
 def _seal(path: Path, keep_rest: bool) -> tuple[int, int]:
-    """Cut an mcap file behind its last complete chunk and write its summary; bytes cut off, chunks
-    left out."""
+    """Cut an mcap file behind its last complete chunk and write its summary; returns bytes cut off
+    and chunks left out."""
     size = path.stat().st_size
     with path.open("r+b") as bio:
         bio.seek(max(-len(MAGIC), -size), 2)
         complete = bio.read() == MAGIC and size > 2 * len(MAGIC)
-        scan = _Scan(bio)
-        if complete and not scan.damaged:
+        found = _Salvaged(bio)
+        if complete and not found.damaged:
             return 0, 0
-        if keep_rest and not complete and size > scan.end:
-            bio.seek(scan.end)
+        if keep_rest and not complete and size > found.end:
+            bio.seek(found.end)
             with path.with_name(path.name + REST).open("wb") as rest:
                 shutil.copyfileobj(bio, rest)
-        if scan.storage.chunks:
-            bio.seek(scan.end)
+        if found.chunks:
+            bio.seek(found.end)
             bio.truncate()
-            # Its topics rosbag2 takes from the summary; without the other keys it reads nothing.
-            storage = scan.storage
-            count = sum(storage.channel_stats.values())
-            file = describe_file(
-                path.name, storage.message_start_time, storage.message_end_time, count
-            )
-            storage.close(METADATA_VERSION, to_yaml(describe("mcap", [file], [])))
-    if not scan.storage.chunks:
+            found.write_summary(bio, path.name)
+    if not found.chunks:
         path.unlink()
-    return 0 if complete else size - scan.end, scan.damaged
+    return 0 if complete else size - found.end, found.damaged
 
 
-class _Scan:
+class _Salvaged:
     """All complete chunks of an mcap file.
 
-    storage: a writer that knows them, ready to be closed; end: where the last of them ends;
-    damaged: left out.
+    schemas, channels: by id; chunks: as the summary has them; counts: messages of each channel
+    end: where the last complete chunk ends; damaged: how many were left out
     """
 
     def __init__(self, bio: BinaryIO) -> None:
-        # Not by its constructor, which begins a new file: only its state is wanted, to write the
-        # summary from.
-        storage = self.storage = McapWriter.__new__(McapWriter)
-        storage.schemas, storage.channels, storage.chunks, storage.channel_stats = [], [], [], {}
-        storage.message_start_time, storage.message_end_time = 2**63 - 1, 0
-        storage.chunk = PendingChunk(0, 0, BytesIO(), defaultdict(list))
-        storage.bio = bio  # type: ignore[assignment]
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.chunks: list[ChunkIndex] = []
+        self.counts: Counter[int] = Counter()
         self.end = self.damaged = 0
         bio.seek(0)
         if bio.read(len(MAGIC)) != MAGIC:
-            raise BagError(
-                f"{getattr(bio, 'name', '')}: does not begin as an mcap file does; nothing can be read"
-            )
-        chunk: _Chunk | None = None
-        while (record := _record(bio)) is not None:
-            kind, start, content = record
-            if kind == HEADER:
+            name = getattr(bio, "name", "")
+            raise BagError(f"{name}: does not begin as an mcap file does; nothing can be read")
+        self._open: tuple[ChunkIndex, Counter[int]] | None = None
+        for opcode, start, content in _records(bio):
+            if opcode == Opcode.HEADER:
                 self.end = bio.tell()
-            elif kind in (SCHEMA, CHANNEL):
-                _learn(storage, kind, content)
-            elif kind == CHUNK:
-                try:
-                    chunk = _Chunk(storage, start, content)
-                except DAMAGE:
-                    chunk = None
-                    self.damaged += 1
-            elif kind == INDEX and chunk is not None:
-                channel, length = struct.unpack_from("<HI", content)
-                chunk.indexes[channel] = start, length // 16
-                if chunk.complete():
-                    chunk.take(bio.tell())
-                    chunk, self.end = None, bio.tell()
-            elif kind in (DATA_END, FOOTER):
+            elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 break
+            try:
+                self._take(opcode, start, content)
+            except SALVAGE_ERRORS:
+                self._open = None
+                self.damaged += 1
 
+    def _take(self, opcode: int, start: int, content: bytes) -> None:
+        """A record of the file. SALVAGE_ERRORS: it is damaged."""
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._learn(opcode, content)
+        elif opcode == Opcode.CHUNK:
+            self._open = self._read_chunk(start, content)
+        elif opcode == Opcode.MESSAGE_INDEX and self._open is not None:
+            chunk, counts = self._open
+            index: MessageIndex = _parse(MessageIndex.read, content)
+            if len(index.records) != counts[index.channel_id]:
+                raise ValueError("an index has another number of messages than its chunk")
+            chunk.message_index_offsets[index.channel_id] = start
+            if chunk.message_index_offsets.keys() == counts.keys():
+                self.end = start + _HEAD.size + len(content)
+                begin = chunk.chunk_start_offset + chunk.chunk_length
+                chunk.message_index_length = self.end - begin
+                self.chunks.append(chunk)
+                self.counts += counts
+                self._open = None
 
-class _Chunk:
-    """A chunk while its indexes, which follow it, are read: of each channel where it stands and its
-    messages."""
-
-    def __init__(self, storage: McapWriter, start: int, content: bytes) -> None:
-        self.storage, self.start, self.length = storage, start, 9 + len(content)
-        self.first, self.last, self.size, crc = struct.unpack_from("<QQQI", content)
-        bio = BytesIO(content[28:])
-        self.compression = read_string(bio)
-        (self.stored,) = struct.unpack("<Q", bio.read(8))
-        inside = BytesIO(decompress(bio.read(self.stored), self.compression, self.size, crc))
-        self.counts: dict[int, int] = {}
-        self.indexes: dict[int, tuple[int, int]] = {}
-        while (record := _record(inside)) is not None:
-            kind, _, data = record
-            if kind in (SCHEMA, CHANNEL):
-                _learn(storage, kind, data)
+    def _read_chunk(self, start: int, content: bytes) -> tuple[ChunkIndex, Counter[int]]:
+        """A chunk without its indexes, and its messages per channel. SALVAGE_ERRORS: its checksum
+        is wrong, or what is in it is not records."""
+        chunk: Chunk = _parse(Chunk.read, content)
+        inside = decompress(
+            chunk.data, chunk.compression, chunk.uncompressed_size, chunk.uncompressed_crc
+        )
+        counts: Counter[int] = Counter()
+        for opcode, _, data in _records(BytesIO(inside)):
+            if opcode == Opcode.MESSAGE:
+                counts[int.from_bytes(data[:2], "little")] += 1
             else:
-                (channel,) = struct.unpack_from("<H", data)
-                self.counts[channel] = self.counts.get(channel, 0) + 1
-
-    def complete(self) -> bool:
-        return {channel: count for channel, (_, count) in self.indexes.items()} == self.counts
-
-    def take(self, end: int) -> None:
-        """Into the summary; its last index ends at `end`."""
-        storage = self.storage
-        for channel, count in self.counts.items():
-            storage.channel_stats[channel] = storage.channel_stats.get(channel, 0) + count
-        storage.message_start_time = min(storage.message_start_time, self.first)
-        storage.message_end_time = max(storage.message_end_time, self.last)
-        places = {channel: at for channel, (at, _) in self.indexes.items()}
-        storage.chunks.append(
-            in_summary(
-                self.first,
-                self.last,
-                self.start,
-                self.start + self.length,
-                end,
-                places,
-                self.compression,
-                self.stored,
-                self.size,
-            )
+                self._learn(opcode, data)
+        index = ChunkIndex(
+            chunk_length=_HEAD.size + len(content),
+            chunk_start_offset=start,
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+            message_end_time=chunk.message_end_time,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=chunk.message_start_time,
+            uncompressed_size=chunk.uncompressed_size,
         )
+        return index, counts
+
+    def _learn(self, opcode: int, content: bytes) -> None:
+        """A schema or a channel; the first of each id counts."""
+        if opcode == Opcode.SCHEMA:
+            schema: Schema = _parse(Schema.read, content)
+            self.schemas.setdefault(schema.id, schema)
+        elif opcode == Opcode.CHANNEL:
+            channel: Channel = _parse(Channel.read, content)
+            self.channels.setdefault(channel.id, channel)
+
+    def write_summary(self, bio: BinaryIO, name: str) -> None:
+        """Everything that follows the data of a complete file."""
+        begin_ns = min(chunk.message_start_time for chunk in self.chunks)
+        end_ns = max(chunk.message_end_time for chunk in self.chunks)
+        messages = self.counts.total()
+        # rosbag2 takes its topics from the summary; without the other keys it reads nothing.
+        said = describe("mcap", [describe_file(name, begin_ns, end_ns, messages)], [])
+        metadata = _bytes_of(Metadata("rosbag2", {"serialized_metadata": to_yaml(said)}))
+        metadata_index = MetadataIndex(bio.tell(), len(metadata), "rosbag2")
+        statistics = Statistics(
+            attachment_count=0,
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self.counts.items())),
+            chunk_count=len(self.chunks),
+            message_count=messages,
+            message_end_time=end_ns,
+            message_start_time=begin_ns,
+            metadata_count=1,
+            schema_count=len(self.schemas),
+        )
+        bio.write(metadata)
+        bio.write(_bytes_of(DataEnd(0)))
+        summary_start = bio.tell()
+        offsets = []
+        groups: list[tuple[Opcode, list[Any]]] = [
+            (Opcode.SCHEMA, list(self.schemas.values())),
+            (Opcode.CHANNEL, list(self.channels.values())),
+            (Opcode.CHUNK_INDEX, self.chunks),
+            (Opcode.METADATA_INDEX, [metadata_index]),
+            (Opcode.STATISTICS, [statistics]),
+        ]
+        for opcode, records in groups:
+            group = b"".join(map(_bytes_of, records))
+            offsets.append(SummaryOffset(opcode, bio.tell(), len(group)))
+            bio.write(group)
+        offsets_start = bio.tell()
+        bio.write(b"".join(map(_bytes_of, offsets)))
+        bio.write(_bytes_of(Footer(summary_start, offsets_start, 0)))
+        bio.write(MAGIC)
 
 
-def _record(bio: BinaryIO) -> tuple[int, int, bytes] | None:
-    """Kind, place and content of the next record; None where the file ends before the record
-    does."""
+def _records(bio: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
+    """Opcode, place and content of each record, until the file ends before a record does."""
     start = bio.tell()
-    head = bio.read(9)
-    if len(head) < 9:
-        return None
-    kind, length = struct.unpack("<BQ", head)
-    left = bio.seek(0, 2) - start - 9
-    bio.seek(start + 9)
-    return (kind, start, bio.read(length)) if length <= left else None
+    size = bio.seek(0, 2)
+    bio.seek(start)
+    while size - start >= _HEAD.size:
+        opcode, length = _HEAD.unpack(bio.read(_HEAD.size))
+        if length > size - start - _HEAD.size:
+            return
+        yield opcode, start, bio.read(length)
+        start += _HEAD.size + length
 
 
-def _learn(storage: McapWriter, kind: int, content: bytes) -> None:
-    """Take a schema or a channel."""
-    bio = BytesIO(content)
-    (number,) = struct.unpack("<H", bio.read(2))
-    if kind == SCHEMA:
-        if all(schema.id != number for schema in storage.schemas):
-            storage.schemas.append(
-                Schema(number, read_string(bio), read_string(bio), read_string(bio))
-            )
-    elif all(channel.id != number for channel in storage.channels):
-        (schema,) = struct.unpack("<H", bio.read(2))
-        name = next(known.name for known in storage.schemas if known.id == schema)
-        storage.channels.append(
-            Channel(number, name, read_string(bio), read_string(bio), read_bytes(bio))
-        )
+def _parse(read: Callable[[ReadDataStream], Any], content: bytes) -> Any:
+    return read(ReadDataStream(BytesIO(content)))
+
+
+def _bytes_of(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()

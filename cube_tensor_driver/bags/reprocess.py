@@ -1,5 +1,8 @@
-"""Recorded frequencies to stress again, by the pipeline of the reconstruction node and to the same
-bits."""
+"""Recorded frequencies to stress again: a bag source, a Reconstructor, a writer.
+
+The result has the bits that the reconstruction node published, unless something is asked for that
+differs from the recording.
+"""
 
 from __future__ import annotations
 
@@ -17,239 +20,80 @@ from ..config.calibration import calibration_text
 from ..config.skin import Skin
 from ..core.calibration import Calibration
 from ..core.errors import BagError, CalibrationError, CubeError
-from ..core.pattern import count_repeats
 from ..core.pipeline import Pipeline
-from ..core.reconstructor import Reconstructor, Verdicts
-from ..core.rows import FrequencyRows, StressRows, concatenate
+from ..core.reconstructor import Reconstructor
+from ..core.rows import StressRows
 from .mcap import HEAD
-from .message_codec import SECOND, Decoded, stress_codec
-from .read import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, damage, pipeline, typestore
-from .recorded_verdicts import RecordedVerdicts
+from .message_codec import stress_codec
+from .read import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, typestore
+from .recording import Settings, stamp_ns
+from .source import BagSource, Segment
 from .tables import TableWriter
 from .write import BagWriter, quality
 
 PARTIAL = ".partial"
 """Folder beside the results for what is not complete; a restart begins those anew."""
-
-BATCHES_BYTES = 30 << 20
+WORKING_BYTES = 30 << 20
+NAMED = 5
+"""Cubes that a message names at most."""
 
 
 @dataclass(frozen=True)
-class Change:
-    """What to do differently from the recording. None: as it was.
+class Overrides:
+    """What differs from the recording. None: as it was recorded.
 
-    calibration: for all cubes; skin: the calibrations of its cubes, by name; tare: from and to in s
-    after the start of the bag, between which the cubes were without load.
+    calibration: for all cubes
+    skin: the calibrations of its cubes, by the cubes' names
+    tare: (begin, end) in s after the start of the bag, between which nothing touched the skin
     """
 
     calibration: Calibration | None = None
     skin: Skin | None = None
     tare: tuple[float, float] | None = None
 
+    @property
+    def any(self) -> bool:
+        return any(value is not None for value in (self.calibration, self.skin, self.tare))
+
+
+AS_RECORDED = Overrides()
+
 
 @dataclass(frozen=True)
-class Job:
-    """One bag to reprocess: where to, as what (bag, parquet, csv)."""
+class ReprocessJob:
+    """One bag to reprocess. form of the output: bag, parquet or csv."""
 
     bag: Path
     output: Path
     form: str
-    change: Change
+    overrides: Overrides = AS_RECORDED
 
 
-class Done(NamedTuple):
-    """What a job did: messages and rows of stress, how much time they cover in s."""
+class ReprocessResult(NamedTuple):
+    """Messages and rows of stress that were made; how much time the bag covers, s."""
 
     messages: int
     rows: int
     seconds: float
 
 
-class Recording:
-    """The frequencies of a bag as a stream of stress; `topic` of frequencies. infos, pipelines: by
-    time.
+def reprocess(job: ReprocessJob) -> ReprocessResult:
+    """Do one job. The output appears when it is complete.
 
-    BagError: no info in the bag, or the change does not fit its cubes.
+    BagError: what is wrong with the bag, the overrides or the output.
     """
-
-    def __init__(self, bag: Bag, topic: str, change: Change | None = None) -> None:
-        change = change or Change()
-        self.bag, self.topic = bag, topic
-        infos = bag.infos(topic.removesuffix("frequencies") + "info")
-        # The driver knows of no tare: what it says counts only where no reconstruction ran.
-        infos = [info for info in infos if info.sender == "reconstruction"] or infos
-        infos.sort(key=lambda info: _stamp_ns(info))
-        self.infos = infos
-        self._now: tuple[int, Reconstructor] | None = None
-        self._since = np.array([_stamp_ns(info) for info in infos])
-        with damage(bag.path):
-            self.pipelines = [self._changed(info, change) for info in infos]
-        if change.tare is not None:
-            self._tare(*change.tare)
-        # What was found bad under other rest frequencies need not be so under these.
-        self.found = RecordedVerdicts(bag, topic, change == Change())
-
-    def batches(
-        self,
-    ) -> Iterator[tuple[Decoded[FrequencyRows], NDArray[np.int64], StressRows]]:
-        """Frequencies, when they were recorded, the stress of all their rows in order."""
-        for messages, recorded_ns in self.bag.frequencies(self.topic):
-            cube = messages.by_message(messages.rows.cube)
-            times_ns = messages.by_message(messages.rows.stamp_ns)
-            # An info holds for what was sampled from its stamp on: the node stamps it just behind
-            # the last row before.
-            newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
-            which = np.maximum(np.searchsorted(self._since, newest_ns, side="right") - 1, 0)
-            found = self.found.of(messages.stamp_ns, cube)
-            changed = (cube[1:] != cube[:-1]).any(axis=1) | (np.diff(which) != 0)
-            ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(cube)]
-            n = cube.shape[1]
-            for run in map(slice, ends[:-1], ends[1:]):
-                part = Decoded(
-                    messages.rows.select(slice(run.start * n, run.stop * n)),
-                    messages.stamp_ns[run],
-                    messages.frame_id,
-                )
-                verdicts = Verdicts(
-                    np.repeat(found.known[run], n),
-                    found.left_out[run].ravel(),
-                    found.bits[run].ravel(),
-                )
-                yield part, recorded_ns[run], self._process(int(which[run.start]), part, verdicts)
-
-    def number(self, newest_ns: int) -> int:
-        """Which info holds for a message whose newest row was sampled then."""
-        return max(int(np.searchsorted(self._since, newest_ns, side="right")) - 1, 0)
-
-    def info_messages(self) -> list[bytes]:
-        """The SkinInfo messages that go with the stress, serialised."""
-        return [_info(info, made) for info, made in zip(self.infos, self.pipelines, strict=True)]
-
-    def _process(
-        self, number: int, messages: Decoded[FrequencyRows], verdicts: Verdicts
-    ) -> StressRows:
-        """Stress of all rows of messages of the same cubes, as the node makes it message by
-        message."""
-        reconstructor, rows = self._use(number), messages.rows
-        n = len(rows) // len(messages)
-        try:
-            if count_repeats(rows.cube[:n]) or len(messages) == 1:
-                return reconstructor.process(rows, verdicts)
-            # Cubes in another order: only message by message are the bits the node's.
-            parts = [slice(k, k + n) for k in range(0, len(rows), n)]
-            return concatenate(
-                [reconstructor.process(rows.select(p), verdicts.select(p)) for p in parts]
-            )
-        except CubeError as error:
-            raise BagError(f"{self.bag.path}: {self.topic}: {error}") from None
-
-    def _use(self, number: int) -> Reconstructor:
-        """The reconstructor under an info: a tare changes rest frequencies only."""
-        wanted = self.pipelines[number]
-        if self._now is None or [c.id for c in self._now[1].calibrations] != [
-            c.id for c in wanted.calibrations
-        ]:
-            made = Reconstructor(wanted.calibrations)
-        elif self._now[0] != number:
-            made = self._now[1]
-        else:
-            return self._now[1]
-        made.rest_frequency = wanted.rest_frequency
-        self._now = number, made
-        return made
-
-    def _changed(self, info: Any, change: Change) -> Pipeline:
-        recorded = pipeline(info)
-        if change.skin is not None:
-            by_name = {cube.name: cube.calibration for cube in change.skin.cubes}
-            missing = [cube.name for cube in info.cubes if cube.name not in by_name]
-            if missing:
-                raise BagError(
-                    f"{self.bag.path}: the skin file {change.skin.name} has no cubes "
-                    f"{', '.join(missing[:5])}; the bag has"
-                )
-            new = [by_name[cube.name] for cube in info.cubes]
-        elif change.calibration is not None:
-            new = [change.calibration] * len(info.cubes)
-        else:
-            return recorded
-        rest = []
-        for cube, old, made, was in zip(
-            info.cubes, recorded.calibrations, new, recorded.rest_frequency, strict=True
-        ):
-            try:
-                made.check(old.layout, cube.uid or None)
-            except CalibrationError as error:
-                raise BagError(f"{self.bag.path}: cube {cube.name}: {error}") from None
-            # A tare is a measurement and stays; without one the calibration says what no load is.
-            n = old.layout.n_pads
-            tared = was[:n] != old.rest_frequency
-            rest.append(
-                np.pad(
-                    np.where(tared, was[:n], made.rest_frequency),
-                    (0, len(was) - n),
-                    constant_values=np.nan,
-                )
-            )
-        result = Pipeline(new, np.float32)
-        result.rest_frequency = np.array(rest)
-        return result
-
-    def _tare(self, begin_s: float, end_s: float) -> None:
-        """Mean frequencies of all pads between two times, temperature taken out, become the rest
-        frequencies."""
-        of = self.pipelines[-1]
-        total, count = np.zeros_like(of.rest_frequency), np.zeros(of.rest_frequency.shape)
-        begin_ns, end_ns = (self.bag.start_ns + round(time * 1e9) for time in (begin_s, end_s))
-        for messages, _ in self.bag.frequencies(self.topic):
-            rows = messages.rows
-            inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
-            rows = rows.select(inside & (rows.cube < len(of.calibrations)))
-            if not len(rows):
-                continue
-            frequency = rows.frequency / of.temperature_factor(rows.cube, rows.temperature)
-            bad = rows.pad_fault[:, None] >> np.arange(frequency.shape[1]) & 1 > 0
-            good = np.isfinite(frequency) & (frequency > 0) & ~bad
-            np.add.at(total, rows.cube, np.where(good, frequency, 0))
-            np.add.at(count, rows.cube, good)
-        exists = np.isfinite(of.rest_frequency)
-        without = (exists & (count == 0)).any(axis=1)
-        if without.any():
-            names = ", ".join(
-                self.infos[-1].cubes[cube].name for cube in np.flatnonzero(without)[:5]
-            )
-            seconds = (self.bag.end_ns - self.bag.start_ns) * 1e-9
-            raise BagError(
-                f"{self.bag.path}: --tare-from {begin_s:g} {end_s:g}: not every pad of {names} was "
-                f"measured in that time; the bag lasts from 0 to {seconds:.3f} s"
-            )
-        rest = np.where(exists, total / np.maximum(count, 1), np.nan)
-        for made in self.pipelines:
-            made.rest_frequency = rest
-
-
-def reprocess(job: Job) -> Done:
-    """Do one job; its output appears when it is complete. BagError: what is wrong with bag or
-    output."""
-    # malloc gives back what is free above twice the largest block that it ever gave back: not the
-    # batches' memory.
-    np.empty(BATCHES_BYTES, np.uint8)
+    # glibc's malloc keeps freed memory up to twice the largest block that it has given back. This
+    # block makes it keep the arrays of the batches, which come again and again.
+    np.empty(WORKING_BYTES, np.uint8)
     partial = job.output.parent / PARTIAL / job.output.name
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+        if partial.is_dir():
+            shutil.rmtree(partial)
+        else:
+            partial.unlink(missing_ok=True)
         with Bag(job.bag) as bag:
-            topics = bag.topics(FREQUENCIES)
-            if not topics:
-                raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
-            if job.form == "bag":
-                done = _to_bag(bag, topics, job.change, partial)
-            elif len(topics) > 1:
-                raise BagError(
-                    f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
-                )
-            else:
-                done = _to_table(bag, topics[0], job.change, partial)
+            result = _reprocess(bag, job, partial)
         partial.replace(job.output)
         with suppress(OSError):  # other jobs are at work in there
             partial.parent.rmdir()
@@ -257,70 +101,193 @@ def reprocess(job: Job) -> Done:
         raise BagError(
             f"{job.output}: {error.strerror}; name a folder that can be written"
         ) from None
-    return done
+    return result
 
 
-def _to_bag(bag: Bag, topics: list[str], change: Change, output: Path) -> Done:
-    messages = rows = 0
+def _reprocess(bag: Bag, job: ReprocessJob, output: Path) -> ReprocessResult:
+    topics = bag.topics(FREQUENCIES)
+    if not topics:
+        raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
+    if job.form != "bag" and len(topics) > 1:
+        raise BagError(
+            f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
+        )
+    sources = [BagSource(bag, topic) for topic in topics]
+    if job.form == "bag":
+        _write_bag(sources, job.overrides, output)
+    else:
+        _write_table(sources[0], job.overrides, output)
+    return ReprocessResult(
+        sum(source.messages for source in sources),
+        sum(source.rows for source in sources),
+        (bag.end_ns - bag.start_ns) * 1e-9,
+    )
+
+
+def _write_bag(sources: list[BagSource], overrides: Overrides, output: Path) -> None:
     with BagWriter(output) as writer:
-        for topic in topics:
-            skin = topic.removesuffix("frequencies")
-            recording = Recording(bag, topic, change)
+        for source in sources:
+            bag, skin = source.bag, source.topic.removesuffix("frequencies")
+            settings = settings_with(source, overrides)
             writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
             writer.add_topic(f"{skin}stress", STRESS, [quality()])
-            for info, data in zip(recording.infos, recording.info_messages(), strict=True):
-                writer.write(
-                    f"{skin}info", max(bag.start_ns, min(bag.end_ns, _stamp_ns(info))), data
+            data = _info_messages(source.recording.infos, settings)
+            for info, one in zip(source.recording.infos, data, strict=True):
+                inside_ns = max(bag.start_ns, min(bag.end_ns, stamp_ns(info)))
+                writer.write(f"{skin}info", inside_ns, one)
+            for segment, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):
+                messages = segment.messages
+                records = stress_codec.encode_many(
+                    stress, messages.stamp_ns, messages.frame_id, before=HEAD
                 )
-            for source, recorded_ns, stress in recording.batches():
-                made = stress_codec.encode_many(stress, source.stamp_ns, source.frame_id, HEAD)
-                writer.write_many(f"{skin}stress", recorded_ns, made)
-                messages += len(recorded_ns)
-                rows += len(stress)
-    return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
+                writer.write_many(f"{skin}stress", segment.recorded_ns, records)
 
 
-def _to_table(bag: Bag, topic: str, change: Change, output: Path) -> Done:
-    messages = rows = 0
-    recording = Recording(bag, topic, change)
-    with TableWriter(
-        output, [cube.name for cube in recording.infos[-1].cubes] + ["unknown"]
-    ) as table:
-        for _, recorded_ns, stress in recording.batches():
+def _write_table(source: BagSource, overrides: Overrides, output: Path) -> None:
+    settings = settings_with(source, overrides)
+    names = [cube.name for cube in source.skin.cubes]
+    with TableWriter(output, [*names, "unknown"]) as table:
+        for _, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):
             table.write(stress)
-            messages += len(recorded_ns)
-            rows += len(stress)
-    return Done(messages, rows, (bag.end_ns - bag.start_ns) * 1e-9)
 
 
-def _stamp_ns(info: Any) -> int:
-    return int(info.header.stamp.sec) * SECOND + int(info.header.stamp.nanosec)
+def reconstruct(
+    source: BagSource, overrides: Overrides = AS_RECORDED
+) -> Iterator[tuple[Segment, StressRows]]:
+    """The stress of each segment of a bag. BagError: damaged, or the overrides do not fit."""
+    return _reconstruct(source, settings_with(source, overrides), with_verdicts=not overrides.any)
 
 
-def _info(info: Any, made: Pipeline) -> bytes:
-    """The recorded info with the calibrations and rest frequencies of the pipeline, serialised."""
-    distinct = {
-        calibration.id: number
-        for number, calibration in reversed(list(enumerate(made.calibrations)))
-    }
-    cubes = [
-        replace(
-            cube,
-            calibration_id=calibration.id,
-            half_side=calibration.half_side,
-            rest_frequency=rest[: calibration.layout.n_pads],
+def _reconstruct(
+    source: BagSource, settings: list[Settings], *, with_verdicts: bool
+) -> Iterator[tuple[Segment, StressRows]]:
+    """settings: for each info. with_verdicts: use those recorded; what was found bad under other
+    settings need not be so under these."""
+    number = -1
+    ids: list[str] = []
+    for segment in source.segments():
+        rows = segment.messages.rows
+        verdicts = source.recording.verdicts(rows) if with_verdicts else None
+        try:
+            if segment.number != number:
+                number = segment.number
+                now = settings[number]
+                # Health remembers across a tare, but not across other calibrations.
+                if ids != (ids := [one.id for one in now.calibrations]):
+                    reconstructor = Reconstructor(now.calibrations)
+                reconstructor.rest_frequency = now.rest_frequency
+            stress = reconstructor.process(rows, verdicts)
+        except CubeError as error:
+            raise BagError(f"{source.bag.path}: {source.topic}: {error}") from None
+        yield segment, stress
+
+
+def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
+    """The settings of each info of a bag, with what differs. BagError: it does not fit the bag."""
+    recording = source.recording
+    settings = recording.settings
+    if overrides.skin is not None or overrides.calibration is not None:
+        settings = [
+            _recalibrated(source, info, recorded, overrides)
+            for info, recorded in zip(recording.infos, settings, strict=True)
+        ]
+    if overrides.tare is not None:
+        rest = _tared(source, settings[-1], *overrides.tare)
+        settings = [replace(one, rest_frequency=rest) for one in settings]
+    return settings
+
+
+def _recalibrated(
+    source: BagSource, info: Any, recorded: Settings, overrides: Overrides
+) -> Settings:
+    """Settings with the calibrations of the overrides."""
+    path = source.bag.path
+    if overrides.skin is not None:
+        by_name = {cube.name: cube.calibration for cube in overrides.skin.cubes}
+        missing = [cube.name for cube in info.cubes if cube.name not in by_name]
+        if missing:
+            raise BagError(
+                f"{path}: the skin file {overrides.skin.name} has no cubes "
+                f"{', '.join(missing[:NAMED])}; the bag has"
+            )
+        calibrations = [by_name[cube.name] for cube in info.cubes]
+    else:
+        calibrations = [overrides.calibration] * len(info.cubes)  # type: ignore[list-item]
+    rest_frequency = recorded.rest_frequency.copy()
+    for cube, old, new, rest in zip(
+        info.cubes, recorded.calibrations, calibrations, rest_frequency, strict=True
+    ):
+        try:
+            new.check(old.layout, cube.uid or None)
+        except CalibrationError as error:
+            raise BagError(f"{path}: cube {cube.name}: {error}") from None
+        # A tare is a measurement and stays; without one the calibration says what no load is.
+        pads = rest[: old.layout.n_pads]
+        pads[:] = np.where(pads != old.rest_frequency, pads, new.rest_frequency)
+    return Settings(tuple(calibrations), rest_frequency)
+
+
+def _tared(
+    source: BagSource, settings: Settings, begin_s: float, end_s: float
+) -> NDArray[np.float64]:
+    """(cubes, P) Hz: mean frequencies of all pads between two times, at the reference
+    temperature."""
+    bag = source.bag
+    pipeline = Pipeline(settings.calibrations)
+    exists = np.isfinite(settings.rest_frequency)
+    total, count = np.zeros(exists.shape), np.zeros(exists.shape)
+    begin_ns, end_ns = (bag.start_ns + round(time * 1e9) for time in (begin_s, end_s))
+    for messages, _ in bag.frequencies(source.topic):
+        rows = messages.rows
+        inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
+        rows = rows.select(inside & (rows.cube < len(exists)))
+        if not len(rows):
+            continue
+        frequency = rows.frequency / pipeline.temperature_factor(rows.cube, rows.temperature)
+        bad = rows.pad_fault[:, None] >> np.arange(frequency.shape[1]) & 1 > 0
+        good = np.isfinite(frequency) & (frequency > 0) & ~bad
+        np.add.at(total, rows.cube, np.where(good, frequency, 0))
+        np.add.at(count, rows.cube, good)
+    without = np.flatnonzero((exists & (count == 0)).any(axis=1))
+    if len(without):
+        names = ", ".join(source.skin.cubes[cube].name for cube in without[:NAMED])
+        seconds = (bag.end_ns - bag.start_ns) * 1e-9
+        raise BagError(
+            f"{bag.path}: --tare-from {begin_s:g} {end_s:g}: not every pad of {names} was "
+            f"measured in that time; the bag lasts from 0 to {seconds:.3f} s"
         )
-        for cube, calibration, rest in zip(
-            info.cubes, made.calibrations, made.rest_frequency, strict=True
+    return np.where(exists, total / np.maximum(count, 1), np.nan)
+
+
+def _info_messages(infos: list[Any], settings: list[Settings]) -> Iterator[bytes]:
+    """The recorded infos with other settings, serialised."""
+    covariances: dict[str, NDArray[np.float64]] = {}
+    for info, one in zip(infos, settings, strict=True):
+        first = {
+            calibration.id: number
+            for number, calibration in reversed(list(enumerate(one.calibrations)))
+        }
+        if not first.keys() <= covariances.keys():
+            pipeline = Pipeline(one.calibrations)
+            covariances |= {key: pipeline.covariance(number) for key, number in first.items()}
+        cubes = [
+            replace(
+                cube,
+                calibration_id=calibration.id,
+                half_side=calibration.half_side,
+                rest_frequency=rest[: calibration.layout.n_pads],
+            )
+            for cube, calibration, rest in zip(
+                info.cubes, one.calibrations, one.rest_frequency, strict=True
+            )
+        ]
+        changed = replace(
+            info,
+            version=max(VERSIONS),
+            sender="reconstruction",
+            cubes=cubes,
+            calibration_ids=list(first),
+            calibrations=[calibration_text(one.calibrations[n]) for n in first.values()],
+            covariance=np.array([covariances[key] for key in first]).ravel(),
         )
-    ]
-    changed = replace(
-        info,
-        version=max(VERSIONS),
-        sender="reconstruction",
-        cubes=cubes,
-        calibration_ids=list(distinct),
-        calibrations=[calibration_text(made.calibrations[number]) for number in distinct.values()],
-        covariance=np.array([made.covariance(number) for number in distinct.values()]).ravel(),
-    )
-    return bytes(typestore().serialize_cdr(changed, INFO))
+        yield bytes(typestore().serialize_cdr(changed, INFO))

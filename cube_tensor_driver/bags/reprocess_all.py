@@ -12,14 +12,16 @@ from typing import Any
 
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import BagError, ConfigError, CubeError
-from .reprocess import Change, Done, Job, reprocess
+from .reprocess import Overrides, ReprocessJob, ReprocessResult, reprocess
 
 SUFFIX = {"bag": "", "parquet": ".parquet", "csv": ".csv"}
 RECIPE = "reprocess.yaml"
 """File in the folder of the results that says how they were made."""
 
 
-def make_jobs(bags: Sequence[Path], folder: Path, form: str, change: Change) -> list[Job]:
+def make_jobs(
+    bags: Sequence[Path], folder: Path, form: str, overrides: Overrides
+) -> list[ReprocessJob]:
     """One job per bag, whose name its result has. BagError: two bags have one name."""
     names: dict[str, Path] = {}
     for bag in bags:
@@ -30,20 +32,23 @@ def make_jobs(bags: Sequence[Path], folder: Path, form: str, change: Change) -> 
                 f"{names[name]} and {bag} would both become {name}; reprocess them into two folders"
             )
         names[name] = bag
-    return [Job(bag, folder / f"{name}{SUFFIX[form]}", form, change) for name, bag in names.items()]
+    return [
+        ReprocessJob(bag, folder / f"{name}{SUFFIX[form]}", form, overrides)
+        for name, bag in names.items()
+    ]
 
 
-def write_recipe(folder: Path, form: str, change: Change) -> None:
+def write_recipe(folder: Path, form: str, overrides: Overrides) -> None:
     """Make the folder and note how its results are made, so that a restart continues the same way.
 
     BagError: results in it were made another way, or it cannot be written.
     """
-    cubes = change.skin.cubes if change.skin else ()
+    cubes = overrides.skin.cubes if overrides.skin else ()
     recipe: dict[str, Any] = {
         "format": form,
-        "calibration": change.calibration.id if change.calibration else None,
+        "calibration": overrides.calibration.id if overrides.calibration else None,
         "skin": {cube.name: cube.calibration.id for cube in cubes} or None,
-        "tare_from_s": list(change.tare) if change.tare else None,
+        "tare_from_s": list(overrides.tare) if overrides.tare else None,
     }
     path = folder / RECIPE
     if path.exists():
@@ -60,8 +65,8 @@ def write_recipe(folder: Path, form: str, change: Change) -> None:
 
 
 def reprocess_all(
-    jobs: Sequence[Job], executor: Executor
-) -> Iterator[tuple[Job, Done | CubeError]]:
+    jobs: Sequence[ReprocessJob], executor: Executor
+) -> Iterator[tuple[ReprocessJob, ReprocessResult | CubeError]]:
     """Each job with what it did, or with the error that ended it, as they end."""
     futures = {executor.submit(reprocess, job): job for job in jobs}
     for future in as_completed(futures):

@@ -27,15 +27,14 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
-from rosbags.rosbag2.enums import CompressionMode
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ..config.yaml import write_yaml
 from ..core.errors import BagError
 from .mcap import HEAD, McapOutput
 from .read import DAMAGE, damage, typestore
+from .rosbags_storage import Sqlite3Writer
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}

@@ -29,12 +29,12 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..bags.read import Bag
+    from ..bags.source import open_bag
     from ..plot.style import save
     from ..plot.time_series import cube_series, draw_series
 
-    with Bag(options.bag) as bag:
-        series = cube_series(bag, options.cube, options.start, options.end)
+    with open_bag(options.bag) as source:
+        series = cube_series(source, options.cube, options.start, options.end)
     save(draw_series(series, options.bag.resolve().name), options.output)
     print(f"wrote {options.output}: cube {series.name}, {len(series.seconds)} samples")
     return 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from .parser import Parser, count, number
 
 if TYPE_CHECKING:
-    from ..bags.reprocess import Change
+    from ..bags.reprocess import Overrides
 
 
 def arguments(parser: Parser) -> None:
@@ -67,9 +67,9 @@ def run(options: argparse.Namespace) -> int:
     )
     from ..terminal.reprocessing import ReprocessingReport
 
-    change = what_to_change(options)
-    jobs = make_jobs(options.bags, options.output, options.format, change)
-    write_recipe(options.output, options.format, change)
+    overrides = overrides_of(options)
+    jobs = make_jobs(options.bags, options.output, options.format, overrides)
+    write_recipe(options.output, options.format, overrides)
     waiting = [job for job in jobs if not job.output.exists()]
     report = ReprocessingReport(options.output, jobs=len(jobs), waiting=len(waiting))
     processes = useful_workers(options.jobs, len(waiting))
@@ -80,9 +80,9 @@ def run(options: argparse.Namespace) -> int:
     return 1 if report.failed else 0
 
 
-def what_to_change(options: argparse.Namespace) -> Change:
+def overrides_of(options: argparse.Namespace) -> Overrides:
     """ConfigError: options that contradict each other, or files that are wrong."""
-    from ..bags.reprocess import Change
+    from ..bags.reprocess import Overrides
     from ..config.calibration import find_calibration, read_calibration
     from ..config.skin import read_skin
     from ..core.errors import ConfigError
@@ -98,4 +98,4 @@ def what_to_change(options: argparse.Namespace) -> Change:
         calibration = read_calibration(find_calibration(options.calibration, Path()))
     if options.skin is not None:
         skin = read_skin(options.skin)
-    return Change(calibration, skin, tare)
+    return Overrides(calibration, skin, tare)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..bags.read import Bag
-from ..bags.reprocess import Recording
+from ..bags.reprocess import reconstruct
+from ..bags.source import BagSource
 from ..core.errors import BagError
 from ..core.modes import COMPONENTS, STRESS
 from ..core.status import INVALID, RESIDUAL
@@ -43,15 +43,15 @@ class TimeSeries:
 
 
 def cube_series(
-    bag: Bag, name: str | None, start_s: float | None, end_s: float | None
+    source: BagSource, name: str | None, start_s: float | None, end_s: float | None
 ) -> TimeSeries:
     """A cube between two times after the bag's start; None: the first cube, from start to end.
 
     Stress is reconstructed from the frequencies, as it was when they were recorded. Raises BagError
-    when there is no such cube, no sample in that time, or more than one skin.
+    when there is no such cube, or no sample in that time.
     """
-    recording = Recording(bag, f"{bag.skin()}frequencies")
-    cubes = recording.infos[-1].cubes
+    bag = source.bag
+    cubes = source.recording.infos[-1].cubes
     names = [cube.name for cube in cubes]
     if name is not None and name not in names:
         raise BagError(f"{bag.path}: no cube {name!r}; there are {', '.join(names[:20])}")
@@ -60,10 +60,10 @@ def cube_series(
     start = 0.0 if start_s is None else start_s
     end = np.inf if end_s is None else end_s
     parts = []
-    for source, _, rows in recording.batches():
+    for segment, rows in reconstruct(source):
         seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
         chosen = (rows.cube == number) & (seconds >= start) & (seconds <= end)
-        frequency = source.rows.frequency[chosen, :n_pads]
+        frequency = segment.messages.rows.frequency[chosen, :n_pads]
         values = np.hstack([rows.stress, rows.gradient])[chosen]
         parts.append(
             (seconds[chosen], frequency, values, rows.residual[chosen], rows.status[chosen])

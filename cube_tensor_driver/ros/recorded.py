@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..bags.recorded_health import RecordedReconstruction
+    from ..bags.recorded_reconstruction import RecordedReconstruction
 
 BAGS = (".mcap", ".db3")
 
@@ -16,6 +16,6 @@ def open_recording(path: Path) -> RecordedReconstruction | None:
     if not path.is_dir() and path.suffix not in BAGS:
         return None
     # Imported here because it loads much that a node does not need otherwise.
-    from ..bags.recorded_health import RecordedReconstruction
+    from ..bags.recorded_reconstruction import RecordedReconstruction
 
     return RecordedReconstruction(path)

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from ..bags.reprocess import Done
+from ..bags.reprocess import ReprocessResult
 from ..core.errors import CubeError
 
 
@@ -30,7 +30,7 @@ class ReprocessingReport:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def add(self, output: Path, result: Done | CubeError) -> None:
+    def add(self, output: Path, result: ReprocessResult | CubeError) -> None:
         """A bag is done, or was given up with an error."""
         if isinstance(result, CubeError):
             self.failed += 1
