@@ -17,7 +17,10 @@ import psutil
 import pytest
 
 from conftest import ROOT
+from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.cli.table import COMMANDS
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.yaml import write_yaml
 
 sys.path.insert(0, str(ROOT / "tools"))
 import environment
@@ -181,14 +184,27 @@ def test_help_lists_every_command_without_the_environment(arguments):
 
 
 @pytest.mark.parametrize("columns", [60, 80, 120])
-def test_help_is_readable(columns):
-    """No line is wider than the terminal, of any command, and none needs the environment."""
+def test_help_is_readable(columns, monkeypatch, capsys):
+    """Of every command no line is wider than the terminal, however wide that is."""
+    monkeypatch.setenv("COLUMNS", str(columns))
     for words in ([], *([name] for name in COMMANDS), ["config", "grid"], ["bench", "scale"]):
-        done = bare(*words, "--help", columns=columns)
-        assert done.returncode == 0 and not done.stderr, words
-        lines = done.stdout.splitlines()
-        assert lines[0].startswith(" ".join(["usage: ./cube", *words]))
+        with pytest.raises(SystemExit) as ended:
+            main([*words, "--help"])
+        lines = capsys.readouterr().out.splitlines()
+        assert ended.value.code == 0 and lines[0].startswith(" ".join(["usage: ./cube", *words]))
         assert max(map(len, lines)) <= min(columns, 100), words
+
+
+def test_help_of_every_command_needs_no_environment():
+    script = (
+        "from cube_tensor_driver.cli.main import parse\n"
+        f"for name in {list(COMMANDS)}:\n"
+        "    try: parse([name, '--help'])\n"
+        "    except SystemExit as ended: assert ended.code == 0\n"
+    )
+    done = subprocess.run([sys.executable, "-S", "-c", script], cwd=ROOT, env={}, **CAPTURED)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("usage: ./cube ") == len(COMMANDS)
 
 
 def test_help_of_a_command_in_three_ways():
@@ -229,6 +245,15 @@ def test_a_usage_error_is_short_and_needs_no_environment(arguments, said):
     assert done.returncode == 2 and not done.stdout
     assert done.stderr.startswith("cube: ") and said in done.stderr
     assert done.stderr.count("\n") <= 2 and "usage" not in done.stderr
+
+
+@pytest.mark.parametrize("words", ["--help", "urdf {skin}"])
+def test_a_reader_that_has_enough_is_no_error(words, tmp_path):
+    skin = tmp_path / "skin.yaml"
+    write_yaml(skin, grid(nx=20, ny=20, pitch=0.01, links=1, rate=100.0))
+    command = f"{sys.executable} -m cube_tensor_driver.cli {words.format(skin=skin)} | head -c 5"
+    done = subprocess.run(["bash", "-c", command], **CAPTURED)
+    assert len(done.stdout) == 5 and not done.stderr
 
 
 def test_exec_becomes_the_command():

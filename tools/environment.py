@@ -344,7 +344,9 @@ def main(arguments: list[str]) -> int:
     sys.path.insert(0, str(ROOT))
     from cube_tensor_driver.cli.main import parse
 
-    # Help, --version and usage errors end here (SystemExit), before anything is set up.
+    # Help, --version and usage errors end here (SystemExit), before anything is set up; a reader
+    # such as head may close their pipe.
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     parse(arguments)
     signal.signal(signal.SIGTERM, interrupt)
     try:
