@@ -1,4 +1,5 @@
-"""Elasticity of the body around the cubes: contact on a half space, finite elements of one cube.
+"""Elasticity of the body around the cubes.
 
-Also the pressure field between the cubes of a skin. Experiments that use it are in `research`.
+Contact on a half space, finite elements of one cube in its body, and the pressure field between the
+cubes of a skin. Experiments that use it are in `research`, pictures in `plot`.
 """

@@ -1,7 +1,7 @@
 """Stress and stress gradient in a half space under contact loads on its surface.
 
-The skin is the half space z <= 0 in the cube frame: z points out of the skin, its surface is z = 0
-and a cube sits at z = -depth. A force acts *on* the skin, so pressing has a negative z component.
+The skin is the half space z <= 0: z points out of the skin, its surface is z = 0 and a cube sits at
+z = -depth. A force acts *on* the skin, so pressing has a negative z component.
 
 With d = point - source, R = |d|, Z = -d_z and the harmonic potential chi = Z ln(R + Z) - R, the
 solutions of Boussinesq (normal force) and Cerruti (tangential force) are one expression::
@@ -9,13 +9,12 @@ solutions of Boussinesq (normal force) and Cerruti (tangential force) are one ex
     sigma_ij = -3 / (2 pi) d_i d_j (F . d) / R^5  +  (1 - 2 nu) / (2 pi) C_ij
     C_xx = g_yy,  C_yy = g_xx,  C_xy = -g_xy,  C_zi = 0,   g = F_x chi_x + F_y chi_y - F_z chi_Z
 
-The first term is the whole answer in an incompressible body; the second is a plane stress field
-with the Airy function g, so it balances by itself and leaves every plane z = const free of
-traction.
+The first term is all there is in an incompressible body. The second is a plane stress field with
+the Airy function g: it balances by itself and leaves every plane z = const free of traction.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 3.2 (normal) and 3.6 (tangential); A. E. H. Love,
-Phil. Trans. R. Soc. A 228 (1929) 377. They print the components; the form with g is ours, and the
-tests hold it to their components.
+Phil. Trans. R. Soc. A 228 (1929) 377. They print the components. The form with g is ours; the tests
+compare it with their components.
 """
 
 from __future__ import annotations
@@ -35,14 +34,14 @@ def field(
 ) -> tuple[Array, Array]:
     """Stress and its gradient at points under point forces on the surface.
 
-    points   (..., N, 3) m, z <= 0
-    sources  (..., L, 3) m, z = 0
-    forces   (..., L, 3) N on the skin
-    poisson  Poisson's ratio, -1 < nu <= 0.5; Young's modulus does not enter
+    points: (..., N, 3) m, z <= 0
+    sources: (..., L, 3) m, z = 0
+    forces: (..., L, 3) N on the skin
+    poisson: Poisson's ratio, -1 < nu <= 0.5; Young's modulus does not matter
 
     Returns stress (..., N, 6) in Pa, order xx yy zz yz zx xy, tension positive, and its gradient
-    (..., N, 6, 3) in Pa/m: the last axis is the direction of the derivative. Leading axes broadcast
-    (time, say); memory is about 500 bytes per pair of point and force.
+    (..., N, 6, 3) in Pa/m, whose last axis is the direction of the derivative. Leading axes, such
+    as time, broadcast. Memory: about 500 bytes per pair of point and force.
 
     Raises ElasticError for a point above the surface or on a source, a source off the surface, or a
     Poisson's ratio out of range.
@@ -68,11 +67,11 @@ def field(
 def disc(
     radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6
 ) -> tuple[Array, Array]:
-    """Uniform traction on a disc as point forces: (sources (L, 3) m, forces (L, 3) N), L = 4
-    order^2.
+    """Uniform traction on a disc, as point forces: sources (L, 3) m, forces (L, 3) N.
 
-    Gauss points in r^2 and equally spaced angles: the error falls exponentially with `order` at
-    points deeper than the spacing. Raises ElasticError unless radius > 0 and order >= 1.
+    radius m; force (3,) N; centre (2,) m; L = 4 order^2. The points are Gauss points in r^2 at
+    equally spaced angles: the error falls exponentially with `order` at points deeper than the
+    spacing. Raises ElasticError unless radius > 0 and order >= 1.
     """
     t, weight = _gauss(order)
     return _rings(radius, np.sqrt(t), weight, force, centre)
@@ -83,7 +82,7 @@ def hertz(
 ) -> tuple[Array, Array]:
     """Traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2) on a disc: a sphere that presses or slides.
 
-    Same result and errors as `disc`; Johnson 4.2 (normal) and 7.1 (sliding).
+    Parameters, result and errors as for `disc`; Johnson 4.2 (normal) and 7.1 (sliding).
     """
     t, weight = _gauss(order)  # with t = sqrt(1 - r^2): p r dr = t^2 dt, smooth at the rim
     return _rings(radius, np.sqrt(1.0 - t**2), 3.0 * weight * t**2, force, centre)
@@ -92,8 +91,7 @@ def hertz(
 def rectangle(
     sides: ArrayLike, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 8
 ) -> tuple[Array, Array]:
-    """Uniform traction on a rectangle of sides (x, y) m as point forces, L = order^2; see
-    `disc`."""
+    """Uniform traction on a rectangle, as point forces; see `disc`. sides (2,) m; L = order^2."""
     length = np.asarray(sides, dtype=np.float64)
     if length.shape != (2,) or not np.all(length > 0.0):
         raise ElasticError(f"rectangle sides are {sides!r}; give two positive lengths in m")
@@ -124,8 +122,7 @@ def _check(points: Array, sources: Array, forces: Array, poisson: float) -> None
 
 
 def _radial(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
-    """The first term, all there is in an incompressible body, and its gradient; summed over
-    forces."""
+    """The first term of the module head and its gradient, summed over forces."""
     k = -3.0 / (2.0 * np.pi)
     pair = np.stack([d[..., i] * d[..., j] for i, j in _PAIRS], axis=-2)  # (..., N, 6, L)
     weight = k * np.einsum("...i,...i->...", d, f) / radius**5
@@ -142,9 +139,9 @@ def _radial(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
 def _airy(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
     """The field C_ij of the module head and its gradient, summed over forces.
 
-    In a plane Z = const a function of r has the derivatives h_ab = delta_ab h1 + d_a d_b h2 and so
-    on, where h1 = h'/r, h2 = h1'/r, ...; below they are those of chi, chi_Z = ln(R + Z) and chi_ZZ
-    = 1/R.
+    In a plane Z = const a function h of r has the derivatives h_ab = delta_ab h1 + d_a d_b h2 and
+    so on, with h1 = h'/r, h2 = h1'/r, ... Below they are those of chi (chi2, chi3, chi4), of
+    chi_Z = ln(R + Z) (log1, log2, log3) and of chi_ZZ = 1/R (inv1, inv2).
     """
     x, y, z = np.moveaxis(d, -1, 0)
     fx, fy, fz = np.moveaxis(np.broadcast_to(f, d.shape), -1, 0)
@@ -197,6 +194,7 @@ def _gauss(order: int) -> tuple[Array, Array]:
 def _rings(
     radius: float, r: Array, weight: Array, force: ArrayLike, centre: ArrayLike
 ) -> tuple[Array, Array]:
+    """Point forces on rings of radii r (n,) times the patch's, each with its part of the force."""
     if not radius > 0.0:
         raise ElasticError(f"patch radius is {radius} m; it must be positive")
     n = 4 * len(r)
@@ -206,8 +204,9 @@ def _rings(
 
 
 def _patch(
-    x: Array, y: Array, share: Array, force: ArrayLike, centre: ArrayLike
+    x: Array, y: Array, fraction: Array, force: ArrayLike, centre: ArrayLike
 ) -> tuple[Array, Array]:
+    """Point forces at x, y (L,) about the centre; fraction (L,): of the force that each carries."""
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
     sources = np.stack([cx + x, cy + y, np.zeros_like(x)], axis=-1)
-    return sources, share[:, None] * np.asarray(force, dtype=np.float64)
+    return sources, fraction[:, None] * np.asarray(force, dtype=np.float64)

@@ -1,8 +1,7 @@
-"""The response matrix of a cube in a body, computed: the mean normal stress of every pad under
-every mode.
+"""The response matrix of a cube by finite elements: the mean stress of each pad under each mode.
 
-The body is a box with the cube bonded in its middle, loaded on its outer faces by the tractions of
-each mode; that is the field which would be everywhere in the body if the cube were not there.
+The body is a box with the cube bonded in its middle. The tractions of a mode load its outer faces:
+without the cube, the mode's field would be everywhere in the body.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.calibration import Calibration
+from ..core.defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, REST_FREQUENCY
 from ..core.errors import ElasticError
 from ..core.estimator import LEAK_TOLERANCE, RANK_TOLERANCE
 from ..core.layout import Layout
@@ -28,6 +28,7 @@ from .solid import Parity, Solid, lame
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
+"""progress(done, total, what)"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +36,12 @@ class Response:
     """A computed response matrix.
 
     matrix: (pads, modes), Pa per Pa, tension positive, gradients times d0
-    coefficients, structure_residual: its projection on the matrices that `symmetry` allows, and the
-    relative part that is left; mode_residual: that part for each mode
-    rank: number of independent states the pads see; unobservable: modes that cannot be told, by
-    name
+    coefficients: its projection on the matrices that `symmetry` allows
+    structure_residual: the relative part that is left; mode_residual: that part for each mode
+    rank: number of independent states that the pads see
+    unobservable: names of the modes that the pads cannot tell
     convergence: one row per mesh: unknowns, seconds, coefficients, and `change`, the largest change
-    of an entry to the next finer mesh relative to the largest entry (None for the last)
+    of an entry to the next finer mesh over the largest entry (None for the last)
     """
 
     body: Body
@@ -84,12 +85,10 @@ def compute_response(
     meshes: int = 3,
     progress: Progress | None = None,
 ) -> Response:
-    """Response of a layout in a body on `meshes` meshes, 1 to 3; the last, finest one is the
-    result.
+    """Response of a layout in a body on 1 to 3 meshes; the last, finest one is the result.
 
-    progress(done, total, what) is called before every solve and at the end. Raises ElasticError
-    when pads overlap or the mesh would not fit into memory, SymmetryError when the layout does not
-    have the symmetry.
+    progress is called before every solve and at the end. Raises ElasticError when pads overlap or
+    the mesh does not fit into memory, SymmetryError when the layout does not have the symmetry.
     """
     start = time.perf_counter()
     structure = find_structure(layout, symmetry)
@@ -99,20 +98,22 @@ def compute_response(
     grids = [make_mesh(body, layout, level) for level in range(meshes)]
     check_memory(grids[-1])
     matrices: list[Array] = []
-    total, done = meshes * 2 ** len(field_axes(layout)), itertools.count()
+    total = meshes * 2 ** len(field_axes(layout))
+    done = itertools.count()
 
     def report(what: str) -> None:
         if progress is not None:
-            progress(
-                next(done), total, f"mesh {len(matrices) + 1}, {what}" if what != "done" else what
-            )
+            progress(next(done), total, what)
+
+    def report_solve(what: str) -> None:
+        report(f"mesh {len(matrices) + 1}, {what}")
 
     rows: list[dict[str, Any]] = []
     for grid in grids:
         began = time.perf_counter()
         try:
             solid = make_solid(body, layout, grid)
-            matrix = linear_response(solid, layout, report)
+            matrix = linear_response(solid, layout, report_solve)
         except MemoryError:  # a limit that check_memory does not know
             raise ElasticError(
                 f"the memory ran out on mesh {len(matrices) + 1}, of {grid.nvertices} corners; "
@@ -156,25 +157,25 @@ def compute_response(
 def calibration_from_fem(
     result: Response,
     whole_matrix: bool = False,
-    rest_frequency: float = 100e3,
-    beta: float = 0.3,
-    modulus: float = 0.3e6,
+    rest_frequency: float = REST_FREQUENCY,
+    beta: float = BETA,
+    modulus: float = FOAM_MODULUS,
     noise: float | None = None,
     neglect: tuple[str, ...] = (),
     source: str = "",
 ) -> Calibration:
-    """Calibration of a cube with the computed response: its symmetric coefficients, or the whole
-    matrix.
+    """Calibration of a cube with the computed response.
 
-    rest_frequency Hz, beta and modulus Pa (of the pads' foam) are not computed: measure them, or
-    tare.
-    noise: standard deviation of a pad's stress in Pa; by default that of counting 1 ms of periods,
-    8 ppm.
-    neglect: modes stated to be zero, so that few pads can tell the others.
+    whole_matrix: store the matrix instead of its symmetric coefficients
+    rest_frequency (Hz), beta, modulus (Pa, of the pads' foam): not computed; measure them, or tare
+    noise: standard deviation of a pad's stress, Pa; by default that of counting periods for 1 ms
+    neglect: modes stated to be zero, so that few pads can tell the others
     """
     content: dict[str, Any] = {"coefficients": result.coefficients}
     if whole_matrix:
         content = {"matrix": result.matrix}
+    if noise is None:
+        noise = FREQUENCY_NOISE * modulus * (1 + beta)
     return Calibration(
         layout=result.layout,
         symmetry=result.symmetry,
@@ -182,7 +183,7 @@ def calibration_from_fem(
         rest_frequency=np.array(rest_frequency),
         beta=np.array(beta),
         modulus=np.array(modulus),
-        noise=np.array(8e-6 * modulus * (1 + beta) if noise is None else noise),
+        noise=np.array(noise),
         neglect=neglect,
         source=source,
         **content,
@@ -190,14 +191,14 @@ def calibration_from_fem(
 
 
 def make_solid(body: Body, layout: Layout, grid: Any = None) -> Solid:
-    """The meshed body; `grid` is a mesh from elastic.mesh, by default the finest that
-    compute_response uses."""
+    """The meshed body, its moduli relative to Young's modulus of the elastomer.
+
+    grid: a mesh from elastic.mesh, by default the finest one of compute_response
+    """
     plane = body.plane if layout.planar else "strain"
-    cube = (
-        None
-        if np.isinf(body.cube_young)
-        else lame(body.cube_young / body.young, body.cube_poisson, plane)
-    )
+    cube = None
+    if not np.isinf(body.cube_young):
+        cube = lame(body.cube_young / body.young, body.cube_poisson, plane)
     return Solid(grid or make_mesh(body, layout, 2), lame(1.0, body.poisson, plane), cube)
 
 
@@ -226,11 +227,14 @@ def pad_stresses(
     forces: Callable[[Parity], Array],
     report: Callable[[str], None] = lambda _: None,
 ) -> Array:
-    """Mean normal stress (pads, n) under n loads; forces(parity) are their nodal forces (dofs, n)
-    of a parity."""
+    """Mean normal stress (pads, n) under n loads.
+
+    forces(parity): nodal forces (dofs, n) of the loads' parts of this parity
+    """
     stresses: Array | float = 0.0
     parities = itertools.product((1, -1), repeat=solid.dim)
-    for parity in sorted(parities, key=lambda parity: solid.alike(parity)[0], reverse=True):
+    # Parities that share their factors follow each other.
+    for parity in sorted(parities, key=lambda p: solid.with_sorted_axes(p)[0], reverse=True):
         report("parity " + "".join("+" if sign > 0 else "-" for sign in parity))
         pads = [pad for pad in range(layout.n_pads) if _sees(layout, pad, parity)]
         load = forces(parity)
@@ -245,16 +249,14 @@ def pad_stresses(
 
 
 def _part(field: Array, parity: Parity) -> Array:
-    """The components of a tensor field (modes, dim, ..., dim) of one parity: each index k flips
-    axis k."""
+    """The components of tensors (modes, dim, ..., dim) of one parity: an index k flips axis k."""
     indices = np.indices(field.shape[1:])
     odd = np.stack([np.sum(indices == k, axis=0) % 2 == 1 for k in range(len(parity))], axis=-1)
     return field * np.all(odd == (np.array(parity) < 0), axis=-1)
 
 
 def _sees(layout: Layout, pad: int, parity: Parity) -> bool:
-    """False for a pad in the middle of its face along an axis in which the field is odd: its mean
-    is zero."""
+    """False where the pad's mean stress is zero, because the field is odd about its middle."""
     axes = list(field_axes(layout))
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
     return bool(np.all((np.array(parity) > 0) | (np.abs(centre) > 1e-9) | (normal != 0)))
@@ -272,7 +274,7 @@ def _pad_stress(solid: Solid, reactions: Array, parity: Parity, layout: Layout, 
 
 
 def _observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
-    """Rank, and the modes with a part in the null space."""
+    """Rank of a response matrix, and the names of modes with a part in its null space."""
     _, singular, rows = np.linalg.svd(matrix)
     rank = int(np.sum(singular > RANK_TOLERANCE * singular[0]))
     part = np.linalg.norm(rows[rank:], axis=0)

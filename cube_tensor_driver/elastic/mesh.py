@@ -1,9 +1,8 @@
-"""Meshes of the positive quarter or eighth of a box with a cube |x_k| <= 1 in its middle (lengths
-in d0).
+"""Meshes of the positive quarter or eighth of a box with a cube |x_k| <= 1 in its middle.
 
-The stress is infinite at the corner (in 3-D the edges) of the cube, so elements shrink towards it.
-Pad edges are element ends. Everything is symmetric under exchange of axes where the box and the
-pads are.
+Lengths are in d0. The stress is infinite at the corner (in space, the edges) of the cube, so
+elements shrink towards it. Elements end at the edges of pads. Meshes are symmetric under exchange
+of axes where the box and the pads are.
 """
 
 from __future__ import annotations
@@ -18,7 +17,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _NEAR = 1.5
-_FAR = 3.0
+"""What the cube adds to the stress has decayed at this distance from its faces, d0."""
+_FAR_GROWTH = 3.0
 _DIRECTIONS = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float
 )
@@ -31,14 +31,13 @@ def section(
     smallest: float = 1e-8,
     largest: float = np.inf,
 ) -> skfem.MeshTri:
-    """Triangles on [0, half[0]] x [0, half[1]], with self-similar rings around the cube's corner
-    (1, 1).
+    """Triangles on [0, half[0]] x [0, half[1]], in rings around the cube's corner (1, 1).
 
-    stops: pad edges on [0, 1]; level: 0 coarse, 1 with twice as many rings, then all triangles cut
-    in four.
-    smallest: size of the last ring over the first; what it leaves out at 1e-8 is below 1e-4 of any
-    entry.
-    largest: the longest side of a triangle away from the cube.
+    stops: pad edges on [0, 1]
+    level: 0 is coarse, 1 has twice as many rings, each further one cuts all triangles in four
+    smallest: size of the last ring over the first; what the rings leave out at 1e-8 is less than
+    1e-4 of any entry of the response
+    largest: the longest side of a triangle away from the cube
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     rho = min(0.5, 1.0 - inner[-1], *(h - 1.0 for h in half))
@@ -46,17 +45,17 @@ def section(
     lines = [np.concatenate([face, _outer(1.0 + rho, h, rho, 2.0, largest)]) for h in half]
     base = skfem.MeshTri.init_tensor(*lines)
     away = np.any(np.abs(base.p[:, base.t].mean(axis=1) - 1.0) > rho, axis=0)
-    ring, corner = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
-    points = np.concatenate([base.p.T, ring])
-    triangles = np.concatenate([base.t.T[away], corner + base.p.shape[1]])
-    # As complex numbers: comparing rows (axis=0) swallows Ctrl-C.
+    ring_points, ring_triangles = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
+    points = np.concatenate([base.p.T, ring_points])
+    triangles = np.concatenate([base.t.T[away], ring_triangles + base.p.shape[1]])
+    # Points as complex numbers: np.unique of rows (axis=0) swallows Ctrl-C.
     unique, inverse = np.unique(points[triangles.ravel()] @ [1, 1j], return_inverse=True)
     mesh = skfem.MeshTri(np.array([unique.real, unique.imag]), inverse.reshape(-1, 3).T.copy())
     return mesh.refined(level - 1) if level > 1 else mesh
 
 
 def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
-    """The whole section from its positive quarter."""
+    """All of the section from its positive quarter."""
     points: list[Array] = []
     triangles: list[NDArray[np.int64]] = []
     for sx, sz in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
@@ -71,11 +70,10 @@ def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
 def block(
     half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float
 ) -> skfem.MeshHex:
-    """Bricks on the product of [0, half[k]]: `size` on a face, shrinking to `smallest` at its
-    edges.
+    """Bricks on the product of [0, half[k]]: `size` on a face, `smallest` at the cube's edges.
 
-    They grow by `growth` up to _NEAR from the face; what the cube adds to the stress has decayed
-    there, and the linear field that is left needs no fine mesh: beyond they grow by _FAR.
+    Away from the cube they grow by the factor `growth`. Where the cube's part of the stress has
+    decayed, a linear field is left, which needs no fine mesh: there they grow faster.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
@@ -83,23 +81,23 @@ def block(
     lines = []
     for h in half:
         near = 1.0 + _graded(min(h - 1.0, _NEAR), smallest, growth)
-        far = _outer(near[-1], h, near[-1] - near[-2], _FAR, np.inf)
+        far = _outer(near[-1], h, near[-1] - near[-2], _FAR_GROWTH, np.inf)
         lines.append(np.concatenate([face, near[1:], far[1:]]))
     return skfem.MeshHex.init_tensor(*lines)
 
 
 def _inner(stops: Sequence[float], end: float, size: float) -> Array:
-    """Points through all stops to end, no further apart than size."""
+    """Points through all stops to the end, no further apart than size."""
     stops = sorted({*stops, end})
-    steps = [
-        np.linspace(a, b, int(np.ceil((b - a) / size - 1e-9)) + 1)[1:] for a, b in pairwise(stops)
-    ]
-    return np.concatenate([[stops[0]], *steps])
+    points = [np.array([stops[0]])]
+    for a, b in pairwise(stops):
+        count = int(np.ceil((b - a) / size - 1e-9))
+        points.append(np.linspace(a, b, count + 1)[1:])
+    return np.concatenate(points)
 
 
 def _outer(start: float, end: float, first: float, growth: float, largest: float) -> Array:
-    """Points from start to end, both included, with steps that grow from about `first` up to
-    `largest`."""
+    """Points from start to end, both included; steps grow from about `first` up to `largest`."""
     if start == end:
         return np.array([start])
     points = start + _graded(end - start, first * growth, growth)
@@ -116,25 +114,24 @@ def _graded(length: float, first: float, growth: float) -> Array:
 
 
 def _rings(rho: float, ratio: float, smallest: float) -> tuple[Array, NDArray[np.int64]]:
-    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1), each a ratio of
-    the last."""
+    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1).
+
+    Each ring is the one before it times `ratio`; the first has the half side `rho`.
+    """
     n = int(np.ceil(np.log(smallest) / np.log(ratio)))
     radii = rho * ratio ** np.arange(n + 1)
-    points = np.concatenate(
-        [1.0 + np.multiply.outer(radii, _DIRECTIONS).reshape(-1, 2), [[1.0, 1.0]]]
-    )
+    around = 1.0 + np.multiply.outer(radii, _DIRECTIONS).reshape(-1, 2)
+    points = np.concatenate([around, [[1.0, 1.0]]])
     triangles = []
-    for k in range(n):
-        for j in range(0, 8, 2):  # j: mid of a side; its neighbours are corners
-            for i in ((j + 1) % 8, (j - 1) % 8):
-                out, out_corner, into, into_corner = (
-                    8 * k + j,
-                    8 * k + i,
-                    8 * k + 8 + j,
-                    8 * k + 8 + i,
-                )
-                # cut along the shorter diagonal
-                triangles += [(out, out_corner, into_corner), (out, into_corner, into)]
+    for outer in range(0, 8 * n, 8):  # number of the ring's first point
+        inner = outer + 8
+        for middle in range(0, 8, 2):  # of a side; its neighbours are corners
+            for corner in ((middle + 1) % 8, (middle - 1) % 8):
+                # Cut the trapezoid along its shorter diagonal.
+                triangles += [
+                    (outer + middle, outer + corner, inner + corner),
+                    (outer + middle, inner + corner, inner + middle),
+                ]
     last = 8 * n
     triangles += [(last + j, last + (j + 1) % 8, len(points) - 1) for j in range(8)]
     return points, np.array(triangles)

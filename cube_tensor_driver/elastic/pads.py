@@ -23,27 +23,27 @@ Array = NDArray[np.float64]
 
 
 def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: float) -> Array:
-    """Weights w (n,) with w . r = integral of the traction from start to stop, -1 <= start < stop
-    <= 1.
+    """Weights w (n,) with w . r = integral of the traction from start to stop.
 
-    nodes   (n,) positions on half a face, from the middle 0 to the corner 1; elements of `order`
-    equal steps parity  +1 when the traction is even about the middle, -1 when it is odd (so zero
-    there) Pad edges must be ends of elements.
+    nodes: (n,) positions on half a face, from the middle 0 to the corner 1; each element has
+    `order` equal steps
+    parity: +1 when the traction is even about the middle, -1 when it is odd, so zero there
+    start, stop: -1 <= start < stop <= 1, ends of elements
     """
 
-    def signed(s: float) -> Array:
-        """Weights of the integral from the middle to s; on the other side its sign is that of the
-        parity."""
-        return _from_middle(nodes, order, parity, abs(s)) * (1 if s >= 0 else -parity)
+    def from_middle(s: float) -> Array:
+        """Weights of the integral from the middle to s, which may be on the other half."""
+        sign = 1 if s >= 0 else -parity
+        return _from_middle(nodes, order, parity, abs(s)) * sign
 
-    return signed(stop) - signed(start)
+    return from_middle(stop) - from_middle(start)
 
 
 def face_integral(nodes: Array, forces: Array, order: int, start: float, stop: float) -> float:
-    """Integral of the traction from start to stop from nodal forces (n,) along a whole face, split
-    by parity.
+    """Integral of the traction from start to stop from nodal forces (n,) along a face.
 
-    nodes: (n,) positions from corner to corner, -1 to 1, symmetric about the middle
+    nodes: (n,) positions from corner to corner, -1 to 1, symmetric about the middle. The forces are
+    split into an even and an odd part.
     """
     half = len(nodes) // 2
     right, left = forces[half:], forces[half::-1]
@@ -65,7 +65,7 @@ def _from_middle(nodes: Array, order: int, parity: int, stop: float) -> Array:
         mass[i : i + order + 1, i : i + order + 1] += length * element_mass
         if nodes[i + order] <= stop * (1 + 1e-12):
             integral[i : i + order + 1] += length * element_integral
-    # an odd traction is zero in the middle, and the mirror plane holds the node there
+    # An odd traction is zero in the middle, and the mirror plane holds the node there.
     keep = slice(0 if parity > 0 else 1, n - 1)
     trial = np.eye(n)[:, keep]
     trial[-1, -order:] = _continuation(order)
@@ -75,8 +75,7 @@ def _from_middle(nodes: Array, order: int, parity: int, stop: float) -> Array:
 
 
 def _line_element(order: int) -> tuple[Array, Array]:
-    """Mass matrix and integrals of the nodal polynomials on the unit interval with order + 1 equal
-    nodes."""
+    """Mass matrix and integrals of the nodal polynomials of order + 1 equal nodes on [0, 1]."""
     s, weight = np.polynomial.legendre.leggauss(order + 1)
     s, weight = (s + 1) / 2, weight / 2
     to_nodal = np.linalg.inv(np.vander(np.arange(order + 1) / order, increasing=True))
