@@ -10,6 +10,7 @@ import skfem
 from scipy.sparse.linalg import spsolve
 from skfem.helpers import dot
 
+from conftest import ROOT
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError, LayoutError, SymmetryError
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
@@ -205,21 +206,22 @@ def test_coefficients_converge_with_the_mesh(result, request):
 def test_the_default_is_right():
     """Every coefficient of the default body and pads, against triangles cut in four once more.
 
-    0.5 % is asked and 0.022 % found. The finer mesh stops its rings at 0.01, which moves the means
-    over strips, that end before the corner, by less than 0.005 %.
+    0.05 % is allowed and 0.022 % found. The shipped planar_slab has the default's response, as
+    test_shipped_calibrations_are_what_their_commands_make says. The finer mesh stops its rings at
+    0.01, which moves the means over strips, that end before the corner, by less than 0.005 %.
     """
     body, layout = Body(), LAYOUTS["planar"]
-    row = compute_response(body, layout, meshes=3).convergence[-1]
+    default = read_calibration(ROOT / "config" / "calibration" / "planar_slab.yaml").response
     finer = Solid(
         mesh.section((15.0, 2.75), (0.3, 0.7), 3, smallest=0.01),
         lame(1.0, 0.48),
         lame(200e9 / 0.3e6, 0.3),
     )
-    truth = project(
-        fem.find_structure(layout, "full"), fem.linear_response(finer, layout, lambda _: None)
-    )[0]
-    assert 1.5 * row["unknowns"] < finer.basis.N
-    assert row["coefficients"] == pytest.approx(truth, rel=5e-4)
+    structure = fem.find_structure(layout, "full")
+    truth, _ = project(structure, fem.linear_response(finer, layout))
+    assert 1.5 * fem.make_solid(body, layout).basis.N < finer.basis.N
+    coefficients, _ = project(structure, default)
+    assert coefficients == pytest.approx(truth, rel=5e-4)
 
 
 def test_elastic_steel_is_as_good_as_rigid(slab):
@@ -393,19 +395,3 @@ def test_progress_counts_to_the_end():
         Body(cube_young=RIGID), HALVES, meshes=2, progress=lambda *step: seen.append(step)
     )
     assert [done for done, _, _ in seen] == list(range(9)) and seen[-1] == (8, 8, "done")
-
-
-@pytest.mark.parametrize(
-    "name, layout, body",
-    [
-        ("planar", "planar", Body(height=60e-3)),
-        ("planar_slab", "planar", Body()),
-        ("quad", "quad", Body()),
-    ],
-)
-def test_shipped_calibrations_are_what_the_code_computes(name, layout, body):
-    shipped = read_calibration(
-        Path(__file__).parents[1] / "config" / "calibration" / f"{name}.yaml"
-    )
-    computed = compute_response(body, LAYOUTS[layout], shipped.symmetry, meshes=2).matrix
-    assert np.abs(shipped.response - computed).max() < 1e-3
