@@ -25,6 +25,7 @@ from cube_tensor_driver.elastic import memory
 from cube_tensor_driver.research import paper
 from cube_tensor_driver.research.layout_study import LayoutStudy
 
+NARROW = bodies.Body(width=20e-3)
 SMALL = ("--width", "20", "--height", "12", "--meshes", "2")
 
 
@@ -402,7 +403,7 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     monkeypatch.setattr("cube_tensor_driver.plot.paper.experiments", one)
     monkeypatch.setattr(
         "cube_tensor_driver.plot.paper.rod_sweep",
-        lambda progress: paper.rod_sweep(places=(0.0, 2e-3), progress=progress),
+        lambda progress: paper.rod_sweep(NARROW, places=(0.0, 2e-3), progress=progress),
     )
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())
