@@ -1,1 +1,5 @@
-"""Tables and progress in the terminal: rich and nothing else draws here."""
+"""What commands show in a terminal: tables of results, progress, the live table of a skin, keys.
+
+rich is used here. Nothing is computed and nothing is read from ROS here: functions are given what
+they show.
+"""

@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
 from visualization_msgs.msg import MarkerArray
 
 from ..config.package_data import package_data
@@ -26,8 +24,8 @@ from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..research.field_study import field_example, field_study
 from ..research.paper import experiments
-from ..ros.node import make_executor
-from ..trials.bench import bench_scale
+from ..ros.session import node_session
+from .bench import bench_scale
 
 START_S = 30.0
 """How long the processes may take to start."""
@@ -103,19 +101,12 @@ def _strongest(children: Children) -> MarkerArray:
         top = float(marker["legend"].text.split(" to ")[1].split()[0])
         heard.append((top * sum(point.z for point in marker["traction"].points), message))
 
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node, executor = rclpy.create_node("pictures"), make_executor()
+    with node_session("pictures") as (node, executor):
         node.create_subscription(MarkerArray, "markers", keep, 10)
-        executor.add_node(node)
         until = time.monotonic() + START_S
         while len(heard) < PERIOD and time.monotonic() < until:
             executor.spin_once(timeout_sec=0.1)
             children.check()
-        executor.remove_node(node)
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
     if len(heard) < PERIOD:
         raise CubeError(
             f"{len(heard)} of {PERIOD} markers within {START_S:g} s:\n{children.log('markers')}"
