@@ -1,5 +1,5 @@
-"""Skin files: what is read, and that every mistake gives one message: file, key, what was found,
-what is allowed."""
+"""Skin files: what is read; and that every mistake gives one message with the file, the key, what
+was found and what is allowed."""
 
 from __future__ import annotations
 
@@ -40,8 +40,7 @@ def test_shipped_calibrations_have_their_id():
 
 
 def test_grid_deals_every_cube_once():
-    # 7 cubes on 3 links: 3, 2, 2, indices from 0 on each link, positions centred and one pitch
-    # apart
+    # 7 cubes on 3 links are 3, 2 and 2. Indices begin with 0 on each link. Positions are centred.
     data = grid(nx=7, ny=1, pitch=0.5, links=3, rate=10.0, port="p{}")
     assert [(cube["link"], cube["index"]) for cube in data["cubes"]] == [
         ("hub0", 0),
@@ -147,6 +146,29 @@ def test_one_message_per_mistake(tmp_path, break_it, words):
     assert "\n" not in text
 
 
+def test_names_and_calibrations_are_in_the_order_of_the_cubes(tmp_path):
+    data = copy.deepcopy(GOOD)
+    for cube in data["cubes"][3:]:
+        cube.update(layout="cube", calibration="cube")
+    skin = read(tmp_path, data)
+    assert skin.names == ("c0", "c1", "c2", "c3", "c4", "c5")
+    assert [one.layout.name for one in skin.calibrations] == 3 * ["planar"] + 3 * ["cube"]
+    assert skin.n_pads == 24
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"nx": 0}, "grid: nx is 0, must be greater than 0"),
+        ({"pitch": -0.01}, "grid: pitch is -0.01"),
+        ({"links": 7}, "grid: 7 links for 6 cubes; use at most one link per cube"),
+    ],
+)
+def test_grids_that_cannot_be(wrong, words):
+    with pytest.raises(ConfigError, match=words):
+        grid(**{"nx": 3, "ny": 2, "pitch": 0.012, "rate": 100.0} | wrong)
+
+
 def test_uids_once_in_any_spelling(tmp_path):
     data = copy.deepcopy(GOOD)
     for number, uid in ((1, 0x1F), (4, "0x1F")):
@@ -174,7 +196,7 @@ def test_a_hub_reads_one_number_of_pads(tmp_path):
         read(tmp_path, data)
 
 
-def test_every_mistake_is_told_at_once(tmp_path):
+def test_every_mistake_is_listed(tmp_path):
     data = copy.deepcopy(GOOD)
     del data["parent_frame"]
     data["links"][1]["baud"] = 3
@@ -230,11 +252,11 @@ def test_missing_file_and_folder_and_size(tmp_path, monkeypatch):
         read(tmp_path, GOOD)
 
 
-def test_merge_keys_are_not_twice():
+def test_merged_keys_may_be_overridden():
     assert parse_yaml("a: &a {x: 1, y: 2}\nb: {<<: *a, x: 3}", "t")["b"] == {"x": 3, "y": 2}
 
 
-def test_written_files_read_back_and_leave_nothing_partial(tmp_path):
+def test_written_files_read_back_and_leave_no_temporary_file(tmp_path):
     path = tmp_path / "s.yaml"
     write_yaml(path, GOOD, "two\nlines")
     assert path.read_text().startswith("# two\n# lines\n")

@@ -1,4 +1,4 @@
-"""The worked examples: their files, and that each runs and finds what its script did."""
+"""The worked examples: their files; and that each runs and finds the loads of its script."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The picture of a skin: its geometry against hand-made cases, its message as other nodes read
-it."""
+"""The picture of a skin: its geometry against cases computed by hand, its message as other nodes
+read it."""
 
 from __future__ import annotations
 
@@ -103,8 +103,9 @@ def test_health_says_doubtful_no_tensor_and_stale():
 
 
 def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
-    """Of 400 cubes at 50 Hz one row in a hundred has a residual above its limit, of cube 7 from 2 s
-    to 4 s nearly all; shown within a window that holds nothing else, and hidden within one."""
+    """Of 400 cubes at 50 Hz, one row in a hundred has a residual above its limit. Of cube 7, from
+    2 s to 4 s, nearly all rows have. It is shown after one window of such rows, and hidden after
+    one without them."""
     n, random = 400, np.random.default_rng(4)
     newest = Newest(n)
     for step in range(300):
@@ -221,6 +222,37 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     contact = contacts[-1]
     assert contact.header.frame_id == "skin_base" and len(contact.position) == 1
     assert contact.normal_force[0] > 0 and contact.force[0].z < 0 < contact.force[0].x
+
+
+@pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "a name of many letters"])
+def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
+    """Lengths of texts decide about the alignment of all that follows."""
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from geometry_msgs.msg import Point
+    from rclpy.serialization import deserialize_message
+    from std_msgs.msg import ColorRGBA
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    from cube_tensor_driver.ros.serialised_markers import SerialisedMarkers
+
+    lines = Marker(ns=name, points=[Point()] * 5, colors=[ColorRGBA()] * 5)
+    text = Marker(ns=f"{name}'s legend", text=" " * 7)
+    text.header.frame_id = name
+    empty = Marker(ns=f"{name}, empty")
+    made = SerialisedMarkers([lines, text, empty, Marker(ns="last", points=[Point()] * 2)])
+    random = np.random.default_rng(len(name))
+    points, colours, last = random.random((5, 3)), random.random((5, 4)), random.random((2, 3))
+    made[name].points[:] = points
+    made[name].colours[:] = colours
+    made["last"].points[:] = last
+    made[f"{name}'s legend"].text[:] = np.frombuffer(b"7 bytes", np.uint8)
+
+    read = {one.ns: one for one in deserialize_message(bytes(made.data), MarkerArray).markers}
+    assert list(read) == [name, f"{name}'s legend", f"{name}, empty", "last"]
+    assert [[p.x, p.y, p.z] for p in read[name].points] == points.tolist()
+    assert [[p.x, p.y, p.z] for p in read["last"].points] == last.tolist()
+    np.testing.assert_allclose([[c.r, c.g, c.b, c.a] for c in read[name].colors], colours, 1e-6)
+    assert read[f"{name}'s legend"].text == "7 bytes" and "nobody" not in made
 
 
 def test_rods_lie_around_their_lines_with_the_radii_asked_for():

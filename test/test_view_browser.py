@@ -1,5 +1,5 @@
-"""The browser view in a real browser: a load that comes, a cube that is chosen, a tare, a replay
-that is steered."""
+"""The page of ./cube view in a real browser: a load, a cube that is chosen, a tare, a replay that
+is held and jumps."""
 
 from __future__ import annotations
 
@@ -174,8 +174,8 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
         ros.wait(lambda: abs(shown(page) + 20e3) < 200, 40)
         assert page.execute_script("return document.querySelectorAll('.uplot canvas').length") == 4
 
-        # what the page shows as tared is tared on the topic; a load that moved within its windows
-        # would refuse it
+        # What the page shows as tared is tared on the topic. The load must not have moved before:
+        # a tare would be refused.
         ros.wait(
             lambda: (
                 heard and rows(heard)[-1][0] > pressed_ns + 2e9 and abs(newest(heard) + 20e3) < 200
@@ -188,14 +188,13 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
         ros.wait(lambda: abs(shown(page)) < 200, 40)
         ros.wait(lambda: abs(newest(heard)) < 200)
         tared_ns = min(at for at, zz in rows(heard) if at > clicked_ns and abs(zz) < 200)
-        print(
-            f"from the click on tare to the first tared row: {1e-6 * (tared_ns - clicked_ns):.0f} ms"
-        )
+        milliseconds = 1e-6 * (tared_ns - clicked_ns)
+        print(f"from the click on tare to the first tared row: {milliseconds:.0f} ms")
         press(page, "clear tare")
         ros.wait(lambda: abs(shown(page) + 20e3) < 200, 40)
         ros.wait(lambda: abs(newest(heard) + 20e3) < 200)
 
-        # the browser that reads nothing has cost the topic not a row
+        # no row of the topic is missing because of the browser that reads nothing
         sequence = np.array([message.sequence[0] for message in heard], int)
         assert len(sequence) > 100 and (np.diff(sequence) == 1).all()
         asked = hosts(page)
@@ -203,9 +202,9 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
         children.check()
 
 
-def test_a_replay_is_steered_from_the_page(ros, tmp_path):
-    """A bag of 6 s whose cubes swing with a period of 2 s."""
-    path = make_bag(tmp_path / "bag", CONFIG, 600)
+def test_a_replay_is_controlled_from_the_page(ros, tmp_path):
+    """A bag of 3 s whose cubes swing with a period of 2 s."""
+    path = make_bag(tmp_path / "bag", CONFIG, 300)
     heard = ros.listen(SkinStress, "stress")
     replay = subprocess.Popen(
         [sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--view"],
@@ -222,8 +221,8 @@ def test_a_replay_is_steered_from_the_page(ros, tmp_path):
                 """Of the newest row in the bag, s."""
                 return 1e-9 * (to_ns(heard[-1].header.stamp) - START_NS)
 
-            # it has come to the end, and holds there without its cubes growing stale
-            ros.wait(lambda: heard and position() > 5.9 and "play" in buttons(page), 40)
+            # It has come to the end, and holds there. Its cubes do not become stale.
+            ros.wait(lambda: heard and position() > 2.9 and "play" in buttons(page), 40)
             ros.wait(lambda: "paused" in text(page) and f"{N} of {N} cubes" in text(page), 40)
             slider = page.find_element("css selector", "[role=slider]")
 
@@ -243,15 +242,15 @@ def test_a_replay_is_steered_from_the_page(ros, tmp_path):
             key(Keys.HOME)
             ros.wait(lambda: position() < 0.3, 40)
             key(Keys.END)
-            ros.wait(lambda: position() > 5.8, 40)
-            ros.wait(lambda: float(slider.get_attribute("aria-valuenow")) > 5.8, 40)
+            ros.wait(lambda: position() > 2.8, 40)
+            ros.wait(lambda: float(slider.get_attribute("aria-valuenow")) > 2.8, 40)
             assert f"{N} of {N} cubes" in text(page)
         refused = ros.call(
-            SteerReplay, "player/steer", SteerReplay.Request(position=6.5, paused=True)
+            SteerReplay, "player/steer", SteerReplay.Request(position=3.5, paused=True)
         )
         assert (
             not refused.success
-            and "6.5 s is not in the bag, which is 5.990 s long" in refused.message
+            and "3.5 s is not in the bag, which is 2.990 s long" in refused.message
         )
         replay.terminate()
         assert replay.wait(timeout=10) == 0
@@ -271,8 +270,11 @@ def buttons(page: webdriver.Chrome) -> list[str]:
 
 
 def press(page: webdriver.Chrome, label: str) -> None:
-    script = "for (const b of document.querySelectorAll('button')) if (b.innerText.trim() == arguments[0]) b.click()"
-    page.execute_script(script, label)
+    page.execute_script(
+        "for (const button of document.querySelectorAll('button'))"
+        "  if (button.innerText.trim() == arguments[0]) button.click()",
+        label,
+    )
 
 
 def shown(page: webdriver.Chrome) -> float:
@@ -300,7 +302,7 @@ def yellow(page: webdriver.Chrome) -> np.ndarray:
 
 
 def hosts(page: webdriver.Chrome) -> set[str | None]:
-    """Whom the page has asked for anything, or tried to."""
+    """The hosts that the page has asked for anything, or tried to."""
     events = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
     urls = [
         event["params"].get("request", event["params"])["url"]

@@ -1,5 +1,5 @@
-"""The live table; and the set-ups for RViz and Foxglove, whose programs are not here: every name in
-them is one that their sources read.
+"""The live table; and the set-ups for RViz and Foxglove. These programs are not installed here, so
+the tests check that every name in the set-ups is one that the programs' sources read.
 
 Names from ros2/rviz, branch jazzy (14.1): plugins_description.xml, panel_factory.cpp and the
 constructors of displays and properties; from Lichtblick (Foxglove Studio's open sources), March
@@ -193,7 +193,8 @@ def test_rviz_reads_every_name_of_ours():
 
 
 def test_rviz_shows_our_topics_as_they_are_offered():
-    """A latched topic wants a latched subscription; and a reliable one a reliable publisher."""
+    """A latched topic needs a latched subscription, and a reliable subscription a reliable
+    publisher."""
     rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
     displays = {
         display["Class"].split("/")[1]: display
@@ -208,8 +209,8 @@ def test_rviz_shows_our_topics_as_they_are_offered():
         and wrench["Topic"]["Reliability Policy"] == "Best Effort"
     )
     assert wrench["Accept NaN Values"] is False
-    # RViz draws no arrow that is shorter than its width: 10 kPa on a cube 4 mm wide must be one, 40
-    # kPa no mast.
+    # RViz draws no arrow that is shorter than its width. On a cube 4 mm wide, 10 kPa must give an
+    # arrow, and 40 kPa must not give one that is too long.
     force = np.array([10e3, 40e3]) * 0.004**2
     short, long = force * wrench["Force Arrow Scale"]
     assert wrench["Enabled"] and wrench["Arrow Width"] < short and long < 0.06
@@ -266,7 +267,7 @@ def test_what_foxglove_plots_are_fields_of_our_messages():
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_the_live_table_of_planar_cubes_is_whole_in(width):
+def test_the_live_table_of_planar_cubes_fits_into(width):
     console = pytest.importorskip("rich.console", reason="needs rich: run this with ./cube test")
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
