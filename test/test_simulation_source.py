@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from conftest import ROOT
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
@@ -153,6 +156,15 @@ def test_a_stopped_oscillator_and_pads_that_a_cube_does_not_have_are_nan(tmp_pat
     path.write_text(yaml.safe_dump({"indenters": [indenter]}))
     crushed = list(simulate(mixed, path, rate=10.0, duration=0.6))[-1]
     assert np.isnan(crushed.frequency[0, :4]).any()
+
+
+def test_the_program_of_the_page_runs(tmp_path, monkeypatch, capsys):
+    page = (ROOT / "docs" / "simulation.md").read_text()
+    (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    shutil.copy(FILE, tmp_path / "skin.yaml")
+    monkeypatch.chdir(tmp_path)
+    exec(program, {})
+    assert re.fullmatch(r"greatest pressure \d+\.\d kPa\n", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ class SimulatedSource:
         return {
             "rows given": self.scans * len(self.skin.cubes),
             "scans given": self.scans,
-            "simulated seconds": 1e-6 * self.scans * self.period_us,
+            "simulated seconds": self.scans * self.period_us / 1e6,
         }
 
     def __iter__(self) -> Iterator[FrequencyRows]:
