@@ -13,12 +13,13 @@ from conftest import samples, stamped
 from cube_tensor_driver.config.tare import read_tare, remove_tare, tare_path, write_tare
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.conditions import HOLD
+from cube_tensor_driver.core.drift import DriftTracker
 from cube_tensor_driver.core.errors import ConfigError, TareError
 from cube_tensor_driver.core.health import Health
 from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.statistics import WINDOW_S
-from cube_tensor_driver.core.tare import DriftTracker, measure_rest
+from cube_tensor_driver.core.tare import measure_rest
 
 CALIBRATION = illustrative("planar")
 NAMES = ["a", "b", "c"]

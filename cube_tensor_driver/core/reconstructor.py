@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .calibration import Calibration
+from .drift import DriftTracker
 from .errors import TareError
 from .health import Health
 from .pipeline import Pipeline
 from .rows import FrequencyRows, StressRows
-from .tare import DriftTracker, measure_rest
+from .tare import measure_rest
 
 
 class Verdicts(NamedTuple):

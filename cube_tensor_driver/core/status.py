@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-PAD_FAULT = (
-    1  # at least one pad was left out: fault bit of the device, or a frequency that no pad can have
-)
-RESIDUAL = 2  # chi-square above its false-alarm limit: a load outside the modes, or a broken pad
-INVALID = 4  # nothing recovered: all components NaN
-TEMPERATURE = (
-    8  # the temperature is unknown though the calibration needs it; its reference was assumed
-)
+PAD_FAULT = 1
+"""At least one pad was left out: the device reports it, or its frequency is impossible."""
+RESIDUAL = 2
+"""Chi-square is above its false-alarm limit: a load outside the modes, or a broken pad."""
+INVALID = 4
+"""Nothing was recovered: all components are NaN."""
+TEMPERATURE = 8
+"""The calibration needs the temperature, which is unknown; its reference temperature was assumed."""
 STATUS = {
     "PAD_FAULT": PAD_FAULT,
     "RESIDUAL": RESIDUAL,
@@ -28,4 +28,4 @@ WORDS = {
     DRIFT: "drifting",
 }
 LEFT_OUT = OPEN | SHORT | RANGE | STUCK | NOISY | REPORTED
-"""A pad with one of these is not used; one that drifts still is: only tare knows better."""
+"""A pad with one of these is not used. A drifting pad still is: only tare can correct it."""
