@@ -44,28 +44,28 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "--plane",
         choices=["strain", "stress"],
-        help="of a layout in a plane (default: strain)",
+        help="plane strain or stress, of a layout in a plane (default: strain)",
     )
     parser.add_argument(
         "--width",
         type=positive,
         default=60.0,
         metavar="MM",
-        help="of the body along x, and along y in space, mm (default: %(default)g)",
+        help="width of the body along x, in space also along y, mm (default: %(default)g)",
     )
     parser.add_argument(
         "--height",
         type=positive,
         default=11.0,
         metavar="MM",
-        help="of the body along z, mm (default: %(default)g)",
+        help="height of the body along z, mm (default: %(default)g)",
     )
     parser.add_argument(
         "--side",
         type=positive,
         default=4.0,
         metavar="MM",
-        help="of the cube, mm (default: %(default)g)",
+        help="side of the cube, mm (default: %(default)g)",
     )
     parser.add_argument(
         "--young",
@@ -82,7 +82,7 @@ def arguments(parser: Parser) -> None:
         help="Poisson's ratio of the body (default: %(default)g)",
     )
     parser.add_argument(
-        "--rigid", action="store_true", help="a rigid cube (default: steel, 200 GPa, 0.30)"
+        "--rigid", action="store_true", help="take a rigid cube (default: steel, 200 GPa, 0.30)"
     )
     parser.add_argument(
         "--pad",

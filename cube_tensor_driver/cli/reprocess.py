@@ -44,7 +44,7 @@ def arguments(parser: Parser) -> None:
         "--format",
         choices=["bag", "parquet", "csv"],
         default="bag",
-        help="of the results (default: %(default)s)",
+        help="format of the results (default: %(default)s)",
     )
     parser.add_argument(
         "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"

@@ -12,25 +12,25 @@ GROUPS = {
         "urdf": "print the URDF of a skin: one link per cube under its parent frame",
     },
     "Record and evaluate": {
-        "record": "record the topics of a running skin into a bag that ros2 bag reads too",
-        "replay": "publish a bag; the stress is left to a reconstruction node",
+        "record": "record the topics of a running skin into a rosbag2 folder",
+        "replay": "publish a bag; a reconstruction node makes the stress again",
         "bag": "show what a bag holds, or repair one",
-        "plot": "draw frequencies, stress, gradient and residual of one cube of a bag",
-        "reprocess": "compute stress from recorded frequencies again, with another calibration",
+        "plot": "draw frequencies, stress, gradient and residual of one cube",
+        "reprocess": "compute stress from the recorded frequencies of bags again",
     },
     "Design and calibrate a cube": {
-        "layout": "show what a layout's pads can measure: ranks, unobservable modes, noise",
+        "layout": "show what a layout's pads measure: ranks, lost modes, noise",
         "fem": "compute a cube's response matrix by finite elements",
         "fit": "calibrate from a table of known loads and measured frequencies",
     },
     "Test faults and speed": {
         "inject": "inject a fault into running simulated hubs",
-        "torture": "run 32 cubes at 500 Hz under a random mix of all faults and check the result",
+        "torture": "run 32 cubes under a random mix of all faults and check them",
         "bench": "measure speed beside the bare minimum",
     },
     "Study the sensor": {
-        "study": "find how wide a contact must be for each layout to measure it right",
-        "paper": "repeat the source paper's simulation and experiments on a virtual bench",
+        "study": "find how wide a contact must be for each layout to be right",
+        "paper": "repeat the source paper's experiments on a virtual bench",
     },
     "Develop": {
         "test": "build and run the test suite",
