@@ -1,5 +1,4 @@
-"""Diagnostics at 1 Hz: by diagnostic_updater where it is installed, else by what stands in for it
-here."""
+"""Diagnostics at 1 Hz, by diagnostic_updater if it is installed, otherwise by a substitute."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ try:
 except ModuleNotFoundError:
 
     class Updater:  # type: ignore[no-redef]
-        """What is used of the real one; it has a parameter for the period besides."""
+        """The part of diagnostic_updater's that is used here."""
 
         def __init__(self, node: Node, period: float = 1.0) -> None:
             self.node, self.node_name = node, node.get_name()
@@ -33,14 +32,13 @@ except ModuleNotFoundError:
 
 
 class Diagnostics(Updater):  # type: ignore[misc]
-    """Publishes what `statuses` says, if anything, under the node's full name; for as long as the
-    node lives."""
+    """Publishes the statuses that `statuses` returns, if any, as long as the node lives."""
 
     def __init__(self, node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
         super().__init__(node)
         self._statuses = statuses
-        # The updater knows the bare name only, or doubles the slash; one skin may run in several
-        # namespaces.
+        # With the namespace, because a skin may run in several. Left to itself, the updater uses
+        # the bare name or doubles the slash.
         self.node_name = node.get_fully_qualified_name()
 
     def update(self) -> None:
@@ -53,7 +51,7 @@ class Diagnostics(Updater):  # type: ignore[misc]
 def make_status(
     name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]
 ) -> DiagnosticStatus:
-    """A status of a part of the node."""
+    """The status of one part of the node."""
     pairs = [_pair(name, key, str(value)) for key, value in values.items()]
     return DiagnosticStatus(
         name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
@@ -64,8 +62,8 @@ _newest: dict[tuple[str, str], KeyValue] = {}
 
 
 def _pair(name: str, key: str, value: str) -> KeyValue:
-    """Most values stay as they are from one second to the next, and rclpy takes 2 us to make a
-    pair."""
+    """A key with its value. The last one is used again if the value has not changed, because rclpy
+    takes 2 µs to make one."""
     pair = _newest.get((name, key))
     if pair is None or pair.value != value:
         pair = _newest[name, key] = KeyValue(key=key, value=value)

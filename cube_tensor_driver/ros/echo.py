@@ -1,11 +1,12 @@
-"""The floor of the benchmark: bare rclpy publishing, and echoing, messages of a skin's sizes. No
-work inside.
+"""What a benchmark compares with: bare rclpy that publishes and echoes messages of a skin's sizes.
 
-`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress; the same
-executor, the same quality of service, the same flat arrays as the real nodes.
+`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress. They have the
+executor, the quality of service and the flat arrays of the real nodes, but compute nothing.
 """
 
 from __future__ import annotations
+
+import sys
 
 import numpy as np
 from std_msgs.msg import Header
@@ -19,8 +20,8 @@ from .parameters import ECHO
 PADS, STRESS, GRADIENT = 8, 6, 9
 
 
-class Source(CubeNode):
-    """Publishes `frequencies` of n cubes at a rate: a timer thread as lean as can be."""
+class BareSource(CubeNode):
+    """Publishes `frequencies` of so many cubes at a rate, with a timer."""
 
     def __init__(self) -> None:
         super().__init__("source", ECHO)
@@ -50,8 +51,8 @@ class Source(CubeNode):
         self._publisher.publish(message)
 
 
-class Echo(CubeNode):
-    """Answers each `frequencies` with a `stress` of as many rows, always the same values."""
+class BareEcho(CubeNode):
+    """Answers each `frequencies` with a `stress` of as many rows, which are all zero."""
 
     def __init__(self) -> None:
         super().__init__("echo", ECHO)
@@ -81,9 +82,7 @@ class Echo(CubeNode):
 
 
 def main() -> None:
-    import sys
-
-    run(lambda: [Source() if "source" in sys.argv else Echo()])
+    run(lambda: [BareSource() if "source" in sys.argv else BareEcho()])
 
 
 if __name__ == "__main__":

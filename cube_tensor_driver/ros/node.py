@@ -1,5 +1,5 @@
-"""What both nodes share: parameters with descriptions, qualities of service, how a node is started,
-spun and ended."""
+"""What all nodes share: parameters with descriptions, qualities of service, and how nodes are
+started, spun and ended."""
 
 from __future__ import annotations
 
@@ -27,33 +27,37 @@ from ..core.errors import ConfigError, CubeError
 from .parameters import Parameter
 
 PAUSE_S = 2.0
-"""The longest pause of a reader that no message is lost in: queue depths are rate times this."""
+"""No message is lost while a subscriber pauses for so long: a queue is as deep as the rate times
+this."""
 QUEUE_BYTES = 64_000_000
-"""What a queue may hold of the largest skins, so that no process grows beyond 200 MB: there the
-pause is shorter."""
+"""A queue holds at most so many bytes, so that no process grows beyond 200 MB. Of the largest skins
+it holds less than PAUSE_S."""
 ROW_BYTES = 78
+"""Of a row of `stress` in a message."""
 UNKNOWN_RATE = 1000.0
+"""Messages per second to expect where the rate is not known."""
 BUFFERS_KEPT = 4
-"""Shapes of messages whose bytes are kept to be filled again."""
+"""How many shapes of messages have memory that is filled again and again."""
 SPIN_S = 0.2
+"""How long one turn of the executor waits, and so how late a signal may be noticed."""
 SWITCH_S = 1e-3
-"""A reader gives up Python's lock at each read; while the main thread computes it would wait 5 ms
-each time."""
+"""How long a thread may keep Python's lock while others wait for it. The reader's thread gives it
+up at each read; with Python's own 5 ms it would wait so long whenever the main thread computes."""
 COLLECT = 20_000, 20, 20
-"""When Python looks for garbage. A scan leaves none, but at 700 objects it looked every scan or
-two."""
+"""Thresholds of Python's garbage collector. A scan leaves no garbage, but with Python's own 700
+objects the collector would run every scan or two."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def queue(rate: float | None, reliability: str = "reliable", rows: int = 1) -> QoSProfile:
-    """Quality of service of the batch topics at `rate` messages of so many rows per second, None:
-    not known.
+    """Quality of service of the batch topics.
 
+    rate: messages per second; None: not known. rows: of each message.
     ConfigError: no such reliability.
     """
-    depth = max(
-        10, math.ceil(min((rate or UNKNOWN_RATE) * PAUSE_S, QUEUE_BYTES / (rows * ROW_BYTES)))
-    )
+    wanted = (rate or UNKNOWN_RATE) * PAUSE_S
+    affordable = QUEUE_BYTES / (rows * ROW_BYTES)
+    depth = max(10, math.ceil(min(wanted, affordable)))
     policies = {
         "reliable": ReliabilityPolicy.RELIABLE,
         "best_effort": ReliabilityPolicy.BEST_EFFORT,
@@ -68,8 +72,10 @@ def queue(rate: float | None, reliability: str = "reliable", rows: int = 1) -> Q
 
 
 def scans_per_message(publish_period: float, rate: float | None) -> int:
-    """How many samples of each cube a message holds; at `rate` samples per second, None: not
-    known."""
+    """How many samples of each cube a message holds that covers publish_period seconds.
+
+    rate: samples per second; None: not known.
+    """
     return max(1, round(publish_period * (rate or UNKNOWN_RATE)))
 
 
@@ -82,15 +88,18 @@ def batch_queue(node: CubeNode, rate: float | None, n_cubes: int) -> QoSProfile:
 
 
 class CubeNode(LifecycleNode):
-    """A lifecycle node whose errors are one line in the log and a transition that fails, never a
-    traceback."""
+    """A lifecycle node. An error in a transition is one line in the log, and the transition
+    fails.
+
+    Subclasses write `configure`, `activate`, `deactivate` and `cleanup`.
+    """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         super().__init__(name)
         self.configured = False
         self._parameters_by_name = {parameter.name: parameter for parameter in parameters}
         self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._take_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
         for parameter in parameters:
             self._declare(parameter)
 
@@ -139,14 +148,14 @@ class CubeNode(LifecycleNode):
             )
         return ""
 
-    def _take_parameters(self, parameters: list[Any]) -> None:
+    def _apply_parameters(self, parameters: list[Any]) -> None:
         for parameter in parameters:
             known = self._parameters_by_name.get(parameter.name)
             if self.configured and known is not None and known.live:
                 self.changed(parameter.name)
 
     def attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
-        """Do the work of a transition; a CubeError becomes a line in the log and a failure."""
+        """Do the work of a transition. A CubeError becomes a line in the log and a failure."""
         try:
             work()
         except CubeError as error:
@@ -156,20 +165,20 @@ class CubeNode(LifecycleNode):
 
     @property
     def failure(self) -> Exception | None:
-        """What makes it useless to go on: the process ends with an error."""
+        """An error after which the node is of no use: the process ends."""
         return None
 
     def configure(self) -> None:
-        """Make all that does not touch the outside yet. CubeError: why it cannot be."""
+        """Make all that the node needs, without opening a device. CubeError: it cannot be made."""
 
     def activate(self) -> None:
-        """Begin. CubeError: why it cannot be."""
+        """Begin to work. CubeError: it cannot begin."""
 
     def deactivate(self) -> None:
-        """End what `activate` began; safe to call twice."""
+        """End what `activate` began. Safe to call twice, and without `activate`."""
 
     def cleanup(self) -> None:
-        """End what `configure` made; safe to call twice."""
+        """End what `configure` made. Safe to call twice, and without `configure`."""
 
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
         result = self.attempt(self.configure)
@@ -188,7 +197,7 @@ class CubeNode(LifecycleNode):
     def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
         self.cleanup()
         self.configured = False
-        gc.collect()  # what was configured leaves garbage, unlike a scan
+        gc.collect()  # now, because `run` lets it come rarely by itself
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
@@ -221,8 +230,10 @@ class NodeClock:
 
 
 def run(make: Callable[[], Sequence[CubeNode]]) -> None:
-    """Run nodes, started in order, until SIGINT or SIGTERM, then end them in reverse; exit code 1:
-    one cannot start."""
+    """Run nodes until SIGINT or SIGTERM. They start in order, and end in reverse.
+
+    The exit code is 1 if a node cannot start, or fails later.
+    """
     stopping = False
 
     def stop(*_: object) -> None:
@@ -240,12 +251,9 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
         executor = make_executor()
         for node in nodes:
             executor.add_node(node)
-            for transition in (
-                (node.trigger_configure, node.trigger_activate) if node.value("autostart") else ()
-            ):
-                if not stopping and transition() != TransitionCallbackReturn.SUCCESS:
-                    stopping, code = True, 1
-        # What is there by now stays: no collection has to look at it, which would take 20 ms.
+            if not stopping and node.value("autostart") and not _start(node):
+                stopping, code = True, 1
+        # All objects made until now will stay. Looking at them would take a collection 20 ms.
         gc.collect()
         gc.freeze()
         gc.set_threshold(*COLLECT)
@@ -271,8 +279,16 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
     raise SystemExit(code)
 
 
+def _start(node: CubeNode) -> bool:
+    """Configure and activate a node; whether it can."""
+    return all(
+        transition() == TransitionCallbackReturn.SUCCESS
+        for transition in (node.trigger_configure, node.trigger_activate)
+    )
+
+
 def make_executor() -> Any:
-    """The executor that costs a third of the default one, where this rclpy has it."""
+    """The EventsExecutor, which costs a third of the default one, if this rclpy has it."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
