@@ -95,7 +95,7 @@ class ScanBuilder:
         missing = self._live - self._pending[-1].keys()
         if not missing:
             return True
-        return n_scans == 1 and self._is_late_part(missing)
+        return n_scans == 1 and self._holds_late_sample(missing)
 
     def build(
         self, make_rows: MakeRows = empty_rows, max_scans: int | None = None
@@ -122,10 +122,12 @@ class ScanBuilder:
         rows = make_rows(sum(len(part.cubes) for part in parts), self.cubes.n_pads)
         self.rows_built += len(rows)
         start = 0
-        for _, group in groupby(parts, key=lambda part: part.sample.n_pads):
+        for _, group in groupby(parts, key=lambda part: part.sample.shape[1]):
             same_width = list(group)
             end = start + sum(len(part.cubes) for part in same_width)
-            _fill(rows.select(slice(start, end)), same_width)
+            # Mostly all cubes have as many pads; then there is nothing to select.
+            is_all = len(same_width) == len(parts)
+            _fill(rows if is_all else rows.select(slice(start, end)), same_width)
             start = end
         return rows
 
@@ -135,7 +137,7 @@ class ScanBuilder:
         left_out = self.cubes.unknown_cube + self.cubes.wrong_pads
         return self.rows_added - waiting - self.rows_built - left_out
 
-    def _is_late_part(self, missing: set[int]) -> bool:
+    def _holds_late_sample(self, missing: set[int]) -> bool:
         """Whether the pending scan holds a sample that belongs to the scan built last.
 
         A link that comes late must not wait for the next samples of the others: it would stay one
