@@ -1,22 +1,20 @@
-"""What those who look cost: markers, contacts and browser view beside a skin of so many cubes that
+"""Measures what views cost: the nodes markers and contacts and the browser view, beside a skin that
 sends at 100 Hz.
 
-measure_views.py CUBES [chromium]: one line of figures. The page is read by a client that draws
-nothing, or by headless Chromium, which draws on the processor; then shown_hz is how often it drew
-something new.
+`measure_views.py CUBES [chromium]` prints one line of figures. A client that draws nothing reads
+the page. With `chromium`, headless Chromium shows it too and draws on the processor; then shown_hz
+is how often it drew something new.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,7 +23,9 @@ import rclpy
 import viser
 import zstandard
 from photograph import chromium
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from selenium import webdriver
 from visualization_msgs.msg import MarkerArray
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
@@ -33,7 +33,7 @@ from websockets.typing import Subprotocol
 
 from cube_tensor_driver.bags.message_codec import stress_codec
 from cube_tensor_driver.config.grid import grid
-from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
@@ -53,12 +53,17 @@ SHOWN = """(() => {
     constructor(...all) {
       super(...all)
       const field = message => message.name == '/field'
-      this.addEventListener('message', ({data}) => { if (data.messages && data.messages.some(field)) come = true })
+      this.addEventListener('message', ({data}) => {
+        if (data.messages && data.messages.some(field)) come = true
+      })
     }
   }
   for (const name of ['drawElements', 'drawElementsInstanced']) {
     const draw = WebGL2RenderingContext.prototype[name]
-    WebGL2RenderingContext.prototype[name] = function(...all) { drawn = true; return draw.apply(this, all) }
+    WebGL2RenderingContext.prototype[name] = function(...all) {
+      drawn = true
+      return draw.apply(this, all)
+    }
   }
   (function next() {
     if (come && drawn) { window.shown_++; come = false }
@@ -66,8 +71,7 @@ SHOWN = """(() => {
     requestAnimationFrame(next)
   })()
 })()"""
-"""Counts the pictures that are drawn after new data came; what is drawn without is no new
-picture."""
+"""Counts the pictures that the browser draws after new data has come."""
 CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": (1, 0, 0, 0),
@@ -80,11 +84,11 @@ CAMERA = {
     "look_at": (0, 0, 0),
     "up_direction": (0, 0, 1),
 }
-"""A page that has said where it looks from is one that the view draws for."""
+"""The view draws only for pages that have said where they look from."""
 
 
-class Counter:
-    """Pictures that a reader of the page gets; it draws nothing."""
+class PictureCounter:
+    """A client of the page that draws nothing and counts the pictures it gets."""
 
     def __init__(self, url: str) -> None:
         self.pictures = 0
@@ -98,110 +102,147 @@ class Counter:
     def _read(self) -> None:
         with contextlib.suppress(ConnectionClosed):
             for data in self._socket:
-                assert isinstance(data, bytes)
+                if not isinstance(data, bytes):
+                    raise TypeError("a text from viser, which sends bytes only")
                 length = int.from_bytes(data[8:16], "little")
                 self.pictures += zstandard.decompress(data[16 : 16 + length]).count(b"/field")
+
+
+class SkinSender:
+    """Publishes the info of a skin, and its stress under a load that moves.
+
+    A context manager: a thread of its own sends while it is entered.
+    """
+
+    def __init__(self, node: Node, skin: Skin) -> None:
+        info = node.create_publisher(SkinInfo, "info", LATCHED)
+        info.publish(info_message(skin, Pipeline(skin.calibrations), time.time_ns()))
+        self._publisher = node.create_publisher(SkinStress, "stress", queue(RATE))
+        load = Load(skin, default_script())
+        self._frame_id = skin.parent_frame.encode() + b"\0"
+        self._instants = [
+            stress_rows(*load.at(number * load.period / INSTANTS)) for number in range(INSTANTS)
+        ]
+        self._instants_per_scan = INSTANTS / (load.period * RATE)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._send)
+
+    def __enter__(self) -> SkinSender:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _send(self) -> None:
+        number = 0
+        while not self._ended.wait(1 / RATE):
+            number += 1
+            rows = self._instants[int(number * self._instants_per_scan) % INSTANTS]
+            rows.sequence[:] = number
+            rows.stamp_ns[:] = time.time_ns()
+            self._publisher.publish(stress_codec.encode(rows, self._frame_id))
+
+
+class MessageCounter:
+    """Counts the messages of a topic."""
+
+    def __init__(self, node: Node, message_type: type, topic: str) -> None:
+        self.count = 0
+        node.create_subscription(message_type, topic, self._receive, 10, raw=True)
+
+    def _receive(self, _: bytes) -> None:
+        self.count += 1
+
+
+class BrowserMeter:
+    """What a browser does with the page."""
+
+    def __init__(self, page: webdriver.Chrome) -> None:
+        self._page = page
+        page.execute_cdp_cmd("Performance.enable", {})
+
+    def pictures(self) -> int:
+        """Pictures drawn so far after new data had come."""
+        return int(self._page.execute_script("return window.shown_"))
+
+    def script_seconds(self) -> float:
+        """Time that the page's main thread has spent in its own code, without drawing."""
+        metrics = self._page.execute_cdp_cmd("Performance.getMetrics", {})["metrics"]
+        durations = {metric["name"]: metric["value"] for metric in metrics}
+        return float(durations["ScriptDuration"])
 
 
 def measure(cubes: int, browser: bool) -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="cube_views_") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        nx = math.ceil(math.sqrt(cubes))
-        while cubes % nx:
-            nx += 1
-        write_yaml(
-            folder / "skin.yaml",
-            grid(nx=nx, ny=cubes // nx, pitch=0.012, links=1, rate=RATE, port="/dev/null"),
-        )
-        skin = read_skin(folder / "skin.yaml")
-        load = Load(skin, default_script())
+        skin = make_skin(folder, cubes)
         node = rclpy.create_node("measure")
-        info = node.create_publisher(SkinInfo, "info", LATCHED)
-        info.publish(
-            info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns())
-        )
-        publisher = node.create_publisher(SkinStress, "stress", queue(RATE))
-        counts = {"markers": 0, "contacts": 0}
-        for topic, kind in (("markers", MarkerArray), ("contacts", SkinContacts)):
-            count = functools.partial(
-                lambda topic, _: counts.__setitem__(topic, counts[topic] + 1), topic
-            )
-            node.create_subscription(kind, topic, count, 10, raw=True)
-        frame_id = skin.parent_frame.encode() + b"\0"
-        rows = [stress_rows(*load.at(k * load.period / INSTANTS)) for k in range(INSTANTS)]
-        ended = threading.Event()
-
-        def send() -> None:
-            number = 0
-            while not ended.wait(1 / RATE):
-                number += 1
-                instant = number * INSTANTS // round(load.period * RATE) % INSTANTS
-                rows[instant].sequence[:] = number
-                rows[instant].stamp_ns[:] = time.time_ns()
-                publisher.publish(stress_codec.encode(rows[instant], frame_id))
-
-        sender = threading.Thread(target=send)
-        sender.start()
-        stack.callback(sender.join)
-        stack.callback(ended.set)
+        executor = make_executor()
+        executor.add_node(node)
+        stack.callback(node.destroy_node)
+        stack.callback(executor.remove_node, node)
+        counters = {
+            "markers": MessageCounter(node, MarkerArray, "markers"),
+            "contacts": MessageCounter(node, SkinContacts, "contacts"),
+        }
+        stack.enter_context(SkinSender(node, skin))
         children = stack.enter_context(Children(folder))
-        for topic in counts:
+        for topic in counters:
             children.start(Process(topic, f"cube_tensor_driver.ros.{topic}"))
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         url = children.wait_for_line("view", "http://", START_S).split()[0]
-        counter = Counter(url)
-        page = stack.enter_context(chromium(url, SHOWN)) if browser else None
-        executor = make_executor()
-        executor.add_node(node)
+        pictures = PictureCounter(url)
+        meter = BrowserMeter(stack.enter_context(chromium(url, SHOWN))) if browser else None
 
         def spin(seconds: float) -> None:
             until = time.monotonic() + seconds
             while time.monotonic() < until:
                 executor.spin_once(timeout_sec=0.1)
 
+        def read() -> dict[str, float]:
+            """Everything that is counted, so far."""
+            counted: dict[str, float] = {}
+            for topic, counter in counters.items():
+                counted[f"{topic}_hz"] = counter.count
+            counted["view_hz"] = pictures.pictures
+            for process in (*counters, "view"):
+                counted[f"cpu_{process}_percent"] = 100 * cpu(children.pid(process))
+            if meter:
+                counted["shown_hz"] = meter.pictures()
+                counted["script"] = meter.script_seconds()
+            return counted
+
         spin(SETTLE_S)
-        if page:
-            page.execute_cdp_cmd("Performance.enable", {})
-            script, shown = scripting(page), page.execute_script("return window.shown_")
-        names = (*counts, "view")
-        before = {name: cpu(children.pid(name)) for name in names}
-        counts_before, pictures, start = counts.copy(), counter.pictures, time.monotonic()
+        before, start = read(), time.monotonic()
         spin(MEASURE_S)
-        seconds = time.monotonic() - start
-        result = {
-            f"cpu_{name}_percent": 100 * (cpu(children.pid(name)) - before[name]) / seconds
-            for name in names
-        }
-        result |= {
-            f"{topic}_hz": (counts[topic] - counts_before[topic]) / seconds for topic in counts
-        }
-        result["view_hz"] = (counter.pictures - pictures) / seconds
-        if page:
-            shown = page.execute_script("return window.shown_") - shown
-            result |= {
-                "shown_hz": shown / seconds,
-                "script_ms_per_picture": 1e3 * (scripting(page) - script) / shown,
-            }
+        after, seconds = read(), time.monotonic() - start
+        result = {name: (after[name] - before[name]) / seconds for name in after}
+        if meter:
+            result["script_ms_per_picture"] = 1e3 * result.pop("script") / result["shown_hz"]
         result["rss_view_mb"] = psutil.Process(children.pid("view")).memory_info().rss / 2**20
         children.check()
-        executor.remove_node(node)
-        ended.set()
-        sender.join()
-        node.destroy_node()
         return {name: round(value, 1) for name, value in result.items()}
 
 
-def scripting(page: Any) -> float:
-    """Seconds that the page's main thread has spent in its own code, without drawing."""
-    metrics = page.execute_cdp_cmd("Performance.getMetrics", {})["metrics"]
-    return float(next(metric["value"] for metric in metrics if metric["name"] == "ScriptDuration"))
+def make_skin(folder: Path, cubes: int) -> Skin:
+    """A grid that is as nearly square as the number of cubes allows."""
+    nx = math.ceil(math.sqrt(cubes))
+    while cubes % nx:
+        nx += 1
+    path = folder / "skin.yaml"
+    write_yaml(path, grid(nx=nx, ny=cubes // nx, pitch=0.012, rate=RATE, port="/dev/null"))
+    return read_skin(path)
 
 
 def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
-    """As planar cubes would give them."""
+    """Rows as planar cubes would give them, which do not observe all components."""
     n = len(stress)
-    stress, gradient = stress.astype(np.float32), gradient[:, :3].reshape(n, 9).astype(np.float32)
-    stress[:, [1, 3, 5]], gradient[:, [1, 3, 4, 5, 7]] = np.nan, np.nan
+    stress = stress.astype(np.float32)
+    gradient = gradient[:, :3].reshape(n, 9).astype(np.float32)
+    stress[:, [1, 3, 5]] = np.nan
+    gradient[:, [1, 3, 4, 5, 7]] = np.nan
     return StressRows(
         cube=np.arange(n, dtype=np.uint16),
         sequence=np.zeros(n, np.uint32),
@@ -216,6 +257,7 @@ def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
 
 
 def cpu(pid: int) -> float:
+    """Processor time of a process, s."""
     times = psutil.Process(pid).cpu_times()
     return float(times.user + times.system)
 

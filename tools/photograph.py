@@ -1,5 +1,7 @@
-"""A picture of a page in headless Chromium, once the page has drawn what it shows: photograph.py
-URL FILE.png"""
+"""Takes a picture of the browser view in headless Chromium, while a load presses.
+
+Use: photograph.py URL FILE.png
+"""
 
 from __future__ import annotations
 
@@ -21,24 +23,27 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--window-size=1400,950",
 )
-READY = "return /of \\d+ cubes/.test(document.body.innerText) && document.body.innerText.includes('live')"
+READY = """const text = document.body.innerText
+return /of \\d+ cubes/.test(text) && text.includes('live')"""
 HELD = """return new Promise(drawn => {
   if (!document.body.innerText.includes('paused')) return drawn(false)
   let left = 3
   const next = () => left-- ? requestAnimationFrame(next) : drawn(true)
   next() })"""
-"""Paused, and drawn since."""
-CLICK = "for (const b of document.querySelectorAll('button')) if (b.innerText.trim() == 'pause') b.click()"
+"""Whether the page is paused, after it has been drawn again."""
+CLICK = """for (const button of document.querySelectorAll('button'))
+  if (button.innerText.trim() == 'pause') button.click()"""
 CLEAR = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 LOADED = "return Number((/([0-9.]+) N, shear/.exec(document.body.innerText) || [0, 0])[1])"
-LEAST_N, WAIT_S, COMINGS = 2.2, 60.0, 3
-"""The load comes and goes: the picture is of its third coming, when the plots are full, while it
-presses."""
+LEAST_N, WAIT_S = 2.2, 60.0
+TOUCHES = 3
+"""The load comes and goes. The picture shows it when it presses the third time: then the plots are
+full."""
 
 
 @contextmanager
 def chromium(url: str, script: str = "") -> Iterator[webdriver.Chrome]:
-    """A headless browser that shows the page; script: runs before the page's own."""
+    """A headless browser that shows the page. script: runs before the page's own code."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or shutil.which("google-chrome") or ""
     for flag in FLAGS:
@@ -54,20 +59,23 @@ def chromium(url: str, script: str = "") -> Iterator[webdriver.Chrome]:
 
 
 def photograph(url: str, path: str) -> None:
+    """Write the picture to the file `path`."""
     with chromium(url) as browser:
         wait = WebDriverWait(browser, WAIT_S, poll_frequency=0.02)
         wait.until(lambda _: browser.execute_script(READY))
         browser.execute_script(CLEAR)
-        for _ in range(COMINGS - 1):
+        for _ in range(TOUCHES - 1):
             wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
             wait.until(lambda _: browser.execute_script(LOADED) < LEAST_N / 2)
-        wait.until(lambda _: pressed(browser, wait))
+        wait.until(lambda _: paused_under_load(browser, wait))
         browser.save_screenshot(path)
 
 
-def pressed(browser: webdriver.Chrome, wait: WebDriverWait[webdriver.Chrome]) -> bool:
-    """Wait for the load and hold the page; whether it was still pressing by then. If not the page
-    runs again."""
+def paused_under_load(browser: webdriver.Chrome, wait: WebDriverWait[webdriver.Chrome]) -> bool:
+    """Wait for the load, then pause the page.
+
+    False: by then the load was gone. The page runs on in this case.
+    """
     wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
     browser.execute_script(CLICK)
     wait.until(lambda _: browser.execute_script(HELD))
