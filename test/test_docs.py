@@ -198,7 +198,7 @@ def test_programs_of_a_page_run(name):
     from cube_tensor_driver.core.scene import CubePoses
 
     there = {
-        "places": CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002)),
+        "poses": CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002)),
         "values": np.zeros((1, 15)),
     }
     programs = re.findall(

@@ -435,9 +435,9 @@ def test_every_picture_of_the_paper_is_there_and_shown():
 
 
 def test_the_figures_of_the_papers_page_are_those_of_its_json():
-    """paper.json is what ./cube paper wrote beside the pictures; each figure of the claims' table
-    is made of it."""
-    text = (ROOT / "docs" / "paper.md").read_text().replace("−", "-")
+    """paper.json is what ./cube paper wrote beside the pictures; the pages' figures are its own."""
+    pages = [ROOT / "docs" / name for name in ("paper.md", "paper_history.md")]
+    text = "\n".join(page.read_text() for page in pages).replace("−", "-")
     found = json.loads((ROOT / "docs" / "paper" / "paper.json").read_text())
     experiment = {
         "a": "a, top plate pressed, bonded",
