@@ -34,7 +34,7 @@ from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import queue
 from ..simulation.verification import Arrivals, compare, percentile
-from .running import Observer, Usage, end_simulator, report, ros
+from .running import Usage, end_simulator, observing, report
 
 LAYOUT, PITCH, CUBES_PER_HUB = "planar", 0.012, 80
 INSTANTS = 16
@@ -113,7 +113,7 @@ def _interleaved(first: Callable[[], None], second: Callable[[], None]) -> tuple
 
 def bench_echo(*, cubes: int, rate: float, duration: float, json_path: Path | None = None) -> int:
     """Measure the bare floor alone: a source of messages, an echo and a receiver."""
-    with ros(), _progress() as progress:
+    with _progress() as progress:
         result = _echo(cubes, rate, duration, progress)
     report({"cubes": cubes, "rate_hz": rate, "duration_s": duration, **result}, json_path)
     return 0
@@ -134,7 +134,7 @@ def bench_skin(
     publish_period: s that one message covers, 0: one message for each scan
     composed: driver and reconstruction in one process
     """
-    with ros(), _progress() as progress:
+    with _progress() as progress:
         result = _skin_and_echo(
             cubes, rate, duration, progress, publish_period=publish_period, composed=composed
         )
@@ -151,7 +151,7 @@ def bench_scale(
     json_path: Path | None = None,
 ) -> int:
     """CPU and latency for each of these numbers of cubes, as figures and as a picture."""
-    with ros(), _progress() as progress:
+    with _progress() as progress:
         rows = [_skin_and_echo(cubes, rate, duration, progress) for cubes in counts]
     report({"rate_hz": rate, "duration_s": duration, "skins": rows}, json_path)
     save(draw_scale(rows), figure)
@@ -266,7 +266,7 @@ def _measure(
 
     names = [process.executable for process in processes]
     task = progress.add_task(what, total=duration)
-    with Observer("bench", children) as observer:
+    with observing("bench", children) as observer:
         observer.listen(SkinStress, "stress", on_stress, queue(rate))
         observer.spin(FIRST_S, lambda: messages > 0)
         if not messages:

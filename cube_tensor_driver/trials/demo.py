@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 import math
 import os
-import signal
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -31,13 +31,14 @@ from ..ros.node import queue
 from ..simulation.load import Load, default_script
 from ..simulation.load_verification import LoadVerification
 from ..terminal.live_table import LiveTable
-from .running import Interrupted, Observer, Usage, end_simulator, interruption, ros
+from .running import Interrupted, Observer, Usage, end_simulator, interruption, observing
 
 FIRST_TENSORS_S = 20.0
 LAST_TENSORS_S = 2.0
 MOST_CUBES = 4096
 PITCH, RATE, CUBES_PER_HUB = 0.012, 100.0, 8
 NODES = ("driver", "reconstruction")
+VIEW = Process("view", "cube_tensor_driver.cli", node=False, arguments=("view",))
 
 
 def run_demo(
@@ -65,56 +66,52 @@ def run_demo(
 
     CubeError: something does not start, or another skin publishes here.
     """
-    interrupted = interruption(signal.SIGHUP)
+    interrupted = interruption()
     try:
-        with ros(), tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
+        with tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
             folder = Path(name)
             path = config.resolve() if config else _skin_file(folder, cubes, rate or RATE)
             skin = read_skin(path)
             rate = rate or skin.rate or RATE
             applied = Load(skin, read_script(load) if load else default_script())
+            verification = LoadVerification(skin, applied) if duration else None
             log = folder / "log.json"
             hubs = SimulatedHubs(folder / "ports", load=load, sample_log=log)
-            with LiveTable(skin, show=not headless) as table, Children(folder) as children:
-                for process in skin_processes(path, rate=rate, simulated=hubs):
+            processes = skin_processes(path, rate=rate, simulated=hubs)
+            if view:
+                processes.append(VIEW)
+            with ExitStack() as stack:
+                table = stack.enter_context(LiveTable(skin, show=not headless))
+                children = stack.enter_context(Children(folder))
+                for process in processes:
                     children.start(process)
-                if view:
-                    children.start(
-                        Process("view", "cube_tensor_driver.cli", False, arguments=("view",))
-                    )
-                with Observer(
-                    "demo", children, interrupted=interrupted, on_step=table.refresh
-                ) as observer:
-                    verification = LoadVerification(skin, applied) if duration else None
-                    demo = _Demo(skin, rate, children, table, observer, verification)
-                    demo.wait_for_tensors()
-                    if view:
-                        demo.note_address()
-                    if duration is None or verification is None:
-                        observer.spin(math.inf)
-                        return 0
-                    figures = demo.measure(duration, log)
-            result = {
-                "cubes": len(skin.cubes),
-                "rate_hz": rate,
-                "duration_s": duration,
-                **figures,
-            }
-            if figure is not None:
-                forces = verification.forces()
-                result |= forces.figures()
-                picture = draw_forces(
-                    seconds=forces.seconds,
-                    force=forces.force,
-                    measured_force=forces.measured_force,
-                    centre=forces.centre,
-                    measured_centre=forces.measured_centre,
-                    cubes=applied.poses.position,
+                observer = stack.enter_context(
+                    observing("demo", children, interrupted=interrupted, on_step=table.refresh)
                 )
-                save(picture, figure)
+                demo = _Demo(skin, rate, children, table, observer, verification)
+                demo.wait_for_tensors()
+                if view:
+                    demo.note_address()
+                if duration is None or verification is None:
+                    observer.spin(math.inf)
+                    return 0
+                figures = demo.measure(verification, duration, log)
     except Interrupted:
         # Without a duration Ctrl-C is how it ends.
         return 0 if duration is None else 130
+    result = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": duration, **figures}
+    if figure is not None:
+        forces = verification.forces()
+        result |= forces.figures()
+        picture = draw_forces(
+            seconds=forces.seconds,
+            force=forces.force,
+            measured_force=forces.measured_force,
+            centre=forces.centre,
+            measured_centre=forces.measured_centre,
+            cubes=applied.poses.position,
+        )
+        save(picture, figure)
     if json_path is None:
         print(json.dumps(result, indent=2))
     else:
@@ -189,11 +186,11 @@ class _Demo:
         address = self._children.log("view").strip().splitlines()[-1].split()[0]
         self._table.note = f"\n{address} shows it"
 
-    def measure(self, duration: float, log: Path) -> dict[str, object]:
+    def measure(
+        self, verification: LoadVerification, duration: float, log: Path
+    ) -> dict[str, object]:
         """Figures of so many seconds; the simulator ends with it."""
-        spin, verification = self._observer.spin, self._verification
-        if verification is None:
-            raise ValueError("nothing is collected: this demo was made without a verification")
+        spin = self._observer.spin
         spin(0.1)
         start_ns, usage = time.time_ns(), Usage(self._children, NODES)
         spin(duration)

@@ -4,7 +4,6 @@ processes use, and where figures go."""
 from __future__ import annotations
 
 import json
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -13,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-import rclpy
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 
 from ..config.output_files import write_json
 from ..core.errors import CubeError
 from ..processes.children import Children
-from ..ros.node import make_executor
+from ..ros.session import node_session, on_stop_signal
 from ..simulation.sample_log import SampleLog
 
 STEP_S = 0.05
@@ -31,51 +29,27 @@ class Interrupted(CubeError):
     """Ctrl-C, or asked to end."""
 
 
-@contextmanager
-def ros() -> Iterator[None]:
-    """rclpy for the length of a block; signals are left to the caller."""
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        yield
-    finally:
-        rclpy.try_shutdown()
-
-
-def interruption(*signals: signal.Signals) -> threading.Event:
-    """Set by these signals from now on, SIGINT and SIGTERM among them."""
+def interruption() -> threading.Event:
+    """Set by Ctrl-C, SIGTERM or the end of the terminal from now on."""
     event = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, *signals):
-        signal.signal(number, lambda *_: event.set())
+    on_stop_signal(event.set)
     return event
 
 
 class Observer:
-    """A node with its executor, beside the processes that it observes; a context that ends it.
-
-    interrupted: ends `spin`; None leaves signals as they are. on_step: called again and again while
-    it spins.
-    """
+    """A node beside the processes that it observes; `observing` makes one."""
 
     def __init__(
         self,
-        name: str,
+        node: Node,
+        executor: Any,
         children: Children,
-        *,
-        interrupted: threading.Event | None = None,
-        on_step: Callable[[], None] = lambda: None,
+        interrupted: threading.Event | None,
+        on_step: Callable[[], None],
     ) -> None:
-        self.node = rclpy.create_node(name, automatically_declare_parameters_from_overrides=False)
+        self.node, self._executor = node, executor
         self._children, self._interrupted, self._on_step = children, interrupted, on_step
-        self._executor = make_executor()
-        self._executor.add_node(self.node)
         self._looked = 0.0
-
-    def __enter__(self) -> Observer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.remove_node(self.node)
-        self.node.destroy_node()
 
     def listen(
         self, kind: type, topic: str, receive: Callable[[bytes], None], quality: QoSProfile
@@ -95,6 +69,23 @@ class Observer:
                 self._looked = time.monotonic()
                 self._children.check()
             self._on_step()
+
+
+@contextmanager
+def observing(
+    name: str,
+    children: Children,
+    *,
+    interrupted: threading.Event | None = None,
+    on_step: Callable[[], None] = lambda: None,
+) -> Iterator[Observer]:
+    """A node of this name, for the length of a block.
+
+    interrupted: ends `Observer.spin`; None leaves signals as they are
+    on_step: called again and again while it spins
+    """
+    with node_session(name) as (node, executor):
+        yield Observer(node, executor, children, interrupted, on_step)
 
 
 class Usage:

@@ -35,7 +35,7 @@ from ..simulation.faults import FRAME_FAULTS, PAD_FAULTS
 from ..simulation.inject import fault_line
 from ..simulation.simulator import FAULT_PIPE
 from ..simulation.torture_verification import TortureVerification
-from .running import Observer, Usage, end_simulator, interruption, report, ros
+from .running import Observer, Usage, end_simulator, interruption, observing, report
 
 HUBS, NX, NY, RATE, INSTANTS = 4, 8, 4, 500.0, 1000
 CUBES_PER_HUB = NX * NY // HUBS
@@ -168,7 +168,7 @@ def run_torture(*, duration: float, seed: int = 0, json_path: Path | None = None
     returns the exit code, 0 when all figures are as they must be. CubeError: something does not
     start."""
     interrupted = interruption()
-    with ros(), tempfile.TemporaryDirectory(prefix="cube_torture_") as name:
+    with tempfile.TemporaryDirectory(prefix="cube_torture_") as name:
         result = _torture(duration, seed, Path(name), interrupted)
     report(result, json_path)
     broken = failures(result)
@@ -198,7 +198,7 @@ def _torture(
             if process.executable == "simulator":
                 process = replace(process, arguments=(*process.arguments, "--tcp"))
             children.start(process)
-        with Observer("torture", children, interrupted=interrupted) as observer:
+        with observing("torture", children, interrupted=interrupted) as observer:
             receiver = _Receiver(observer, verification)
             driver = _Lifecycle(observer)
             _start(observer, driver, children, ports)
