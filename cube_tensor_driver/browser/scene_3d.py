@@ -156,7 +156,7 @@ class Cubes:
                 "/cubes",
                 vertices,
                 faces,
-                scene.turns(poses.rotation),
+                scene.quaternions(poses.rotation),
                 poses.position,
                 batched_scales=poses.half_side,
                 batched_colors=np.full((len(poses.position), 3), 90, np.uint8),
@@ -304,7 +304,7 @@ class SelectionRing:
         self._upper_faces = (
             poses.position + 1.1 * poses.rotation[:, :, 2] * poses.half_side[:, None]
         )
-        self._orientations = scene.turns(poses.rotation)
+        self._orientations = scene.quaternions(poses.rotation)
         radius = 0.6 * placement.pitch + 0.01 * placement.arrow
         self._mesh = _add_mesh(api, "selected", WHITE)
         _set_mesh(self._mesh, ring(radius, THIN + 0.005 * placement.arrow))

@@ -152,7 +152,7 @@ class FlatImage:
             columns * pixel,
             rows * pixel,
             format="png",
-            wxyz=scene.turns(image_frame[None])[0],
+            wxyz=scene.quaternions(image_frame[None])[0],
             position=self._raster.centre + height * z,
             cast_shadow=False,
             receive_shadow=False,

@@ -62,8 +62,8 @@ class CubePoses(NamedTuple):
         return max(side, float(np.sqrt(max(0.0, np.median(apart.min(axis=1))))))
 
 
-def turns(rotation: np.ndarray) -> np.ndarray:
-    """(N, 4) quaternions w, x, y, z of rotations (N, 3, 3). A loop: for once per skin, not per
+def quaternions(rotation: np.ndarray) -> np.ndarray:
+    """(N, 4) w, x, y, z of rotations (N, 3, 3). It loops: call it once per skin, not per
     picture."""
     return np.array([np.roll(quaternion_from_rotation(matrix), 1) for matrix in rotation])
 

@@ -187,7 +187,7 @@ class Canvas:
     def _cube_markers(self, frame_id: str, rotations: NDArray[np.float64]) -> list[Marker]:
         """One for each orientation, because all boxes of a CUBE_LIST are parallel."""
         markers = []
-        for group, (w, x, y, z) in enumerate(scene.turns(rotations).tolist()):
+        for group, (w, x, y, z) in enumerate(scene.quaternions(rotations).tolist()):
             members = self._groups[group]
             side = SIDE * float(self._poses.half_side[members].max())
             marker = _marker(frame_id, f"cubes {group}", Marker.CUBE_LIST)
