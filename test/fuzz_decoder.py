@@ -1,10 +1,10 @@
-"""Coverage-guided fuzzing of decoder and account, by hand: pip install atheris, then in the
+"""Coverage-guided fuzzing of decoder and account, by hand: `pip install atheris`, then in the
 environment
 
     python test/fuzz_decoder.py CORPUS_FOLDER -max_total_time=60
 
-Any bytes, and sound frames around any payload: nothing may be raised, whatever is decoded encodes
-to one frame again, and the book adds up.
+It feeds any bytes, and frames with a right checksum around any payload. Nothing may be raised,
+whatever is decoded encodes to one frame again, and the account adds up.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def one(data: bytes) -> None:
         - counters["lost_on_the_way"]
     )
     if account.contradictions() or rest or min(counters.values()) < 0:
-        raise RuntimeError(f"the book does not add up: {counters}")
+        raise RuntimeError(f"the account does not add up: {counters}")
 
 
 if __name__ == "__main__":

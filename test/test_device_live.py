@@ -33,7 +33,7 @@ RATE = 200.0
 UNMEASURED = 0
 
 
-class PlayedHub:
+class RandomHub:
     """A simulated hub on a pseudo-terminal, played in a thread: each sample is random.
 
     sent: frequencies (cubes, pads), mHz, of each sample by its number.
@@ -96,19 +96,19 @@ def make_skin(*cubes_of_links: int) -> Skin:
     return Skin("test", "world", RATE, links, cubes)
 
 
-Play = Callable[[Skin], list[PlayedHub]]
+Play = Callable[[Skin], list[RandomHub]]
 
 
 @pytest.fixture
 def play(tmp_path: Path) -> Iterator[Play]:
     """Play the hubs of a skin, on ports in tmp_path, until the test is over."""
-    hubs: list[PlayedHub] = []
+    hubs: list[RandomHub] = []
 
-    def begin(skin: Skin) -> list[PlayedHub]:
+    def begin(skin: Skin) -> list[RandomHub]:
         for number, link in enumerate(skin.links):
             count = sum(cube.link == link.name for cube in skin.cubes)
             uids = list(range(1000 * number + 1, 1000 * number + 1 + count))
-            hubs.append(PlayedHub(tmp_path / link.name, number, uids))
+            hubs.append(RandomHub(tmp_path / link.name, number, uids))
         return hubs
 
     yield begin

@@ -24,8 +24,10 @@ from .scan import MakeRows, ScanBuilder, empty_rows
 from .sequence import Account, Arrival
 
 MAX_SCANS = 4
-"""Scans in one callback at most, or one more than were asked for. After a pause many scans wait;
-buffers that are kept for rows need not be as large as all of them."""
+"""Scans in one callback at most, or one more than were asked for. Many scans wait after a pause;
+memory that is kept for rows need not hold them all."""
+EVENTS_KEPT = 100
+"""Of each link, until the next report."""
 
 
 class Log(Protocol):
@@ -42,9 +44,10 @@ class Log(Protocol):
 class RowCounts:
     """What became of the rows that came in.
 
-    delivered: given to the callback. unknown_cube, wrong_pads: left out because the skin does not
-    have the cube, or has it with another number of pads. unaccounted: none of these and not waiting
-    either; always 0.
+    delivered: given to the callback
+    unknown_cube: left out because the skin does not have the cube
+    wrong_pads: left out because the skin has the cube with another number of pads
+    unaccounted: none of these, and not waiting for their scan; always 0
     """
 
     delivered: int
@@ -57,9 +60,11 @@ class RowCounts:
 class LinkReport:
     """How one link is doing.
 
-    hub_uid: None before the hub has said it. state: the present one. past_states: other states than
-    open that it had since the last report. notes: what is wrong or was since the last report, each
-    with the way out. values: counters and clock, by name.
+    hub_uid: None before the hub has said it
+    state: the present one
+    past_states: states other than open since the last report
+    notes: what is wrong, or was wrong since the last report, with the fix
+    values: counters and clock, by name
     """
 
     name: str
@@ -74,28 +79,31 @@ class LinkReport:
 class _LinkRecord:
     """What `LiveLinks` keeps of one link.
 
-    problems: which cubes do not fit the skin. contradictions: of the account. events: states other
-    than open since the last report, and why.
+    problems: cubes that do not fit the skin
+    contradictions: of the account
+    events: states other than open since the last report, and the reason of each
+    logged_version: the last other protocol version that was logged
     """
 
     account: Account = field(default_factory=Account)
     clock: ClockMap = field(default_factory=ClockMap)
     problems: list[str] = field(default_factory=list)
     contradictions: list[str] = field(default_factory=list)
-    events: deque[tuple[LinkState, str]] = field(default_factory=deque)
+    events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     logged_version: int | None = None
 
 
 class LiveLinks:
     """Reads the links of a skin and calls back with rows of frequencies.
 
-    on_rows: called in the reader's thread with the rows of each complete scan. They are only valid
-    until it returns if make_rows gives the same memory again.
-    rate: samples per second to ask of the hubs; None leaves it to them.
-    scans_per_call: how many scans are gathered for one call.
-    make_rows: makes the arrays that rows are written into.
-    clock_ns: the clock of `stamp_ns`.
-    on_end: called in the reader's thread when it ends, whether `close` or an error ended it.
+    on_rows: called in the reader's thread with the rows of each complete scan. If make_rows gives
+        the same memory again, they are valid only until the call returns
+    rate: samples per second to ask of the hubs; None leaves it to them
+    scans_per_call: how many scans are gathered for one call
+    make_rows: makes the arrays that rows are written into
+    clock_ns: the clock of `stamp_ns`
+    log: for what happens to the links; None: Python's logging
+    on_end: called in the reader's thread when it ends, after `close` or by an error
     """
 
     def __init__(

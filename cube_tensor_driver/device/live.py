@@ -110,9 +110,9 @@ class LinkSource:
     def statistics(self) -> dict[str, object]:
         """Rows by what became of them, and of each link its state, notes and counters.
 
-        All rows that came in are: given, waiting, dropped because the consumer was too slow, of
-        unknown cubes, or with another number of pads. Notes include what happened since
-        the last call.
+        Rows that came in were given to the consumer, wait for it, were dropped because it was too
+        slow, or were left out: of unknown cubes, or with another number of pads. Notes of a link
+        include what happened since the last call.
         """
         counts = self._links.row_counts()
         links = {
@@ -143,7 +143,7 @@ class LinkSource:
         self._links.close()
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        """Raises the error that ended the reader's thread, after the rows that came before it."""
+        """If an error ends the reader's thread, it is raised after the rows that came before."""
         while True:
             rows = self._get()
             if rows is None:
