@@ -1,4 +1,4 @@
-"""Calibration: all that turns a cube's frequencies into stress, one frozen value with an id."""
+"""Calibration: what turns a cube's frequencies into stress, as one frozen value with an id."""
 
 from __future__ import annotations
 
@@ -24,19 +24,25 @@ SCHEMA = 1
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What is known of one cube, or of a kind of cubes.
+    """What is known about one cube, or about all cubes of a kind.
 
-    layout: its pads; symmetry: the group that its coefficients respect
-    coefficients: {name: value} in Pa per Pa, see symmetry.Structure; or
-    matrix: (P, M) the whole response instead, before gains; exactly one of the two
-    gain: (P,) pad sensitivity relative to the symmetric response, 1 on average
-    beta: (P,) parasitic over active capacitance at rest; modulus: (P,) E in Pa
-    rest_frequency: (P,) in Hz at no load, at the temperature model's reference
-    noise: (P,) standard deviation of a pad's stress in Pa; half_side: d0 in m
-    covariance: (K, K) of the coefficients, if known; temperature: model of f0(T), if known
-    neglect: names of modes stated to be zero, so that fewer pads can tell the others
-    uid: of the cube, None when it holds for any; created: ISO 8601 time; source: what it was made
-    from Numbers may be given for (P,) fields. CalibrationError says what is wrong.
+    layout: its pads
+    symmetry: the group that its coefficients respect
+    coefficients: {name: value} in Pa per Pa, see symmetry.Structure; or instead
+    matrix: (P, M) the whole response before gains; exactly one of the two is given
+    gain: (P,) sensitivity of a pad relative to the symmetric response, 1 on average
+    beta: (P,) parasitic over active capacitance at rest
+    modulus: (P,) E in Pa
+    rest_frequency: (P,) Hz without load, at the reference of the temperature model
+    noise: (P,) standard deviation of a pad's stress, Pa
+    half_side: d0, m
+    covariance: (K, K) of the coefficients, if known
+    temperature: model of f0(T), if known
+    neglect: names of modes stated to be zero, so that fewer pads can recover the others
+    uid: of the cube; None: it holds for any cube
+    created: ISO 8601 time
+    source: what it was made from
+    One number may be given for a (P,) field. CalibrationError says what is wrong.
     """
 
     layout: Layout
@@ -104,7 +110,8 @@ class Calibration:
         array = _array(value, None, name)
         if array.shape not in ((), (n,)):
             raise CalibrationError(
-                f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n} pads: give one number or {n}"
+                f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n} pads: "
+                f"give one number or {n}"
             )
         low = 0.0 if name == "beta" else np.nextafter(0, 1)
         if np.any(array < low):
@@ -161,11 +168,10 @@ class Calibration:
 
     def _content(self) -> dict[str, Any]:
         known = LAYOUTS.get(self.layout.name)
+        is_built_in = known is not None and known.same_as(self.layout)
         content: dict[str, Any] = {
             "schema": SCHEMA,
-            "layout": self.layout.name
-            if known and known.same_as(self.layout)
-            else self.layout.to_dict(),
+            "layout": self.layout.name if is_built_in else self.layout.to_dict(),
             "symmetry": self.symmetry,
         }
         for item in fields(self):
@@ -187,8 +193,8 @@ class Calibration:
     def from_dict(cls, data: Mapping[str, Any]) -> Calibration:
         """A calibration from plain types. CalibrationError names the wrong key, type, shape or id.
 
-        Without an id it is taken as it is: a hand-written start. With one, the id must match the
-        content.
+        An id must match the content. Without one the content is accepted as it is: a calibration
+        that somebody begins by hand.
         """
         if not isinstance(data, Mapping):
             raise CalibrationError(f"a calibration is a table; found {data!r}")
@@ -205,15 +211,11 @@ class Calibration:
                 f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}"
             )
         values = {key: value for key, value in data.items() if key in allowed}
-        layout, neglect, model = (
-            values["layout"],
-            values.get("neglect", ()),
-            values.get("temperature"),
-        )
+        layout, neglect = values["layout"], values.get("neglect", ())
+        model = values.get("temperature")
+        is_table = isinstance(layout, Mapping)
         try:
-            values["layout"] = (
-                Layout.from_dict(layout) if isinstance(layout, Mapping) else find_layout(layout)
-            )
+            values["layout"] = Layout.from_dict(layout) if is_table else find_layout(layout)
         except LayoutError as error:
             raise CalibrationError(f"calibration: {error}") from error
         if isinstance(neglect, str) or not isinstance(neglect, Sequence):
@@ -228,8 +230,9 @@ class Calibration:
         calibration = cls(**values)
         if "id" in data and data["id"] != calibration.id:
             raise CalibrationError(
-                f"calibration: the id says {data['id']!r} but the content gives {calibration.id!r}: "
-                "it was edited by hand or damaged. Restore the file, or remove the id to accept it"
+                f"calibration: the id says {data['id']!r} but the content gives "
+                f"{calibration.id!r}: it was edited by hand or damaged. Restore the file, or "
+                "remove the id to accept it"
             )
         return calibration
 
@@ -272,17 +275,13 @@ def _coefficients(value: Any) -> Mapping[str, float]:
 
 
 def _array(value: Any, shape: tuple[int, ...] | None, name: str) -> np.ndarray:
-    items = (
-        np.asarray(value, dtype=object).ravel()
-        if not isinstance(value, np.ndarray)
-        else value.ravel()
-    )
-    if not isinstance(value, np.ndarray) and any(
-        isinstance(x, (str, bool)) or x is None for x in items
-    ):
-        raise CalibrationError(
-            f"{name} is {value!r}; it must be numbers (write 2.0e-3 with its point)"
-        )
+    if not isinstance(value, np.ndarray):
+        # numpy would make numbers of some of these.
+        items = np.asarray(value, dtype=object).ravel()
+        if any(isinstance(item, (str, bool)) or item is None for item in items):
+            raise CalibrationError(
+                f"{name} is {value!r}; it must be numbers (write 2.0e-3 with its point)"
+            )
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Conditions of pads, held so that they do not flicker: one lasts until HOLD windows were without."""
+"""Conditions of pads. One lasts until HOLD windows were without it, so that nothing flickers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the statistics of a window say about pads: stuck, noisy, drifting; and whether a cube is still.
+"""Diagnosis: which pads are stuck, noisy or drifting, and which cubes are still, by statistics.
 
 All arrays are (cubes, pads); nothing loops over cubes.
 """

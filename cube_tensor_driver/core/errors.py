@@ -1,4 +1,4 @@
-"""All errors of the package. Each message names the value found, the limit and the way out."""
+"""All errors of the package. Each message names the value found, the limit and the fix."""
 
 
 class CubeError(Exception):

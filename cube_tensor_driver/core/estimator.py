@@ -1,5 +1,4 @@
-"""Inversion of a response by weighted least squares: what the pads see, how well, and what does not
-fit.
+"""Inversion of a response by weighted least squares: what the pads see, how well, and the residual.
 
 With W = diag(1 / noise) and W A = U1 S V1' (the singular values above RANK_TOLERANCE of the
 largest):
@@ -26,26 +25,23 @@ import numpy as np
 from .modes import Modes
 from .symmetry import Structure
 
-# A combination of modes counts as unseen when the pads answer it with less than this part of the
-# strongest.
 RANK_TOLERANCE = 1e-4
-# A component counts as observed when at most this part of it lies along unseen combinations of
-# modes.
+"""The pads do not see a combination of modes whose response is below this part of the strongest."""
 LEAK_TOLERANCE = 1e-3
-# Chance that pads with nothing but their stated noise set the residual bit.
+"""A component is observed when at most this part of it lies along combinations not seen."""
 FALSE_ALARM = 1e-3
-# A pad is cleared when another explains the residual better by odds of 100 to 1: 2 ln(odds) of
-# chi-square.
+"""Probability that pads with nothing but their stated noise set the residual bit."""
 SUSPECT_MARGIN = 2 * math.log(100)
+"""Of chi-square: a pad is cleared when another explains the residual with odds of 100 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
     """Linear maps for one response, noise and set of present pads.
 
-    matrix: (T, P) pad stresses to targets; rows of unobserved targets NaN, columns of missing pads
-    0
-    observed: (T,) bool
+    matrix: (T, P) pad stresses to targets; rows of unobserved targets are NaN, columns of missing
+        pads are 0
+    observed: (T,) bool, which targets the pads see
     covariance: (T, T), NaN in rows and columns of unobserved targets
     null: (dof, P) whitened rows; chi-square is the sum of squares of null @ v
     limit: chi-square that noise alone exceeds with probability FALSE_ALARM; NaN without redundancy
@@ -69,14 +65,14 @@ class Estimator:
         return np.sum((np.asarray(pad_stress) @ self.null.T) ** 2, axis=-1)
 
     def suspects(self, pad_stress: np.ndarray) -> np.ndarray:
-        """(N, P) bool: the pads of which one broken alone explains a bad chi-square of (N, P) pad
-        stresses.
+        """(N, P) bool: pads that, broken alone, explain a bad chi-square of pad stresses (N, P).
 
-        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, z = null v, u_p its column of
-        U2'. A row marks pads when chi-square is above its limit and what is left without the best
-        pad is below the limit of one degree less; marked are the best and all that explain as much
-        within SUSPECT_MARGIN, none when that is every pad. Pads opposite through the centre of a
-        symmetric cube always come as a pair: a gradient takes up their difference.
+        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, with z = null v and u_p its
+        column of U2'. A row has suspects when chi-square is above its limit, but below the limit of
+        one degree less without the best pad. The best pad is one, and so are all that explain as
+        much within SUSPECT_MARGIN; if that is every pad, none is. Pads that lie opposite each other
+        through the centre of a symmetric cube always come as a pair: a gradient takes up their
+        difference.
         """
         v = np.atleast_2d(np.asarray(pad_stress, dtype=float))
         if self.dof < 2:
@@ -102,9 +98,11 @@ def make_estimator(
 ) -> Estimator:
     """The estimator of the COMPONENTS (or of targets @ state) from the pads that are not missing.
 
-    response: (P, M) in Pa per Pa; noise: (P,) standard deviation of each pad's stress in Pa
-    missing: indices of pads to leave out; neglect: names of modes stated to be zero, which are then
-    reported unobserved themselves; targets: (T, M), default modes.components
+    response: (P, M) in Pa per Pa
+    noise: (P,) standard deviation of each pad's stress, Pa
+    missing: indices of pads to leave out
+    neglect: names of modes stated to be zero; they are unobserved themselves
+    targets: (T, M), by default modes.components
     """
     response, noise = np.asarray(response, dtype=float), np.asarray(noise, dtype=float)
     targets = modes.components if targets is None else np.asarray(targets, dtype=float)
@@ -152,9 +150,11 @@ def summary(
 ) -> dict[str, Any]:
     """What a response (P, M) lets a layout see, in plain types.
 
-    rank_uniform, rank_gradient: of the columns of uniform and gradient modes, and their condition
-    unobservable: modes hidden from the pads; noise: {mode: standard deviation per unit of pad
-    noise} None stands for what there is not.
+    rank_uniform, rank_gradient: of the columns of uniform and of gradient modes
+    condition_uniform, condition_gradient: their condition numbers
+    unobservable: modes that the pads do not see
+    noise: {mode: standard deviation per unit of pad noise}
+    None stands for a value that does not exist.
     """
     modes, n_pads = structure.modes, structure.layout.n_pads
     estimator = make_estimator(
@@ -185,8 +185,8 @@ def summary(
 
 @lru_cache
 def chi2_limit(dof: int, probability: float) -> float:
-    """The x that chi-square of dof degrees of freedom exceeds with this probability; NaN for dof =
-    0."""
+    """The x that chi-square of dof degrees of freedom exceeds with this probability; NaN for
+    dof = 0."""
     if dof < 1:
         return math.nan
     low, high = 0.0, 1.0

@@ -32,23 +32,26 @@ from .robust import (
 )
 from .symmetry import Structure
 
-FOLDS = 10  # of the cross-validation
+FOLDS = 10
+"""Of the cross-validation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """What loads say about a structure.
 
-    coefficients, deviations: {name: value} and standard deviations in Pa per Pa, NaN where not
-    determined
-    covariance: (K, K) of the coefficients; gain, gain_deviation: (P,)
-    scale: scatter found, in units of the stated noise; chi2, dof: over the readings that are not
-    outliers
+    coefficients, deviations: {name: value} and standard deviations, Pa per Pa; NaN where the loads
+        do not determine them
+    covariance: (K, K) of the coefficients
+    gain, gain_deviation: (P,)
+    scale: scatter found, in units of the stated noise
+    chi2, dof: over the readings that are not outliers
     held_out: rms error on loads left out of the fit over rms reading (cross-validation), without
-    outliers
-    fitted: (N, P) Pa; outliers: (N, P) bool, readings that had no weight
-    undetermined: names of coefficients that these loads leave open; advice: which loads to add, in
-    words
+        outliers
+    fitted: (N, P) Pa
+    outliers: (N, P) bool, readings that had no weight
+    undetermined: names of coefficients that these loads leave open
+    advice: which loads to add, in words
     """
 
     structure: Structure
@@ -98,7 +101,8 @@ def measured_stress(
     f = np.asarray(frequency, dtype=float)
     if f.ndim != 2 or f.shape[1] != base.layout.n_pads:
         raise FitError(
-            f"frequencies have shape {f.shape}; layout {base.layout.name!r} needs (loads, {base.layout.n_pads})"
+            f"frequencies have shape {f.shape}; layout {base.layout.name!r} needs "
+            f"(loads, {base.layout.n_pads})"
         )
     rest = base.rest_frequency
     if base.temperature is not None and temperature is not None:
@@ -123,7 +127,8 @@ def traction_loads(modes: Modes, force: np.ndarray, area: float) -> np.ndarray:
     f = np.asarray(force, dtype=float)
     if f.ndim != 2 or f.shape[1] != 3 or not area > 0:
         raise FitError(
-            f"forces have shape {f.shape} and the area is {area} m^2; needed are (loads, 3) and above 0"
+            f"forces have shape {f.shape} and the area is {area} m^2; "
+            "needed are (loads, 3) and above 0"
         )
     stress = np.zeros((len(f), 6))
     stress[:, [4, 3, 2]] = f / area
@@ -140,11 +145,11 @@ def fit(
 ) -> Fit:
     """Coefficients and gains from loads (N, M) in Pa and measured pad stresses (N, P) in Pa.
 
-    noise: standard deviation of readings in Pa, one or (P,); fixed: coefficients known from
-    elsewhere
-    gains: False takes every gain as 1, for loads that reach too few pads to tell gains from
-    coefficients
-    FitError for wrong shapes, NaN, loads of zero, and loads that determine no coefficient at all.
+    noise: standard deviation of the readings in Pa, one or (P,)
+    fixed: coefficients known from elsewhere
+    gains: False takes every gain as 1, for loads that reach too few pads to separate gains from
+        coefficients
+    FitError: wrong shapes, NaN, loads of zero, or loads that determine no coefficient at all.
     """
     fixed = dict(fixed or {})
     x, y, sigma = _check(structure, loads, measured, noise, fixed)
@@ -254,8 +259,8 @@ def _check(structure, loads, measured, noise, fixed):
         raise FitError("loads, measured stresses and noise must be numbers") from None
     if x.ndim != 2 or x.shape[1] != n_modes or y.shape != (len(x), n_pads) or not len(x):
         raise FitError(
-            f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} needs "
-            f"(loads, {n_modes}) and (loads, {n_pads}) with at least one load"
+            f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} "
+            f"needs (loads, {n_modes}) and (loads, {n_pads}) with at least one load"
         )
     for what, array, columns in (
         ("load", x, structure.modes.names),
@@ -275,7 +280,8 @@ def _check(structure, loads, measured, noise, fixed):
     unknown = set(fixed) - set(structure.names)
     if unknown:
         raise FitError(
-            f"unknown fixed coefficients {sorted(unknown)}; the coefficients are {', '.join(structure.names)}"
+            f"unknown fixed coefficients {sorted(unknown)}; "
+            f"the coefficients are {', '.join(structure.names)}"
         )
     return x, y, np.broadcast_to(noise, (n_pads,))
 
@@ -297,9 +303,8 @@ def _advise(
     """Sentences that name single-mode loads, found greedily, which would determine what is open."""
     advice = []
     theta = theta.copy()
-    theta[: len(open_)][open_] = (
-        0.5  # any value: without one, the new load's gains would seem undetermined
-    )
+    # Any value: without one, the gains of the new load would seem undetermined.
+    theta[: len(open_)][open_] = 0.5
     loads, size = x, np.sqrt(np.mean(x[x != 0] ** 2))
     while open_.any():
         trials = [np.vstack([loads, size * np.eye(x.shape[1])[m]]) for m in range(x.shape[1])]
@@ -312,7 +317,8 @@ def _advise(
         names = [model.structure.names[k] for k, o in zip(model.free, open_, strict=True) if o]
         if hiddens[best].shape[1] >= hidden.shape[1]:
             advice.append(
-                f"no load determines {', '.join(names)}: give them as fixed, or choose a larger symmetry"
+                f"no load determines {', '.join(names)}: "
+                "give them as fixed, or choose a larger symmetry"
             )
             break
         settled = [
@@ -322,8 +328,8 @@ def _advise(
         ]
         mode = model.structure.modes.names[best]
         advice.append(
-            f"these loads do not determine {', '.join(settled or names)}: add a load of {mode} alone, "
-            f"{describe_mode(mode)}, of about {size:.3g} Pa"
+            f"these loads do not determine {', '.join(settled or names)}: add a load of {mode} "
+            f"alone, {describe_mode(mode)}, of about {size:.3g} Pa"
         )
         loads, hidden, open_ = trials[best], hiddens[best], still
     return advice

@@ -1,5 +1,7 @@
-"""Layouts: where the pads of a cube sit. Frame: z out of the skin, x and y along it; lengths in
-d0."""
+"""Layouts: where the pads of a cube are.
+
+Frame: z out of the skin, x and y along it. Lengths are in d0, the half side of the cube.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,8 @@ class Layout:
             edge = np.max(np.abs(x - n * (x @ n))) + self.pad_size / 2
             if edge > 1 + 1e-9:
                 raise LayoutError(
-                    f"layout {self.name!r}: pad {i + 1} reaches {edge:.3g} from the face's centre; the face ends at 1"
+                    f"layout {self.name!r}: pad {i + 1} reaches {edge:.3g} from the face's centre; "
+                    "the face ends at 1"
                 )
             for j in range(i):
                 if np.allclose(x, positions[j], atol=1e-9) and np.array_equal(n, normals[j]):
@@ -81,7 +84,7 @@ class Layout:
 
     @cached_property
     def pads(self) -> tuple[str, ...]:
-        """Stable names: face, then side of the face, such as "+z-x"; a second pad there is
+        """Names that stay: face, then side of the face, such as "+z-x"; a second pad there is
         "+z-x#2"."""
         plain = [
             _signed_axes(n) + _signed_axes(x - n * (x @ n))
@@ -126,8 +129,10 @@ class Layout:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Layout:
-        """A layout from plain types: name, positions, normals, optional pad_size; LayoutError if
-        wrong."""
+        """A layout from plain types: name, positions, normals, optional pad_size.
+
+        LayoutError: a key or value that is wrong.
+        """
         if not isinstance(data, Mapping):
             raise LayoutError(f"a layout is a table with name, positions, normals; found {data!r}")
         unknown = set(data) - {"name", "positions", "normals", "pad_size"}
@@ -154,7 +159,8 @@ def _vectors(value: Any, what: str) -> np.ndarray:
         ) from None
     if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.all(np.isfinite(vectors)):
         raise LayoutError(
-            f"layout: {what} must be a list of [x, y, z] finite numbers; found shape {vectors.shape}"
+            f"layout: {what} must be a list of [x, y, z] finite numbers; "
+            f"found shape {vectors.shape}"
         )
     return vectors
 
@@ -170,9 +176,8 @@ def _section(sides: str, name: str, offset: float = PAD_OFFSET) -> Layout:
         return (1.0 if text[0] == "+" else -1.0) * np.eye(3)[AXES.index(text[1])]
 
     normals = np.array([axis(pad[:2]) for pad in sides.split()])
-    return Layout(
-        name, normals + offset * np.array([axis(pad[2:]) for pad in sides.split()]), normals
-    )
+    side = np.array([axis(pad[2:]) for pad in sides.split()])
+    return Layout(name, normals + offset * side, normals)
 
 
 _PLANAR = "+z-x +z+x -z-x -z+x +x-z +x+z -x-z -x+z"  # V1 .. V8 of the paper

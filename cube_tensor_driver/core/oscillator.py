@@ -1,11 +1,16 @@
-"""The pad's law: how its oscillator's frequency tells the normal stress on it.
+"""The pad law: from the frequency of a pad's oscillator to the normal stress on the pad.
 
     r = f / f0,   strain d/d0 = r / (1 + beta (1 - r)),   v = E (d/d0 - 1)
 
-which with u = r - 1 is v = E (1 + beta) u / (1 - beta u). v: Pa, tension positive; f, f0: Hz; beta:
-parasitic over active capacitance at rest; E: modulus in Pa. Source: the paper's eq. 6, f = k d / (R
-(eps S + C' d)), solved for d against the rest state. Frequencies outside 0 < f < f0 (1 + beta) /
-beta belong to no thickness: they give NaN. All functions broadcast.
+which with u = r - 1 is v = E (1 + beta) u / (1 - beta u).
+
+    v          Pa, tension positive
+    f, f0      Hz, now and without load
+    beta       parasitic over active capacitance at rest
+    E          modulus, Pa
+
+Frequencies outside 0 < f < f0 (1 + beta) / beta belong to no thickness and give NaN. All functions
+broadcast. Source: the paper's eq. 6, f = k d / (R (eps S + C' d)), solved for d relative to rest.
 """
 
 from __future__ import annotations
@@ -20,8 +25,7 @@ from .errors import CalibrationError
 
 
 def pad_stress(frequency, rest_frequency, beta, modulus):
-    """Normal stress in Pa, tension positive, from frequencies in Hz; NaN outside the law's
-    range."""
+    """Normal stress in Pa, tension positive, from frequencies in Hz; NaN outside the law."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
         u = (f - f0) / f0
@@ -72,13 +76,12 @@ class TemperatureModel:
 
     def __post_init__(self) -> None:
         try:
-            reference, coefficients = (
-                float(self.reference),
-                np.array(self.coefficients, dtype=float),
-            )
+            reference = float(self.reference)
+            coefficients = np.array(self.coefficients, dtype=float)
         except (TypeError, ValueError):
             raise CalibrationError(
-                f"temperature: reference {self.reference!r} and coefficients {self.coefficients!r} must be numbers"
+                f"temperature: reference {self.reference!r} and coefficients "
+                f"{self.coefficients!r} must be numbers"
             ) from None
         if coefficients.ndim != 2 or coefficients.shape[1] == 0:
             raise CalibrationError(

@@ -159,7 +159,7 @@ class Pipeline:
         """Stress of N rows: of one scan, or of several scans of the same cubes one after the other.
 
         left_out: (N,) bits of pads that are not used; None: those that the device reports broken.
-        Raises LayoutError for arrays of the wrong shape; all that a row can hold ends in its status.
+        LayoutError: arrays of the wrong shape. All else that a row can hold ends in its status.
         """
         if left_out is None:
             left_out = rows.pad_fault

@@ -98,8 +98,8 @@ class Reconstructor:
         """Stress of rows: of one scan, or of several scans one after the other.
 
         recorded: verdicts about pads that replace those made now, where they are known.
-        LayoutError: the rows have cubes or pads that the skin does not have. All else that a row can
-        hold ends in its status.
+        LayoutError: the rows have cubes or pads that the skin does not have. All else that a row
+        can hold ends in its status.
         """
         windows = self.health.closed
         left_out, pad_status = self.health.update(rows)

@@ -41,13 +41,15 @@ ILLUSTRATIVE_CUBE: dict[str, float] = {
 
 
 def illustrative_coefficients(structure: Structure) -> dict[str, float]:
-    """Illustrative coefficients of a built-in layout under any of its symmetries; LayoutError for
-    others."""
+    """Illustrative coefficients of a built-in layout under any of its symmetries.
+
+    LayoutError: another layout.
+    """
     letters = structure.layout.name in ("quad", "planar")
     if not letters and structure.layout.name != "cube":
         raise LayoutError(
-            f"no illustrative response for layout {structure.layout.name!r}; there is one for quad, "
-            "planar and cube: fit a calibration for yours"
+            f"no illustrative response for layout {structure.layout.name!r}; there is one for "
+            "quad, planar and cube: fit a calibration for yours"
         )
     if set(structure.names) in (set(ILLUSTRATIVE), set(ILLUSTRATIVE_CUBE)):
         return {
@@ -64,12 +66,12 @@ def generic_response(structure: Structure) -> np.ndarray:
 
 
 def response(structure: Structure, coefficients: Mapping[str, float]) -> np.ndarray:
-    """A = sum_k c_k B_k, shape (P, M); CalibrationError names what is missing, unknown or not
-    finite."""
-    missing, unknown = (
-        set(structure.names) - set(coefficients),
-        set(coefficients) - set(structure.names),
-    )
+    """A = sum_k c_k B_k, shape (P, M).
+
+    CalibrationError names the coefficients that are missing, unknown or not finite.
+    """
+    missing = set(structure.names) - set(coefficients)
+    unknown = set(coefficients) - set(structure.names)
     if missing or unknown:
         raise CalibrationError(
             f"layout {structure.layout.name!r} with symmetry {structure.symmetry!r} has "
@@ -105,26 +107,28 @@ def project(structure: Structure, matrix: np.ndarray) -> tuple[dict[str, float],
 
 
 def prototype(shift: np.ndarray) -> np.ndarray:
-    """Readings (N, 3) of the paper's prototype, normal, shear, gradient, from frequency shifts (N,
-    4) of V1 .. V4.
+    """Readings (N, 3) of the paper's prototype: normal, shear, gradient.
 
-    The paper's eqs. 8 to 10 as they are, in the unit of the shifts and uncalibrated. In terms of
-    eq. 1 they are -4 (a zz - b xx), 4 (c + d) zx and -4 (e zz_x - h xx_x): the normal reading holds
-    sigma_xx too, and the third shows the true gradient only where that of sigma_xx is known.
+    shift: (N, 4) of the frequencies of V1 .. V4. These are the paper's eqs. 8 to 10 as they stand,
+    in the unit of the shifts and uncalibrated. In terms of eq. 1 they are
+
+        -4 (a zz - b xx),   4 (c + d) zx,   -4 (e zz_x - h xx_x)
+
+    The normal reading holds sigma_xx too, and the third shows the true gradient only where that of
+    sigma_xx is known.
     """
     return np.asarray(shift) @ np.array([[-1, -1, 1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1]])
 
 
 def _illustrative_response(structure: Structure) -> np.ndarray:
-    whole = {"quad": "slab", "planar": "full", "cube": "full"}[structure.layout.name]
-    symmetric = find_structure(structure.layout, whole)
+    largest = {"quad": "slab", "planar": "full", "cube": "full"}[structure.layout.name]
+    symmetric = find_structure(structure.layout, largest)
     return response(symmetric, illustrative_coefficients(symmetric))
 
 
 def _some(names) -> str:
-    names = sorted(names)
-    return (
-        "none"
-        if not names
-        else ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-    )
+    """The first few names of a set."""
+    if not names:
+        return "none"
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return ", ".join(sorted(names)[:6]) + more

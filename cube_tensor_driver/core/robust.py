@@ -1,5 +1,4 @@
-"""Least squares that forget outliers and say what the data leave open: the steps and weights of
-`fit`.
+"""Least squares that forget outliers and know what the data leave open: steps and weights of `fit`.
 
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """

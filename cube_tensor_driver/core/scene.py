@@ -1,9 +1,8 @@
-"""What a skin looks like: quantities, colours, arrows and crosses of its cubes as plain arrays, for
-every viewer alike.
+"""What a skin looks like: colours, arrows and crosses of its cubes as arrays, for all viewers.
 
-Values are (N, 15) in the order of COMPONENTS, Pa and Pa/m, in the cubes' frames, NaN where not
-observed; places and what is drawn are in the skin's parent frame, m. Colours are (..., 3) from 0 to
-1.
+Values are (N, 15) in the order of COMPONENTS, Pa and Pa/m, in the cubes' frames, NaN where they are
+not observed. Poses and what is drawn are in the skin's parent frame, m. Colours are (..., 3) from 0
+to 1.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from .statistics import WINDOW_S
 from .status import INVALID, RESIDUAL
 from .tensor import principal_stresses, quaternion_from_rotation
 
-# viridis, and ColorBrewer's RdBu turned round: lightness is monotonous away from zero, so that both
-# read in grey.
+# viridis, and ColorBrewer's RdBu reversed. Lightness changes monotonically away from zero, so that
+# both can be read in grey.
 SEQUENTIAL = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 DIVERGING = "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f"
 GREY, RED, ORANGE, WHITE = (
@@ -34,8 +33,8 @@ GREY, RED, ORANGE, WHITE = (
 
 FINE, DOUBTFUL, FAULTY, STALE = range(4)
 HEALTH = ("ok", "doubtful", "no tensor", "stale")
-"""Words of `Newest.health`. Doubtful: a status bit is set, RESIDUAL in many rows; no tensor:
-INVALID; stale: nothing came lately."""
+"""Words of `Newest.health`. doubtful: a status bit is set, RESIDUAL in many rows; no tensor:
+INVALID; stale: no row came lately."""
 MARK = np.array([GREY, ORANGE, RED, WHITE])
 """Colour of the cross over a cube by its health; a fine cube has none."""
 FALL = 0.98
@@ -86,7 +85,7 @@ class Newest:
         self._over = np.zeros(n, np.int64)  # rows of the window with RESIDUAL
 
     def update(self, rows: StressRows, now: float) -> None:
-        """Take rows; of several rows of a cube the last stays. Rows of unknown cubes are ignored."""
+        """Keep rows, of several rows of a cube the last. Rows of unknown cubes are ignored."""
         known = rows.cube < len(self.status)
         if not known.all():
             rows = rows.select(known)

@@ -118,7 +118,8 @@ class WindowStatistics:
     def _pace(
         self, cubes: slice | np.ndarray, stamp_ns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """r and w of B scans, (B, N, 1) each or one for all, from the intervals between the rows of a cube."""
+        """r and w of B scans from the intervals between the rows of a cube: (B, N, 1), or one for
+        all."""
         interval = _differences(self._time_ns[cubes], stamp_ns)
         before = np.concatenate([self._interval_ns[cubes][None], interval[:-1]])
         self._time_ns[cubes], self._interval_ns[cubes] = stamp_ns[-1], interval[-1]

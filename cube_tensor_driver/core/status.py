@@ -9,7 +9,7 @@ RESIDUAL = 2
 INVALID = 4
 """Nothing was recovered: all components are NaN."""
 TEMPERATURE = 8
-"""The calibration needs the temperature, which is unknown; its reference temperature was assumed."""
+"""The calibration needs the temperature, which is unknown; its reference was assumed."""
 STATUS = {
     "PAD_FAULT": PAD_FAULT,
     "RESIDUAL": RESIDUAL,

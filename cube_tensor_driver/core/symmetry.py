@@ -2,8 +2,8 @@
 
 Every element R of the group permutes the pads (P(R)) and turns the modes (M(R)). The response A
 obeys A M(R) = P(R) A for all R. Because both act as signed permutations, the entries of A fall into
-orbits of equal
-magnitude: each orbit is one coefficient, and each coefficient is one entry of A.
+orbits of equal magnitude. Each orbit is one coefficient, named after one of its entries.
+
 Source: the symmetry argument of the paper's section on eq. 1, for any layout.
 """
 
@@ -89,9 +89,9 @@ def pad_images(layout: Layout, rotation: np.ndarray) -> np.ndarray:
         )
         if not same.any():
             raise SymmetryError(
-                f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be carried "
-                f"to {x.round(6).tolist()} on face {n.astype(int).tolist()}, where there is no pad; "
-                f"choose a smaller group of {', '.join(GENERATORS)}"
+                f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be "
+                f"carried to {x.round(6).tolist()} on face {n.astype(int).tolist()}, where there "
+                f"is no pad; choose a smaller group of {', '.join(GENERATORS)}"
             )
         images[pad] = np.flatnonzero(same)[0]
     return images

@@ -14,8 +14,7 @@ from .modes import to_matrix, to_six
 
 
 def principal_stresses(stress: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal stresses (..., 3), largest first, and their directions (..., 3, 3), one unit vector
-    per row.
+    """Principal stresses (..., 3), largest first, and directions (..., 3, 3), one vector a row.
 
     Rows with NaN give NaN. The sign of a direction is arbitrary.
     """
@@ -110,10 +109,12 @@ def contact_wrench(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Force (N, 3) in N and torque (N, 3) in N m on the square face +z of a reference side in m.
 
-    stress: (N, 6) Pa; gradient: (N, 9) Pa/m of the normal stresses, as in StressRows
-    force = w^2 sigma n; torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0). The twist needs gradients
-    of shear, which pads of normal stress do not see, so it is 0. Components that are not observed
-    count as 0.
+        force  = w^2 sigma n
+        torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0)
+
+    stress: (N, 6) Pa; gradient: (N, 9) Pa/m of the normal stresses, as in StressRows. The twist
+    needs gradients of shear, which pads of normal stress do not see, so it is 0. Components that
+    are not observed count as 0.
     """
     s, g = np.nan_to_num(stress), np.nan_to_num(gradient)
     force = side**2 * s[..., [4, 3, 2]]
