@@ -82,6 +82,12 @@ class _Quiet:
 _quiet = _Quiet()
 
 
+@pytest.fixture
+def effort(request: pytest.FixtureRequest) -> int:
+    """How long a test marked `campaign` tries: in the suite once, under -m campaign 20 times."""
+    return 20 if request.config.option.markexpr == "campaign" else 1
+
+
 @contextlib.contextmanager
 def free_domain() -> Iterator[int]:
     """A DDS domain that no other test uses, of no other suite either, in the environment of this

@@ -109,6 +109,7 @@ def running(ros, tmp_path):
         children.check()
 
 
+@pytest.mark.alone
 def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     """Nothing lost against what another subscriber hears; and the pipeline gives the nodes' own
     bits again.

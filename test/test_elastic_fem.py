@@ -24,6 +24,9 @@ from cube_tensor_driver.elastic.pads import interval_weights
 from cube_tensor_driver.elastic.solid import Solid, brick_stiffness, lame, stiffness
 from cube_tensor_driver.research.virtual_bench import VirtualBench
 
+# The bodies of its fixtures are computed once.
+pytestmark = pytest.mark.xdist_group("finite elements")
+
 HALVES = strip_layout(LAYOUTS["planar"], 1.0)
 RIGID = float("inf")
 # With several workers, one of them computes the responses that several tests look at.

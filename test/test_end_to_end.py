@@ -70,6 +70,7 @@ def test_demo_loses_nothing_and_is_right(domain, tmp_path):
         assert result[f"cpu_{name}_percent"] >= 0
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_ended_demo_leaves_no_process(domain, number):
     process = demo("--cubes", "4")
@@ -117,6 +118,7 @@ def test_demo_does_not_mix_with_another_skin(ros):
     assert "another skin publishes stress in DDS domain" in errors and "ROS_DOMAIN_ID" in errors
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("scans", [1, 5])
 def test_every_topic_of_a_skin(ros, tmp_path, scans):
     """Also with batches of several samples of each cube in a message."""

@@ -31,10 +31,11 @@ def feed(decoder: Decoder, data: bytes) -> None:
         decoder.feed(data[at : at + READ])
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", list(NOISE))
-def test_two_million_bytes_of_noise(name: str) -> None:
+def test_two_million_bytes_of_noise(name: str, effort: int) -> None:
     """No exception, and every run is counted once, as what it is when it comes alone."""
-    noise = NOISE[name](EACH)
+    noise = NOISE[name](EACH * effort)
     decoder = Decoder()
     feed(decoder, noise)
     feed(decoder, b"\0")

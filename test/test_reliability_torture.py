@@ -13,6 +13,8 @@ from conftest import ROOT
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
+from cube_tensor_driver.trials import torture
+
 KEYS = {
     "samples_sent",
     "delivered",
@@ -29,14 +31,16 @@ KEYS = {
 
 
 @pytest.mark.alone
-def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(domain, tmp_path):
+@pytest.mark.campaign
+def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(domain, tmp_path, effort):
     path = tmp_path / "torture.json"
-    # The last fault of this mix ends before the eight seconds do.
+    # The last fault of the short mix ends before its eight seconds do.
+    settle_s = 4.0 if effort == 1 else torture.SETTLE_S
     code = f"""
 import pathlib
 from cube_tensor_driver.trials import torture
-torture.SETTLE_S = 4.0
-torture.run_torture(duration=8.0, seed=3, json_path=pathlib.Path({str(path)!r}))
+torture.SETTLE_S = {settle_s}
+torture.run_torture(duration={8.0 * effort}, seed=3, json_path=pathlib.Path({str(path)!r}))
 """
     process = subprocess.Popen(
         [sys.executable, "-c", code],
@@ -46,14 +50,15 @@ torture.run_torture(duration=8.0, seed=3, json_path=pathlib.Path({str(path)!r}))
         cwd=ROOT,
     )
     try:
-        output, _ = process.communicate(timeout=120)
+        output, _ = process.communicate(timeout=120 * effort)
     finally:
         process.kill()
     assert path.exists(), output
     result = json.loads(path.read_text())
     assert set(result) >= KEYS
-    assert result["delivered"] > 32 * 500 * 8 and result["counted"] > 0
+    assert result["delivered"] > 32 * 500 * 8 * effort and result["counted"] > 0
     # One hub came back under another name, another one behind its bridge (TCP)
-    assert result["reconnects"] == 2 and result["worst_reconnect_s"] < 3.0
+    assert result["reconnects"] == 2 or effort > 1
+    assert result["worst_reconnect_s"] < 3.0
     for name in ("unaccounted", "wrong", "wrong_tensors", "threads_leaked", "crashes"):
         assert result[name] == 0, output
