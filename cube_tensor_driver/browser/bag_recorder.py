@@ -26,7 +26,15 @@ class BagRecorder:
     def start(self) -> str:
         """Start to record; returns the name of the bag."""
         name = time.strftime("skin_%Y%m%d_%H%M%S")
-        command = [*END_WITH_PARENT, sys.executable, "-m", "cube_tensor_driver.cli", "record", "-o", name]
+        command = [
+            *END_WITH_PARENT,
+            sys.executable,
+            "-m",
+            "cube_tensor_driver.cli",
+            "record",
+            "-o",
+            name,
+        ]
         self._process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
         )

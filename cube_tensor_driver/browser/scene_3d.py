@@ -43,7 +43,7 @@ AMBIENT, DIRECT = 2.0, 1.4
 """Intensities of the lights with which colours look as in the legend."""
 WHITE, GOLD = (235, 235, 235), (255, 153, 38)
 PULL, PUSH = (255, 90, 70), (90, 150, 255)
-UNLIT: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 
 class Colouring(NamedTuple):
@@ -103,7 +103,7 @@ class Scene3D:
         surface: Surface,
         pick: Callable[[int], None],
     ) -> None:
-        placement = self._placement = Placement.of(poses)
+        placement = Placement.of(poses)
         self.shown = set(SHOWN_AT_FIRST)
         self.selected = int((placement.poses.position**2).sum(axis=1).argmin())
         self.top = 0.0
@@ -162,7 +162,7 @@ class Cubes:
                 batched_colors=np.full((len(poses.position), 3), 90, np.uint8),
                 flat_shading=True,
                 lod="off",
-                **UNLIT,
+                **NO_SHADOWS,
             )
         of_cube = surface.cube
         down = poses.rotation[of_cube, :, 2] * poses.half_side[of_cube, None]
@@ -341,7 +341,7 @@ def _set_up_lights(api: viser.SceneApi) -> None:
 
 def _add_mesh(api: viser.SceneApi, name: str, colour: Colour) -> viser.MeshHandle:
     return api.add_mesh_simple(
-        f"/{name}", *NOTHING, color=colour, flat_shading=True, side="double", **UNLIT
+        f"/{name}", *NOTHING, color=colour, flat_shading=True, side="double", **NO_SHADOWS
     )
 
 
