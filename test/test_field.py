@@ -5,6 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cube_tensor_driver.core.defaults import (
+    CONTACT_PRESSURE,
+    HALF_SIDE,
+    POISSONS_RATIO,
+    SURFACE_DEPTH,
+)
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.scene import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
@@ -12,7 +18,7 @@ from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.surface import Surface
 from cube_tensor_driver.research.field_study import field_study
 
-DEPTH, POISSON, HALF_SIDE = 4e-3, 0.48, 2e-3
+DEPTH = SURFACE_DEPTH
 
 
 def flat(nx: int, ny: int, pitch: float) -> CubePoses:
@@ -26,10 +32,9 @@ def flat(nx: int, ny: int, pitch: float) -> CubePoses:
 def at(
     points: np.ndarray, width: float, force: tuple, centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stress and gradient at points of the cubes' plane, DEPTH below a ball of this contact
-    width."""
+    """Stress and gradient at points of the cubes' plane, below a ball of this contact width."""
     below = np.column_stack([points[:, :2], np.full(len(points), -DEPTH)])
-    return contact.field(below, *contact.hertz(width / 2, force, centre), POISSON)
+    return contact.field(below, *contact.hertz(width / 2, force, centre), POISSONS_RATIO)
 
 
 def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) -> np.ndarray:
@@ -39,8 +44,7 @@ def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) 
 
 
 def errors(pitch: float, width: float, places: int = 8) -> tuple[float, float]:
-    """Relative rms error of the pressure without and with gradients, over contacts anywhere in a
-    cell."""
+    """Relative rms error of the pressure without and with gradients; contacts all over a cell."""
     skin = flat(7, 7, pitch)
     without, with_them = Surface(skin, DEPTH, 6, gradients=False), Surface(skin, DEPTH, 6)
     random = np.random.default_rng(1)
@@ -68,8 +72,10 @@ def test_gradients_make_the_field_better(pitch, width, factor):
 
 
 def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
-    """One gradient is better than none and worse than two, for the field; a planar cube knows less
-    of the place."""
+    """For the field, one gradient is better than none and worse than two.
+
+    A planar cube knows less of the position.
+    """
     study = field_study(np.array([0.006, 0.012]), np.array([0.02]), cases=3)
     alone, whole, planar = np.moveaxis(study.error[0], 1, 0)
     assert (whole < planar).all() and (planar < alone).all()
@@ -82,9 +88,8 @@ def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
 def test_value_and_gradient_are_met_at_the_cubes():
     skin = flat(5, 5, 0.008)
     values = measured(skin, 0.01, (0, 0, -2), np.array([0.001, -0.002]))
-    fine = Surface(
-        skin, DEPTH, 81
-    )  # an odd number: the middle point of a patch is the cube's own place
+    # An odd number: the middle point of a patch is where the cube is.
+    fine = Surface(skin, DEPTH, 81)
     field = fine.field(values).pressure.reshape(25, 81, 81)
     peak = field.max()
     # the ridge of 1e-6 lets it miss by its root, a thousandth
@@ -104,16 +109,19 @@ def test_cubes_without_a_tensor_are_filled_in_by_the_others():
     assert np.abs(hole - full).max() < 0.25 * full.max()
     values[:] = np.nan
     assert np.isnan(surface.field(values).pressure).all()
-    assert surface.contacts(values, 300.0) == []
+    assert surface.contacts(values, CONTACT_PRESSURE) == []
 
 
 def test_weights_solved_anew_for_some_cubes_are_those_of_a_new_surface():
     skin = flat(7, 7, 0.006)
     surface, values = Surface(skin, DEPTH), measured(skin, 0.02, (1, 0, -3), np.zeros(2))
-    surface.contacts(values, 300.0)
+    surface.contacts(values, CONTACT_PRESSURE)
     values[10], values[30, 12:] = np.nan, np.nan
     anew = Surface(skin, DEPTH)
-    (known,), (new,) = surface.contacts(values, 300.0), anew.contacts(values, 300.0)
+    (known,), (new,) = (
+        surface.contacts(values, CONTACT_PRESSURE),
+        anew.contacts(values, CONTACT_PRESSURE),
+    )
     np.testing.assert_array_equal(surface.field(values).pressure, anew.field(values).pressure)
     np.testing.assert_array_equal(surface.uncertainty(values), anew.uncertainty(values))
     np.testing.assert_array_equal(known.position, new.position)
@@ -125,21 +133,20 @@ def test_a_contact_beside_cubes_of_which_nothing_is_known_is_finite():
     values[skin.position[:, 0] > 0.01] = np.nan
     surface = Surface(skin, DEPTH)
     assert np.isnan(surface.field(values).pressure).any()
-    (found,) = surface.contacts(values, 300.0)
+    (found,) = surface.contacts(values, CONTACT_PRESSURE)
     assert found.normal_force == pytest.approx(2, rel=0.1) and np.isfinite(found.position).all()
 
 
 def test_contact_has_the_load_s_place_and_force():
     skin = flat(9, 9, 0.006)
     force, centre = np.array([0.6, -0.4, -3.0]), np.array([0.0023, -0.0031])
-    (found,) = Surface(skin, DEPTH).contacts(measured(skin, 0.012, force, centre), 300.0)
-    # of what spreads beyond a skin of 54 mm nothing comes back: 3 (1 - (1 + (27/4)²)^-3/2) N is 0.3
-    # % less
+    (found,) = Surface(skin, DEPTH).contacts(measured(skin, 0.012, force, centre), CONTACT_PRESSURE)
+    # What spreads beyond a skin of 54 mm is lost: 3 (1 - (1 + (27/4)²)^-3/2) N is 0.3 % less.
     assert found.normal_force == pytest.approx(3.0, rel=0.02)
-    # shear falls as 3 depth x² / (2 π r⁵): 1.5 depth / 27 mm of it lies outside
+    # Shear falls as 3 depth x² / (2 π r⁵): 1.5 depth / 27 mm of it lies outside.
     shear = found.force[:2] / force[:2]
     np.testing.assert_allclose(shear, 1 - 1.5 * DEPTH / 0.027, rtol=0.1)
-    # without the layer's equilibrium it would be DEPTH × shear / normal = 0.96 mm off
+    # Without the layer's equilibrium it would be DEPTH × shear / normal = 0.96 mm off.
     np.testing.assert_allclose(found.position, [*centre, DEPTH], atol=3e-4)
     np.testing.assert_allclose(found.normal, [0, 0, 1], atol=1e-12)
     assert found.shear_force == pytest.approx(np.linalg.norm(found.force[:2]))
@@ -150,14 +157,11 @@ def test_two_contacts_are_two_the_stronger_first():
     skin = flat(15, 5, 0.006)
     left, right = np.array([-0.03, 0.0]), np.array([0.03, 0.002])
     values = measured(skin, 0.008, (0, 0, -1), left) + measured(skin, 0.008, (0, 0, -2), right)
-    first, second = Surface(skin, DEPTH).contacts(values, 300.0)
-    assert first.normal_force == pytest.approx(2, rel=0.1) and second.normal_force == pytest.approx(
-        1, rel=0.1
-    )
-    assert (
-        np.linalg.norm(first.position[:2] - right) < 1e-3
-        and np.linalg.norm(second.position[:2] - left) < 1e-3
-    )
+    first, second = Surface(skin, DEPTH).contacts(values, CONTACT_PRESSURE)
+    assert first.normal_force == pytest.approx(2, rel=0.1)
+    assert second.normal_force == pytest.approx(1, rel=0.1)
+    assert np.linalg.norm(first.position[:2] - right) < 1e-3
+    assert np.linalg.norm(second.position[:2] - left) < 1e-3
 
 
 def test_a_turned_skin_gives_the_turned_field():
@@ -172,7 +176,10 @@ def test_a_turned_skin_gives_the_turned_field():
     np.testing.assert_allclose(
         turned.field(values).pressure, straight.field(values).pressure, atol=1e-6 * peak
     )
-    (a,), (b,) = straight.contacts(values, 300.0), turned.contacts(values, 300.0)
+    (a,), (b,) = (
+        straight.contacts(values, CONTACT_PRESSURE),
+        turned.contacts(values, CONTACT_PRESSURE),
+    )
     np.testing.assert_allclose(b.position, turn @ a.position + [1, 2, 3], atol=1e-8)
     np.testing.assert_allclose(b.force, turn @ a.force, atol=1e-6)
 
