@@ -158,7 +158,7 @@ def test_rigid_disc_converges_to_the_closed_form(poisson):
 def test_nothing_holds_the_cube(cube):
     """What the mirrors and the pin leave free must balance: no net force or couple on the cube."""
     body = Solid(mesh.section((15.0, 2.75), (0.0, 1.0)), lame(1.0, 0.48), cube)
-    x, c = body.place, body.component
+    x, c = body.positions, body.component
     stress = np.array([[0.0, 1.0], [1.0, 0.0]])
     gradient = np.zeros((2, 2, 2))
     gradient[0, 0, 0], gradient[0, 1, 1], gradient[1, 0, 1] = 1.0, -1.0, -1.0  # the mode xx_x

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import skfem
 from numpy.typing import NDArray
 
 from ..core.calibration import Calibration
@@ -21,7 +22,7 @@ from ..core.errors import ElasticError
 from ..core.estimator import LEAK_TOLERANCE, RANK_TOLERANCE
 from ..core.layout import Layout
 from ..core.response import project
-from ..core.symmetry import default_modes, find_structure
+from ..core.symmetry import Structure, default_modes, find_structure
 from .body import Body, check_pads, field_axes, make_mesh
 from .memory import check_memory
 from .solid import Parity, Solid, lame
@@ -97,7 +98,6 @@ def compute_response(
     check_pads(body, layout)
     grids = [make_mesh(body, layout, level) for level in range(meshes)]
     check_memory(grids[-1])
-    matrices: list[Array] = []
     total = meshes * 2 ** len(field_axes(layout))
     done = itertools.count()
 
@@ -105,39 +105,26 @@ def compute_response(
         if progress is not None:
             progress(next(done), total, what)
 
-    def report_solve(what: str) -> None:
-        report(f"mesh {len(matrices) + 1}, {what}")
-
     rows: list[dict[str, Any]] = []
-    for grid in grids:
+    coarser: Array | None = None
+    for number, grid in enumerate(grids, 1):
         began = time.perf_counter()
-        try:
-            solid = make_solid(body, layout, grid)
-            matrix = linear_response(solid, layout, report_solve)
-        except MemoryError:  # a limit that check_memory does not know
-            raise ElasticError(
-                f"the memory ran out on mesh {len(matrices) + 1}, of {grid.nvertices} corners; "
-                "ask for fewer meshes or wider pads"
-            ) from None
-        if rows:
-            rows[-1]["change"] = float(np.abs(matrix - matrices[-1]).max() / np.abs(matrix).max())
-        matrices.append(matrix)
+        matrix, unknowns = _solve(body, layout, grid, number, report)
+        if coarser is not None:
+            rows[-1]["change"] = float(np.abs(matrix - coarser).max() / np.abs(matrix).max())
         rows.append(
             {
-                "unknowns": int(solid.basis.N),
+                "unknowns": unknowns,
                 "seconds": time.perf_counter() - began,
                 "coefficients": project(structure, matrix)[0],
                 "change": None,
             }
         )
+        coarser = matrix
     report("done")
-    matrix = matrices[-1]
-    coefficients, residual = project(structure, matrix)
-    left = matrix - np.tensordot(list(coefficients.values()), structure.basis, axes=1)
     names = structure.modes.names
-    norms = np.linalg.norm(matrix, axis=0)
-    per_mode = np.linalg.norm(left, axis=0) / np.where(norms > 0, norms, 1.0)
-    rank, unseen = _observable(matrix, names)
+    coefficients, residual = project(structure, matrix)
+    rank, unobservable = _observable(matrix, names)
     return Response(
         body=body,
         layout=layout,
@@ -146,12 +133,37 @@ def compute_response(
         matrix=matrix,
         coefficients=coefficients,
         structure_residual=residual,
-        mode_residual=dict(zip(names, per_mode.tolist(), strict=True)),
+        mode_residual=_mode_residual(structure, matrix, coefficients),
         rank=rank,
-        unobservable=unseen,
+        unobservable=unobservable,
         convergence=tuple(rows),
         seconds=time.perf_counter() - start,
     )
+
+
+def _solve(
+    body: Body, layout: Layout, grid: skfem.Mesh, number: int, report: Callable[[str], None]
+) -> tuple[Array, int]:
+    """Response matrix on the mesh of this number, and its number of unknowns."""
+    try:
+        solid = make_solid(body, layout, grid)
+        matrix = linear_response(solid, layout, lambda what: report(f"mesh {number}, {what}"))
+    except MemoryError:  # a limit that check_memory does not know
+        raise ElasticError(
+            f"the memory ran out on mesh {number}, of {grid.nvertices} corners; "
+            "ask for fewer meshes or wider pads"
+        ) from None
+    return matrix, int(solid.basis.N)
+
+
+def _mode_residual(
+    structure: Structure, matrix: Array, coefficients: dict[str, float]
+) -> dict[str, float]:
+    """The relative part of each mode's column that the structure does not explain."""
+    left = matrix - np.tensordot(list(coefficients.values()), structure.basis, axes=1)
+    norms = np.linalg.norm(matrix, axis=0)
+    relative = np.linalg.norm(left, axis=0) / np.where(norms > 0, norms, 1.0)
+    return dict(zip(structure.modes.names, relative.tolist(), strict=True))
 
 
 def calibration_from_fem(

@@ -100,7 +100,7 @@ class Solid:
     """A meshed body with a cube; triangles of order 4 in the plane, 27-node bricks in space.
 
     basis: the elements; its dofs are the unknown displacements
-    place: (dim, dofs) where each of them is, d0; component: (dofs,) the axis that it is along
+    positions: (dim, dofs) of each of them, d0; component: (dofs,) the axis that it is along
     body: stiffness of the body without the cube; total: of both (dofs, dofs)
 
     Parameters: mesh: the positive part of the box, from elastic.mesh, lengths in d0. body: Lame's
@@ -116,13 +116,13 @@ class Solid:
         element = skfem.ElementVector(scalar)
         inside = np.all(mesh.p[:, mesh.t].mean(axis=1) < 1.0, axis=0)
         self.basis = skfem.Basis(mesh, element, intorder=2 * self.order)
-        self.place = self.basis.doflocs
+        self.positions = self.basis.doflocs
         self.component = np.zeros(self.basis.N, dtype=int)
         for k in range(self.dim):
             self.component[self.basis.get_dofs(elements=True).all(f"u^{k + 1}")] = k
         self.rigid = cube is None
         # (dim, dofs): on which lines of the product grid of bricks each dof lies
-        lines = [np.unique(np.round(x, 9), return_inverse=True) for x in self.place]
+        lines = [np.unique(np.round(x, 9), return_inverse=True) for x in self.positions]
         self._grid = np.stack([index for _, index in lines])
         self._first_equal_axis = _first_equal([line for line, _ in lines])
         self._last_solve: _Factors | None = None
@@ -211,7 +211,7 @@ class Solid:
         reactions: (dofs, n); intervals: of the pad, in [-1, 1], one per other axis
         """
         others = [k for k in range(self.dim) if k != axis]
-        x = self.place
+        x = self.positions
         on_face = _at(x[axis], 1.0) & np.all(x[others] < 1.0 + _SAME, axis=0)
         dofs = np.flatnonzero(on_face & (self.component == axis))
         weights = np.ones(len(dofs))
@@ -236,7 +236,7 @@ class Solid:
         A parity leaves at most one rigid motion. A rigid cube can be held altogether, since this
         motion is free for the body, too.
         """
-        x, c = self.place, self.component
+        x, c = self.positions, self.component
         held = np.zeros(len(c), dtype=bool)
         for k, sign in enumerate(parity):
             held |= _at(x[k], 0.0) & ((c == k) == (sign > 0))
