@@ -10,6 +10,8 @@ import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
@@ -17,7 +19,7 @@ import pytest
 from conftest import ROOT
 
 PACKAGE = ROOT / "cube_tensor_driver"
-# A folder may import those after it, never those before it.
+# A folder may import those below it in this list, never one above or beside it.
 FLOORS = [
     ["cli"],
     ["trials"],
@@ -67,48 +69,38 @@ def python(script: str, folder: Path = ROOT, **environment: str) -> str:
 
 
 def imports(path: Path) -> set[str]:
-    """Modules that a file imports anywhere, relative ones resolved."""
-    here = ["cube_tensor_driver", *path.relative_to(PACKAGE).parts[:-1]]
+    """What a file imports anywhere, by its whole name."""
+    package = ".".join(path.relative_to(ROOT).parent.parts)
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = here[: len(here) - node.level + 1] if node.level else []
-            found.add(".".join([*base, *([node.module] if node.module else [])]))
-            if node.level and not node.module:
-                found |= {".".join([*base, name.name]) for name in node.names}
+            base = resolve_name("." * node.level + (node.module or ""), package)
+            found |= {f"{base}.{name.name}" for name in node.names}
     return found
+
+
+def all_imports() -> Iterator[tuple[str, str, Path]]:
+    """(folder, what is imported, file) of every import of the package."""
+    for path in PACKAGE.rglob("*.py"):
+        for module in imports(path):
+            yield path.relative_to(PACKAGE).parts[0], module, path
 
 
 def test_imports_point_one_way():
     floor = {name: number for number, names in enumerate(FLOORS) for name in names}
-    for path in PACKAGE.rglob("*.py"):
-        top = path.relative_to(PACKAGE).parts[0]
-        if top == "__init__.py":
-            continue
-        for module in imports(path):
-            parts = module.split(".")
-            if (
-                parts[0] == "cube_tensor_driver"
-                and len(parts) > 1
-                and parts[1] not in ("msg", "srv")
-            ):
-                target = parts[1] if parts[1] in floor else parts[1] + ".py"
-                same = target == top
-                assert same or floor[target] > floor[top], (
-                    f"{path.relative_to(ROOT)} imports {module}"
-                )
+    assert set(floor) == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    for room, module, path in all_imports():
+        other = module.removeprefix(f"{PACKAGE.name}.").split(".")[0]
+        if room in floor and other in floor and module.startswith(PACKAGE.name) and other != room:
+            assert floor[other] > floor[room], f"{path} imports {module}"
 
 
 def test_heavy_libraries_stay_at_home():
-    for path in PACKAGE.rglob("*.py"):
-        for module in imports(path):
-            home = HOMES.get(module.split(".")[0])
-            if home is not None:
-                assert path.relative_to(PACKAGE).parts[0] in home, (
-                    f"{path.relative_to(ROOT)} imports {module}"
-                )
+    for room, module, path in all_imports():
+        homes = HOMES.get(module.split(".")[0], {room})
+        assert room in homes, f"{path} imports {module}"
 
 
 def test_core_needs_numpy_and_nothing_else():
@@ -156,7 +148,7 @@ def test_every_dependency_is_declared_and_pinned():
     for extra in project["optional-dependencies"].values():
         by_pip += extra
     of_pip = {re.match(r"[a-z0-9-]+", requirement)[0] for requirement in by_pip}
-    used = {module.split(".")[0] for path in PACKAGE.rglob("*.py") for module in imports(path)}
+    used = {module.split(".")[0] for _, module, _ in all_imports()}
     for module in used - sys.stdlib_module_names - {"cube_tensor_driver"} - of_ros:
         wheel = WHEELS.get(module, module)
         key = KEYS.get(wheel, f"python3-{wheel}")
