@@ -40,7 +40,6 @@ class SimulatedHub:
     next_us: simulated time of the next sample
     sequence: number of the next sample since the last restart, counted on beyond 2^32
     dropped: samples that found no room on the line since the last restart
-    runs: the samples that were taken
     decoder: of the requests that come in
     boots: restarts so far
 
@@ -62,7 +61,6 @@ class SimulatedHub:
     next_us: int = 0
     sequence: int = 0
     dropped: int = 0
-    runs: list[SampleRun] = field(default_factory=list)
     decoder: Decoder = field(default_factory=Decoder)
     boots: int = 0
     drift_ppm: float = 0.0
@@ -71,6 +69,10 @@ class SimulatedHub:
     extra_pads: int = 0
     celsius: int = TEMPERATURE_UNKNOWN
     _drift_since_us: int = 0
+    _ended_runs: list[SampleRun] = field(default_factory=list)
+    _run: SampleRun | None = None  # the newest, as it began; _last: its last sample
+    _last: int = 0
+    _expected: tuple[int, int, int] | None = None  # time, period and boot of its next sample
     _prepared: dict[int, tuple[NDArray[np.uint32], PreparedFrame]] = field(default_factory=dict)
 
     def hello(self) -> bytes:
@@ -143,20 +145,22 @@ class SimulatedHub:
         pad_fault, temperature = np.zeros(n, "<u4"), np.full(n, celsius, "<i2")
         return Sample(sequence, 0, device_us, frequency, pad_fault, temperature)
 
+    @property
+    def runs(self) -> list[SampleRun]:
+        """All samples that were taken, in the order of time."""
+        if self._run is None:
+            return []
+        return [*self._ended_runs, replace(self._run, last=self._last)]
+
     def _log(self) -> None:
-        """The sample of next_us goes on with the last run or begins a new one."""
-        run = self.runs[-1] if self.runs else None
-        if (
-            run is not None
-            and run.boot == self.boots
-            and run.period_us == self.period_us
-            and run.end_us == self.next_us
-        ):
-            self.runs[-1] = replace(run, last=self.sequence)
-        else:
-            self.runs.append(
-                SampleRun(self.sequence, self.sequence, self.next_us, self.period_us, self.boots)
+        """The sample of next_us goes on with the run or begins a new one."""
+        if (self.next_us, self.period_us, self.boots) != self._expected:
+            self._ended_runs = self.runs
+            self._run = SampleRun(
+                self.sequence, self.sequence, self.next_us, self.period_us, self.boots
             )
+        self._last = self.sequence
+        self._expected = self.next_us + self.period_us, self.period_us, self.boots
 
     def skip(self, now_us: int) -> None:
         """Take the next sample after now_us; those before are never taken."""
