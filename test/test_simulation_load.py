@@ -1,5 +1,5 @@
-"""Load scripts: what they say in time, and the stress that they make at the cubes, against
-truth."""
+"""Load scripts: what they do in time, and the stress that they cause at the cubes, against
+closed forms."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy import interpolate
 
 from cube_tensor_driver.config.load_script import Script, between, read_script
 from cube_tensor_driver.config.package_data import package_data
@@ -17,6 +18,7 @@ from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.spline import CubicSpline
 
 ONE = read_skin(package_data() / "config" / "cube.yaml").cubes[0]
 H = 0.004
@@ -131,20 +133,40 @@ def test_mirrored_cubes_see_mirrored_stress(tmp_path):
 
 def test_a_slide_is_a_press_moved(tmp_path):
     """In the middle of a straight slide: the force at the middle, friction × force along the
-    way."""
+    path."""
     skin = skin_of(np.random.default_rng(0).uniform(-0.02, 0.02, (20, 3)) * [1, 1, 0])
-    way = {"from": 0, "to": 2, "path": [[-0.01, 0, 0], [0.02, 0.04, 0]], "force": [0, 3, 0]}
-    slide = Load(skin, script_of(tmp_path, {"slide": way}))
-    here = {"from": 0, "to": 2, "at": [0.005, 0.02, 0], "force": [0, 3, 0], "shear": [0.9, 1.2, 0]}
-    press = Load(skin, script_of(tmp_path, {"press": here}))
+    moved = {"from": 0, "to": 2, "path": [[-0.01, 0, 0], [0.02, 0.04, 0]], "force": [0, 3, 0]}
+    slide = Load(skin, script_of(tmp_path, {"slide": moved}))
+    in_place = {
+        "from": 0,
+        "to": 2,
+        "at": [0.005, 0.02, 0],
+        "force": [0, 3, 0],
+        "shear": [0.9, 1.2, 0],
+    }
+    press = Load(skin, script_of(tmp_path, {"press": in_place}))
     # 1.5 × 50 mm in 2 s in the middle: (SLOW / v)² / 2 is missing of the friction
-    for moved, still in zip(slide.at(1.0), press.at(1.0), strict=True):
-        np.testing.assert_allclose(moved, still, atol=1e-3 * np.abs(still).max())
-    roll = Load(skin, script_of(tmp_path, {"roll": way}))
+    for sliding, still in zip(slide.at(1.0), press.at(1.0), strict=True):
+        np.testing.assert_allclose(sliding, still, atol=1e-3 * np.abs(still).max())
+    roll = Load(skin, script_of(tmp_path, {"roll": moved}))
     np.testing.assert_allclose(roll.total(1.0)[0], [0, 0, -3], atol=1e-12)
     np.testing.assert_allclose(roll.total(1.0)[1], [0.005, 0.02, 0])
     # at rest at both ends
     np.testing.assert_allclose(slide.presses(1e-6)[0].position, [-0.01, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("points", [2, 3, 4, 9])
+def test_the_curve_of_a_path_is_the_cubic_spline_of_scipy(points, closed):
+    path = np.random.default_rng(points).normal(size=(points, 3))
+    if closed:
+        path = np.concatenate([path, path[:1]])
+    curve = CubicSpline(path, closed=closed)
+    ends = "periodic" if closed else "clamped"
+    expected = interpolate.CubicSpline(np.linspace(0, 1, len(path)), path, bc_type=ends)
+    for time in np.linspace(0, 1, 41):
+        np.testing.assert_allclose(curve.position(time), expected(time), atol=1e-12)
+        np.testing.assert_allclose(curve.velocity(time), expected(time, 1), atol=1e-10)
 
 
 def test_taps_presses_and_the_time_between(tmp_path):

@@ -1,5 +1,5 @@
-"""The line of a simulated hub: a pseudo-terminal or TCP, that can be unplugged, held up, and taken
-in bursts."""
+"""The line between a simulated hub and the host: a pseudo-terminal or TCP. It can be unplugged,
+stalled, and made to send in bursts."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ..core.errors import ConfigError
 from ..device.tcp import parse_url
 
 OUT_LIMIT = 1 << 16
-"""Bytes that wait for the line at most: what is sampled beyond is dropped in the hub, and counted
-there."""
+"""Bytes that wait for the line at most: the hub drops and counts what it samples beyond."""
 BURST_US = 16_000
 """The latency timer of common USB serial chips."""
 
 
 class Line:
-    """One pseudo-terminal, whose near end appears as the link `port`.
+    """A pseudo-terminal. One end is the hub's; the other appears as the symbolic link `port`.
 
-    held_until_us, burst_until_us: until when (simulated time) nothing, or every BURST_US all, goes
-    out.
+    fd: of the hub's end, -1 while it is unplugged
+    held_until_us: until this simulated time nothing goes out
+    burst_until_us: until this simulated time all that waits goes out every BURST_US
     """
 
     def __init__(self, port: Path) -> None:
@@ -49,7 +49,7 @@ class Line:
         self.port.symlink_to(os.ttyname(self._far))
 
     def unplug(self) -> None:
-        """Vanish, with all that was on its way."""
+        """Vanish, together with all that was on its way."""
         if self.plugged:
             self.port.unlink(missing_ok=True)
             os.close(self.fd)
@@ -98,11 +98,11 @@ class Line:
 
 
 class TcpLine(Line):
-    """The same behind a bridge that listens at `url`: what is unplugged is the bridge, and it has
-    no other name."""
+    """A line behind a bridge that listens at a url socket://host:port. Unplugging takes the bridge
+    away; it always comes back under the same name."""
 
     def __init__(self, url: str) -> None:
-        """LinkError: no address; ConfigError: it cannot be listened at."""
+        """LinkError: the url is no such address. ConfigError: the address cannot be used."""
         self._address = parse_url(url)
         self._listener: socket.socket | None = None
         self._connection: socket.socket | None = None
@@ -121,7 +121,7 @@ class TcpLine(Line):
         self.fd = self._listener.fileno()
 
     def unplug(self) -> None:
-        """Vanish, with all that was on its way."""
+        """Vanish, together with all that was on its way."""
         self._hang_up()
         if self._listener is not None:
             self._listener.close()
@@ -138,9 +138,9 @@ class TcpLine(Line):
             self._hang_up()
 
     def read(self) -> bytes:
-        """What the host sent; the first time its connection is taken up."""
+        """What the host sent. The first call accepts its connection."""
         if self._connection is None and self._listener is not None:
-            with contextlib.suppress(OSError):  # it went away again
+            with contextlib.suppress(OSError):  # the host went away again
                 self._connection, _ = self._listener.accept()
                 self._connection.setblocking(False)
                 self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
