@@ -29,6 +29,8 @@ ONCE = 0
 """Width of a field that has one value per message."""
 _SECONDS_AT = len(LITTLE_ENDIAN)
 _FRAME_LENGTH_AT = _SECONDS_AT + 8
+SHAPE_AT = _FRAME_LENGTH_AT
+"""Where in a message `shape_bytes` are."""
 _FRAME_AT = _FRAME_LENGTH_AT + 4
 
 AnyRows = TypeVar("AnyRows", FrequencyRows, StressRows)
@@ -170,7 +172,7 @@ class MessageCodec(Generic[AnyRows]):
         self._layout = lru_cache(LAYOUTS_KEPT)(self._make_layout)
 
     def decode(self, *messages: bytes) -> Decoded[AnyRows]:
-        """The rows of serialised messages, one or several of the same shape (`same_shape`).
+        """The rows of serialised messages, one or several of the same shape (`shape_bytes`).
 
         MessageError: too short, fields that contradict each other, or shapes that differ.
         """
@@ -188,12 +190,11 @@ class MessageCodec(Generic[AnyRows]):
         frame_id = data[_FRAME_AT : _FRAME_AT + layout.shape.frame]
         return Decoded(self.make_rows(record, times_ns), stamp_ns, frame_id)
 
-    def same_shape(self, one: bytes, other: bytes) -> bool:
-        """Whether two messages can be decoded together: they have the same length, frame id and
-        number of rows."""
-        frame = int.from_bytes(other[_FRAME_LENGTH_AT:_FRAME_AT], "little")
-        end = _aligned(_FRAME_AT + frame) + 4
-        return len(one) == len(other) and one[_FRAME_LENGTH_AT:end] == other[_FRAME_LENGTH_AT:end]
+    def shape_bytes(self, data: bytes) -> bytes:
+        """Frame id and number of rows. Messages of one length that have the same bytes at SHAPE_AT
+        can be decoded together."""
+        frame = int.from_bytes(data[_FRAME_LENGTH_AT:_FRAME_AT], "little")
+        return data[SHAPE_AT : _aligned(_FRAME_AT + frame) + 4]
 
     def buffer(self, frame_id: bytes, rows: int, pads: int = 0) -> MessageBuffer[AnyRows]:
         """A message to fill. frame_id: with its closing zero; pads: of a row of frequencies."""

@@ -22,6 +22,7 @@ from ..core.errors import BagError, CubeError, MessageError
 from ..core.rows import FrequencyRows, StressRows
 from .mcap import BagReader
 from .message_codec import (
+    SHAPE_AT,
     AnyRows,
     Decoded,
     MessageCodec,
@@ -237,12 +238,17 @@ class Bag:
     ) -> Iterator[tuple[Decoded[AnyRows], NDArray[np.int64]]]:
         waiting: list[bytes] = []
         times_ns: list[int] = []
+        size = most = 0
+        shape = b""
         try:
             for _, time_ns, data in self._messages({topic}):
-                most = max(1, min(TOGETHER, TOGETHER_BYTES // max(1, len(data))))
-                if waiting and (len(waiting) >= most or not codec.same_shape(data, waiting[0])):
-                    yield codec.decode(*waiting), np.array(times_ns)
+                together = len(data) == size and data.startswith(shape, SHAPE_AT)
+                if len(waiting) >= most or not together:
+                    if waiting:
+                        yield codec.decode(*waiting), np.array(times_ns)
                     waiting, times_ns = [], []
+                    size, shape = len(data), codec.shape_bytes(data)
+                    most = max(1, min(TOGETHER, TOGETHER_BYTES // max(1, size)))
                 waiting.append(data)
                 times_ns.append(time_ns)
             if waiting:
