@@ -634,20 +634,32 @@ def test_plot_and_info(bag, tmp_path, capsys):
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'empty'}: no messages\n")
 
 
+FILL_THE_DISK = """
+import resource, signal, sys
+from pathlib import Path
+
+from cube_tensor_driver.bags.read import Bag
+from cube_tensor_driver.bags.write import BagWriter
+from cube_tensor_driver.core.errors import BagError
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+try:
+    with Bag(Path(sys.argv[1])) as source, BagWriter(Path(sys.argv[2])) as writer:
+        for one in source.connections:
+            writer.add_topic(one.topic, one.msgtype)
+        for entry in source.entries():
+            writer.write(entry.topic, entry.time_ns, entry.data)
+            writer.flush()
+except BagError as error:
+    print(error)
+    sys.exit(3)
+"""
+
+
 def test_disk_full_leaves_what_was_written(bag, tmp_path):
     """The file system takes 300 kB, then no more."""
-    script = (
-        "import resource, signal, sys; from pathlib import Path\n"
-        "from cube_tensor_driver.core.errors import BagError\n"
-        "from cube_tensor_driver.bags.read import Bag; from cube_tensor_driver.bags.write import BagWriter\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n"
-        "try:\n"
-        "    with Bag(Path(sys.argv[1])) as source, BagWriter(Path(sys.argv[2])) as writer:\n"
-        "        for one in source.connections: writer.add_topic(one.topic, one.msgtype)\n"
-        "        for entry in source.entries(): writer.write(entry.topic, entry.time_ns, entry.data); writer.flush()\n"
-        "except BagError as error: print(error); sys.exit(3)"
-    )
-    command = [sys.executable, "-c", script, str(bag), str(tmp_path / "full")]
+    command = [sys.executable, "-c", FILL_THE_DISK, str(bag), str(tmp_path / "full")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (
         done.returncode == 3 and "File too large" in done.stdout and "with room" in done.stdout

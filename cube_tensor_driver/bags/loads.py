@@ -103,8 +103,8 @@ def _reference(
     else:
         there = ", ".join(sorted({one.topic for one in bag.connections}))
         raise BagError(
-            f"{bag.path}: --reference {topic} is {kind or 'not there'}; needed is a WrenchStamped, a "
-            f"StressTensorStamped or a SkinStress. Topics: {there}"
+            f"{bag.path}: --reference {topic} is {kind or 'not there'}; needed is a "
+            f"WrenchStamped, a StressTensorStamped or a SkinStress. Topics: {there}"
         )
     at, first = np.unique(at, return_index=True)
     if len(at) < 2:

@@ -8,6 +8,7 @@ nothing here loops over rows. ROS is not imported: nodes and bags share this cod
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -176,19 +177,16 @@ class MessageCodec(Generic[AnyRows]):
 
         MessageError: too short, fields that contradict each other, or shapes that differ.
         """
-        layout = self._layout(self._shape(messages[0]))
-        size, count = layout.record.itemsize, len(messages)
-        data = messages[0]
-        if count > 1:
-            data = b"".join(message[:size] for message in messages)
-            if len(data) != count * size:
-                raise MessageError(f"{self._name}: {count} messages of different lengths")
-        self._check(layout, data, count)
-        record = np.frombuffer(data, layout.record, count)
-        stamp_ns = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
-        times_ns = (stamp_ns[:, None] + record["time_offset"]).reshape(-1)
-        frame_id = data[_FRAME_AT : _FRAME_AT + layout.shape.frame]
-        return Decoded(self.make_rows(record, times_ns), stamp_ns, frame_id)
+        layout, record = self._records(messages)
+        stamp_ns, times_ns = _stamps(record)
+        rows: AnyRows = self.make_rows(record, times_ns)
+        frame_id = messages[0][_FRAME_AT : _FRAME_AT + layout.shape.frame]
+        return Decoded(rows, stamp_ns, frame_id)
+
+    def decode_columns(self, names: Sequence[str], *messages: bytes) -> list[NDArray[Any]]:
+        """`stamp_ns` and the named columns of what `decode` gives: it does not copy the others."""
+        record = self._records(messages)[1]
+        return [_stamps(record)[1], *(_flat(record, name) for name in names)]
 
     def shape_bytes(self, data: bytes) -> bytes:
         """Frame id and number of rows. Messages of one length that have the same bytes at SHAPE_AT
@@ -242,6 +240,19 @@ class MessageCodec(Generic[AnyRows]):
             record[f"length of {name}"] = values
         if self._has_pads:
             record["n_pads"] = layout.shape.pads
+
+    def _records(self, messages: Sequence[bytes]) -> tuple[_Layout, NDArray[Any]]:
+        """Messages of one shape as records (M,). MessageError: as `decode`."""
+        layout = self._layout(self._shape(messages[0]))
+        size, count = layout.record.itemsize, len(messages)
+        data = messages[0]
+        if count > 1:
+            data = b"".join(message[:size] for message in messages)
+            if len(data) != count * size:
+                raise MessageError(f"{self._name}: {count} messages of different lengths")
+        self._check(layout, data, count)
+        record: NDArray[Any] = np.frombuffer(data, layout.record, count)
+        return layout, record
 
     def _shape(self, data: bytes) -> _Shape:
         """MessageError: too short, or its length is not that of so many rows."""
@@ -336,6 +347,12 @@ def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
     if width == 1:
         return (shape.rows,)
     return (shape.rows, shape.pads if width == PADS else width)
+
+
+def _stamps(record: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Of records (M,): their stamps, and those of all their rows one after the other."""
+    stamp_ns = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
+    return stamp_ns, (stamp_ns[:, None] + record["time_offset"]).reshape(-1)
 
 
 def _flat(record: NDArray[Any], name: str) -> NDArray[Any]:

@@ -4,9 +4,9 @@ a `BagError`."""
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,6 @@ from ..core.rows import FrequencyRows, StressRows
 from .mcap import BagReader
 from .message_codec import (
     SHAPE_AT,
-    AnyRows,
     Decoded,
     MessageCodec,
     frequency_codec,
@@ -83,7 +82,8 @@ def damage(path: Path) -> Iterator[None]:
     except DAMAGE as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
-            f"{path}: damaged, or no bag ({text[:200]}); ./cube bag repair may help if it was cut off"
+            f"{path}: damaged, or no bag ({text[:200]}); "
+            "./cube bag repair may help if it was cut off"
         ) from None
 
 
@@ -156,7 +156,8 @@ class Bag:
         found = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
         if len(found) != 1:
             raise BagError(
-                f"{self.path}: {len(found)} topics of {FREQUENCIES} ({', '.join(found) or 'none'}); needed is one"
+                f"{self.path}: {len(found)} topics of {FREQUENCIES} "
+                f"({', '.join(found) or 'none'}); needed is one"
             )
         return found[0]
 
@@ -207,16 +208,16 @@ class Bag:
         infos = [self.decode(entry) for entry in self.entries({topic})]
         if not infos:
             raise BagError(
-                f"{self.path}: no message on {topic}: the bag does not say what its frequencies mean; "
-                f"record {topic} too"
+                f"{self.path}: no message on {topic}: the bag does not say what its frequencies "
+                f"mean; record {topic} too"
             )
         for info in infos:
             if info.version not in VERSIONS:
                 older = "older than" if info.version < min(VERSIONS) else "newer than"
                 raise BagError(
-                    f"{self.path}: {topic} has version {info.version}, {older} what this package "
-                    f"reads ({', '.join(map(str, VERSIONS))}); use the package it was recorded with, or "
-                    "a newer one"
+                    f"{self.path}: {topic} has version {info.version}, {older} what this "
+                    f"package reads ({', '.join(map(str, VERSIONS))}); use the package it was "
+                    "recorded with, or a newer one"
                 )
         return infos
 
@@ -227,15 +228,23 @@ class Bag:
         Messages of one shape that follow each other come together, at most `TOGETHER`. BagError: a
         message contradicts itself.
         """
-        return self._decoded(topic, frequency_codec)
+        return self._decoded(topic, frequency_codec, frequency_codec.decode)
 
     def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], NDArray[np.int64]]]:
         """As `frequencies`, of a topic with stress."""
-        return self._decoded(topic, stress_codec if self.version > 1 else stress_codec_1)
+        codec = stress_codec if self.version > 1 else stress_codec_1
+        return self._decoded(topic, codec, codec.decode)
+
+    def stress_columns(self, topic: str, names: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+        """As `stress`, but only `stamp_ns` and the named columns. Not of version 1."""
+        decode = partial(stress_codec.decode_columns, names)
+        for columns, _ in self._decoded(topic, stress_codec, decode):
+            yield columns
 
     def _decoded(
-        self, topic: str, codec: MessageCodec[AnyRows]
-    ) -> Iterator[tuple[Decoded[AnyRows], NDArray[np.int64]]]:
+        self, topic: str, codec: MessageCodec[Any], decode: Callable[..., Any]
+    ) -> Iterator[tuple[Any, NDArray[np.int64]]]:
+        """What `decode` makes of messages of one shape, and when they were recorded."""
         waiting: list[bytes] = []
         times_ns: list[int] = []
         size = most = 0
@@ -245,14 +254,14 @@ class Bag:
                 together = len(data) == size and data.startswith(shape, SHAPE_AT)
                 if len(waiting) >= most or not together:
                     if waiting:
-                        yield codec.decode(*waiting), np.array(times_ns)
+                        yield decode(*waiting), np.array(times_ns)
                     waiting, times_ns = [], []
                     size, shape = len(data), codec.shape_bytes(data)
                     most = max(1, min(TOGETHER, TOGETHER_BYTES // max(1, size)))
                 waiting.append(data)
                 times_ns.append(time_ns)
             if waiting:
-                yield codec.decode(*waiting), np.array(times_ns)
+                yield decode(*waiting), np.array(times_ns)
         except MessageError as error:
             raise BagError(f"{self.path}: {topic}: {error}") from None
 

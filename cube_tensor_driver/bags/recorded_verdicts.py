@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.reconstructor import Verdicts
-from ..core.rows import FrequencyRows, StressRows
+from ..core.rows import FrequencyRows
 from ..core.status import WORDS
 from .message_codec import SECOND
 from .read import STRESS, Bag
@@ -96,17 +96,11 @@ class VerdictReader:
             yield part
 
     def _read(self) -> Iterator[_Part]:
-        for messages, _ in self._bag.stress(self._topic):
-            rows: StressRows = messages.rows
-            if len(rows):
-                yield _Part(
-                    int(rows.stamp_ns.min()),
-                    int(rows.stamp_ns.max()),
-                    rows.stamp_ns,
-                    rows.cube,
-                    rows.left_out,
-                    rows.status & HEALTH_BITS,
-                )
+        names = ("cube", "left_out", "status")
+        for stamp_ns, cube, left_out, status in self._bag.stress_columns(self._topic, names):
+            if len(cube):
+                begin_ns, end_ns = int(stamp_ns.min()), int(stamp_ns.max())
+                yield _Part(begin_ns, end_ns, stamp_ns, cube, left_out, status & HEALTH_BITS)
 
 
 def _find(part: _Part, rows: FrequencyRows) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:

@@ -176,7 +176,10 @@ def _reconstruct(
                 if ids != (ids := [one.id for one in now.calibrations]):
                     reconstructor = Reconstructor(now.calibrations)
                 reconstructor.rest_frequency = now.rest_frequency
-            stress = reconstructor.process(rows, verdicts)
+            if verdicts is not None and verdicts.known.all():
+                stress = reconstructor.process_known(rows, verdicts)
+            else:
+                stress = reconstructor.process(rows, verdicts)
         except CubeError as error:
             raise BagError(f"{source.bag.path}: {source.topic}: {error}") from None
         yield segment, stress

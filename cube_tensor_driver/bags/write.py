@@ -124,7 +124,8 @@ class BagWriter:
         """Before its first message. BagError: the type is not known."""
         if msgtype not in typestore().fielddefs:
             raise BagError(
-                f"{topic}: the type {msgtype} is not known; known are those of ROS 2 Jazzy and of this package"
+                f"{topic}: the type {msgtype} is not known; known are those of ROS 2 Jazzy and "
+                "of this package"
             )
         self._types[topic] = msgtype, tuple(qos)
         self._attempt(lambda: self._connect(topic))
@@ -260,7 +261,8 @@ def write_metadata(folder: Path) -> int:
     kinds = {path.suffix for path in paths}
     if len(kinds) != 1:
         raise BagError(
-            f"{folder}: storage files of {len(kinds)} kinds; a bag's folder has .mcap or .db3 files, one or more"
+            f"{folder}: storage files of {len(kinds)} kinds; a bag's folder has .mcap files or "
+            ".db3 files, one or more"
         )
     files: list[dict[str, Any]] = []
     topics: dict[tuple[str, str], dict[str, Any]] = {}

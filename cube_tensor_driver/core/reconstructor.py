@@ -115,6 +115,13 @@ class Reconstructor:
 
     __call__ = process
 
+    def process_known(self, rows: FrequencyRows, recorded: Verdicts) -> StressRows:
+        """As `process`, of rows whose verdicts are all known. Health does not see them, which saves
+        two fifths of the time of reading and reconstructing a bag."""
+        stress = self.pipeline.process(rows, recorded.left_out)
+        stress.status[:] |= recorded.status
+        return stress
+
     def covariance(self, cube: int, left_out: int = 0) -> NDArray[np.float64]:
         """(15, 15) of the components of a cube, from the noise of its pads; see Pipeline."""
         return self.pipeline.covariance(cube, left_out)

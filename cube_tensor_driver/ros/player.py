@@ -150,7 +150,8 @@ class Player:
     def _at(self, position: float) -> int:
         if not 0 <= position <= self.length:
             raise BagError(
-                f"{self._bag.path}: {position:g} s is not in the bag, which is {self.length:.3f} s long"
+                f"{self._bag.path}: {position:g} s is not in the bag, which is "
+                f"{self.length:.3f} s long"
             )
         return self._bag.start_ns + round(position * SECOND)
 

@@ -147,5 +147,6 @@ def message_class(topic: str, msgtype: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError):
         raise BagError(
-            f"{topic}: the messages of {package} are not installed here; source the workspace that has them"
+            f"{topic}: the messages of {package} are not installed here; "
+            "source the workspace that has them"
         ) from None
