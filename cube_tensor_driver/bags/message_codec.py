@@ -185,7 +185,7 @@ class MessageCodec(Generic[AnyRows]):
 
     def decode_columns(self, names: Sequence[str], *messages: bytes) -> list[NDArray[Any]]:
         """`stamp_ns` and the named columns of what `decode` gives: it does not copy the others."""
-        record = self._records(messages)[1]
+        record: NDArray[Any] = self._records(messages)[1]
         return [_stamps(record)[1], *(_flat(record, name) for name in names)]
 
     def shape_bytes(self, data: bytes) -> bytes:
