@@ -45,7 +45,7 @@ PERIOD_S = 0.01
 UID = 0xCD
 
 
-class Scene3D:
+class PlayedSkin:
     """A hub that plays frequencies in real time, both nodes, and what they publish."""
 
     def __init__(self, ros, tmp_path, children):
@@ -120,7 +120,7 @@ class Scene3D:
 @pytest.fixture
 def stage(ros, tmp_path):
     with Children(tmp_path) as children:
-        stage = Scene3D(ros, tmp_path, children)
+        stage = PlayedSkin(ros, tmp_path, children)
         try:
             yield stage
         finally:

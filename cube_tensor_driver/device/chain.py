@@ -168,6 +168,11 @@ class LiveLinks:
         return None if self._reader is None else self._reader.failure
 
     @property
+    def callback_errors(self) -> int:
+        """How often a callback in the reader's thread has failed."""
+        return 0 if self._reader is None else self._reader.callback_errors
+
+    @property
     def cube_uids(self) -> dict[int, int]:
         """uids of the skin's cubes by index, as the hubs say."""
         return self._scans.cubes.uids

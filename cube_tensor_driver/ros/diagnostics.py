@@ -32,11 +32,20 @@ except ModuleNotFoundError:
 
 
 class Diagnostics(Updater):  # type: ignore[misc]
-    """Publishes the statuses that `statuses` returns, if any, as long as the node lives."""
+    """Publishes the statuses that `statuses` returns, if any, as long as the node lives.
 
-    def __init__(self, node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
+    The first one also says how many callbacks of the node have failed (`count_errors`).
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        statuses: Callable[[], list[DiagnosticStatus]],
+        count_errors: Callable[[], int],
+    ) -> None:
         super().__init__(node)
-        self._statuses = statuses
+        self._statuses, self._count_errors = statuses, count_errors
+        self._errors_before = 0
         # With the namespace, because a skin may run in several. Left to itself, the updater uses
         # the bare name or doubles the slash.
         self.node_name = node.get_fully_qualified_name()
@@ -45,7 +54,17 @@ class Diagnostics(Updater):  # type: ignore[misc]
         """Called by the timer."""
         statuses = self._statuses()
         if statuses:
+            self._add_errors(statuses[0])
             self.publish(statuses)
+
+    def _add_errors(self, status: DiagnosticStatus) -> None:
+        errors = self._count_errors()
+        status.values = [*status.values, KeyValue(key="callback errors", value=str(errors))]
+        if errors > self._errors_before:
+            status.level = DiagnosticStatus.ERROR
+            text = f"{errors - self._errors_before} callbacks failed: see the log of the node"
+            status.message = "; ".join(filter(None, [status.message, text]))
+        self._errors_before = errors
 
 
 def make_status(

@@ -33,7 +33,7 @@ class Driver(CubeNode):
         self._node_clock = NodeClock(self)
         self._links: LiveLinks | None = None
         self._is_active = False
-        self._diagnostics = Diagnostics(self, self._statuses)
+        self._diagnostics = Diagnostics(self, self._statuses, self._count_errors)
 
     @property
     def failure(self) -> Exception | None:
@@ -94,6 +94,10 @@ class Driver(CubeNode):
         self._frequencies.publish()
         if self._on_rows is not None:
             self._on_rows(rows)
+
+    def _count_errors(self) -> int:
+        """Of callbacks in the main thread and in the reader's."""
+        return self.guard.errors + (0 if self._links is None else self._links.callback_errors)
 
     def _publish_info(self) -> None:
         now_ns = self.get_clock().now().nanoseconds

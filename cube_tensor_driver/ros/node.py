@@ -9,11 +9,13 @@ import math
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import rclpy
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import ROSClock
 from rclpy.exceptions import ParameterException
@@ -24,6 +26,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 
 from ..core.errors import ConfigError, CubeError
+from .guard import CallbackGuard, refuse_errors
 from .parameters import Parameter
 
 PAUSE_S = 2.0
@@ -95,13 +98,37 @@ class CubeNode(LifecycleNode):
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
+        self.guard = CallbackGuard(self)
         super().__init__(name)
+        self._guard_lifecycle_services()
         self.configured = False
         self._parameters_by_name = {parameter.name: parameter for parameter in parameters}
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         for parameter in parameters:
             self._declare(parameter)
+
+    def create_subscription(self, *arguments: Any, **options: Any) -> Any:
+        message_type, topic, callback, *others = arguments
+        guarded = self.guard.wrap(callback)
+        return super().create_subscription(message_type, topic, guarded, *others, **options)
+
+    def create_timer(self, *arguments: Any, **options: Any) -> Any:
+        period, callback, *others = arguments
+        return super().create_timer(period, self.guard.wrap(callback), *others, **options)
+
+    def create_service(self, *arguments: Any, **options: Any) -> Any:
+        service_type, name, callback, *others = arguments
+        guarded = self.guard.wrap_service(callback)
+        return super().create_service(service_type, name, guarded, *others, **options)
+
+    def _guard_lifecycle_services(self) -> None:
+        """rclpy makes these without `create_service`, and raises RCLError, a RuntimeError, when a
+        peer asks for a transition that is not possible now."""
+        for service in self.services:
+            if service.srv_type is ChangeState:
+                service.callback = refuse_errors(service.callback, RuntimeError)
+            service.callback = self.guard.wrap_service(service.callback)
 
     def _declare(self, parameter: Parameter) -> None:
         choices = parameter.choices
@@ -141,6 +168,8 @@ class CubeNode(LifecycleNode):
             return f"parameter {name} is {value!r}, allowed: {known.choices}"
         if isinstance(value, float) and not math.isfinite(value):
             return f"parameter {name} is {value}, allowed: a finite number"
+        if known is not None and known.least is not None and 0 < value < known.least:
+            return f"parameter {name} is {value}, allowed: 0, or at least {known.least:g}"
         if self.configured and known is not None and not known.live:
             return (
                 f"parameter {name} cannot change while the node is configured: "
@@ -155,11 +184,14 @@ class CubeNode(LifecycleNode):
                 self.changed(parameter.name)
 
     def attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
-        """Do the work of a transition. A CubeError becomes a line in the log and a failure."""
+        """Do the work of a transition. An error becomes a line in the log and a failure."""
         try:
             work()
         except CubeError as error:
             self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:  # noqa: BLE001  (rclpy would swallow it without a word)
+            self.get_logger().error(f"{error!r}: please report it\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 

@@ -11,8 +11,10 @@ from ..core.scene import QUANTITIES
 class Parameter(NamedTuple):
     """A parameter: its default, what `ros2 param describe` says, and what it allows.
 
-    span: lowest and highest value of a number; choices: of a text, separated by commas; live: it
-    may change while the node is configured.
+    span: lowest and highest value of a number
+    choices: of a text, separated by commas
+    live: it may change while the node is configured
+    least: lowest value other than 0
     """
 
     name: str
@@ -21,6 +23,7 @@ class Parameter(NamedTuple):
     span: tuple[float, float] | None = None
     choices: str = ""
     live: bool = False
+    least: float | None = None
 
 
 AUTOSTART = Parameter(
@@ -47,6 +50,7 @@ DRIVER = (
         "Samples per second to ask of the hubs; 0: as the skin file says.",
         span=(0.0, 10_000.0),
         live=True,
+        least=0.1,
     ),
     Parameter(
         "publish_period",

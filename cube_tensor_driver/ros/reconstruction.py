@@ -37,7 +37,7 @@ class Reconstruction(CubeNode):
         # In one process with the driver, its thread calls `on_rows`; services run in the main one.
         self._lock = threading.Lock()
         self._configured = ExitStack()
-        self._updater = Diagnostics(self, self._statuses)
+        self._updater = Diagnostics(self, self._statuses, lambda: self.guard.errors)
 
     def configure(self) -> None:
         made = self._configured

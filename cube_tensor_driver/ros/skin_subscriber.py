@@ -17,9 +17,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from cube_tensor_driver.msg import SkinInfo, SkinStress
 
 from ..bags.message_codec import stress_codec
-from ..core.errors import MessageError
+from ..core.errors import CubeError, MessageError
 from ..core.scene import CubePoses, Newest
 from ..core.tensor import rotation_from_quaternion
+from .guard import CallbackGuard
 from .node import CubeNode
 from .parameters import Parameter
 
@@ -60,9 +61,11 @@ class SkinSubscriber:
         self._on_skin = on_skin
         latched = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         newest = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        guard = CallbackGuard(node)
+        on_info, on_stress = guard.wrap(self._receive_info), guard.wrap(self._receive_stress)
         self._subscriptions = [
-            node.create_subscription(SkinInfo, "info", self._receive_info, latched),
-            node.create_subscription(SkinStress, "stress", self._receive_stress, newest, raw=True),
+            node.create_subscription(SkinInfo, "info", on_info, latched),
+            node.create_subscription(SkinStress, "stress", on_stress, newest, raw=True),
         ]
 
     def close(self) -> None:
@@ -77,8 +80,13 @@ class SkinSubscriber:
         if self.skin is not None and _geometry(self.skin.info) == _geometry(info):
             self.skin.info = info
             return
-        self.skin = FollowedSkin(info, cube_poses(info), Newest(len(info.cubes)))
-        self._on_skin(self.skin)
+        try:
+            skin = FollowedSkin(info, cube_poses(info), Newest(len(info.cubes)))
+        except CubeError as error:
+            self._refuse(error)
+            return
+        self._on_skin(skin)
+        self.skin = skin
 
     def _receive_stress(self, data: bytes) -> None:
         if self.skin is None:
@@ -86,11 +94,14 @@ class SkinSubscriber:
         try:
             message = stress_codec.decode(data)
         except MessageError as error:
-            self._node.get_logger().error(str(error), throttle_duration_sec=ERROR_PERIOD_S)
+            self._refuse(error)
             return
         self.skin.newest.update(message.rows, self.now())
         self.skin.messages += 1
         self.skin.stamp_ns = int(message.stamp_ns[0])
+
+    def _refuse(self, error: CubeError) -> None:
+        self._node.get_logger().error(str(error), throttle_duration_sec=ERROR_PERIOD_S)
 
 
 class SkinSubscriberNode(CubeNode):
@@ -148,15 +159,29 @@ class SkinSubscriberNode(CubeNode):
 
 
 def cube_poses(info: SkinInfo) -> CubePoses:
-    """Where the cubes of an `info` are, in m. CubeError: an orientation that is no rotation."""
+    """Where the cubes of an `info` are, in m.
+
+    CubeError: no cubes, or a pose or size that no cube can have.
+    """
+    if not info.cubes:
+        raise MessageError(f"info of the skin {info.name}: it has no cubes")
     positions = [cube.pose.position for cube in info.cubes]
     orientations = [cube.pose.orientation for cube in info.cubes]
     rotations = [rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w])) for q in orientations]
-    return CubePoses(
+    poses = CubePoses(
         position=np.array([(p.x, p.y, p.z) for p in positions]),
         rotation=np.array(rotations),
         half_side=np.array([cube.half_side for cube in info.cubes]),
     )
+    possible = np.isfinite(poses.position).all(axis=1) & (0 < poses.half_side)
+    possible &= np.isfinite(poses.half_side)
+    for number in np.flatnonzero(~possible).tolist():
+        raise MessageError(
+            f"info of the skin {info.name}: cube {info.cubes[number].name} is at "
+            f"{poses.position[number].tolist()} m with a half side of {poses.half_side[number]} m; "
+            "it needs finite numbers and a size above 0"
+        )
+    return poses
 
 
 def _geometry(info: SkinInfo) -> list[object]:

@@ -1,0 +1,149 @@
+"""What peers send over DDS ends no node: transitions, services, parameters, messages of any content."""
+
+from __future__ import annotations
+
+import copy
+import math
+from datetime import datetime, timezone
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Quaternion
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from cube_tensor_driver.bags.message_codec import frequency_codec
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.tare import write_tare
+from cube_tensor_driver.config.yaml import read_yaml, write_yaml
+from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.srv import Tare
+
+ACTIVE = 3
+
+
+@pytest.fixture
+def skin(ros, tmp_path):
+    """A running simulated skin of one cube with all its nodes; none has ended at the end."""
+    with Children(tmp_path) as children:
+        config = package_data() / "config" / "cube.yaml"
+        hubs = SimulatedHubs(tmp_path / "ports")
+        for process in skin_processes(config, simulated=hubs, markers=True, contacts=True):
+            children.start(process)
+        stress = ros.listen(SkinStress, "stress")
+        ros.wait(lambda: stress)
+        yield ros
+        count = len(stress)
+        ros.wait(lambda: len(stress) > count + 10)
+        children.check()
+
+
+def test_a_transition_that_is_not_possible_now_is_refused(skin):
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+    for node in ("driver", "reconstruction", "markers", "contacts"):
+        skin.wait(lambda node=node: state(skin, node) == ACTIVE)
+        assert not skin.call(ChangeState, f"/{node}/change_state", request).success, node
+        assert state(skin, node) == ACTIVE, node
+
+
+def state(ros, node):
+    return ros.call(GetState, f"/{node}/get_state", GetState.Request()).current_state.id
+
+
+def test_a_tare_over_no_time_is_refused(skin):
+    for duration in (math.nan, math.inf, -math.inf, -1.0, 1e300):
+        answer = skin.call(Tare, "/reconstruction/tare", Tare.Request(duration=duration))
+        assert not answer.success and "allowed" in answer.message, duration
+
+
+def test_a_rate_that_no_hub_can_have_is_refused(skin):
+    for rate in (1e-300, 1e-9, 2e-4, 0.09, 1e9, -1.0):
+        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=rate)
+        request = SetParameters.Request(parameters=[Parameter(name="rate", value=value)])
+        (result,) = skin.call(SetParameters, "/driver/set_parameters", request).results
+        assert not result.successful and "rate" in result.reason, rate
+
+
+def test_messages_of_any_content_are_refused_and_counted(skin):
+    publisher = skin.node.create_publisher(SkinFrequencies, "frequencies", 100)
+    diagnostics = skin.listen(DiagnosticArray, "/diagnostics")
+    good = frequency_codec.encode(
+        FrequencyRows.of(np.zeros(1, np.uint16), np.full((1, 8), 1e5, np.float32)), b"skin\0"
+    )
+    rows_at = len(good) - len(good[good.index(b"skin\0") + 8 :])
+    for rows in (2**29, 2**31, 2**32 - 1):
+        publisher.publish(good[:rows_at] + rows.to_bytes(4, "little") + good[rows_at + 4 :])
+    publisher.publish(good[:20])
+
+    def refused() -> bool:
+        values = {
+            pair.key: pair.value
+            for array in diagnostics
+            for status in array.status
+            if status.name == "/reconstruction: rows"
+            for pair in status.values
+        }
+        assert values.get("callback errors", "0") == "0"
+        return values.get("messages that contradict themselves", "0") == "4"
+
+    skin.wait(refused)
+
+
+INFOS = {
+    "a quaternion of length 0": lambda info: setattr(
+        info.cubes[0].pose, "orientation", Quaternion(x=0.0, y=0.0, z=0.0, w=0.0)
+    ),
+    "a position that is NaN": lambda info: setattr(info.cubes[0].pose.position, "x", math.nan),
+    "no cubes": lambda info: setattr(info, "cubes", []),
+    "no calibrations": lambda info: setattr(info, "calibrations", []),
+    "a half side of 0": lambda info: setattr(info.cubes[0], "half_side", 0.0),
+    "a half side that is NaN": lambda info: setattr(info.cubes[0], "half_side", math.nan),
+}
+
+
+def test_an_info_of_any_content_ends_no_node(skin):
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    infos = skin.listen(SkinInfo, "info", latched)
+    skin.wait(lambda: infos)
+    publisher = skin.node.create_publisher(SkinInfo, "info", latched)
+    skin.wait(lambda: publisher.get_subscription_count() >= 4)  # all nodes but the driver, and us
+    for change in INFOS.values():
+        info = copy.deepcopy(infos[0])
+        change(info)
+        count = len(infos)
+        publisher.publish(info)
+        skin.wait(lambda count=count: len(infos) > count)
+
+
+def test_a_tared_skin_with_uids_starts_again(ros, tmp_path):
+    data = read_yaml(package_data() / "config" / "cube.yaml")
+    for number, cube in enumerate(data["cubes"]):
+        cube["uid"] = 0xABC0 + number
+        cube.pop("index", None)
+    config = tmp_path / "skin.yaml"
+    write_yaml(config, data)
+    cube = read_skin(config).cubes[0]
+    kept = 1.001 * cube.calibration.rest_frequency
+    created = datetime.now(timezone.utc)
+    write_tare(tmp_path / "tare", cube.uid, cube.calibration, kept, created)
+    with Children(tmp_path) as children:
+        processes = skin_processes(config, simulated=SimulatedHubs(tmp_path / "ports"))
+        for process in processes:
+            if process.executable == "reconstruction":
+                process.parameters["tare_folder"] = str(tmp_path / "tare")
+            children.start(process)
+        stress = ros.listen(SkinStress, "stress")
+        ros.wait(lambda: stress)
+        children.wait_for_line("reconstruction", "restored", 5)
+        children.check()
