@@ -104,7 +104,7 @@ def test_values_are_those_of_a_live_link(tmp_path):
     number = (time_ns - sampled.start_time_ns) // 10_000_000
     scans = [rows.frequency for rows in islice(simulate(SKIN), int(number.max()) + 1)]
     np.testing.assert_array_equal(live.frequency, np.array(scans)[number, live.cube])
-    assert set(live.cube.tolist()) == set(range(16)) and len(live) > 1000
+    assert set(live.cube.tolist()) == set(range(16))
 
 
 def test_it_is_a_source_that_begins_anew_each_time(tmp_path):
