@@ -1,4 +1,4 @@
-"""What peers send over DDS ends no node: transitions, services, parameters, messages of any content."""
+"""What peers send over DDS ends no node: transitions, services, parameters, messages."""
 
 from __future__ import annotations
 

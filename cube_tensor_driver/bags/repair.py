@@ -3,7 +3,7 @@ are.
 
 An mcap file is a sequence of records. A chunk record with its index records is complete or it is
 not. What follows the last complete one is cut off, and the summary that readers look for is written
-anew. An sqlite3 file undoes by itself what was not committed.
+again. An sqlite3 file undoes by itself what was not committed.
 
 The records themselves are read and written by the library `mcap`. Its StreamReader is not used: it
 trusts the lengths inside a record, so behind the first damaged one it finds nothing any more. Here

@@ -32,7 +32,7 @@ from .tables import TableWriter
 from .write import BagWriter, quality
 
 PARTIAL = ".partial"
-"""Folder beside the results for what is not complete; a restart begins those anew."""
+"""Folder beside the results for what is not complete; a restart begins those again."""
 WORKING_BYTES = 30 << 20
 NAMED = 5
 """Cubes that a message names at most."""

@@ -54,7 +54,7 @@ def _summary(
     if len(sequence) < 2:
         return CubeSummary(name, uid, len(sequence))
     steps = np.diff(sequence).astype(np.uint32).astype(np.int64)
-    # A step of half the range is a hub that began anew, no loss.
+    # A step of half the range is a hub that restarted, not loss.
     lost = (steps[(steps > 0) & (steps < 1 << 31)] - 1).sum()
     times_ns = np.diff(stamp_ns)
     usual_ns = float(np.median(times_ns))

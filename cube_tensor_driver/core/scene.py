@@ -175,9 +175,9 @@ def automatic(quantity: Quantity, shown: np.ndarray, before: float = 0.0) -> flo
 
 def colours(quantity: Quantity, shown: np.ndarray, top: float) -> np.ndarray:
     """(N, 3) of values in SI on the range 0 .. top, or −top .. top if signed; grey where NaN."""
-    place = np.nan_to_num(shown) / top
+    share = np.nan_to_num(shown) / top
     table = _table(DIVERGING if quantity.signed else SEQUENTIAL)
-    at = np.clip(place / 2 + 0.5 if quantity.signed else place, 0, 1) * (len(table) - 1)
+    at = np.clip(share / 2 + 0.5 if quantity.signed else share, 0, 1) * (len(table) - 1)
     low = np.minimum(at.astype(int), len(table) - 2)
     part = (at - low)[:, None]
     return np.where(
@@ -189,30 +189,30 @@ def _table(hexes: str) -> np.ndarray:
     return np.array([[int(text[i : i + 2], 16) / 255 for i in (0, 2, 4)] for text in hexes.split()])
 
 
-def traction_arrows(places: CubePoses, values: np.ndarray, length: float) -> np.ndarray:
+def traction_arrows(poses: CubePoses, values: np.ndarray, length: float) -> np.ndarray:
     """(N, 2, 3) from tail to tip: the traction σ·n on the faces +z, `length` metres per Pa.
 
     It is how the load pushes: pressing points into the skin and ends on the face, pulling begins
     there. Unobserved parts count as 0.
     """
     t = np.nan_to_num(values[:, [4, 3, 2]]) * length
-    arrow = np.einsum("nij,nj->ni", places.rotation, t)
-    face = places.position + places.rotation[:, :, 2] * places.half_side[:, None]
+    arrow = np.einsum("nij,nj->ni", poses.rotation, t)
+    face = poses.position + poses.rotation[:, :, 2] * poses.half_side[:, None]
     tail = np.where(t[:, 2:] < 0, face - arrow, face)
     return np.stack([tail, tail + arrow], axis=1)
 
 
-def gradient_arrows(places: CubePoses, values: np.ndarray, length: float) -> np.ndarray:
+def gradient_arrows(poses: CubePoses, values: np.ndarray, length: float) -> np.ndarray:
     """(N, 2, 3) on the faces +z: where pressure grows, `length` metres per Pa/m; unobserved parts
     count as 0."""
     g = -np.nan_to_num(values[:, [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]]) * length
-    arrow = np.einsum("nij,nj->ni", places.rotation[:, :, :2], g)
-    tail = places.position + places.rotation[:, :, 2] * (1.15 * places.half_side[:, None])
+    arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], g)
+    tail = poses.position + poses.rotation[:, :, 2] * (1.15 * poses.half_side[:, None])
     return np.stack([tail, tail + arrow], axis=1)
 
 
 def principal_crosses(
-    places: CubePoses, values: np.ndarray, length: float
+    poses: CubePoses, values: np.ndarray, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lines (N, 3, 2, 3) along the principal stresses, `length` metres per Pa, and whether each
     pulls (N, 3).
@@ -221,22 +221,22 @@ def principal_crosses(
     """
     principal, directions = principal_stresses(np.nan_to_num(values[:, : len(STRESS)]))
     half = (
-        np.einsum("nij,nkj->nki", places.rotation, directions)
+        np.einsum("nij,nkj->nki", poses.rotation, directions)
         * (0.5 * length * np.abs(principal))[..., None]
     )
     centre = (
-        places.position[:, None] + places.rotation[:, None, :, 2] * places.half_side[:, None, None]
+        poses.position[:, None] + poses.rotation[:, None, :, 2] * poses.half_side[:, None, None]
     )
     return np.stack([centre - half, centre + half], axis=2), principal > 0
 
 
-def fault_crosses(places: CubePoses, health: np.ndarray) -> np.ndarray:
+def fault_crosses(poses: CubePoses, health: np.ndarray) -> np.ndarray:
     """(N, 2, 2, 3) two lines across the face +z of each cube that is not fine; lines of length 0
     where it is."""
     corner = np.array([[[-1, -1, 0.0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]) * 1.3
     corner = np.where((health != FINE)[:, None, None, None], corner, 0) + np.array([0, 0, 1.2])
-    return places.position[:, None, None] + np.einsum(
-        "nij,nabj->nabi", places.rotation, corner * places.half_side[:, None, None, None]
+    return poses.position[:, None, None] + np.einsum(
+        "nij,nabj->nabi", poses.rotation, corner * poses.half_side[:, None, None, None]
     )
 
 

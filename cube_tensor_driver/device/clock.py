@@ -38,7 +38,7 @@ class ClockMap:
     """Maps one hub's clock to the host's. Bounded memory; amortised constant time per sample.
 
     jitter_ns: mean delay above the line, over about the last 64 calls.
-    resets: how often the map began anew.
+    resets: how often the map was fitted from the start.
     """
 
     # Times are in ns since the first point; a point is (device time, arrival - device time).
@@ -62,7 +62,7 @@ class ClockMap:
         self._begin()
 
     def reset(self) -> None:
-        """The hub restarted: fit anew.
+        """The hub restarted: fit from the start.
 
         Drift is kept as a first guess, and stamps still do not go backward.
         """
@@ -86,7 +86,7 @@ class ClockMap:
         """Host times, ns, of samples taken at device_us, µs, that arrived together at arrival_ns.
 
         Along device time stamps never go backward, and none is later than its arrival. The map
-        begins anew when device time falls back by more than 1 s, and when either clock was set.
+        starts again when device time falls back by more than 1 s, and when either clock was set.
         Only a host clock that is set back makes stamps go backward.
         """
         if not device_us:

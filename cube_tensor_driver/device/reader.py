@@ -32,7 +32,7 @@ longer."""
 HELLO_S = 1.0
 """Interval at which a hub that does not answer is asked again."""
 REOPEN_S = 5.0
-"""A link without a single byte for so long is opened anew. Hubs say HELLO every second."""
+"""A link without a single byte for so long is opened again. Hubs say HELLO every second."""
 LOOK_S = 0.25
 """Interval at which the reader looks whether the port of a waiting link has come back."""
 GATHER_PERIODS = 0.2
@@ -370,7 +370,7 @@ class Reader:
             if now - session.last_byte > REOPEN_S:
                 link.next_candidate()
                 raise LinkError(
-                    f"{link.path}: not a byte for {REOPEN_S:g} s: opening it anew; "
+                    f"{link.path}: not a byte for {REOPEN_S:g} s: opening it again; "
                     "check the hub's power",
                     "silent",
                 )

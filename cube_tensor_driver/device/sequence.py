@@ -81,7 +81,7 @@ class SequenceTracker:
         number = self._next + ahead
         if 0 <= ahead <= MAX_GAP:
             self.counters.missing += ahead
-            # The count goes on but the clock went back: the clock's map must begin anew.
+            # The count goes on but the clock went back: the clock's map must start again.
             arrival = Arrival.NEW if device_us >= self._newest_us else Arrival.RESET
             self.counters.resets += arrival is Arrival.RESET
             self._next = number + 1

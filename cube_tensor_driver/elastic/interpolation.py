@@ -66,7 +66,7 @@ class Interpolation:
     def _solved(self, known: Mask, columns: list[int]) -> _Weights:
         """Weights of these columns.
 
-        They depend only on what is known: they are kept, and solved anew where that has changed.
+        They depend only on what is known: they are kept, and solved again where that has changed.
         """
         wanted = known[:, columns]
         key = tuple(columns)

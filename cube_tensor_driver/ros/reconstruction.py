@@ -100,7 +100,7 @@ class Reconstruction(CubeNode):
             self._publish(rows, int(rows.stamp_ns.min()), frame_id)
 
     def _publish(self, rows: FrequencyRows, stamp_ns: int, frame_id: bytes) -> None:
-        """Publish the stress of the rows of one message; stamp and frame of the message are kept."""
+        """Publish the stress of the rows of one message, with its stamp and frame."""
         if not self._active:
             return
         try:

@@ -173,7 +173,7 @@ def cube_poses(info: SkinInfo) -> CubePoses:
         rotation=np.array(rotations),
         half_side=np.array([cube.half_side for cube in info.cubes]),
     )
-    possible = np.isfinite(poses.position).all(axis=1) & (0 < poses.half_side)
+    possible = np.isfinite(poses.position).all(axis=1) & (poses.half_side > 0)
     possible &= np.isfinite(poses.half_side)
     for number in np.flatnonzero(~possible).tolist():
         raise MessageError(

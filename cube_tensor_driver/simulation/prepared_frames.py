@@ -33,7 +33,7 @@ class PreparedFrame:
         self._middle = cobs.encode(body[_HEAD:last_zero])
         self._rest = body[last_zero + 1 :]
         # Where there is no zero, or 254 bytes without one before one of these two zeros, COBS codes
-        # otherwise: such a sample is encoded anew each time.
+        # otherwise: such a sample is encoded again each time.
         self._sample: Sample | None = None
         if last_zero < 0 or self.encode(sample.sequence, sample.device_us) != frame:
             self._sample = sample

@@ -58,7 +58,7 @@ def simulate(
 
 @dataclass
 class SimulatedSource:
-    """A `core.rows.Source`: each time it is iterated the same skin begins anew at time 0.
+    """A `core.rows.Source`: each time it is iterated the same skin starts again at time 0.
 
     One scan has a row of every cube, in the order in which the driver delivers them: link by link.
     All rows of scan k have sequence k and stamp_ns = k × period: simulated time 0 is the start of

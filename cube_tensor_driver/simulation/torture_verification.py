@@ -39,7 +39,7 @@ NEAR_ZERO = 1 << 20
 """A hub that begins to count above this has been made to wrap: its first samples are not counted
 from 0."""
 CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "step", "drift")
-"""What makes the driver fit a hub's clock anew."""
+"""What makes the driver fit a hub's clock from the start."""
 RECONNECT_FAULTS = ("unplug", "rename")
 NOT_FOUND = -1
 """Instant of a sample that is like none of the table."""
