@@ -88,8 +88,7 @@ class CubeHealth:
             )
         pads = self._skin.cubes[cube].calibration.layout.pads
         texts = [
-            f"pad {pads[pad]} {' and '.join(word for bit, word in WORDS.items() if bits[pad] & bit)}"
-            for pad in np.flatnonzero(bits).tolist()
+            f"pad {pads[pad]} {_words(int(bits[pad]))}" for pad in np.flatnonzero(bits).tolist()
         ]
         if strained:
             named = suspects.get(cube)
@@ -117,3 +116,8 @@ class CubeHealth:
             ]
             for cube, row in zip(cubes.tolist(), found, strict=True)
         }
+
+
+def _words(bits: int) -> str:
+    """The conditions of a pad in words."""
+    return " and ".join(word for bit, word in WORDS.items() if bits & bit)
