@@ -27,7 +27,7 @@ from .taring import Taring, tare_folder
 
 
 class Reconstruction(CubeNode):
-    """Publishes `stress`, `info` and diagnostics; for each cube `cubes/<name>/stress` and `wrench`."""
+    """Publishes `stress`, `info`, diagnostics, and `cubes/<name>/stress` and `wrench` of each cube."""
 
     def __init__(self, subscribes: bool = True) -> None:
         """subscribes: False when a driver in the same process calls `on_rows`."""
