@@ -27,7 +27,7 @@ from .taring import Taring, tare_folder
 
 
 class Reconstruction(CubeNode):
-    """Publishes `stress`, `info`, diagnostics, and `cubes/<name>/stress` and `wrench` of each cube."""
+    """Publishes `stress`, `info`, diagnostics, and the stress and wrench of single cubes."""
 
     def __init__(self, subscribes: bool = True) -> None:
         """subscribes: False when a driver in the same process calls `on_rows`."""
