@@ -1,9 +1,9 @@
-"""mcap storage files as rosbags reads and writes them, but chunk by chunk: a message costs one
-step, not ten.
+"""mcap storage files as rosbags reads and writes them, but chunk by chunk, so that a message costs
+one step instead of ten.
 
-In a chunk messages stand one behind the other, each behind its HEAD: opcode, length of what
-follows, channel, sequence, two times. Chunks carry a checksum: a flipped byte is found when it is
-read.
+A chunk holds messages one after the other, each behind its HEAD: opcode, length of what follows,
+channel, sequence, two times. Chunks carry a checksum, so a flipped byte is detected when the chunk
+is read.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from .rosbags_storage import (
 MESSAGE, CHUNK, INDEX = 5, 6, 7
 CHUNK_BYTES = 1 << 18
 KEPT = 4
-"""Newest chunks that a reader keeps, for whoever reads another topic beside."""
+"""Chunks that a reader keeps, the newest, for another topic that is read at the same time."""
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _HEAD = struct.Struct("<BQHIQQ")
 HEAD = _HEAD.size
@@ -57,7 +57,7 @@ _CHUNK = struct.Struct(
 )  # first and last time, size, checksum, no letters of compression, size again
 _CRC_AT = _RECORD.size + 24
 
-Placed = tuple[int, int, int, int]
+MessageSpan = tuple[int, int, int, int]
 """A message in a chunk: time, channel, where its data begins and ends."""
 
 
@@ -66,13 +66,13 @@ class McapFile(McapReader):
 
     def __init__(self, path: Any) -> None:
         super().__init__(path)
-        self._kept: dict[int, tuple[bytes, list[Placed]]] = {}
+        self._kept: dict[int, tuple[bytes, list[MessageSpan]]] = {}
 
     def messages(
         self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
     ) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """As rosbags': in the order of their times, of some connections, from start until before
-        stop."""
+        """Messages of some connections in the order of their times, from start until before stop,
+        as rosbags gives them."""
         if not self.chunks:
             yield from super().messages(connections, start, stop)
             return
@@ -99,14 +99,14 @@ class McapFile(McapReader):
                     yield wanted[channel], time, data
 
     def _lazily(self, chunk: ChunkInfo) -> Iterator[tuple[int, int, int, bytes]]:
-        """Messages of a chunk and where it stands, behind one of no channel, so that it is read
-        when its time comes."""
+        """Messages of a chunk, and where the chunk is. The first has no channel: it delays reading
+        the chunk until its time comes."""
         yield chunk.message_start_time, chunk.chunk_start_offset, -1, b""
         data, placed = self._read(chunk)
         for time, channel, at, behind in placed:
             yield time, chunk.chunk_start_offset, channel, data[at:behind]
 
-    def _read(self, chunk: ChunkInfo) -> tuple[bytes, list[Placed]]:
+    def _read(self, chunk: ChunkInfo) -> tuple[bytes, list[MessageSpan]]:
         """A chunk, and its messages in the order of their times. ReaderError: damaged."""
         kept = self._kept.get(chunk.chunk_start_offset)
         if kept is not None:
@@ -121,7 +121,7 @@ class McapFile(McapReader):
         data = decompress(stored, chunk.compression, chunk.uncompressed_size, crc)  # type: ignore[arg-type]
         if chunk.compression:
             record, at = data, 0
-        placed = _placed(record, at, at + chunk.uncompressed_size)
+        placed = _message_spans(record, at, at + chunk.uncompressed_size)
         if (
             placed
             and not chunk.message_start_time
@@ -269,9 +269,9 @@ def in_summary(
     return record
 
 
-def _placed(data: bytes, at: int, end: int) -> list[Placed]:
-    """The messages that stand somewhere in a chunk, in the order of their times."""
-    placed: list[Placed] = []
+def _message_spans(data: bytes, at: int, end: int) -> list[MessageSpan]:
+    """The messages of a chunk between two places, in the order of their times."""
+    placed: list[MessageSpan] = []
     unpack = _HEAD.unpack_from
     while at < end:
         if data[at] == MESSAGE:
@@ -287,7 +287,7 @@ def _placed(data: bytes, at: int, end: int) -> list[Placed]:
 
 
 def _overlapping(chunks: list[ChunkInfo]) -> Iterator[list[ChunkInfo]]:
-    """Chunks in the order of their times; together are those whose times overlap."""
+    """Chunks in the order of their times, in groups whose times overlap."""
     together: list[ChunkInfo] = []
     end_ns = -1
     for chunk in sorted(

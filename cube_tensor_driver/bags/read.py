@@ -1,5 +1,5 @@
-"""Bags (rosbag2 folders, or one .mcap or .db3 file) read without ROS. All that is wrong with one is
-a `BagError`."""
+"""Bags (rosbag2 folders, or one .mcap or .db3 file) read without ROS. Whatever is wrong with a bag
+is a `BagError`."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ FREQUENCIES, STRESS, INFO = (
     f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo")
 )
 VERSIONS = (1, 2)
-"""Of SkinInfo that this package reads. An older one that is not among them has to be converted
-here."""
+"""Versions of SkinInfo that this package reads."""
 TOGETHER, TOGETHER_BYTES = 64, 1 << 19
 """Most messages that are decoded at once: the cost of calling numpy no longer counts, and they fit
 the cache."""
@@ -63,7 +62,7 @@ DAMAGE = (
 
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
-    """What goes wrong inside with the bag `path` is a BagError; errors of our own pass."""
+    """Turns what libraries raise about the bag `path` into a BagError; a CubeError passes."""
     try:
         yield
     except CubeError:
@@ -152,7 +151,7 @@ class Bag:
         )
 
     def skin(self) -> str:
-        """What its topics begin with, ending in /. BagError: no skin, or several."""
+        """The prefix of the skin's topics, which ends in /. BagError: no skin, or several."""
         found = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
         if len(found) != 1:
             raise BagError(

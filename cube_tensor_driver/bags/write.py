@@ -1,9 +1,8 @@
 """Bags written as rosbag2 does: a folder with storage files and metadata.yaml, message definitions
 inside.
 
-Each storage file is written by rosbags in a folder of its own and moves up when it is complete, so
-whatever stands in the bag's folder can be read. mcap chunks carry a checksum: a flipped byte is
-found when it is read.
+rosbags writes each storage file in a folder of its own. The file moves up when it is complete, so
+every file in the bag's folder can be read. mcap chunks carry a checksum.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) ->
 
 
 class _Sqlite3Output(Sqlite3Writer):
-    """As rosbags writes it, but for whichever thread has its turn, as files are."""
+    """As rosbags writes it, but usable from any thread, one at a time."""
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
         super().__init__(path, compression)
@@ -145,7 +144,7 @@ class BagWriter:
         """Add B messages of one length, serialised, each behind HEAD bytes: (B, HEAD + bytes).
         BagError: as `write`.
 
-        They come into one storage file. The records are the bag's own from now on.
+        All of them go into one storage file. The caller must not use the records any more.
         """
         self._put(
             len(records),
@@ -155,7 +154,8 @@ class BagWriter:
         )
 
     def flush(self) -> None:
-        """Hand all that was written to the system: it survives the end of this process."""
+        """Hand everything written so far to the system, so that it survives the end of this
+        process."""
         storage = self._writer.storage if self._writer else None
         if isinstance(storage, McapOutput):
             if storage.indexes:
@@ -180,8 +180,8 @@ class BagWriter:
             self._attempt(lambda topic=topic: self._connect(topic))  # type: ignore[misc]
 
     def _put(self, count: int, time_ns: int, size: int, write: Callable[[_Writer], None]) -> None:
-        """Write messages into the storage file that is on, or into the next one where it is large
-        or long enough."""
+        """Write messages into the current storage file, or into the next one if the current one is
+        large or long enough."""
         if (self._max_bytes and self._part_bytes >= self._max_bytes) or (
             self._max_ns and self._part_messages and time_ns - self._part_start_ns >= self._max_ns
         ):
@@ -236,7 +236,7 @@ class BagWriter:
 
 
 def move_up(part: Path) -> None:
-    """Put a storage file out of the folder that it was written in into the bag's folder."""
+    """Move a storage file from the folder that it was written in to the bag's folder."""
     for path in part.iterdir():
         if path.suffix in SUFFIXES.values():
             path.replace(part.parent / path.name)
@@ -297,8 +297,8 @@ def describe_file(name: str, begin_ns: int, end_ns: int, messages: int) -> dict[
 def describe(
     storage: str, files: list[dict[str, Any]], topics: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """All that metadata.yaml says of storage files; mcap files say it of themselves, too. rosbag2
-    misses no key."""
+    """What metadata.yaml says about storage files; an mcap file also says it about itself. rosbag2
+    requires every key."""
     used = [file for file in files if file["message_count"]] or files[:1]
     start = min(file["starting_time"]["nanoseconds_since_epoch"] for file in used)
     end = max(

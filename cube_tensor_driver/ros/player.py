@@ -1,5 +1,5 @@
-"""A bag onto its topics again, bytes as they were recorded, in its own rhythm, with its own clock
-if asked for."""
+"""Publishes a bag on its topics again: the recorded bytes at the recorded intervals, with /clock if
+asked for."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ from .messages import SECOND
 from .recorder import DEPTH, message_class
 
 CLOCK_S = 0.01
-"""Of real time, at least so often the clock is sent; and before every message."""
+"""The clock is published at least so often in real time, and before every message."""
 DISCOVERY_S, NOBODY_S, LOOK_S = 1.0, 3.0, 0.1
-"""Before the first message: no further subscriber has found the publishers for so long; or none of
-frequencies at all.
+"""The first message waits until no further subscriber has come for DISCOVERY_S, or until nobody
+has subscribed to frequencies for NOBODY_S.
 
-Each topic is discovered in its own time: that somebody hears of `info` says nothing of
-`frequencies` yet.
+Each topic is discovered separately: a subscriber to `info` need not have found `frequencies` yet.
 """
 SHOWN_NS = 100_000_000
-"""So much of the bag is published after a jump, though the player is paused: enough for every link
-to deliver."""
+"""Length of bag that is published after a jump while the player is paused: enough for a row of
+every link."""
 MADE = (
     f"{PACKAGE}/msg/SkinStress",
     f"{PACKAGE}/msg/StressTensorStamped",
     "geometry_msgs/msg/WrenchStamped",
 )
-"""Types that a reconstruction makes, of topics that are left out unless stress is asked for."""
+"""Types that a reconstruction publishes. Their topics are left out unless stress is asked for."""
 
 
 class Player:
@@ -84,20 +83,20 @@ class Player:
         return self._paused
 
     def pause(self, paused: bool) -> None:
-        """Hold the bag, or go on."""
+        """Pause, or go on."""
         with self._wake:
             self._paused, self._steps = paused, 0
             self._wake.notify()
 
     def step(self) -> None:
-        """While paused: the next message of frequencies, and what stands before it."""
+        """While paused: publish the next message of frequencies, and what comes before it."""
         with self._wake:
             self._steps += 1
             self._wake.notify()
 
     def jump(self, position: float, paused: bool) -> None:
-        """Go on from there, or hold there once what stands there has been published. BagError: not
-        in the bag."""
+        """Go on from a position, or pause there after SHOWN_NS of the bag. BagError: it is not in
+        the bag."""
         to_ns = max(self._bag.start_ns, min(self._at(position), self._bag.end_ns - SHOWN_NS))
         with self._wake:
             self._jump_ns, self._paused, self._steps = to_ns, paused, 0
@@ -110,8 +109,8 @@ class Player:
             self._wake.notify()
 
     def run(self, start: float, loop: bool, hold: bool = False) -> None:
-        """Publish from `start` to the end of the bag, over and over with `loop`; with `hold` wait
-        there to be steered.
+        """Publish from `start` to the end of the bag, again and again with `loop`. With `hold`,
+        pause at the end and wait for `jump` or `end`.
 
         BagError: damaged, or start is not in the bag.
         """
@@ -132,7 +131,7 @@ class Player:
                     self._shown_ns = next_ns + SHOWN_NS
 
     def _await_subscribers(self) -> None:
-        """Until those who listen have found the publishers."""
+        """Wait until subscribers have found the publishers."""
         publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
         raw = [
             publisher
@@ -184,7 +183,7 @@ class Player:
         for entry in self._bag.entries(set(self._publishers), start_ns):
             if not self._wait(entry.time_ns):
                 return
-            self._say(entry.time_ns)
+            self._publish_clock(entry.time_ns)
             self._publish(entry)
             self.position = (entry.time_ns - self._bag.start_ns) / SECOND
             if self._steps and entry.topic.endswith("frequencies"):
@@ -192,11 +191,11 @@ class Player:
                     self._steps -= 1
 
     def _anchor(self, bag_ns: int) -> None:
-        """From now on bag_ns is now."""
+        """Let the time bag_ns of the bag be now."""
         self._bag_ns, self._begun = bag_ns, time.monotonic()
 
     def _wait(self, bag_ns: int) -> bool:
-        """Until a message is due; False: asked to end or to jump."""
+        """Wait until a message is due. False: the player shall end or jump."""
         with self._wake:
             while not self.stop.is_set() and self._jump_ns is None:
                 if self._paused:
@@ -212,12 +211,12 @@ class Player:
                 if left <= 0:
                     return True
                 if self._clock is not None:
-                    self._say(bag_ns - round(left * self._rate * SECOND))
+                    self._publish_clock(bag_ns - round(left * self._rate * SECOND))
                     left = min(left, CLOCK_S)
                 self._wake.wait(left)
         return False
 
-    def _say(self, bag_ns: int) -> None:
+    def _publish_clock(self, bag_ns: int) -> None:
         if self._clock is not None:
             self._clock.publish(Clock(clock=Time(sec=bag_ns // SECOND, nanosec=bag_ns % SECOND)))
 

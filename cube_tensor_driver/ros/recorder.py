@@ -1,5 +1,5 @@
-"""Topics into a bag, bytes as they come: the main thread takes messages, a thread of its own writes
-them."""
+"""Records topics into a bag, in the bytes in which messages arrive. The main thread receives them,
+a separate thread writes them."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from ..core.errors import BagError
 
 DEPTH = 2000
 WRITE_S = 0.05
-"""How often the writing thread looks what there is: seldom, so that it does not contend for the
+"""How often the writing thread looks for messages: seldom, so that it does not contend for the
 interpreter."""
 FLUSH_S = 0.25
-"""How often all that was written is handed to the system: what a kill -9 can cost, twice over."""
+"""How often written data is handed to the system. A kill -9 costs at most twice this time."""
 WAITING_BYTES = 256 << 20
-"""Of messages that the disk has not taken yet; what comes on top is dropped and counted."""
+"""Messages that wait for the disk; those beyond it are dropped and counted."""
 
 
 class Recorder:
     """Records `topics` of a node's graph into a bag from now until `close`.
 
-    Topics that appear later are taken up by `find_topics`, to be called now and then. received,
-    dropped: messages.
+    Call `find_topics` now and then: it subscribes to topics that have appeared. received, dropped:
+    messages. counts: messages of each topic. refused: why a topic is not recorded.
     """
 
     def __init__(self, node: Node, topics: Sequence[str], bag: BagWriter) -> None:
@@ -92,7 +92,7 @@ class Recorder:
         clock = self._node.get_clock()
         self.counts[topic] = 0
 
-        def take(data: bytes) -> None:
+        def receive(data: bytes) -> None:
             self.received += 1
             self.counts[topic] += 1
             if (
@@ -113,7 +113,7 @@ class Recorder:
         )
         self._subscriptions.append(
             self._node.create_subscription(
-                message_class(topic, msgtype), topic, take, profile, raw=True
+                message_class(topic, msgtype), topic, receive, profile, raw=True
             )
         )
 

@@ -1,4 +1,4 @@
-"""A player steered over ROS: its state as a topic, hold, go on and jump as a service."""
+"""Control of a player over ROS: a topic with its state, and a service to pause, resume and jump."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class ReplayControl:
         self._player = player
         self._state = node.create_publisher(ReplayState, "~/state", 1)
         node.create_service(SteerReplay, "~/steer", self._steer)
-        node.create_timer(STATE_S, self._say)
+        node.create_timer(STATE_S, self._publish_state)
 
-    def _say(self) -> None:
+    def _publish_state(self) -> None:
         player = self._player
         self._state.publish(
             ReplayState(position=player.position, length=player.length, paused=player.paused)
