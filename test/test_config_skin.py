@@ -4,6 +4,7 @@ was found and what is allowed."""
 from __future__ import annotations
 
 import copy
+import os
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,11 @@ import yaml
 
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.load_table import read_loads
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import check_skin, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
-from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.core.errors import ConfigError, FitError
 
 GOOD = grid(nx=3, ny=2, pitch=0.012, links=2, rate=100.0)
 
@@ -250,6 +252,59 @@ def test_missing_file_and_folder_and_size(tmp_path, monkeypatch):
     monkeypatch.setattr("cube_tensor_driver.config.yaml.MAX_BYTES", 10)
     with pytest.raises(ConfigError, match="the limit is 10"):
         read(tmp_path, GOOD)
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("/dev/zero", ["a device", "regular file"]),
+        ("pipe", ["a pipe", "regular file"]),
+        ("/proc/self/maps", ["the limit is 1000"]),  # its size is 0
+    ],
+)
+def test_only_regular_files_are_read_and_only_up_to_their_limit(tmp_path, monkeypatch, path, words):
+    """A device has no end and a pipe waits for ever: neither is read at all."""
+    os.mkfifo(tmp_path / "pipe")
+    monkeypatch.setattr("cube_tensor_driver.config.yaml.MAX_BYTES", 1000)
+    monkeypatch.setattr("cube_tensor_driver.config.load_table.MAX_BYTES", 1000)
+    layout = read_skin(package_data() / "config" / "cube.yaml").calibrations[0].layout
+    for read_one in (read_skin, lambda at: read_loads(at, layout)):
+        with pytest.raises((ConfigError, FitError)) as caught:
+            read_one(tmp_path / path)
+        assert "\n" not in str(caught.value)
+        for word in words:
+            assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 200_000, ["lists and mappings within each other", "100"]),
+        ("{a: " * 200_000, ["lists and mappings within each other"]),
+        ("- " * 200_000, ["lists and mappings within each other"]),
+        ("a: &a [*a]", ["alias 'a'"]),
+        # Nine aliases of nine aliases of …: small as a file, 3.5e9 values when written out.
+        (
+            "a0: &a0 [x]\n"
+            + "".join(f"a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(10)),
+            ["more than 2000000 values"],
+        ),
+        ("rate: " + ":".join(["1"] * 200_000), ["a number of 399999 characters"]),
+        ("rate: 0x" + "f" * 90, ["an integer of", "bits"]),
+        ("rate: !!int " + "1" * 5000, ["a number of 5000 characters"]),
+        ("rate: 1" + ":1" * 400 + ".5", ["a number of"]),
+        ("rate: !!bool maybe", ["not YAML"]),
+        ("rate: !!timestamp never", ["not YAML"]),
+    ],
+    ids=lambda part: part[:12] if isinstance(part, str) else "",
+)
+def test_yaml_that_would_cost_too_much_is_one_line(tmp_path, text, words):
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path, text)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+    for word in words:
+        assert word in str(caught.value)
 
 
 def test_merged_keys_may_be_overridden():

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import FitError
+from ..core.errors import ConfigError, FitError
 from ..core.fit import traction_loads
 from ..core.layout import Layout
 from ..core.modes import Modes
 from ..core.symmetry import default_modes
+from .input_files import read_bounded
 from .yaml import MAX_BYTES
 
 FORCE = ("fx", "fy", "fz")
@@ -121,10 +123,12 @@ def _read_cells(path: Path) -> tuple[list[str], NDArray[np.float64]]:
 def _read_lines(path: Path) -> list[list[str]]:
     """The cells of each line, without spaces around them; empty lines are left out."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise FitError(f"{path}: larger than {MAX_BYTES} bytes: this is no table of loads")
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [[cell.strip() for cell in line] for line in csv.reader(file)]
+        text = read_bounded(path, MAX_BYTES, "table of loads").decode("utf-8-sig")
+        lines = [
+            [cell.strip() for cell in line] for line in csv.reader(io.StringIO(text, newline=""))
+        ]
+    except ConfigError as error:
+        raise FitError(str(error)) from None
     except OSError as error:
         raise FitError(f"{path}: {error.strerror}; name a CSV file that can be read") from None
     except (UnicodeDecodeError, csv.Error) as error:
