@@ -127,6 +127,13 @@ def change(*path, to=None, remove=False):
             ["cubes[0].calibration", "'nope'", "planar, planar_slab"],
         ),
         (change("links", to=[]), ["links", "at least one"]),
+        (
+            change("links", 1, "port", to="spy:///dev/null?file=/tmp/x"),
+            ["links: port of hub1", "'spy:///dev/null?file=/tmp/x'", "a device path"],
+        ),
+        (change("links", 1, "port", to="rfc2217://h:5"), ["hub1", "socket://host:port"]),
+        (change("links", 1, "port", to="socket://h"), ["hub1", "a port from 1 to 65535"]),
+        (change("links", 1, "port", to="a\nb"), ["hub1", "a device path"]),
         (change("parent_frame", remove=True), ["'parent_frame' is missing"]),
         (change("rate", to=0), ["rate", "found 0", "0.1 to 10000"]),
         (change("rate", to=float("nan")), ["rate", "found nan"]),

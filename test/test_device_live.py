@@ -17,7 +17,7 @@ import pytest
 
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
-from cube_tensor_driver.core.errors import ConfigError, LinkError
+from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device import live
 from cube_tensor_driver.device.chain import MAX_SCANS
@@ -321,12 +321,15 @@ def test_a_reader_that_fails_raises_its_error_in_the_iteration(
             next(iter(source))
 
 
-def test_arguments_that_cannot_be_used_are_refused() -> None:
+def test_arguments_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"rate is -1, allowed: 0\.1 to 10000"):
         open_links(make_skin(1), rate=-1)
     with pytest.raises(ConfigError, match=r"rate is nan"):
         open_links(make_skin(1), rate=float("nan"))
     with pytest.raises(ConfigError, match=r"port is '/dev/x', but the skin test has 2 links"):
         open_links(make_skin(1, 1), port="/dev/x")
-    with pytest.raises(LinkError, match="port from 1 to 65535"):
+    with pytest.raises(ConfigError, match="port from 1 to 65535"):
         open_links(make_skin(1), port="socket://nowhere")
+    with pytest.raises(ConfigError, match="a device path, a pattern"):
+        open_links(make_skin(1), port=f"spy:///dev/null?file={tmp_path}/log")
+    assert list(tmp_path.iterdir()) == []

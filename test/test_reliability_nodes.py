@@ -230,6 +230,7 @@ def test_parameters_live(stage):
     for node, name, value, words in (
         ("driver", "rate", -1.0, "range"),
         ("driver", "config", "other.yaml", "while the node is configured"),
+        ("driver", "port", "spy:///dev/null?file=/nowhere/log", "a device path"),
         ("driver", "qos_reliability", "maybe", "reliable, best_effort"),
         ("reconstruction", "drift_time", float("nan"), ""),
         ("reconstruction", "tare_duration", 60.0, "range"),

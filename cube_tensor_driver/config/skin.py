@@ -12,6 +12,7 @@ from typing import Any
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError, CubeError
 from .calibration import find_calibration, read_calibration
+from .port import port_problem
 from .schema import NAME, TEXT, TRIPLE, Schema, list_of, mapping, real
 from .yaml import read_yaml
 
@@ -270,6 +271,10 @@ class _CubeReader:
 
 
 def _link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
+    for link in links:
+        problem = port_problem(link.port)
+        if problem:
+            yield f"links: port of {link.name}: {problem}"
     yield from _repeated("links", "name", [repr(link.name) for link in links])
     hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
     yield from _repeated("links", "hub_uid", hub_uids)

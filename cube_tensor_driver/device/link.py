@@ -1,7 +1,7 @@
 """One link: a byte stream from and to a hub over a serial port, a pseudo-terminal or TCP.
 
 Nothing here blocks, has a thread or knows a frame; `reader.py` drives it. Serial ports are opened
-by pyserial (``serial_for_url``) and read with ``os.read``, which gives up to 4 kB per call. What
+by pyserial, by their path only, and read with ``os.read``, which gives up to 4 kB per call. What
 goes wrong is a `LinkError`. Its `kind` is one word, its text names the fix:
 
     no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
@@ -26,10 +26,11 @@ from pathlib import Path
 
 import serial
 
+from ..config.port import TCP, port_problem
 from ..core.errors import LinkError
 from .decoder import Decoder
 from .protocol import Hello
-from .tcp import Connecting, parse_url
+from .tcp import Connecting
 
 READ_CHUNK = 1 << 16
 """Bytes read from one link at a time, so that a link that floods does not hold up the others."""
@@ -74,8 +75,8 @@ class LinkState(str, Enum):
 class LinkConfig:
     """Where a hub is.
 
-    port: device path, ``socket://host:port``, or another URL that pyserial opens. A device path may
-    be a pattern such as ``/dev/ttyACM*``: its matches are tried one after the other, which finds a
+    port: device path or ``socket://host:port``; other URLs are refused. A device path may be a
+    pattern such as ``/dev/ttyACM*``: its matches are tried one after the other, which finds a
     hub that comes back under another name.
     baud: ignored by USB and TCP.
     hub_uid: the hub that must answer; None for any.
@@ -95,7 +96,7 @@ class Link:
     """
 
     def __init__(self, config: LinkConfig) -> None:
-        """LinkError `bad_port`: an empty port, or a TCP address that cannot be read."""
+        """LinkError `bad_port`: neither a device path nor a TCP address."""
         self.config = config
         self.state = LinkState.CLOSED
         self.error: LinkError | None = None
@@ -104,20 +105,16 @@ class Link:
         self.opened = self.lost = self.silences = self.before_hello = self.bytes_out = 0
         self.path = config.port
         self.is_pattern = "://" not in config.port and glob.has_magic(config.port)
-        self._tcp = config.port.startswith("socket://")
-        self._stream: serial.SerialBase | socket.socket | None = None
+        self._tcp = config.port.startswith(TCP)
+        self._stream: serial.Serial | socket.socket | None = None
         self._connecting: Connecting | None = None
         self._fd = -1
         self._out = bytearray()
         self._backoff = BACKOFF_S[0]
         self._first_candidate = 0  # which match of the pattern to try first
-        if self._tcp:
-            parse_url(config.port)
-        elif not config.port:
-            raise LinkError(
-                f"link {config.name!r} has an empty port: name a device path or socket://host:port",
-                "bad_port",
-            )
+        problem = port_problem(config.port)
+        if problem:
+            raise LinkError(f"link {config.name!r}: port: {problem}", "bad_port")
 
     @property
     def counters(self) -> dict[str, int]:
@@ -303,25 +300,17 @@ def open_error(path: str, error: BaseException) -> LinkError:
     return LinkError(f"{path}: cannot open it ({error}): correct the port", "bad_port")
 
 
-def _open_port(path: str, baud: int) -> serial.SerialBase:
+def _open_port(path: str, baud: int) -> serial.Serial:
     try:
         # inter_byte_timeout=0 sets VMIN to 1: then reading an empty port gives EAGAIN, and b""
         # always means unplugged.
-        port = serial.serial_for_url(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
+        port = serial.Serial(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
     except (OSError, termios.error) as error:
         raise open_error(path, error) from error
     except ValueError as error:
         kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"
         raise LinkError(
             f"{path} at {baud} baud: {error}: correct the port or the baud rate", kind
-        ) from error
-    try:
-        port.fileno()
-    except (AttributeError, OSError) as error:
-        port.close()
-        raise LinkError(
-            f"{path}: this kind of port cannot be waited on: use a device path or socket://",
-            "bad_port",
         ) from error
     with contextlib.suppress(ValueError, AttributeError, NotImplementedError, OSError):
         port.set_low_latency_mode(True)

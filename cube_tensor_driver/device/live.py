@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from ..config.port import port_problem
 from ..config.skin import Skin
 from ..core.errors import ConfigError
 from ..core.rows import FrequencyRows
@@ -36,8 +37,8 @@ def open_links(
     rate: samples per second to ask of the hubs, 0.1 to 10000; None: as the skin file says.
     port: instead of the one in the skin file, for a skin with one link.
     port_directory: folder with the links' ports under the links' names, as of simulated hubs.
-    A port that is not there yet is waited for. ConfigError: an argument that cannot be used.
-    LinkError `bad_port`: a port that can never be opened.
+    A port that is not there yet is waited for. ConfigError: an argument that cannot be used, or a
+    port that can never be opened.
     """
     low, high = RATE_LIMITS
     if rate is not None and not low <= rate <= high:
@@ -49,7 +50,7 @@ def open_links(
 def link_configs(skin: Skin, port: str = "", port_directory: str | Path = "") -> list[LinkConfig]:
     """The links of a skin, with other ports if they are given; see `open_links`.
 
-    ConfigError: one port for a skin with several links.
+    ConfigError: one port for a skin with several links, or a port that can never be opened.
     """
     if port and len(skin.links) > 1:
         raise ConfigError(
@@ -59,7 +60,11 @@ def link_configs(skin: Skin, port: str = "", port_directory: str | Path = "") ->
     configs = []
     for link in skin.links:
         path = str(Path(port_directory) / link.name) if port_directory else link.port
-        configs.append(LinkConfig(link.name, port or path, link.baud, link.hub_uid))
+        chosen = port or path
+        problem = port_problem(chosen)
+        if problem:
+            raise ConfigError(f"link {link.name}: port: {problem}")
+        configs.append(LinkConfig(link.name, chosen, link.baud, link.hub_uid))
     return configs
 
 

@@ -13,8 +13,8 @@ import socket
 import threading
 import time
 from typing import Any
-from urllib.parse import urlsplit
 
+from ..config.port import port_problem, tcp_address
 from ..core.errors import LinkError
 
 CONNECT_TIMEOUT_S = 2.0
@@ -23,17 +23,10 @@ CONNECT_TIMEOUT_S = 2.0
 
 def parse_url(url: str) -> tuple[str, int]:
     """Host and port of ``socket://host:port``, IPv6 hosts in brackets. LinkError `bad_port`."""
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host, port = None, None
-    if not host or not port:
-        raise LinkError(
-            f"{url!r} is no TCP address: write socket://host:port with a port from 1 to 65535",
-            "bad_port",
-        )
-    return host, port
+    address = tcp_address(url)
+    if address is None:
+        raise LinkError(port_problem(url), "bad_port")
+    return address
 
 
 class Connecting:

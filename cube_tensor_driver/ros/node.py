@@ -170,6 +170,10 @@ class CubeNode(LifecycleNode):
             return f"parameter {name} is {value}, allowed: a finite number"
         if known is not None and known.least is not None and 0 < value < known.least:
             return f"parameter {name} is {value}, allowed: 0, or at least {known.least:g}"
+        if known is not None and known.problem is not None and value:
+            problem = known.problem(value)
+            if problem:
+                return f"parameter {name}: {problem}"
         if self.configured and known is not None and not known.live:
             return (
                 f"parameter {name} cannot change while the node is configured: "

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from ..config.port import port_problem
 from ..core.defaults import CONTACT_PRESSURE, SURFACE_DEPTH
 from ..core.scene import QUANTITIES
 
@@ -15,6 +17,7 @@ class Parameter(NamedTuple):
     choices: of a text, separated by commas
     live: it may change while the node is configured
     least: lowest value other than 0
+    problem: what is wrong with a text that is not empty, in words; empty if nothing is
     """
 
     name: str
@@ -24,6 +27,7 @@ class Parameter(NamedTuple):
     choices: str = ""
     live: bool = False
     least: float | None = None
+    problem: Callable[[str], str] | None = None
 
 
 AUTOSTART = Parameter(
@@ -38,7 +42,12 @@ RELIABILITY = Parameter(
 DRIVER = (
     AUTOSTART,
     Parameter("config", "", "Skin file (YAML)."),
-    Parameter("port", "", "Port instead of the one in the skin file, for a skin with one link."),
+    Parameter(
+        "port",
+        "",
+        "Port instead of the one in the skin file, for a skin with one link.",
+        problem=port_problem,
+    ),
     Parameter(
         "port_directory",
         "",
