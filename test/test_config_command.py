@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
+from cube_tensor_driver.cli.config import check_file
+from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 
 
@@ -56,6 +59,12 @@ def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
     [
         (["--nx", 0, "--ny", 1], 2, "--nx: '0' is not a whole number of at least 1"),
         (["--nx", 2, "--ny", 1, "--links", 3], 1, "3 links for 2 cubes"),
+        (["--nx", 1000, "--ny", 1000], 1, "1000000 cubes, a skin has at most 65536"),
+        (["--nx", 2, "--ny", 1, "--links", 2, "--port", "/dev/x"], 1, "is that of all 2 links"),
+        (["--nx", 1, "--ny", 1, "--layout", "banana"], 1, "'banana'"),
+        (["--nx", 1, "--ny", 1, "--name", "a skin"], 1, "name: found 'a skin', allowed: a name"),
+        (["--nx", 1, "--ny", 1, "--rate", 1e9], 1, "rate: found 1000000000.0"),
+        (["--nx", 1, "--ny", 1, "--port", "socket://host"], 1, "write socket://host:port"),
     ],
 )
 def test_a_grid_that_cannot_be(tmp_path, arguments, code, words):
@@ -72,3 +81,63 @@ def test_check_says_what_is_wrong(tmp_path):
         f"cube: {path}: top level: the key 'parent_frame', 'cubes' is missing",
         f"cube: {path}: links: found [], allowed: a list of links, at least one",
     ]
+
+
+def test_a_grid_of_another_layout_has_its_calibration_and_replaces_no_file(tmp_path):
+    arguments = "--nx", 2, "--ny", 1, "--layout", "cube", "--port", "/dev/{name}", "-o"
+    path = tmp_path / "skin.yaml"
+    done = cube("config", "grid", *arguments, path)
+    assert done.returncode == 0, done.stderr
+    assert {cube.calibration.layout.name for cube in read_skin(path).cubes} == {"cube"}
+    before = path.read_bytes()
+    done = cube("config", "grid", *arguments, path)
+    assert done.returncode == 1 and f"{path}: the file is there" in done.stderr
+    assert path.read_bytes() == before
+
+
+def written(tmp_path, **changes):
+    """A skin file of 3 x 1 cubes on 3 links, with changes."""
+    skin = grid(nx=3, ny=1, pitch=0.012, rate=100.0, links=3)
+    for key, values in changes.items():
+        for item, value in zip(skin["cubes" if key == "xyz" else "links"], values, strict=False):
+            if key == "xyz":
+                item["pose"]["xyz"] = value
+            else:
+                item[key] = value
+    path = tmp_path / "skin.yaml"
+    write_yaml(path, skin)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"port": ["/dev/a", "/dev/a"]}, "the port '/dev/a' appears twice"),
+        ({"port": ["socket://host"]}, "'socket://host' is no TCP address: write socket://"),
+        ({"xyz": [[0.0, 0.0, 0.1]] * 2}, "'c0', 'c1' are at one place, [0, 0, 0.1] m"),
+        ({"xyz": [[-12.0, 0, 0], [0, 0, 0], [12, 0, 0]]}, "what was typed in mm"),
+        ({"xyz": [[-1.5, 0, 0], [0, 0, 0], [1.5, 0, 0]]}, "what was typed in mm"),
+        (
+            {"port": ["/dev/ttyUSB0"], "baud": [9600]},
+            "1 of the cubes at 100 Hz send 6900 bytes per second, 9600 baud carry 960",
+        ),
+    ],
+)
+def test_check_says_what_no_skin_can_be(tmp_path, capsys, changes, words):
+    assert check_file(written(tmp_path, **changes)) == 1
+    output = capsys.readouterr()
+    assert words in output.err and not output.out
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"port": ["/dev/serial/by-id/*"] * 2},
+        {"port": ["socket://[::1]:5", "socket://[::1]:6"]},
+        {"xyz": [[0, 0, 0], [1.5, 0, 0], [1.512, 0, 0]]},
+        {"port": ["/dev/ttyACM7", "/dev/ttyUSB0"], "baud": [9600, 115200]},
+    ],
+)
+def test_check_accepts_what_may_be_meant(tmp_path, capsys, changes):
+    assert check_file(written(tmp_path, **changes)) == 0
+    assert "nothing wrong" in capsys.readouterr().out

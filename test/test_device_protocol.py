@@ -25,6 +25,7 @@ from cube_tensor_driver.device.protocol import (
     Stats,
     encode,
     join,
+    sample_bytes,
 )
 
 DOC = (Path(__file__).parent.parent / "docs" / "protocol.md").read_text(encoding="utf-8")
@@ -104,6 +105,20 @@ def test_page_agrees_with_itself(name: str) -> None:
     assert int.from_bytes(raw[2:4], "little") == len(raw) - 8
     assert int.from_bytes(raw[-4:], "little") == crc_of(raw[:-4])
     assert dump("wire", name) == b"\0" + cobs_of(raw) + b"\0"
+
+
+@pytest.mark.parametrize(("n_cubes", "n_pads"), [(1, 8), (5, 24), (500, 8)])
+def test_bytes_of_a_sample_are_known_beforehand(n_cubes: int, n_pads: int) -> None:
+    frequency = np.full((n_cubes, n_pads), 0x01010101, "<u4")
+    full = Sample(
+        0x01010101,
+        0,
+        0x0101010101010101,
+        frequency,
+        np.full(n_cubes, 0x01010101, "<u4"),
+        np.full(n_cubes, 0x0101, "<i2"),
+    )
+    assert abs(len(encode(full)) - sample_bytes(n_cubes, n_pads)) <= 1
 
 
 @pytest.mark.parametrize("name", CASES)

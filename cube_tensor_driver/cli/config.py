@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from .parser import Parser, count, positive
 
@@ -49,9 +50,8 @@ def arguments(parser: Parser) -> None:
     )
     grid.add_argument(
         "--calibration",
-        default="planar",
         metavar="FILE",
-        help="calibration file or name (default: %(default)s)",
+        help="calibration file or name (default: that of the package for the layout)",
     )
     grid.add_output("-o", "--output", required=True, help="skin file to write")
     check = parser.add_subcommand("check", "list what is wrong with a skin file, or what it holds")
@@ -63,9 +63,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 def write_grid(options: argparse.Namespace) -> int:
+    """ConfigError: the file is there, or would be one that `config check` refuses."""
     from ..config.grid import grid
+    from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
+    from ..core.errors import ConfigError
 
+    if options.output.exists():
+        raise ConfigError(f"-o {options.output}: the file is there; remove it, or name another one")
     skin = grid(
         options.name,
         nx=options.nx,
@@ -77,24 +82,44 @@ def write_grid(options: argparse.Namespace) -> int:
         rate=options.rate,
         port=options.port,
     )
+    _, mistakes = check_skin_data(ends_of_links(skin), options.output.parent)
+    if mistakes:
+        raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
-    text = f"{size}, on {options.links} links"
+    text = f"{size}, on {options.links} {'link' if options.links == 1 else 'links'}"
     write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
     print(f"wrote {options.output}: {text}")
     return 0
 
 
+def ends_of_links(skin: dict[str, Any]) -> dict[str, Any]:
+    """The content of a grid's file with the first and the last cube of each link only: the others
+    have no mistake that these do not have."""
+    first: dict[str, Any] = {}
+    last: dict[str, Any] = {}
+    for cube in skin["cubes"]:
+        first.setdefault(cube["link"], cube)
+        last[cube["link"]] = cube
+    ends = {cube["name"]: cube for cube in (*first.values(), *last.values())}
+    return skin | {"cubes": list(ends.values())}
+
+
 def check_file(path: Path) -> int:
-    """Print every mistake of a skin file and return 1, or print what the file holds."""
+    """Print what is wrong with a skin file and return 1, or print what the file holds."""
+    from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin
+    from ..device.line_load import line_doubts
 
     skin, mistakes = check_skin(path)
-    if skin is None:
-        for mistake in mistakes:
-            print(f"cube: {path}: {mistake}", file=sys.stderr)
+    if skin is not None:
+        mistakes = [*pose_doubts(skin), *line_doubts(skin)]
+    for mistake in mistakes:
+        print(f"cube: {path}: {mistake}", file=sys.stderr)
+    if skin is None or mistakes:
         return 1
     layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
     cubes = ", ".join(f"{number} {name}" for name, number in layouts.items())
     rate = "the rate of the hubs" if skin.rate is None else f"{skin.rate:g} Hz"
-    print(f"{path}: skin {skin.name}, {cubes} on {len(skin.links)} links, {rate}: nothing wrong")
+    links = f"{len(skin.links)} {'link' if len(skin.links) == 1 else 'links'}"
+    print(f"{path}: skin {skin.name}, {cubes} on {links}, {rate}: nothing wrong")
     return 0

@@ -6,6 +6,11 @@ from typing import Any
 
 from ..core.errors import ConfigError
 
+MOST_CUBES = 1 << 16
+"""Messages number cubes with 16 bits."""
+PLACE = "{}"
+"""In a port, for the number of the link."""
+
 
 def grid(
     name: str = "skin",
@@ -15,7 +20,7 @@ def grid(
     pitch: float,
     rate: float,
     links: int = 1,
-    calibration: str = "planar",
+    calibration: str | None = None,
     layout: str = "planar",
     port: str = "/dev/ttyACM{}",
 ) -> dict[str, Any]:
@@ -23,9 +28,11 @@ def grid(
 
     The grid is centred on the frame's origin; x runs fastest. pitch: distance of neighbours, m.
     rate: samples per second. The links carry equally many cubes, or one more, in order. port: the
-    port of each link, where {} stands for the number of the link.
+    port of each link, where {} stands for the number of the link. calibration: file or name;
+    None: that of the package for the layout.
 
-    Raises ConfigError if a number is not greater than 0, or if there are more links than cubes.
+    Raises ConfigError if a number is not greater than 0, if there are more links than cubes or
+    more cubes than messages can number, or if all links would have one port.
     """
     numbers = {"nx": nx, "ny": ny, "pitch": pitch, "links": links, "rate": rate}
     for what, value in numbers.items():
@@ -34,6 +41,17 @@ def grid(
     count = nx * ny
     if links > count:
         raise ConfigError(f"grid: {links} links for {count} cubes; use at most one link per cube")
+
+    if count > MOST_CUBES:
+        raise ConfigError(
+            f"grid: {nx} x {ny} are {count} cubes, a skin has at most {MOST_CUBES}: "
+            "make several skins"
+        )
+    if links > 1 and PLACE not in port:
+        raise ConfigError(
+            f"grid: the port {port!r} is that of all {links} links; write {PLACE} where the number "
+            "of the link belongs"
+        )
 
     digits = len(str(count - 1))
     cubes = []
@@ -49,13 +67,15 @@ def grid(
                 "index": number - first_of_link,
                 "pose": {"xyz": [round(x, 9), round(y, 9), 0.0], "rpy": [0.0, 0.0, 0.0]},
                 "layout": layout,
-                "calibration": calibration,
+                "calibration": calibration or layout,
             }
         )
     return {
         "name": name,
         "parent_frame": f"{name}_base",
         "rate": rate,
-        "links": [{"name": f"hub{link}", "port": port.format(link)} for link in range(links)],
+        "links": [
+            {"name": f"hub{link}", "port": port.replace(PLACE, str(link))} for link in range(links)
+        ],
         "cubes": cubes,
     }

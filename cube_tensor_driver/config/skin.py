@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from glob import has_magic
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +168,11 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
     Entries beside a malformed one are checked as well. Raises ConfigError if the file cannot be
     read or is not YAML.
     """
-    data = read_yaml(path)
+    return check_skin_data(read_yaml(path), path.parent)
+
+
+def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
+    """As `check_skin`, of the content of a file that is or will be in `folder`."""
     found = _SCHEMA.mistakes(data)
     mistakes = [line for _, line in found]
     if not isinstance(data, dict):
@@ -186,7 +191,7 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
 
     # Where a link is malformed its name is unknown, so no cube can be blamed for naming it.
     all_links_known = len({link.name for link in links}) == len(data["links"])
-    reader = _CubeReader(path.parent, [link.name for link in links] if all_links_known else None)
+    reader = _CubeReader(folder, [link.name for link in links] if all_links_known else None)
     for number, item in enumerate(data["cubes"]):
         if ("cubes", number) not in malformed:
             reader.read(number, item)
@@ -278,6 +283,9 @@ def _link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
     yield from _repeated("links", "name", [repr(link.name) for link in links])
     hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
     yield from _repeated("links", "hub_uid", hub_uids)
+    # Each match of a pattern is tried: two links may share one.
+    ports = [repr(link.port) for link in links if "://" in link.port or not has_magic(link.port)]
+    yield from _repeated("links", "port", ports)
 
 
 def _cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:

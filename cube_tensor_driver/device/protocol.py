@@ -292,6 +292,13 @@ UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
 }
 
 
+def sample_bytes(n_cubes: int, n_pads: int) -> int:
+    """How many bytes one SAMPLE of all cubes of a hub takes on the wire, in one frame."""
+    frame = _FREQUENCY + n_cubes * (4 * n_pads + 4 + 2) + 4
+    # COBS adds one byte in 254, and each frame lies between two zeros.
+    return frame + 1 + frame // 254 + 2
+
+
 def encode(frame: Frame, version: int = VERSION) -> bytes:
     """Bytes of one frame: a zero, the COBS code of header, payload and CRC-32, a zero.
 
