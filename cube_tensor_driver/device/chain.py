@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -18,8 +19,9 @@ from ..core.rows import FrequencyRows
 from .clock import ClockMap
 from .cube_table import CubeAddress
 from .link import Link, LinkConfig, LinkState
-from .protocol import VERSION, Command, Hello, Request, Sample, Stats
+from .protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats
 from .reader import LinkFrames, Reader
+from .row_account import RowAccount, RowCounts
 from .scan import MakeRows, ScanBuilder, empty_rows
 from .sequence import Account, Arrival
 
@@ -38,22 +40,6 @@ class Log(Protocol):
     def warning(self, message: str, /) -> object: ...
 
     def error(self, message: str, /) -> object: ...
-
-
-@dataclass(frozen=True)
-class RowCounts:
-    """What became of the rows that came in.
-
-    delivered: given to the callback
-    unknown_cube: left out because the skin does not have the cube
-    wrong_pads: left out because the skin has the cube with another number of pads
-    unaccounted: none of these, and not waiting for their scan; always 0
-    """
-
-    delivered: int
-    unknown_cube: int
-    wrong_pads: int
-    unaccounted: int
 
 
 @dataclass(frozen=True)
@@ -130,8 +116,8 @@ class LiveLinks:
         self._make_rows = make_rows
         self._clock_ns = clock_ns
         self._log: Log = log or logging.getLogger(__name__)
-        self._delivered = 0
-        self._unaccounted = 0
+        self._rows = RowAccount(self._scans)
+        self._errors = 0
         self._reader: Reader | None = None
 
     def start(self) -> None:
@@ -170,7 +156,8 @@ class LiveLinks:
     @property
     def callback_errors(self) -> int:
         """How often a callback in the reader's thread has failed."""
-        return 0 if self._reader is None else self._reader.callback_errors
+        in_reader = 0 if self._reader is None else self._reader.callback_errors
+        return self._errors + in_reader
 
     @property
     def cube_uids(self) -> dict[int, int]:
@@ -179,8 +166,7 @@ class LiveLinks:
 
     def row_counts(self) -> RowCounts:
         """What became of all rows until now."""
-        cubes = self._scans.cubes
-        return RowCounts(self._delivered, cubes.unknown_cube, cubes.wrong_pads, self._unaccounted)
+        return self._rows.counts
 
     def report(self) -> list[LinkReport]:
         """How each link is doing, and what happened since the last report; empty before `start`."""
@@ -197,35 +183,58 @@ class LiveLinks:
         The reader's thread calls this once per wake-up.
         """
         for link, arrival_ns, frames in received:
-            record = self._records[link]
-            samples: list[Sample] = []
-            for frame in frames:
-                if isinstance(frame, Sample):
-                    arrival = record.account.sample(frame)
-                    if arrival is Arrival.RESET:
-                        record.clock.reset()
-                    if arrival is not Arrival.DUPLICATE:
-                        samples.append(frame)
-                elif isinstance(frame, Hello):
-                    self._learn_cubes(link, frame)
-                elif isinstance(frame, Stats):
-                    record.account.stats(frame)
-                    record.contradictions = record.account.contradictions()
-            if samples:
-                device_us = [sample.device_us for sample in samples]
-                stamps_ns = record.clock.update(device_us, arrival_ns)
-                self._scans.add(link, samples, stamps_ns)
+            self._rows.received += _count_rows(frames)
+            try:
+                self._take(link, arrival_ns, frames)
+            except Exception as error:  # noqa: BLE001  (the rows of other links go on)
+                self._lose(error)
         self._deliver()
-        self._unaccounted = self._scans.unaccounted()
+        self._rows.check()
+
+    def _take(self, link: int, arrival_ns: int, frames: Sequence[Frame]) -> None:
+        """Count the frames of a link and give their samples to the scans."""
+        record = self._records[link]
+        samples: list[Sample] = []
+        for frame in frames:
+            if isinstance(frame, Sample):
+                arrival = record.account.sample(frame)
+                if arrival is Arrival.RESET:
+                    record.clock.reset()
+                if arrival is Arrival.DUPLICATE:
+                    self._rows.duplicate += frame.n_cubes
+                else:
+                    samples.append(frame)
+            elif isinstance(frame, Hello):
+                self._learn_cubes(link, frame)
+            elif isinstance(frame, Stats):
+                record.account.stats(frame)
+                record.contradictions = record.account.contradictions()
+        if samples:
+            device_us = [sample.device_us for sample in samples]
+            stamps_ns = record.clock.update(device_us, arrival_ns)
+            self._scans.add(link, samples, stamps_ns)
 
     def _deliver(self) -> None:
-        """Call back with all scans that are complete."""
+        """Call back with all scans that are complete. Scans without a row of the skin end here."""
         while self._scans.is_complete(self._scans_per_call):
-            rows = self._scans.build(self._make_rows, self._max_scans)
-            if rows is None:
-                return
-            self._on_rows(rows)
-            self._delivered += len(rows)
+            try:
+                rows = self._scans.build(self._make_rows, self._max_scans)
+                if rows is not None:
+                    self._on_rows(rows)
+                    self._rows.delivered += len(rows)
+            except Exception as error:  # noqa: BLE001  (the next rows go on)
+                self._lose(error)
+
+    def _lose(self, error: Exception) -> None:
+        """An error has lost rows: they are counted with its reason."""
+        lost = self._rows.lose(error)
+        self._errors += 1
+        # Not all of them: at 1 kHz they would fill the log.
+        if self._errors in (1, 10, 100, 1000, 10_000):
+            self._log.error(
+                f"{lost} rows lost by an error ({self._errors} errors so far); reading goes on\n"
+                f"{traceback.format_exc()}"
+            )
 
     def _learn_cubes(self, link: int, hello: Hello) -> None:
         problems = self._scans.cubes.learn(link, hello)
@@ -281,6 +290,10 @@ class LiveLinks:
             notes=tuple(notes),
             values=_values(link, record),
         )
+
+
+def _count_rows(frames: Sequence[Frame]) -> int:
+    return sum(frame.n_cubes for frame in frames if isinstance(frame, Sample))
 
 
 def _period_us(rate: float | None) -> int | None:

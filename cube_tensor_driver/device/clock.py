@@ -29,6 +29,8 @@ STEP_NS = 20e6
 """If all points lie further above the line, one of the clocks was set. USB bursts take 16 ms."""
 STEP_BUCKETS = 2
 """It must last for so many buckets, because a stall looks the same at first."""
+MAX_DELAY_NS = 60_000_000_000
+"""No sample waits longer. A stamp further back is no time at all: arrival is taken."""
 RESTART_US = 1_000_000
 """If device time falls back by more, the hub restarted; if by less, a sample is out of order."""
 _NEVER = -(2**63)
@@ -91,11 +93,13 @@ class ClockMap:
         """
         if not device_us:
             return []
+        stamps: list[int] = []
+        start = 0
         for k in range(1, len(device_us)):
             if device_us[k] < device_us[k - 1] - RESTART_US:
-                before = self.update(device_us[:k], arrival_ns)
-                return before + self.update(device_us[k:], arrival_ns)
-        return self._stamps(device_us, arrival_ns)
+                stamps += self._stamps(device_us[start:k], arrival_ns)
+                start = k
+        return stamps + self._stamps(device_us[start:], arrival_ns)
 
     def _stamps(self, times: Sequence[int], arrival_ns: int) -> list[int]:
         if arrival_ns < self._last_arrival:
@@ -116,6 +120,8 @@ class ClockMap:
             t = 1000 * (time_us - self._first_us)
             stamp = self._first_ns + t + round(self._offset + self._drift * t)
             stamp = min(stamp, arrival_ns)
+            if stamp < arrival_ns - MAX_DELAY_NS:
+                stamp = arrival_ns
             if t > self._newest:
                 stamp = max(stamp, self._last_stamp)
                 self._newest = t

@@ -107,6 +107,8 @@ class CubeTable:
     def find(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
         """The skin's cubes in a sample, and the sample without all other rows; None if none is
         left."""
+        if not sample.n_cubes:
+            return None
         hub = self._hubs[link]
         if hub.complete is not None and sample.first_cube == 0:
             cubes, shape = hub.complete

@@ -116,7 +116,8 @@ class LinkSource:
         """Rows by what became of them, and of each link its state, notes and counters.
 
         Rows that came in were given to the consumer, wait for it, were dropped because it was too
-        slow, or were left out: of unknown cubes, or with another number of pads. Notes of a link
+        slow, came twice, were lost by an error of the driver, or were left out: of unknown cubes,
+        or with another number of pads. Notes of a link
         include what happened since the last call.
         """
         counts = self._links.row_counts()
@@ -136,6 +137,8 @@ class LinkSource:
                 "rows dropped": self._dropped,
                 "rows of unknown cubes": counts.unknown_cube,
                 "rows with another number of pads": counts.wrong_pads,
+                "rows that came twice": counts.duplicate,
+                "rows lost by errors": counts.lost,
                 "rows unaccounted": counts.unaccounted,
                 "links": links,
             }

@@ -20,6 +20,9 @@ from .protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample, join
 _CELSIUS = np.arange(1 << 16, dtype=np.uint16).view(np.int16) * np.float32(0.01)
 _CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
 
+MAX_SPAN_NS = 2_000_000_000
+"""Rows that are built together lie within it: a message holds 2.1 s after its stamp."""
+
 MakeRows = Callable[[int, int], FrequencyRows]
 """Makes rows to fill: so many rows, of so many pads."""
 
@@ -48,16 +51,14 @@ class ScanBuilder:
     """Gathers samples of all links until a scan is complete, and builds its rows.
 
     cubes: `CubeTable`, which knows the cube of each row.
-    rows_added, rows_built: how many came in, and how many were built.
     """
 
     def __init__(self, n_links: int, addresses: Sequence[CubeAddress]) -> None:
         self.cubes = CubeTable(n_links, addresses)
-        self.rows_added = 0
-        self.rows_built = 0
         self._live: set[int] = set()
         # Scans not built yet: of each link its first sample, with its time; then its second ...
         self._pending: list[dict[int, tuple[Sample, int]]] = []
+        self._too_late: list[_Part] = []  # to be built next: beyond MAX_SPAN_NS of the last
         self._n_pending = [0] * n_links  # of each link
         self._built_ns = [0] * n_links  # when the newest sample that was built was taken
 
@@ -78,7 +79,6 @@ class ScanBuilder:
                 self._pending.append({})
             self._pending[scan][link] = sample, stamp_ns
             self._n_pending[link] += 1
-            self.rows_added += sample.n_cubes
 
     def is_complete(self, n_scans: int = 1) -> bool:
         """Whether it is time to build rows of so many scans.
@@ -86,6 +86,8 @@ class ScanBuilder:
         It is when every live link has given its samples, or when one link has given one more. A
         single scan is also complete if it only holds samples that came late to the last one.
         """
+        if self._too_late:
+            return True
         if not self._pending:
             return False
         if len(self._pending) > n_scans or not self._live:
@@ -100,27 +102,15 @@ class ScanBuilder:
     def build(
         self, make_rows: MakeRows = empty_rows, max_scans: int | None = None
     ) -> FrequencyRows | None:
-        """The rows gathered since the last time, of at most so many scans; None if there are none.
+        """The rows of the oldest scans, of at most so many; None if the skin has none of them.
 
-        Rows are written into what make_rows gives: a message's own memory, where there is one.
+        There may be more: `is_complete` says so. Rows are written into what make_rows gives: a
+        message's own memory, where there is one.
         """
-        n_scans = self._n_scans_to_build()
-        if max_scans is not None:
-            n_scans = min(n_scans, max_scans)
-        parts: list[_Part] = []
-        for scan in self._pending[:n_scans]:
-            for link in sorted(scan):
-                sample, stamp_ns = scan[link]
-                self._built_ns[link] = stamp_ns
-                self._n_pending[link] -= 1
-                found = self.cubes.find(link, sample)
-                if found is not None:
-                    parts.append(_Part(*found, stamp_ns))
-        del self._pending[:n_scans]
+        parts, self._too_late = _split(self._too_late or self._take(max_scans))
         if not parts:
             return None
         rows = make_rows(sum(len(part.cubes) for part in parts), self.cubes.n_pads)
-        self.rows_built += len(rows)
         start = 0
         for _, group in groupby(parts, key=lambda part: part.sample.shape[1]):
             same_width = list(group)
@@ -131,11 +121,31 @@ class ScanBuilder:
             start = end
         return rows
 
-    def unaccounted(self) -> int:
-        """Rows that came in and were neither built, nor wait, nor count as left out: always 0."""
-        waiting = sum(sample.n_cubes for scan in self._pending for sample, _ in scan.values())
-        left_out = self.cubes.unknown_cube + self.cubes.wrong_pads
-        return self.rows_added - waiting - self.rows_built - left_out
+    def rows_waiting(self) -> int:
+        """How many rows came in and were neither built nor left out yet."""
+        gathered = sum(sample.n_cubes for scan in self._pending for sample, _ in scan.values())
+        return gathered + sum(len(part.cubes) for part in self._too_late)
+
+    def _take(self, max_scans: int | None) -> list[_Part]:
+        """Take the oldest scans out, and find the skin's cubes in them."""
+        n_scans = self._n_scans_to_build()
+        if max_scans is not None:
+            n_scans = min(n_scans, max_scans)
+        # Out before anything can fail: what is looked at is never looked at again.
+        scans = self._pending[:n_scans]
+        del self._pending[:n_scans]
+        for scan in scans:
+            for link in scan:
+                self._n_pending[link] -= 1
+        parts: list[_Part] = []
+        for scan in scans:
+            for link in sorted(scan):
+                sample, stamp_ns = scan[link]
+                self._built_ns[link] = stamp_ns
+                found = self.cubes.find(link, sample)
+                if found is not None:
+                    parts.append(_Part(*found, stamp_ns))
+        return parts
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
         """Whether the pending scan holds a sample that belongs to the scan built last.
@@ -160,6 +170,16 @@ class ScanBuilder:
         while complete < len(self._pending) and self._live <= self._pending[complete].keys():
             complete += 1
         return complete or len(self._pending)
+
+
+def _split(parts: list[_Part]) -> tuple[list[_Part], list[_Part]]:
+    """Those within MAX_SPAN_NS of the earliest, and the others."""
+    stamps_ns = [part.stamp_ns for part in parts]
+    if not parts or max(stamps_ns) - min(stamps_ns) <= MAX_SPAN_NS:
+        return parts, []
+    end_ns = min(stamps_ns) + MAX_SPAN_NS
+    within = [part for part in parts if part.stamp_ns <= end_ns]
+    return within, [part for part in parts if part.stamp_ns > end_ns]
 
 
 def _fill(rows: FrequencyRows, parts: Sequence[_Part]) -> None:

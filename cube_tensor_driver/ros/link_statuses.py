@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from ..device.chain import LinkReport, LiveLinks, RowCounts
+from ..device.chain import LinkReport, LiveLinks
 from ..device.link import LinkState
+from ..device.row_account import RowCounts
 from .diagnostics import make_status
 
 LEVELS = {
@@ -21,29 +22,33 @@ class LinkStatuses:
 
     def __init__(self, skin_name: str) -> None:
         self._skin_name = skin_name
-        self._delivered_before = 0
+        self._before = RowCounts()
 
     def __call__(self, links: LiveLinks, with_links: bool) -> list[DiagnosticStatus]:
         """The status of all rows, and of each link if with_links."""
         counts = links.row_counts()
-        new_rows = counts.delivered - self._delivered_before
-        self._delivered_before = counts.delivered
-        statuses = [_rows_status(self._skin_name, counts, new_rows)]
+        statuses = [_rows_status(self._skin_name, counts, self._before)]
+        self._before = counts
         if with_links:
             statuses += [_link_status(report) for report in links.report()]
         return statuses
 
 
-def _rows_status(skin_name: str, counts: RowCounts, rows_per_second: int) -> DiagnosticStatus:
+def _rows_status(skin_name: str, counts: RowCounts, before: RowCounts) -> DiagnosticStatus:
     level, text = DiagnosticStatus.OK, ""
     if counts.unaccounted:
         level = DiagnosticStatus.ERROR
         text = f"{counts.unaccounted} rows are lost in the driver: please report it"
+    elif counts.lost > before.lost:
+        level = DiagnosticStatus.ERROR
+        text = f"{counts.lost - before.lost} rows lost by an error: {counts.lost_reason}"
     values = {
         "rows published": counts.delivered,
-        "rows per second": rows_per_second,
+        "rows per second": counts.delivered - before.delivered,
         "rows of unknown cubes": counts.unknown_cube,
         "rows with another number of pads": counts.wrong_pads,
+        "rows that came twice": counts.duplicate,
+        "rows lost by errors": counts.lost,
         "rows unaccounted": counts.unaccounted,
     }
     return make_status("rows", skin_name, level, text, values)
