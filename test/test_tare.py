@@ -154,6 +154,58 @@ def test_a_cube_that_is_silent_is_refused_and_bad_pads_keep_their_rest():
         skin.tare([1])
 
 
+@pytest.mark.parametrize("gap", [0.4, 2.0, 60.0, -20.0])
+@pytest.mark.parametrize("after", [0.1, 0.4, 0.9])
+def test_data_from_before_a_gap_are_not_averaged(gap, after):
+    """Of the whole skin, by the rows' own time. A recording that starts again is a gap, too."""
+    skin = Skin()
+    skin.play(23, pads(1.00001))
+    skin.seconds += gap
+    skin.play(after, pads())
+    with pytest.raises(TareError, match=r"cube a: .*gap"):
+        skin.tare()
+    skin.play(1.7 - after, pads())
+    np.testing.assert_allclose(skin.tare(), pads(), rtol=7e-6)
+
+
+def test_the_gap_of_one_cube_is_refused_where_the_others_go_on():
+    """Shorter than a window, so that every window has rows of it; and at the end."""
+    skin = Skin()
+    skin.play(3, pads())
+
+    def play_without_b(seconds):
+        for _ in range(round(seconds * RATE)):
+            stamp_ns = np.full(2, round(skin.seconds * 1e9))
+            frequency = pads()[[0, 2]].astype(np.float32)
+            cubes = np.array([0, 2])
+            skin.health.update(stamped(cubes, frequency, np.zeros(2, np.uint32), stamp_ns))
+            skin.seconds += 1 / RATE
+
+    play_without_b(0.4)
+    with pytest.raises(TareError, match=r"cube b: a gap of 0\.\d+ s .* limit is 0\.25 s"):
+        skin.tare()
+    skin.play(0.1, pads())
+    with pytest.raises(TareError, match=r"cube b: a gap of 0\.4\d* s"):
+        skin.tare()
+    np.testing.assert_allclose(skin.tare([0, 2])[[0, 2]], pads()[[0, 2]], rtol=8e-6)
+    skin.play(1.7, pads())
+    skin.tare()
+
+
+def test_lost_rows_and_slow_rates_are_no_gaps():
+    skin = Skin()
+    for number in range(400):
+        if number % 10 not in (3, 4, 5):  # 3 in 10 lost, one after the other
+            skin.play(1 / RATE, pads())
+        else:
+            skin.seconds += 1 / RATE
+    skin.tare()
+    for _ in range(60):  # 4 rows a second
+        skin.play(1 / RATE, pads())
+        skin.seconds += 0.225
+    np.testing.assert_allclose(skin.tare(duration=8.0), pads(), rtol=8e-6)
+
+
 def test_a_steady_load_survives_an_hour_of_drift_tracking_and_drift_does_not():
     """In simulated time: cubes a and c are loaded after 10 s, for an hour; b and c drift by 20 ppm
     a minute."""

@@ -106,6 +106,12 @@ class Health:
         """(cubes, P) Hz, newest frequencies."""
         return self._statistics.last
 
+    @property
+    def age_ns(self) -> np.ndarray:
+        """(cubes,) how far the newest row of each cube is behind the newest of all, ns."""
+        age: np.ndarray = self.newest_ns - self._statistics.newest_ns
+        return age
+
     def window(self) -> Window:
         """The window that is not over yet."""
         return self._statistics.window()

@@ -36,6 +36,9 @@ class Window(NamedTuple):
     rows: (cubes,) how many came
     mean, lowest, highest, noise: (cubes, P) Hz; NaN where nothing was measured
     rough: (cubes, P) bool, rougher than a load that moves
+    gap_before: (cubes,) ns from the row before the window to its first one
+    gap_within: (cubes,) ns, longest interval between two of its rows
+    Both are 0 where no interval reached GAP_NS, and negative where time went back.
     """
 
     rows: np.ndarray
@@ -44,6 +47,8 @@ class Window(NamedTuple):
     highest: np.ndarray
     noise: np.ndarray
     rough: np.ndarray
+    gap_before: np.ndarray
+    gap_within: np.ndarray
 
 
 class WindowStatistics:
@@ -66,6 +71,7 @@ class WindowStatistics:
         ) = self._pads
         self._base[:] = np.nan_to_num(rest_frequency)
         self._count = np.zeros(len(rest_frequency), int)
+        self._gap_before, self._gap_within = np.zeros((2, len(rest_frequency)), np.int64)
         # When the newest row of each cube came, and how long after the one before: 0 is unknown.
         self._time_ns, self._interval_ns = np.zeros((2, len(rest_frequency)), np.int64)
         self.clear()
@@ -75,6 +81,7 @@ class WindowStatistics:
         for total in (self._first_squares, self._second_squares, self._sum, self._count):
             total[:] = 0
         self._lowest[:] = self._highest[:] = np.nan
+        self._gap_before[:] = self._gap_within[:] = 0
 
     def add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
         """B scans of the same N cubes: frequency (B, N, P) Hz, stamp_ns (B, N).
@@ -113,7 +120,14 @@ class WindowStatistics:
             highest=self._highest.copy(),
             noise=np.sqrt(self._second_squares / count / 6),
             rough=self._second_squares > ROUGH * self._first_squares,
+            gap_before=self._gap_before.copy(),
+            gap_within=self._gap_within.copy(),
         )
+
+    @property
+    def newest_ns(self) -> np.ndarray:
+        """(cubes,) stamp of the newest row; 0 before the first."""
+        return self._time_ns
 
     def _pace(
         self, cubes: slice | np.ndarray, stamp_ns: np.ndarray
@@ -127,9 +141,20 @@ class WindowStatistics:
         even = (interval < EVEN * before) & (before < EVEN * interval)
         if (known & even).all():  # as it mostly is: saves a third of the time of `add`
             return np.ones((1, 1, 1), np.float32), np.ones((1, 1, 1), np.float32)
+        self._note_gaps(cubes, interval)
         ratio = np.where(known & ~even, interval / np.where(known, before, 1), 1.0)
         weight = known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
         return ratio.astype(np.float32)[..., None], weight.astype(np.float32)[..., None]
+
+    def _note_gaps(self, cubes: slice | np.ndarray, interval: np.ndarray) -> None:
+        """Keep the longest of intervals (B, N), ns, forward or back."""
+        gap = np.where((interval < 0) | (interval >= GAP_NS), interval, 0)
+        is_first = self._count[cubes] == 0
+        self._gap_before[cubes] = np.where(is_first, gap[0], self._gap_before[cubes])
+        gap[0] = np.where(is_first, 0, gap[0])
+        widest = np.concatenate([self._gap_within[cubes][None], gap])
+        chosen = np.abs(widest).argmax(axis=0)
+        self._gap_within[cubes] = np.take_along_axis(widest, chosen[None], axis=0)[0]
 
 
 def _differences(before: np.ndarray, values: np.ndarray) -> np.ndarray:

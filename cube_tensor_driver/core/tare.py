@@ -2,7 +2,7 @@
 
     f0 = mean(f) / factor(T)
 
-per pad, over the windows of `Health`; factor(T) is the calibration's temperature model. The mean is
+per pad, over the windows of `Health`, if no gap parts them; factor(T) is the calibration's temperature model. The mean is
 of data that are there already: nobody waits, and a signal that moved a moment ago is refused.
 """
 
@@ -31,6 +31,11 @@ FAR = 0.2
 JUMP_SPAN = 10.0
 """Times its own noise beyond which a span is a jump: a jump raises the noise, too, but white noise
 does not span so much."""
+
+GAP_S = 0.25
+"""What a load did in a longer gap is not known: data from before it are not the present load."""
+GAP_ROWS = 4.0
+"""Where rows come slowly, a gap is longer than so many of their intervals."""
 
 
 class _Means(NamedTuple):
@@ -102,7 +107,30 @@ def _newest_windows(
         raise TareError(
             f"cube {names[cube]}: no data, or gaps in it, in the last {duration:g} s; see its link"
         )
+    _refuse_gaps(health, chosen, windows, rows.sum(axis=0), names)
     return windows
+
+
+def _refuse_gaps(
+    health: Health,
+    chosen: np.ndarray,
+    windows: Sequence[Window],
+    rows: np.ndarray,
+    names: Sequence[str],
+) -> None:
+    """TareError: rows of a cube are too far apart in time to be averaged.
+
+    rows: (len(chosen),) how many of each cube there are in the windows.
+    """
+    before = [window.gap_before[chosen] for window in windows[1:]]
+    within = [window.gap_within[chosen] for window in windows]
+    gaps_s = 1e-9 * np.abs([*before, *within, health.age_ns[chosen]])
+    limit_s = np.maximum(GAP_S, GAP_ROWS * len(windows) * WINDOW_S / rows)
+    for at in np.flatnonzero((gaps_s > limit_s).any(axis=0)).tolist():
+        raise TareError(
+            f"cube {names[chosen[at]]}: a gap of {gaps_s[:, at].max():.3g} s in the data to "
+            f"average, the limit is {limit_s[at]:.2g} s: wait until there are data after it"
+        )
 
 
 def _average(windows: Sequence[Window], chosen: np.ndarray) -> _Means:
