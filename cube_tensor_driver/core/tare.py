@@ -2,8 +2,9 @@
 
     f0 = mean(f) / factor(T)
 
-per pad, over the windows of `Health`, if no gap parts them; factor(T) is the calibration's temperature model. The mean is
-of data that are there already: nobody waits, and a signal that moved a moment ago is refused.
+per pad, over the windows of `Health`; factor(T) is the calibration's temperature model. The mean is
+of data that are there already: nobody waits. A signal that moved a moment ago is refused, and so
+are data with a gap.
 """
 
 from __future__ import annotations
