@@ -26,18 +26,27 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionMode, Reader, ReaderError
 
+from ..config.input_files import check_regular
+from ..config.yaml import read_yaml
+from ..core.errors import ConfigError
 from .rosbags_storage import (
     ChunkInfo,
     DirectoryReader,
     McapReader,
     McapWriter,
     PendingChunk,
+    Sqlite3Reader,
     decompress,
     read_exact,
 )
+from .unpack import check_size, check_zstd_file, total_limit, unpack_zstd
 
 MESSAGE, CHUNK, INDEX = 5, 6, 7
 CHUNK_BYTES = 1 << 18
+MAX_MESSAGES = 1 << 18
+"""In one chunk."""
+MAX_OVERLAPPING = 1 << 29
+"""Bytes of chunks whose times overlap: all of them have to be in memory at once."""
 KEPT = 4
 """Chunks that a reader keeps, the newest, for another topic that is read at the same time."""
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -55,6 +64,7 @@ _HEADS = np.dtype(
 _CHUNK = struct.Struct(
     "<QQQIIQ"
 )  # first and last time, size, checksum, no letters of compression, size again
+_CHUNK_BEGIN = struct.Struct("<QQQ")  # first and last time, size
 _CRC_AT = _RECORD.size + 24
 
 MessageSpan = tuple[int, int, int, int]
@@ -67,6 +77,44 @@ class McapFile(McapReader):
     def __init__(self, path: Any) -> None:
         super().__init__(path)
         self._kept: dict[int, tuple[bytes, list[MessageSpan]]] = {}
+
+    def open(self) -> None:
+        """ReaderError: damaged, or beyond the bounds of `unpack.py`."""
+        _check_regular(self.path)
+        super().open()
+
+    def read_index(self) -> None:
+        """As rosbags'. ReaderError: the chunks that it names are too large, or in the file more
+        than once."""
+        super().read_index()
+        if not self.chunks:
+            self._check_chunks()
+        size = self.path.stat().st_size
+        for chunk in self.chunks:
+            check_size("a chunk", max(chunk.uncompressed_size, chunk.chunk_length))
+        unpacked = sum(chunk.uncompressed_size for chunk in self.chunks)
+        check_size("chunks", unpacked, total_limit(size))
+        stored = sum(chunk.chunk_length for chunk in self.chunks)
+        check_size("stored chunks", stored, size)
+
+    def meta_scan(self) -> None:
+        """As rosbags', of a file without an index. ReaderError: its chunks are too large."""
+        self._check_chunks()
+        super().meta_scan()
+
+    def _check_chunks(self) -> None:
+        if self.bio is None:
+            raise ReaderError("the bag is closed")
+        limit, total, at = total_limit(self.path.stat().st_size), 0, self.data_start
+        while at < self.data_end:
+            self.bio.seek(at)
+            opcode, length = _RECORD.unpack(read_exact(self.bio, _RECORD.size))
+            if opcode == CHUNK:
+                _, _, size = _CHUNK_BEGIN.unpack(read_exact(self.bio, _CHUNK_BEGIN.size))
+                check_size("a chunk", max(size, length))
+                total += size
+                check_size("chunks", total, limit)
+            at += _RECORD.size + length
 
     def messages(
         self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
@@ -85,6 +133,7 @@ class McapFile(McapReader):
             and chunk.message_start_time < end
             and any(chunk.channel_count.get(number) for number in wanted)
         ]
+        _check_overlap(chunks)
         for together in _overlapping(chunks):
             if len(together) == 1:
                 data, placed = self._read(together[0])
@@ -136,17 +185,53 @@ class McapFile(McapReader):
         return record, placed
 
 
+class SqliteFile(Sqlite3Reader):
+    """A database to read."""
+
+    def open(self) -> None:
+        """ReaderError: damaged, or no file."""
+        _check_regular(self.path)
+        super().open()
+
+
 class McapFolder(DirectoryReader):
     """A bag's folder."""
 
-    STORAGE_PLUGINS = MappingProxyType({**DirectoryReader.STORAGE_PLUGINS, "mcap": McapFile})
+    STORAGE_PLUGINS = MappingProxyType(
+        {**DirectoryReader.STORAGE_PLUGINS, "mcap": McapFile, "sqlite3": SqliteFile}
+    )
+
+    def open(self) -> None:
+        """ReaderError: damaged, or beyond the bounds of `unpack.py`."""
+        path = self.path / "metadata.yaml"
+        try:
+            said = read_yaml(Path(str(path)))
+        except ConfigError as error:
+            raise ReaderError(str(error)) from None
+        about = said.get("rosbag2_bagfile_information") if isinstance(said, dict) else None
+        if isinstance(about, dict) and str(about.get("compression_mode")).lower() == "file":
+            for name in about.get("relative_file_paths") or ():
+                part = self.path / Path(str(name)).name
+                _check_regular(part)
+                check_zstd_file(Path(str(part)))
+        super().open()
+        self._is_message_packed = self.metadata.compression_mode == "message"
+        if self._is_message_packed:  # unpacked below, within bounds
+            self.metadata = self.metadata._replace(compression_mode=None)
+
+    def messages(
+        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """As rosbags'."""
+        for connection, time_ns, data in super().messages(connections, start, stop):
+            yield connection, time_ns, unpack_zstd(data) if self._is_message_packed else data
 
 
 class BagReader(Reader):
     """rosbags' reader of a folder or a file."""
 
     STORAGE_PLUGINS = MappingProxyType(
-        {**Reader.STORAGE_PLUGINS, "dir": McapFolder, ".mcap": McapFile}
+        {**Reader.STORAGE_PLUGINS, "dir": McapFolder, ".mcap": McapFile, ".db3": SqliteFile}
     )
 
 
@@ -277,6 +362,8 @@ def _message_spans(data: bytes, at: int, end: int) -> list[MessageSpan]:
         if data[at] == MESSAGE:
             _, length, channel, _, time, _ = unpack(data, at)
             placed.append((time, channel, at + HEAD, at + _RECORD.size + length))
+            if len(placed) > MAX_MESSAGES:
+                raise ReaderError(f"a chunk of more than {MAX_MESSAGES} messages")
         else:
             (length,) = struct.unpack_from("<Q", data, at + 1)
         at += _RECORD.size + length
@@ -284,6 +371,23 @@ def _message_spans(data: bytes, at: int, end: int) -> list[MessageSpan]:
         raise ReaderError("the last record of a chunk ends behind it")
     placed.sort(key=itemgetter(0))
     return placed
+
+
+def _check_regular(path: Any) -> None:
+    try:
+        check_regular(path)
+    except ConfigError as error:
+        raise ReaderError(str(error)) from None
+
+
+def _check_overlap(chunks: list[ChunkInfo]) -> None:
+    """ReaderError: too many chunks have messages of the same time."""
+    begins = [(chunk.message_start_time, 1, chunk.uncompressed_size) for chunk in chunks]
+    ends = [(chunk.message_end_time, 2, -chunk.uncompressed_size) for chunk in chunks]
+    size = 0
+    for _, _, change in sorted(begins + ends):
+        size += change
+        check_size("chunks of overlapping times", size, MAX_OVERLAPPING)
 
 
 def _overlapping(chunks: list[ChunkInfo]) -> Iterator[list[ChunkInfo]]:

@@ -43,6 +43,7 @@ from ..config.yaml import to_yaml
 from ..core.errors import BagError
 from .read import DAMAGE, damage
 from .rosbags_storage import decompress
+from .unpack import check_size
 from .write import SUFFIXES, describe, describe_file, move_up, write_metadata
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -167,6 +168,7 @@ class _Salvaged:
         """A chunk without its indexes, and its messages per channel. SALVAGE_ERRORS: its checksum
         is wrong, or what is in it is not records."""
         chunk: Chunk = _parse(Chunk.read, content)
+        check_size("a chunk", max(chunk.uncompressed_size, len(content)))
         inside = decompress(
             chunk.data, chunk.compression, chunk.uncompressed_size, chunk.uncompressed_crc
         )

@@ -8,6 +8,7 @@ rosbags to a range, nothing else is imported from its inner modules, and
 
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import (
+    DECOMPRESSORS,
     ChunkInfo,
     McapReader,
     McapWriter,
@@ -16,22 +17,25 @@ from rosbags.rosbag2.storage_mcap import (
     read_exact,
     zstd,
 )
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer, apsw
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader, Sqlite3Writer, apsw
 from rosbags.typesys.store import Typestore
 
 ZstdError = zstd.ZstdError
 Sqlite3Error = apsw.Error
 
 __all__ = [
+    "DECOMPRESSORS",
     "ChunkInfo",
     "DirectoryReader",
     "McapReader",
     "McapWriter",
     "PendingChunk",
     "Sqlite3Error",
+    "Sqlite3Reader",
     "Sqlite3Writer",
     "Typestore",
     "ZstdError",
     "decompress",
     "read_exact",
+    "zstd",
 ]
