@@ -113,6 +113,23 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
     assert taken() == [6] * 4 and scan.rows_waiting() == 0
 
 
+@pytest.mark.parametrize("begins, lost", [(1, ()), (3, ()), (4, ()), (0, (11, 12))])
+def test_what_a_link_has_not_sent_does_not_keep_batches_small(begins, lost):
+    """Batches of five scans; the second link begins later, or loses two samples."""
+    scan, period, sizes = two_links(), 10_000_000, []
+    for number in range(60):
+        for link in (0, 1):
+            if link == 0 or (number >= begins and number not in lost):
+                frame = sample(number, [[1.0, 1.0], [1.0, 1.0]])
+                scan.add(link, [frame], [number * period + 1_000_000 * link])
+            while scan.is_complete(5):
+                rows = scan.build(max_scans=6)
+                sizes.append(len(rows))
+    assert set(sizes[4:]) == {5 * 2 * 2}
+    sent = 60 * 2 * 2 - 2 * (begins + len(lost))
+    assert sum(sizes) + scan.rows_waiting() == sent and scan.rows_waiting() < 5 * 2 * 2
+
+
 def test_a_sample_in_two_frames_goes_on_at_once():
     """Its second part does not wait for the next scan, whichever hub is the earlier one."""
     scan = two_links()
@@ -249,6 +266,7 @@ def test_stamps_use_the_arrival_of_their_own_read():
             LinkFrames(0, 10_000, samples((0, 0), (1, 5))),
             LinkFrames(1, 20_000, samples((0, 0))),
             LinkFrames(0, 30_000, samples((2, 25))),
+            LinkFrames(1, 40_000, samples((1, 15))),
         ]
     )
     stamps = {
@@ -256,8 +274,14 @@ def test_stamps_use_the_arrival_of_their_own_read():
         for rows in given
         for cube, number, stamp_ns in zip(rows.cube, rows.sequence, rows.stamp_ns, strict=True)
     }
-    assert stamps == {(0, 0): 5_000, (0, 1): 10_000, (1, 0): 20_000, (0, 2): 30_000}
-    assert live.row_counts() == RowCounts(4, 0, 0, 0)
+    assert stamps == {
+        (0, 0): 5_000,
+        (0, 1): 10_000,
+        (1, 0): 20_000,
+        (0, 2): 30_000,
+        (1, 1): 35_000,
+    }
+    assert live.row_counts() == RowCounts(delivered=5)
 
 
 def test_pads_that_a_cube_does_not_have_are_nan():
@@ -355,7 +379,7 @@ def test_rows_far_apart_in_time_are_given_one_after_the_other():
         [LinkFrames(0, 5 * second, waited), LinkFrames(1, 5 * second, [timed(1, 5_000_000)])]
     )
     stamps = sorted((rows.stamp_ns / second).tolist() for rows in given[1:])
-    assert stamps == [[1.0], [5.0], [5.0]]
+    assert stamps == [[1.0], [5.0, 5.0]]
     assert live.row_counts() == RowCounts(delivered=5)
 
 

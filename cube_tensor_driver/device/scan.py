@@ -5,6 +5,7 @@ A scan holds one sample of each link that delivers. Nothing here looks at a valu
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from itertools import groupby
 from typing import NamedTuple
@@ -22,6 +23,9 @@ _CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
 
 MAX_SPAN_NS = 2_000_000_000
 """Rows that are built together lie within it: a message holds 2.1 s after its stamp."""
+
+CLEARLY_BEFORE = 0.75
+"""Of a period: hubs sample at different phases, and stamps jitter."""
 
 MakeRows = Callable[[int, int], FrequencyRows]
 """Makes rows to fill: so many rows, of so many pads."""
@@ -59,7 +63,8 @@ class ScanBuilder:
         # Scans not built yet: of each link its first sample, with its time; then its second ...
         self._pending: list[dict[int, tuple[Sample, int]]] = []
         self._too_late: list[_Part] = []  # to be built next: beyond MAX_SPAN_NS of the last
-        self._n_pending = [0] * n_links  # of each link
+        self._pending_ns: list[int] = []  # when the first sample of each pending scan was taken
+        self._n_pending = [0] * n_links  # how many pending scans each link has reached
         self._built_ns = [0] * n_links  # when the newest sample that was built was taken
 
     def set_live(self, link: int, live: bool) -> None:
@@ -74,11 +79,14 @@ class ScanBuilder:
         """Samples of one link in order, and when they were taken, ns, in the clock of the rows."""
         self._live.add(link)
         for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
-            scan = self._n_pending[link]
+            # What a link has not sent, because it began later or lost it, leaves a gap. Its samples
+            # counted one by one would stay behind the others for as long as it delivers.
+            scan = max(self._n_pending[link], self._first_scan_at(stamp_ns))
             if scan == len(self._pending):
                 self._pending.append({})
+                self._pending_ns.append(stamp_ns)
             self._pending[scan][link] = sample, stamp_ns
-            self._n_pending[link] += 1
+            self._n_pending[link] = scan + 1
 
     def is_complete(self, n_scans: int = 1) -> bool:
         """Whether it is time to build rows of so many scans.
@@ -133,10 +141,8 @@ class ScanBuilder:
             n_scans = min(n_scans, max_scans)
         # Out before anything can fail: what is looked at is never looked at again.
         scans = self._pending[:n_scans]
-        del self._pending[:n_scans]
-        for scan in scans:
-            for link in scan:
-                self._n_pending[link] -= 1
+        del self._pending[:n_scans], self._pending_ns[:n_scans]
+        self._n_pending = [max(0, count - n_scans) for count in self._n_pending]
         parts: list[_Part] = []
         for scan in scans:
             for link in sorted(scan):
@@ -162,14 +168,21 @@ class ScanBuilder:
         return min(self._built_ns[link] for link in missing) > min(middles)
 
     def _n_scans_to_build(self) -> int:
-        """Scans that every live link is part of; all, if a live link has given nothing.
+        """Scans that every live link has reached; all, if a live link has given nothing.
 
         The other scans wait: a link that was late once would else stay a sample behind.
         """
-        complete = 0
-        while complete < len(self._pending) and self._live <= self._pending[complete].keys():
-            complete += 1
-        return complete or len(self._pending)
+        reached = min((self._n_pending[link] for link in self._live), default=0)
+        return reached or len(self._pending)
+
+    def _first_scan_at(self, stamp_ns: int) -> int:
+        """The first pending scan that was not taken clearly before this time, as far as it is
+        known."""
+        times = self._pending_ns
+        if len(times) < 2:
+            return 0
+        period = (times[-1] - times[0]) / (len(times) - 1)
+        return bisect_left(times, stamp_ns - CLEARLY_BEFORE * period)
 
 
 def _split(parts: list[_Part]) -> tuple[list[_Part], list[_Part]]:
