@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from conftest import ROOT, decoded
 from cube_tensor_driver.bags.read import FREQUENCIES, Bag
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess import ReprocessJob, reprocess
+from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
@@ -95,6 +97,21 @@ def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
             for messages, _ in opened.frequencies("/frequencies")
             for stamp in messages.stamp_ns
         ]
+
+
+@pytest.fixture(scope="module")
+def bag_of_a_second(tmp_path_factory) -> Path:
+    return make_bag(tmp_path_factory.mktemp("bags") / "bag", SKIN, messages=100)
+
+
+@pytest.fixture
+def own_signals() -> Iterator[None]:
+    """A command that runs in this process leaves no signal handler behind."""
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    handlers = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, handlers, strict=True):
+        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -211,7 +228,39 @@ def test_record_says_what_is_wrong(domain, tmp_path):
     assert recorder.returncode == 1 and "is there already" in errors and "Traceback" not in errors
     recorder = cube("record", "-o", tmp_path / "bag", "--topics", "nothing", "--duration", "0.5")
     _, errors = recorder.communicate(timeout=30)
-    assert "/nothing: nobody offers it" in errors and "Traceback" not in errors
+    assert recorder.returncode == 1 and "Traceback" not in errors
+    assert f"nobody offers /nothing in DDS domain {domain}; start the skin" in errors
+    assert not (tmp_path / "bag").exists()
+    recorder = cube("record", "-o", tmp_path / "bag", "--topics", "bad topic!")
+    _, errors = recorder.communicate(timeout=30)
+    assert recorder.returncode == 1 and errors.count("\n") == 1
+    assert "topic 'bad topic!', allowed: letters" in errors
+    assert not (tmp_path / "bag").exists()
+
+
+@pytest.mark.parametrize("number", ["abc", "500", "-1"])
+@pytest.mark.parametrize("words", ["record -o {}", "view", "replay {}", "demo --headless"])
+def test_a_domain_that_is_none_is_one_line(
+    bag_of_a_second, own_signals, monkeypatch, capsys, words, number
+):
+    monkeypatch.setenv("ROS_DOMAIN_ID", number)
+    there, new = bag_of_a_second, bag_of_a_second.with_name("new")
+    command = words.format(there if words.startswith("replay") else new).split()
+    assert main(command) == 1
+    assert capsys.readouterr().err == (
+        f"cube: ROS_DOMAIN_ID is {number!r}, allowed: 0 to 232; set it or unset it\n"
+    )
+    assert not new.exists()
+
+
+def test_a_node_in_a_domain_that_is_none_ends_with_one_line(domain, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
+    command = [sys.executable, "-m", "cube_tensor_driver.ros.driver"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "cube_tensor_driver: ROS_DOMAIN_ID is 'abc', allowed: 0 to 232; set it or unset it\n"
+    )
 
 
 def reconstruction(children: Children, config: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shutil
 import socket
@@ -122,21 +123,13 @@ class Skin(threading.Thread):
 
 
 def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
-    """Beside a browser that has stopped reading, and without the internet."""
+    """Beside a browser that has stopped reading, and without the internet; before, that there is
+    none."""
     heard = ros.listen(SkinStress, "stress")
     skin = Skin(ros.node)
     with ExitStack() as stack:
         children = stack.enter_context(Children(tmp_path))
-        children.start(
-            Process(
-                "reconstruction",
-                "cube_tensor_driver.ros.reconstruction",
-                parameters={"config": str(CONFIG), "tare_folder": str(tmp_path / "tare")},
-            )
-        )
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-        skin.start()
-        stack.callback(skin.end)
         url = children.wait_for_line("view", "http://", 30).split()[0]
         port = urlparse(url).port
         sleeper = socket.socket()
@@ -151,7 +144,22 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
             )
         )
         page = stack.enter_context(browser(url))
+        waiting = (
+            f"Waiting for a skin: none is published in DDS domain {os.environ['ROS_DOMAIN_ID']}."
+        )
+        children.wait_for_line("view", waiting, 10)
+        ros.wait(lambda: waiting in text(page), 40)
+        children.start(
+            Process(
+                "reconstruction",
+                "cube_tensor_driver.ros.reconstruction",
+                parameters={"config": str(CONFIG), "tare_folder": str(tmp_path / "tare")},
+            )
+        )
+        skin.start()
+        stack.callback(skin.end)
 
+        ros.wait(lambda: "Waiting" not in text(page), 40)
         ros.wait(lambda: f"{N} of {N} cubes" in text(page) and "live" in text(page), 40)
         assert "pressure −σzz in kPa" in text(page)
         ros.wait(lambda: "state" in text(page), 40)

@@ -39,6 +39,14 @@ class PageStatus:
     recording: bool = False
 
 
+def waiting(domain: str) -> str:
+    """What page and terminal say while nothing publishes a skin. domain: of DDS."""
+    return (
+        f"Waiting for a skin: none is published in DDS domain {domain}. "
+        "Start one, for example with ./cube demo; it appears here."
+    )
+
+
 def box(content: str) -> str:
     """Content with the margins that all texts of the page have."""
     return _div(BOX_STYLE, content)

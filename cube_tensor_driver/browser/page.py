@@ -168,6 +168,20 @@ class Page:
         self._cube.value = self._names[cube]  # type: ignore[misc]  # viser's handle has a setter
 
 
+class WaitingPage:
+    """What the page shows before there is a skin."""
+
+    def __init__(self, server: viser.ViserServer, text: str) -> None:
+        _set_up(server, "no skin yet")
+        self._text: viser.GuiMarkdownHandle | None = server.gui.add_markdown(text)
+
+    def close(self) -> None:
+        """Safe to call twice."""
+        if self._text is not None:
+            self._text.remove()
+            self._text = None
+
+
 def _set_up(server: viser.ViserServer, name: str) -> None:
     """Colours, panel and camera of a page."""
     server.gui.configure_theme(

@@ -8,6 +8,8 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import math
+import os
 import queue
 import signal
 import time
@@ -17,26 +19,29 @@ from typing import Any, NamedTuple
 import rclpy
 import viser
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from cube_tensor_driver.srv import Tare
 
 from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ConfigError
-from ..ros.node import make_executor
+from ..ros.executor import make_executor
+from ..ros.session import start_ros
 from ..ros.skin_subscriber import STALE_S, FollowedSkin, SkinSubscriber
+from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S
 from .history import History, RowRate
 from .markup import PageStatus
-from .page import Buttons, Page
+from .page import Buttons, Page, WaitingPage
 from .replay_client import ReplayClient
 from .service_calls import ServiceCalls
 
 HOST = "127.0.0.1"
 PORT = 8080
 PICTURES_HZ, NUMBERS_HZ = 20.0, 4.0
+SAY_WAITING_S = 2.0
+"""Without a skin, until the terminal says that the page waits for one."""
 NEVER_STALE_S = 1e9
 """For cubes while a replay is held."""
 
@@ -75,6 +80,7 @@ class Viewer:
         self._links: dict[str, str] = {}
         self._pressed: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._shown: ShownSkin | None = None
+        self._waiting = WaitingPage(self._server, markup.waiting(_domain()))
         self._executor = make_executor()
         self._executor.add_node(self._node)
 
@@ -85,6 +91,7 @@ class Viewer:
     def spin(self, stopping: Callable[[], bool]) -> None:
         """Serve until `stopping` is true."""
         next_picture = next_numbers = time.monotonic()
+        say_waiting_at = next_picture + SAY_WAITING_S
         while not stopping():
             wait = min(next_picture - time.monotonic(), 1 / PICTURES_HZ)
             self._executor.spin_once(timeout_sec=max(0.0, wait))
@@ -100,6 +107,9 @@ class Viewer:
                 next_numbers = now + 1 / NUMBERS_HZ
             if self._shown is not None:
                 self._update(self._shown, with_numbers)
+            elif now >= say_waiting_at:
+                say_waiting_at = math.inf
+                print(markup.waiting(_domain()), flush=True)
 
     def close(self) -> None:
         self._recorder.end()
@@ -111,6 +121,7 @@ class Viewer:
         """There is a skin, or another one: make its page."""
         if self._shown is not None:
             self._shown.page.close()
+        self._waiting.close()
         names = [cube.name for cube in skin.info.cubes]
         page = Page(self._server, skin.info.name, names, skin.poses, self._depth, self._buttons())
         page.show_replay(self._replay.state)
@@ -186,6 +197,10 @@ class Viewer:
                 self._links[status.name] = f"{name}: {status.message}"
 
 
+def _domain() -> str:
+    return os.environ.get("ROS_DOMAIN_ID") or "0"
+
+
 def _serve(port: int) -> viser.ViserServer:
     """ConfigError: the port is in use."""
     logging.getLogger("websockets").setLevel(logging.ERROR)
@@ -210,7 +225,7 @@ def run_view(port: int = PORT, depth: float = SURFACE_DEPTH) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    start_ros()
     try:
         with contextlib.closing(Viewer(port, depth)) as viewer:
             print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..core.errors import CubeError
+from .domain import check_domain
 from .skin_processes import Process, Value
 
 END_S = 1.2
@@ -32,10 +33,11 @@ class ChildError(CubeError):
 class Children:
     """Child processes by the name of their executable; a context manager that ends them all.
 
-    Each writes its output to a log file in the folder `logs`.
+    Each writes its output to a log file in the folder `logs`. ConfigError: ROS_DOMAIN_ID is none.
     """
 
     def __init__(self, logs: Path) -> None:
+        check_domain()
         self._logs = logs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 

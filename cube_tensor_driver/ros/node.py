@@ -23,11 +23,12 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 
 from ..core.errors import ConfigError, CubeError
+from .executor import make_executor
 from .guard import CallbackGuard, refuse_errors
 from .parameters import Parameter
+from .session import start_ros
 
 PAUSE_S = 2.0
 """No message is lost while a subscriber pauses for so long: a queue is as deep as the rate times
@@ -280,9 +281,8 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
         signal.signal(number, stop)
     sys.setswitchinterval(SWITCH_S)
     code = 0
-    # rclpy's own handlers would end the context under a thread that publishes.
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
+        start_ros()
         nodes = make()
         executor = make_executor()
         for node in nodes:
@@ -321,14 +321,3 @@ def _start(node: CubeNode) -> bool:
         transition() == TransitionCallbackReturn.SUCCESS
         for transition in (node.trigger_configure, node.trigger_activate)
     )
-
-
-def make_executor() -> Any:
-    """The EventsExecutor, which costs a third of the default one, if this rclpy has it."""
-    try:
-        from rclpy.experimental.events_executor import EventsExecutor
-    except ImportError:
-        from rclpy.executors import SingleThreadedExecutor
-
-        return SingleThreadedExecutor()
-    return EventsExecutor()

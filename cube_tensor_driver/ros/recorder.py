@@ -28,7 +28,7 @@ WAITING_BYTES = 256 << 20
 
 
 class Recorder:
-    """Records `topics` of a node's graph into a bag from now until `close`.
+    """Records `topics`, whole names, of a node's graph into a bag from now until `close`.
 
     Call `find_topics` now and then: it subscribes to topics that have appeared. received, dropped:
     messages. counts: messages of each topic. refused: why a topic is not recorded.
@@ -40,7 +40,7 @@ class Recorder:
         self.refused: dict[str, str] = {}
         self.error: BagError | None = None
         self._node, self._bag = node, bag
-        self._wanted = [node.resolve_topic_name(topic) for topic in topics]
+        self._wanted = list(topics)
         self._subscriptions: list[Any] = []
         self._waiting: deque[tuple[str, int, bytes]] = deque()
         self._taken_bytes = self._written_bytes = 0

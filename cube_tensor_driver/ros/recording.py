@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from rclpy.node import Node
+
 from ..bags.repair import repair
 from ..bags.write import BagWriter
-from ..core.errors import BagError
+from ..core.errors import BagError, ConfigError
 from .recorder import Recorder
 from .session import node_session, on_stop_signal
 
@@ -30,13 +34,15 @@ def record(
     """Record for `duration` s (None: until a signal) into a new bag; `BagWriter` says of what kind.
 
     show: called once a second with the recorder and the seconds since the start.
-    BagError: cannot be written; what was written before is made readable.
+    BagError: cannot be written; what was written before is made readable. Or nothing came: then
+    there is no bag. ConfigError: no such topics, or ROS does not start.
     """
     stop = threading.Event()
     on_stop_signal(stop.set)
-    bag = BagWriter(folder, storage, max_bytes, max_seconds)
     with node_session("recorder") as (node, executor):
-        recorder = Recorder(node, topics, bag)
+        names = resolve_topics(node, topics)
+        bag = BagWriter(folder, storage, max_bytes, max_seconds)
+        recorder = Recorder(node, names, bag)
         begin = find_at = show_at = time.monotonic()
         until = float("inf") if duration is None else begin + duration
         try:
@@ -53,7 +59,34 @@ def record(
                     show(recorder, now - begin)
         finally:
             _close(recorder, folder)
+    if not bag.messages:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise BagError(f"nothing recorded, no bag made: {_why_nothing(recorder)}")
     return recorder
+
+
+def resolve_topics(node: Node, topics: Sequence[str]) -> list[str]:
+    """The whole names of topics. ConfigError: ROS does not allow such a name."""
+    names = []
+    for topic in topics:
+        try:
+            names.append(node.resolve_topic_name(topic))
+        except (RuntimeError, ValueError):  # RCLError, InvalidTopicNameException
+            raise ConfigError(
+                f"topic {topic!r}, allowed: letters, digits, _ and /, and no digit after a /"
+            ) from None
+    return names
+
+
+def _why_nothing(recorder: Recorder) -> str:
+    if recorder.refused:
+        return "; ".join(recorder.refused.values())
+    if recorder.counts:
+        return f"no message came on {', '.join(sorted(recorder.counts))}"
+    return (
+        f"nobody offers {', '.join(recorder.missing)} in DDS domain "
+        f"{os.environ.get('ROS_DOMAIN_ID') or 0}; start the skin, or correct --topics"
+    )
 
 
 def _close(recorder: Recorder, folder: Path) -> None:

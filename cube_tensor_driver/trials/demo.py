@@ -183,7 +183,7 @@ class _Demo:
     def note_address(self) -> None:
         """Write the address of the browser view above the table."""
         self._observer.spin(FIRST_TENSORS_S, lambda: "http://" in self._children.log("view"))
-        address = self._children.log("view").strip().splitlines()[-1].split()[0]
+        address = self._children.wait_for_line("view", "http://", 0.0).split()[0]
         self._table.note = f"\n{address} shows it"
 
     def measure(
