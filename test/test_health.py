@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -288,6 +290,21 @@ def test_a_residual_is_of_the_cube_and_has_hysteresis():
     assert not skin.health.strained.any()
     skin.play(3, bend(15))
     assert not skin.health.strained.any()
+
+
+@pytest.mark.parametrize("first", [3, 5])
+def test_many_rows_of_one_cube_take_bounded_time(first):
+    """As many scans as rows, whether or not another cube comes before them."""
+    n = 30_000
+    cube = np.full(n, 5, np.uint16)
+    cube[0] = first
+    rows = stamped(cube, np.full((n, 8), 100e3, np.float32), np.zeros(n, np.uint32), np.arange(n))
+    health = Skin().health
+    begun = time.perf_counter()
+    left_out, _ = health.update(rows)
+    assert time.perf_counter() - begun < 1.0  # 0.1 s; each row for itself takes 2.5 s
+    assert not left_out.any()
+    assert health.window().rows.sum() == n and health.window().rows[first] >= 1
 
 
 def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():

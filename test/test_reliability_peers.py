@@ -85,6 +85,9 @@ def test_messages_of_any_content_are_refused_and_counted(skin):
     for rows in (2**29, 2**31, 2**32 - 1):
         publisher.publish(good[:rows_at] + rows.to_bytes(4, "little") + good[rows_at + 4 :])
     publisher.publish(good[:20])
+    many = np.zeros(30_000, np.uint16)
+    rows = FrequencyRows.of(many, np.zeros((len(many), 8), np.float32))
+    publisher.publish(frequency_codec.encode(rows, b"skin\0"))
 
     def refused() -> bool:
         values = {
@@ -95,7 +98,7 @@ def test_messages_of_any_content_are_refused_and_counted(skin):
             for pair in status.values
         }
         assert values.get("callback errors", "0") == "0"
-        return values.get("messages that contradict themselves", "0") == "4"
+        return values.get("messages that contradict themselves", "0") == "5"
 
     skin.wait(refused)
 

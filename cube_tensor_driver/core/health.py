@@ -145,7 +145,7 @@ class Health:
         if pattern.repeats:
             return self._check(pattern, rows)
         left_out, status = np.empty(len(rows), np.uint32), np.empty(len(rows), np.uint16)
-        for chosen in _occurrences(rows.cube):
+        for chosen in _regular_parts(rows.cube):
             part = rows.select(chosen)
             left_out[chosen], status[chosen] = self._check(self._make_pattern(part.cube), part)
         return left_out, status
@@ -272,11 +272,19 @@ class Health:
         )
 
 
-def _occurrences(cube: np.ndarray) -> list[np.ndarray]:
-    """Row numbers of the first row of each cube, of the second row of each, and so on."""
+def _regular_parts(cube: np.ndarray) -> list[np.ndarray]:
+    """Row numbers in parts, each of several scans of the same cubes: of the first row of each cube,
+    of the second row of each, and so on.
+
+    The cubes that come k times are among those that come k - 1 times, so there are at most as many
+    parts as cubes.
+    """
+    if not len(cube):
+        return []
     order = np.argsort(cube, kind="stable")
     ordered = cube[order]
     occurrence = np.arange(len(cube)) - np.searchsorted(ordered, ordered)
     by_occurrence = np.argsort(occurrence, kind="stable")
-    ends = np.cumsum(np.bincount(occurrence)) if len(cube) else np.empty(0, int)
-    return np.split(order[by_occurrence], ends[:-1]) if len(cube) else []
+    sizes = np.bincount(occurrence)
+    ends = np.cumsum(sizes)[:-1]
+    return np.split(order[by_occurrence], ends[sizes[1:] != sizes[:-1]])

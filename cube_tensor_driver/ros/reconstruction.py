@@ -6,6 +6,7 @@ import threading
 from contextlib import ExitStack
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import SubscriptionEventCallbacks
 
@@ -13,17 +14,21 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
 from ..bags.message_codec import frequency_codec
 from ..config.skin import read_skin
-from ..core.errors import CubeError
+from ..core.errors import CubeError, MessageError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows
 from .diagnostics import Diagnostics
 from .messages import info_message
-from .node import LATCHED, CubeNode, batch_queue, run
+from .node import LATCHED, CubeNode, batch_queue, run, scans_per_message
 from .parameters import RECONSTRUCTION
 from .reconstruction_diagnostics import ReconstructionDiagnostics, log_changes
 from .recorded import open_recording
 from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
+
+MAX_SCANS = 1000
+"""Rows of one cube in one message, if its publish_period does not need more. Each may take 0.3 ms of
+a skin of 1280 cubes, and the node does nothing else meanwhile."""
 
 
 class Reconstruction(CubeNode):
@@ -48,6 +53,9 @@ class Reconstruction(CubeNode):
         reconstructor = self._reconstructor = Reconstructor(skin)
         reconstructor.drift_time = float(self.value("drift_time"))
         quality = batch_queue(self, skin.rate, len(skin.cubes))
+        # One more than asked for, as drivers may gather it; twice, because rates are not exact.
+        scans = scans_per_message(self.value("publish_period"), skin.rate)
+        self._max_scans = max(MAX_SCANS, 2 * (scans + 1))
         side = self.value("wrench_side") or None
         self._publisher = StressPublisher(self, skin, reconstructor, quality, side)
         made.callback(self._publisher.close)
@@ -104,6 +112,7 @@ class Reconstruction(CubeNode):
         if not self._active:
             return
         try:
+            _check_scans(rows, self._max_scans)
             with self._lock:
                 recorded = self._recorded
                 verdicts = recorded.verdicts(rows, self._reconstructor) if recorded else None
@@ -140,6 +149,18 @@ class Reconstruction(CubeNode):
             statuses, changes = self._diagnostics.statuses()
         log_changes(self.get_logger(), changes)
         return statuses
+
+
+def _check_scans(rows: FrequencyRows, limit: int) -> None:
+    """MessageError: more rows of one cube in a message than may be."""
+    if len(rows) <= limit:
+        return
+    counts = np.bincount(rows.cube)
+    if counts.max() > limit:
+        raise MessageError(
+            f"a message has {counts.max()} rows of cube {counts.argmax()}, the limit is {limit}: "
+            "set parameter publish_period to the driver's"
+        )
 
 
 def main() -> None:
