@@ -27,6 +27,7 @@ import viser
 from bag_maker import START_NS, make_bag
 from PIL import Image
 from selenium import webdriver
+from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
@@ -232,11 +233,19 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path):
             # It has come to the end, and holds there. Its cubes do not become stale.
             ros.wait(lambda: heard and position() > 2.9 and "play" in buttons(page), 40)
             ros.wait(lambda: "paused" in text(page) and f"{N} of {N} cubes" in text(page), 40)
-            slider = page.find_element("css selector", "[role=slider]")
 
             def key(one: str) -> None:
-                page.execute_script("arguments[0].focus()", slider)
-                slider.send_keys(one)
+                ros.wait(lambda: sent(one))
+
+            def sent(one: str) -> bool:
+                # The page may draw the slider again at any time, also between these two steps.
+                try:
+                    slider = page.find_element("css selector", "[role=slider]")
+                    page.execute_script("arguments[0].focus()", slider)
+                    slider.send_keys(one)
+                except StaleElementReferenceException:
+                    return False
+                return True
 
             key(Keys.HOME)
             ros.wait(lambda: position() < 0.3, 40)
@@ -251,7 +260,7 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path):
             ros.wait(lambda: position() < 0.3, 40)
             key(Keys.END)
             ros.wait(lambda: position() > 2.8, 40)
-            ros.wait(lambda: float(slider.get_attribute("aria-valuenow")) > 2.8, 40)
+            ros.wait(lambda: slider_value(page) > 2.8, 40)
             assert f"{N} of {N} cubes" in text(page)
         refused = ros.call(
             SteerReplay, "player/steer", SteerReplay.Request(position=3.5, paused=True)
@@ -269,6 +278,11 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path):
 
 def text(page: webdriver.Chrome) -> str:
     return page.execute_script("return document.body.innerText")
+
+
+def slider_value(page: webdriver.Chrome) -> float:
+    script = "return document.querySelector('[role=slider]').getAttribute('aria-valuenow')"
+    return float(page.execute_script(script))
 
 
 def buttons(page: webdriver.Chrome) -> list[str]:
