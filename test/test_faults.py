@@ -232,12 +232,19 @@ def test_inject_speaks_to_the_pipe_or_says_that_nobody_listens(tmp_path):
     with pytest.raises(ConfigError, match="no simulator reads it"):
         inject(tmp_path, ["kind=drop"])
     reader = os.open(tmp_path / ".faults", os.O_RDONLY | os.O_NONBLOCK)
-    inject(tmp_path, ["kind=unplug", "link=hub0", "seconds=2"])
+    write_yaml(tmp_path / ".hubs", {"hub0": {"cubes": 8, "pads": 8}})
+    for words in (["kind=unplug", "link=hub7"], ["kind=open", "cube=8"], ["kind=short", "pad=8"]):
+        with pytest.raises(ConfigError, match=r"fault .*: .*allowed: "):
+            inject(tmp_path, words)
+    said = inject(tmp_path, ["kind=unplug", "link=hub0", "seconds=2"])
+    assert said == "hub0: cut the port and the power for 2 s"
     assert parse_yaml(os.read(reader, 1000), "pipe") == {
         "kind": "unplug",
         "link": "hub0",
         "seconds": 2,
     }
+    said = inject(tmp_path, ["kind=stuck", "cube=3", "pad=5", "seconds=10"])
+    assert said == "hub0: repeat the reading of pad 5 of cube 3 for 10 s"
     os.close(reader)
 
 

@@ -27,5 +27,5 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from ..simulation.inject import inject
 
-    inject(options.ports, options.fault)
+    print(inject(options.ports, options.fault))
     return 0

@@ -8,6 +8,7 @@ the hub), `value`. `injector.py` carries faults out.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -78,6 +79,32 @@ class Fault:
         if data["kind"] not in KINDS:
             raise ConfigError(f"{place}: kind: found {data['kind']!r}, allowed: {', '.join(KINDS)}")
         return cls(**{key: types[key](value) for key, value in data.items()})
+
+
+@dataclass(frozen=True)
+class HubSize:
+    """How many cubes a simulated hub has, and how many pads each of them."""
+
+    cubes: int
+    pads: int
+
+
+def check_target(fault: Fault, hubs: Mapping[str, HubSize]) -> list[str]:
+    """The links that a fault is for. ConfigError: a link, cube or pad that there is not.
+
+    hubs: by the name of the link
+    """
+    names = [fault.link] if fault.link else list(hubs)
+    for name in names:
+        hub = hubs.get(name)
+        if hub is None:
+            raise ConfigError(f"fault {fault.kind}: link {name!r}, allowed: {', '.join(hubs)}")
+        if fault.kind in PAD_FAULTS and not (fault.cube < hub.cubes and fault.pad < hub.pads):
+            raise ConfigError(
+                f"fault {fault.kind}: found cube {fault.cube}, pad {fault.pad} of link {name!r}; "
+                f"allowed: below {hub.cubes}, {hub.pads}"
+            )
+    return names
 
 
 def _fits(key: str, value: Any, wanted: type) -> bool:

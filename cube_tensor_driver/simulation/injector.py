@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError
 from ..device.protocol import TEMPERATURE_UNKNOWN, VERSION
-from .faults import FRAME_FAULTS, MOMENTARY_FAULTS, PAD_FAULTS, Fault
+from .faults import FRAME_FAULTS, MOMENTARY_FAULTS, PAD_FAULTS, Fault, HubSize, check_target
 from .hub import SimulatedHub
 from .line import Line
 from .sample_log import FaultRecord
@@ -87,18 +86,11 @@ class Injector:
     def add(self, fault: Fault, at_us: int) -> None:
         """Carry out a fault at a simulated time. ConfigError: of a link, cube or pad that there is
         not."""
-        for name in [fault.link] if fault.link else list(self._links):
-            link = self._links.get(name)
-            if link is None:
-                raise ConfigError(
-                    f"fault {fault.kind}: link {name!r}, allowed: {', '.join(self._links)}"
-                )
-            cubes, pads = len(link.hub.cube_uids), link.hub.n_pads
-            if fault.kind in PAD_FAULTS and not (fault.cube < cubes and fault.pad < pads):
-                raise ConfigError(
-                    f"fault {fault.kind}: found cube {fault.cube}, pad {fault.pad}; "
-                    f"allowed: below {cubes}, {pads}"
-                )
+        sizes = {
+            name: HubSize(len(link.hub.cube_uids), link.hub.n_pads)
+            for name, link in self._links.items()
+        }
+        for name in check_target(fault, sizes):
             self._push(self._coming, at_us, replace(fault, link=name))
 
     def due_us(self) -> int | None:

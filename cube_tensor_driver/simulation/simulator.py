@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config.skin import Skin
-from ..config.yaml import parse_yaml
+from ..config.yaml import parse_yaml, write_yaml
 from ..core.errors import ConfigError
 from .cubes import HubCubes, hub_cubes
-from .faults import Fault
+from .faults import Fault, HubSize
 from .hub import SimulatedHub
 from .injector import Injector, SimulatedLink
 from .line import Line, TcpLine
@@ -41,6 +41,8 @@ without limit."""
 SECOND_US = 1_000_000
 FAULT_PIPE = ".faults"
 """A pipe in the folder of the ports: each line written to it is a fault, as YAML."""
+HUBS_FILE = ".hubs"
+"""A file in the folder of the ports: link -> `HubSize`, as YAML. It is there before the pipe."""
 
 
 @dataclass
@@ -91,6 +93,11 @@ class Simulator:
             ports.mkdir(parents=True, exist_ok=True)
             for carried in hub_cubes(skin, noise=noise, drift=drift):
                 self._links.append(_connect(skin, carried, ports, tcp))
+            sizes = {
+                link.name: asdict(HubSize(len(link.hub.cube_uids), link.hub.n_pads))
+                for link in self._links
+            }
+            write_yaml(ports / HUBS_FILE, sizes)
             self._fault_pipe = _open_pipe(ports / FAULT_PIPE)
         except OSError as error:
             raise ConfigError(
@@ -158,7 +165,8 @@ class Simulator:
         for link in self._links:
             link.line.unplug()
         os.close(self._fault_pipe)
-        (self._ports / FAULT_PIPE).unlink(missing_ok=True)
+        for name in (FAULT_PIPE, HUBS_FILE):
+            (self._ports / name).unlink(missing_ok=True)
         # The folder stays when somebody else put something there.
         with contextlib.suppress(OSError):
             self._ports.rmdir()
