@@ -40,18 +40,26 @@ class Skin:
 
     def play(self, seconds, frequency, time_constant=None, temperature=None, fault=0):
         """frequency: (3, 8), or a function of time that gives it."""
-        for _ in range(round(seconds * RATE)):
-            f = frequency(self.seconds) if callable(frequency) else frequency
-            f = f * (1 + self.noise * self._random.standard_normal((3, 8)))
-            windows = self.health.closed
-            faults = np.array([0, fault, 0], np.uint32)
-            stamp_ns = np.full(3, round(self.seconds * 1e9))
-            self.health.update(
-                stamped(np.arange(3), f.astype(np.float32), faults, stamp_ns, temperature)
+        left = round(seconds * RATE)
+        while left:
+            # As many scans at once as a window has: it closes once at most.
+            scans = min(left, round(WINDOW_S * RATE))
+            times = self.seconds + np.arange(scans) / RATE
+            f = np.array([frequency(t) if callable(frequency) else frequency for t in times])
+            f = f * (1 + self.noise * self._random.standard_normal(f.shape))
+            rows = stamped(
+                np.tile(np.arange(3), scans),
+                f.reshape(-1, 8).astype(np.float32),
+                np.tile(np.array([0, fault, 0], np.uint32), scans),
+                np.repeat(np.rint(times * 1e9), 3),
+                None if temperature is None else np.tile(temperature, scans),
             )
+            windows = self.health.closed
+            self.health.update(rows)
             if time_constant and self.health.closed != windows:
                 self.tracker.step(time_constant)
-            self.seconds += 1 / RATE
+            self.seconds += scans / RATE
+            left -= scans
 
     def tare(self, cubes=(0, 1, 2), duration=1.0):
         self.pipeline.rest_frequency = measure_rest(
