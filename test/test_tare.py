@@ -85,6 +85,13 @@ def test_tare_is_the_mean_and_only_of_the_cubes_named():
     assert np.nanmax(np.abs(rows.stress[0])) < 20 < np.nanmax(np.abs(rows.stress[1]))
 
 
+def test_tare_of_the_first_second_of_data():
+    """The first rows of a cube have no differences; they do not count as noise."""
+    skin = Skin()
+    skin.play(1.1, pads())
+    np.testing.assert_allclose(skin.tare(), pads(), rtol=8e-6)
+
+
 def test_tare_is_at_the_reference_temperature():
     model = TemperatureModel(25.0, np.full((8, 1), -1e-3))
     skin = Skin(illustrative_with(model))

@@ -138,13 +138,18 @@ def _average(windows: Sequence[Window], chosen: np.ndarray) -> _Means:
     rows = np.array([window.rows[chosen] for window in windows])[:, :, None]
     mean = np.array([window.mean[chosen] for window in windows])
     variance = np.array([window.noise[chosen] for window in windows]) ** 2
+    # The first rows of a cube have no differences yet: the noise of their window is NaN.
+    with_noise = rows * np.isfinite(variance)
     highest = np.fmax.reduce([window.highest[chosen] for window in windows])
     lowest = np.fmin.reduce([window.lowest[chosen] for window in windows])
     total = rows.sum(axis=0)
     return _Means(
         frequency=(np.where(rows > 0, mean, 0) * rows).sum(axis=0) / total,
         span=highest - lowest,
-        noise=np.sqrt((variance * rows).sum(axis=0) / total),
+        noise=np.sqrt(
+            (np.nan_to_num(variance) * with_noise).sum(axis=0)
+            / np.maximum(with_noise.sum(axis=0), 1)
+        ),
     )
 
 
