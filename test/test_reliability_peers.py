@@ -67,6 +67,16 @@ def test_a_tare_over_no_time_is_refused(skin):
         assert not answer.success and "allowed" in answer.message, duration
 
 
+def test_many_calls_at_once_are_all_answered(skin):
+    """The client must hold as many answers, too: with ROS's own depth it drops some of them."""
+    client = skin.node.create_client(
+        Tare, "/reconstruction/tare", qos_profile=QoSProfile(depth=1000)
+    )
+    skin.wait(client.service_is_ready)
+    calls = [client.call_async(Tare.Request(duration=-1.0)) for _ in range(1000)]
+    skin.wait(lambda: all(call.done() for call in calls))
+
+
 def test_a_rate_that_no_hub_can_have_is_refused(skin):
     for rate in (1e-300, 1e-9, 2e-4, 0.09, 1e9, -1.0):
         value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=rate)

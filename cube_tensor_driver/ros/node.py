@@ -51,6 +51,9 @@ COLLECT = 20_000, 20, 20
 """Thresholds of Python's garbage collector. A scan leaves no garbage, but with Python's own 700
 objects the collector would run every scan or two."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+SERVICES = QoSProfile(depth=1000)
+"""Calls that wait for an answer. ROS's own depth is 10: of more calls at once DDS drops the oldest
+without a word. Parameter services have 1000 by themselves."""
 
 
 def queue(rate: float | None, reliability: str = "reliable", rows: int = 1) -> QoSProfile:
@@ -121,6 +124,7 @@ class CubeNode(LifecycleNode):
     def create_service(self, *arguments: Any, **options: Any) -> Any:
         service_type, name, callback, *others = arguments
         guarded = self.guard.wrap_service(callback)
+        options.setdefault("qos_profile", SERVICES)
         return super().create_service(service_type, name, guarded, *others, **options)
 
     def _guard_lifecycle_services(self) -> None:

@@ -27,8 +27,8 @@ from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
 
 MAX_SCANS = 1000
-"""Rows of one cube in one message, if its publish_period does not need more. Each may take 0.3 ms of
-a skin of 1280 cubes, and the node does nothing else meanwhile."""
+"""Rows of one cube in one message, if publish_period does not need more. Each may take 0.3 ms of a
+skin of 1280 cubes, and the node does nothing else meanwhile."""
 
 
 class Reconstruction(CubeNode):
