@@ -9,6 +9,7 @@ import pytest
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.cube_table import CubeAddress
 from cube_tensor_driver.device.link import LinkConfig
+from cube_tensor_driver.device.link_log import LinkLog
 from cube_tensor_driver.device.protocol import Hello, Sample
 from cube_tensor_driver.device.reader import LinkFrames
 from cube_tensor_driver.device.row_account import RowCounts
@@ -245,6 +246,48 @@ def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
     assert first.frequency[:, 0].tolist() == [1, 1, 11, 11, 2, 2, 12, 12]
     assert second.sequence.tolist() == [2, 2, 2, 2]
     assert scan.build() is None and scan.rows_waiting() == 0
+
+
+class LinesLog:
+    """Keeps what is logged."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def info(self, message: str) -> None:
+        self.lines.append(message)
+
+    warning = error = info
+
+
+def test_a_hub_that_is_ever_another_one_does_not_fill_the_log():
+    """Each HELLO is taken in all the same: the last one counts."""
+    log = LinesLog()
+    links = [LinkConfig("a", "/dev/none"), LinkConfig("b", "/dev/none")]
+    addresses = [CubeAddress("a", 0, None, 5000, 1), CubeAddress("b", 1, 0, None, 1)]
+    live = LiveLinks(links, addresses, lambda rows: None, log=log)
+    live.receive([LinkFrames(0, 0, [hello([uid], 1)]) for uid in range(1, 3001)])
+    assert 20 <= len(log.lines) <= 25, log.lines[-1]
+    assert live.cube_uids == {}
+    live.receive([LinkFrames(0, 0, [hello([5000], 1)]), LinkFrames(1, 0, [hello([2], 1)])])
+    assert live.cube_uids == {0: 5000, 1: 2}
+    # Each link has its own bound.
+    assert log.lines[-1] == "link b: hub 0x1 with 1 cubes of 1 pads"
+
+
+def test_lines_that_were_left_out_are_counted_and_told():
+    now = [0.0]
+    log = LinesLog()
+    link_log = LinkLog("a", log, lambda: now[0])
+    for number in range(50):
+        link_log.error(str(number))
+    assert len(log.lines) == 20 and link_log.left_out == 30
+    now[0] = 1.0
+    link_log.info("late")
+    assert log.lines[-1] == "link a: late (30 lines about this link were left out before)"
+    now[0] = 2.0
+    link_log.warning("later")
+    assert log.lines[-1] == "link a: later"
 
 
 def test_stamps_use_the_arrival_of_their_own_read():

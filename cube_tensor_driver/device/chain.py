@@ -12,13 +12,13 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
 from .clock import ClockMap
 from .cube_table import CubeAddress
 from .link import Link, LinkConfig, LinkState
+from .link_log import LinkLog, Log
 from .protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats
 from .reader import LinkFrames, Reader
 from .row_account import RowAccount, RowCounts
@@ -30,16 +30,6 @@ MAX_SCANS = 4
 memory that is kept for rows need not hold them all."""
 EVENTS_KEPT = 100
 """Of each link, until the next report."""
-
-
-class Log(Protocol):
-    """What is needed of a logger, that of Python or of ROS."""
-
-    def info(self, message: str, /) -> object: ...
-
-    def warning(self, message: str, /) -> object: ...
-
-    def error(self, message: str, /) -> object: ...
 
 
 @dataclass(frozen=True)
@@ -69,6 +59,7 @@ class _LinkRecord:
     contradictions: of the account
     events: states other than open since the last report, and the reason of each
     logged_version: the last other protocol version that was logged
+    hub_changes: how often a hub said that it has other cubes than before, the first time included
     """
 
     account: Account = field(default_factory=Account)
@@ -77,6 +68,7 @@ class _LinkRecord:
     contradictions: list[str] = field(default_factory=list)
     events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     logged_version: int | None = None
+    hub_changes: int = 0
 
 
 class LiveLinks:
@@ -116,6 +108,7 @@ class LiveLinks:
         self._make_rows = make_rows
         self._clock_ns = clock_ns
         self._log: Log = log or logging.getLogger(__name__)
+        self._link_logs = [LinkLog(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
         self._errors = 0
         self._reader: Reader | None = None
@@ -173,8 +166,10 @@ class LiveLinks:
         if self._reader is None:
             return []
         return [
-            self._report(link, record)
-            for link, record in zip(self._reader.links, self._records, strict=True)
+            self._report(link, record, log)
+            for link, record, log in zip(
+                self._reader.links, self._records, self._link_logs, strict=True
+            )
         ]
 
     def receive(self, received: Sequence[LinkFrames]) -> None:
@@ -240,13 +235,12 @@ class LiveLinks:
         problems = self._scans.cubes.learn(link, hello)
         if problems is None:
             return
-        self._records[link].problems = problems
-        name = self._configs[link].name
-        self._log.info(
-            f"link {name}: hub {hello.hub_uid:#x} with {hello.n_cubes} cubes of {hello.n_pads} pads"
-        )
+        record, log = self._records[link], self._link_logs[link]
+        record.problems = problems
+        record.hub_changes += 1
+        log.info(f"hub {hello.hub_uid:#x} with {hello.n_cubes} cubes of {hello.n_pads} pads")
         for problem in problems:
-            self._log.error(f"link {name}: {problem}")
+            log.error(problem)
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
         """The state of a link, or why it waits, has changed."""
@@ -256,13 +250,13 @@ class LiveLinks:
                 self._records[link].events.append((state, str(error or state.value)))
             self._scans.set_live(link, False)
             self._deliver()
-        name = self._configs[link].name
+        log = self._link_logs[link]
         if error is not None:
-            self._log.warning(f"link {name}: {state.value}: {error}")
+            log.warning(f"{state.value}: {error}")
         else:
-            self._log.info(f"link {name}: {state.value}")
+            log.info(state.value)
 
-    def _report(self, link: Link, record: _LinkRecord) -> LinkReport:
+    def _report(self, link: Link, record: _LinkRecord, log: LinkLog) -> LinkReport:
         notes = [*record.problems, *record.contradictions]
         if link.error is not None:
             notes.insert(0, str(link.error))
@@ -274,6 +268,7 @@ class LiveLinks:
             )
             if other != record.logged_version:
                 record.logged_version = other
+                # Once a report at most, so it needs no other bound.
                 self._log.error(f"link {link.config.name}: {notes[-1]}")
         past_states = []
         # Taken out one by one, because the reader's thread may add to them.
@@ -288,7 +283,7 @@ class LiveLinks:
             state=link.state,
             past_states=tuple(past_states),
             notes=tuple(notes),
-            values=_values(link, record),
+            values=_values(link, record, log),
         )
 
 
@@ -300,7 +295,7 @@ def _period_us(rate: float | None) -> int | None:
     return None if rate is None else round(1e6 / rate)
 
 
-def _values(link: Link, record: _LinkRecord) -> dict[str, object]:
+def _values(link: Link, record: _LinkRecord, log: LinkLog) -> dict[str, object]:
     clock = record.clock
     values: dict[str, object] = {
         **link.counters,
@@ -309,6 +304,8 @@ def _values(link: Link, record: _LinkRecord) -> dict[str, object]:
         "clock drift ppm": round(clock.drift_ppm, 2),
         "clock jitter us": round(1e-3 * clock.jitter_ns, 1),
         "clock resets": clock.resets,
+        "hub changes": record.hub_changes,
+        "log lines left out": log.left_out,
     }
     stats = record.account.stats_frame
     if stats is not None:
