@@ -241,9 +241,9 @@ def _torture(
 def _skin_file(folder: Path, ports: Path) -> Path:
     """A skin whose links may each be behind every port: only its uid tells which hub it is. The
     last hub is behind a TCP bridge, for the same faults there."""
-    data = grid(nx=NX, ny=NY, pitch=0.012, links=HUBS, rate=RATE, port=str(ports / "*"))
+    data = grid(nx=NX, ny=NY, pitch=0.012, links=HUBS, rate=RATE, port="{}")
     for number, link in enumerate(data["links"]):
-        link["hub_uid"] = number + 1
+        link["port"], link["hub_uid"] = str(ports / "*"), number + 1
     with socket.create_server(("127.0.0.1", 0)) as free:
         data["links"][-1]["port"] = f"socket://127.0.0.1:{free.getsockname()[1]}"
     path = folder / "skin.yaml"
