@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -484,6 +485,35 @@ def test_random_damage_is_one_message_or_no_harm(tmp_path, effort):
         if source == mcap:  # sqlite has no checksums: a flipped bit of a number stays a number
             assert all_differing_bits(again, good[source]) == 0
     assert outcomes["refused"] > 40 * effort
+
+
+def test_the_command_that_is_advised_for_a_cut_file_works_on_it(bag, tmp_path, capsys):
+    whole = next(bag.glob("*.mcap")).read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    assert main(["bag", "info", str(cut)]) == 1
+    advice = re.search(r"\./cube (bag repair \S+)", capsys.readouterr().err)
+    assert main(advice[1].split()) == 0
+    assert "messages can be read" in capsys.readouterr().out
+    assert main(["bag", "info", str(cut)]) == 0
+    assert main(["bag", "repair", str(tmp_path / "nothing.mcap")]) == 1
+
+
+def test_a_reprocess_that_failed_does_not_refuse_the_corrected_command(bag, tmp_path, capsys):
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out"
+    cut.write_bytes(b"no bag")
+    assert main(["reprocess", str(cut), "-o", str(out), "--jobs", "1"]) == 1
+    assert not out.exists()
+    # as one that was killed leaves it
+    out.mkdir()
+    (out / "reprocess.yaml").write_text("format: bag\n")
+    command = ["reprocess", str(bag), "-o", str(out), "--jobs", "1", "--format", "csv"]
+    assert main(command) == 0, capsys.readouterr().err
+
+
+def test_fit_of_a_bag_names_the_option_that_is_missing(bag, tmp_path, capsys):
+    assert main(["fit", str(bag), "--layout", "planar", "-o", str(tmp_path / "x.yaml")]) == 1
+    assert f"{bag} is a bag: name the topic to fit to with --reference" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

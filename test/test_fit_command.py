@@ -60,6 +60,19 @@ def write(path: Path, state: np.ndarray, frequency: np.ndarray, **change) -> Pat
     return path
 
 
+def test_the_example_of_the_page_scatters_as_its_calibration_states(tmp_path):
+    output, figures = tmp_path / "mine.yaml", tmp_path / "fit.json"
+    table = ROOT / "docs" / "example_loads.csv"
+    done = cube("fit", table, "--layout", "planar", "-o", output, "--json", figures)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(figures.read_text())
+    # five standard deviations of a chi-square
+    assert abs(result["chi2"] - result["dof"]) < 5 * np.sqrt(2 * result["dof"])
+    assert "0.00000" not in done.stdout
+    fitted = read_calibration(output)
+    np.testing.assert_allclose(fitted.noise, 3.12, rtol=0.2)
+
+
 def test_a_bench_is_recovered_with_its_deviations(tmp_path):
     truth, state, frequency = bench(0, noise=0.001, loads=20, outliers=2)
     table = write(tmp_path / "loads.csv", state, frequency)

@@ -60,6 +60,11 @@ DAMAGE = (
 )
 
 
+def is_bag(path: Path) -> bool:
+    """Whether a path is a folder, or named like the file of a bag; it may be damaged."""
+    return path.is_dir() or path.suffix in (".mcap", ".db3")
+
+
 @contextmanager
 def damage(path: Path) -> Iterator[None]:
     """Turns what libraries raise about the bag `path` into a BagError; a CubeError passes."""
@@ -82,7 +87,7 @@ def damage(path: Path) -> Iterator[None]:
         text = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
             f"{path}: damaged, or no bag ({text[:200]}); "
-            "./cube bag repair may help if it was cut off"
+            f"./cube bag repair {path} may help if it was cut off"
         ) from None
 
 
@@ -188,7 +193,7 @@ class Bag:
             names = ", ".join(sorted({connection.topic for connection in wanted}))
             raise BagError(
                 f"{self.path}: damaged: {count} messages on {names}, the bag says {promised}; "
-                "./cube bag repair may help"
+                f"./cube bag repair {self.path} may help"
             )
 
     @property

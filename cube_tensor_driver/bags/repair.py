@@ -17,6 +17,7 @@ import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -41,7 +42,7 @@ from mcap.records import (
 
 from ..config.yaml import to_yaml
 from ..core.errors import BagError
-from .read import DAMAGE, damage
+from .read import DAMAGE, Bag, damage
 from .rosbags_storage import decompress
 from .unpack import check_size
 from .write import SUFFIXES, describe, describe_file, move_up, write_metadata
@@ -63,14 +64,32 @@ class Repaired(NamedTuple):
     damaged: int
 
 
-def repair(folder: Path, keep_rest: bool = True) -> Repaired:
-    """Make a bag's folder readable. keep_rest: put what is cut off into a file beside it, ending in
-    .rest.
+def repair(path: Path, keep_rest: bool = True) -> Repaired:
+    """Make a bag readable: a folder, or one file of it.
 
-    BagError: no folder of a bag, no complete message in it, or it cannot be written.
+    keep_rest: put what is cut off into a file beside it, ending in .rest.
+
+    BagError: no bag, no complete message in it, or it cannot be written.
     """
-    if not folder.is_dir():
-        raise BagError(f"{folder}: no folder; name the folder of a bag")
+    if path.is_dir():
+        return _repair_folder(path, keep_rest)
+    if not path.is_file() or path.suffix not in SUFFIXES.values():
+        raise BagError(
+            f"{path}: no bag; name the folder of a bag, or a file that ends in "
+            f"{' or '.join(SUFFIXES.values())}"
+        )
+    if (path.parent / "metadata.yaml").exists():
+        # It says of each file what the file holds.
+        return _repair_folder(path.parent, keep_rest)
+    with damage(path):
+        cut, damaged = _repair_file(path, keep_rest)
+        if not path.exists():
+            raise BagError(f"{path}: no complete message in it; nothing can be read")
+        with Bag(path) as bag:
+            return Repaired(sum(one.msgcount for one in bag.connections), cut, damaged)
+
+
+def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
     cut = damaged = 0
     with damage(folder):
         # While it is written a file stands in a folder of its own name, whatever the bag's folder
@@ -78,18 +97,23 @@ def repair(folder: Path, keep_rest: bool = True) -> Repaired:
         written = [path for suffix in SUFFIXES.values() for path in folder.glob(f"*/*{suffix}")]
         for part in {path.parent for path in written if path.parent.name == path.stem}:
             move_up(part)
-        for path in folder.glob("*.mcap"):
-            one_cut, one_damaged = _seal(path, keep_rest)
+        for path in [path for suffix in SUFFIXES.values() for path in folder.glob(f"*{suffix}")]:
+            one_cut, one_damaged = _repair_file(path, keep_rest)
             cut, damaged = cut + one_cut, damaged + one_damaged
-        for path in folder.glob("*.db3"):
-            with sqlite3.connect(path) as connection:
-                connection.execute("SELECT count(*) FROM messages")
-            connection.close()
     if not any(path.suffix in SUFFIXES.values() for path in folder.iterdir()):
         raise BagError(
             f"{folder}: no .mcap or .db3 file with a complete message in it; nothing can be read"
         )
     return Repaired(write_metadata(folder), cut, damaged)
+
+
+def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
+    """Make one storage file readable; returns bytes cut off and chunks left out."""
+    if path.suffix == SUFFIXES["mcap"]:
+        return _seal(path, keep_rest)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("SELECT count(*) FROM messages")
+    return 0, 0
 
 
 def _seal(path: Path, keep_rest: bool) -> tuple[int, int]:

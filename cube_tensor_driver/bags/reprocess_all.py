@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from typing import Any
 
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import BagError, ConfigError, CubeError
-from .reprocess import Overrides, ReprocessJob, ReprocessResult, reprocess
+from .reprocess import PARTIAL, Overrides, ReprocessJob, ReprocessResult, reprocess
 
 SUFFIX = {"bag": "", "parquet": ".parquet", "csv": ".csv"}
 RECIPE = "reprocess.yaml"
@@ -51,7 +52,7 @@ def write_recipe(folder: Path, form: str, overrides: Overrides) -> None:
         "tare_from_s": list(overrides.tare) if overrides.tare else None,
     }
     path = folder / RECIPE
-    if path.exists():
+    if path.exists() and has_results(folder):
         if read_yaml(path) != recipe:
             raise BagError(
                 f"{folder} was made with other options ({path} says which); name another folder"
@@ -62,6 +63,17 @@ def write_recipe(folder: Path, form: str, overrides: Overrides) -> None:
     except OSError as error:
         raise BagError(f"{folder}: {error.strerror}; name a folder that can be written") from None
     write_yaml(path, recipe, "How the bags of this folder were reprocessed.")
+
+
+def has_results(folder: Path) -> bool:
+    """Whether a folder of results has any."""
+    return any(path.name not in (RECIPE, PARTIAL) for path in folder.iterdir())
+
+
+def remove_without_results(folder: Path) -> None:
+    """Remove a folder in which nothing was completed, with what was begun in it."""
+    if folder.is_dir() and not has_results(folder):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def reprocess_all(

@@ -16,7 +16,7 @@ def arguments(parser: Parser) -> None:
     repair = parser.add_subcommand(
         "repair", "make a bag readable that was cut off: killed, disk full, power lost"
     )
-    repair.add_argument("bag", type=Path, metavar="BAG", help="folder of the bag")
+    repair.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -28,13 +28,13 @@ def run(options: argparse.Namespace) -> int:
     return repair_bag(options.bag)
 
 
-def repair_bag(folder: Path) -> int:
-    """Make a bag's folder readable and print what was lost."""
+def repair_bag(bag: Path) -> int:
+    """Make a bag readable and print what was lost."""
     from ..bags.repair import REST, repair
     from ..terminal.output import warn
 
-    done = repair(folder)
-    print(f"{folder}: {done.messages} messages can be read")
+    done = repair(bag)
+    print(f"{bag}: {done.messages} messages can be read")
     if done.cut:
         print(f"moved {done.cut} bytes behind the last complete chunk to files ending in {REST}")
     if done.damaged:

@@ -63,6 +63,7 @@ def run(options: argparse.Namespace) -> int:
     import datetime
     from dataclasses import replace
 
+    from ..bags.read import is_bag
     from ..config.calibration import find_calibration, read_calibration, write_calibration
     from ..config.layout import named_layout, shipped_calibration
     from ..config.load_table import read_loads, unloaded
@@ -86,6 +87,11 @@ def run(options: argparse.Namespace) -> int:
         # A reference sensor never reads exactly 0: only the tare tells when there was no load.
         rest, rest_source = base.rest_frequency, "of the bag, after tare"
     else:
+        if is_bag(options.loads):
+            raise ConfigError(
+                f"{options.loads} is a bag: name the topic to fit to with --reference; "
+                f"./cube bag info {options.loads} lists them"
+            )
         loads = read_loads(options.loads, layout, options.area)
         rest, rest_source = unloaded(loads), "of the rows without load"
     if options.base is not None:

@@ -60,6 +60,7 @@ def run(options: argparse.Namespace) -> int:
     """1 if a bag could not be reprocessed. CubeError: nothing was begun."""
     from ..bags.reprocess_all import (
         make_jobs,
+        remove_without_results,
         reprocess_all,
         useful_workers,
         workers,
@@ -73,9 +74,12 @@ def run(options: argparse.Namespace) -> int:
     waiting = [job for job in jobs if not job.output.exists()]
     report = ReprocessingReport(options.output, jobs=len(jobs), waiting=len(waiting))
     processes = useful_workers(options.jobs, len(waiting))
-    with workers(processes, options.scheduler) as executor, report:
-        for job, result in reprocess_all(waiting, executor):
-            report.add(job.output, result)
+    try:
+        with workers(processes, options.scheduler) as executor, report:
+            for job, result in reprocess_all(waiting, executor):
+                report.add(job.output, result)
+    finally:
+        remove_without_results(options.output)
     report.summary()
     return 1 if report.failed else 0
 

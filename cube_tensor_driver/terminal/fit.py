@@ -17,7 +17,7 @@ def show_fit(result: Fit, rest: str) -> None:
     table = _table("coefficient")
     for name, value in result.coefficients.items():
         if math.isfinite(value):
-            table.add_row(name, f"{value:+.5f}", f"{result.deviations[name]:.5f}")
+            table.add_row(name, f"{value:+.5f}", f"{result.deviations[name]:.2g}")
         else:
             table.add_row(name, "open", "not determined")
     console.print(table)
@@ -25,7 +25,7 @@ def show_fit(result: Fit, rest: str) -> None:
     gains = _table("pad")
     pads = result.structure.layout.pads
     for pad, gain, deviation in zip(pads, result.gain, result.gain_deviation, strict=True):
-        gains.add_row(pad, f"{gain:.5f}", f"{deviation:.5f}")
+        gains.add_row(pad, f"{gain:.5f}", f"{deviation:.2g}")
     console.print(gains)
     console.print(
         f"scatter {result.scale:.3g} × the stated noise; "
