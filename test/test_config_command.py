@@ -63,7 +63,7 @@ def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
         (["--nx", 2, "--ny", 1, "--links", 2, "--port", "/dev/x"], 1, "is that of all 2 links"),
         (["--nx", 1, "--ny", 1, "--layout", "banana"], 1, "'banana'"),
         (["--nx", 1, "--ny", 1, "--name", "a skin"], 1, "name: found 'a skin', allowed: a name"),
-        (["--nx", 1, "--ny", 1, "--rate", 1e9], 1, "rate: found 1000000000.0"),
+        (["--nx", 1, "--ny", 1, "--rate", 1e9], 2, "is not a rate from 0.1 to 10000"),
         (["--nx", 1, "--ny", 1, "--port", "socket://host"], 1, "write socket://host:port"),
     ],
 )

@@ -5,7 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import numpy as np
+
 from conftest import ROOT
+from cube_tensor_driver.plot.time_series import TimeSeries, draw_series
 
 PROGRAM = """
 import importlib, pathlib, pkgutil, sys
@@ -29,3 +32,26 @@ def test_drawing_changes_no_global_setting_and_opens_no_window(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     assert picture.stat().st_size > 10_000
+
+
+def test_no_line_bridges_a_gap():
+    seconds = np.delete(np.arange(100) / 100, slice(40, 60))
+    n = len(seconds)
+    series = TimeSeries(
+        name="c0",
+        pads=["a", "b"],
+        seconds=seconds,
+        frequency=np.full((n, 2), 1e5),
+        rest=np.full(2, 1e5),
+        values=np.zeros((n, 15)),
+        residual=np.ones(n),
+        status=np.zeros(n, np.uint16),
+    )
+    lines = [line for axes in draw_series(series, "bag").axes for line in axes.lines]
+    assert len(lines) == 2 + 15 + 1
+    for line in lines:
+        x, y = (np.asarray(values, float) for values in line.get_data())
+        drawn = np.isfinite(x) & np.isfinite(y)
+        assert drawn.sum() == n
+        joined = drawn[1:] & drawn[:-1]
+        assert np.diff(x)[joined].max() < 0.02

@@ -266,8 +266,8 @@ def test_what_foxglove_plots_are_fields_of_our_messages():
         assert isinstance(value, float)
 
 
-@pytest.mark.parametrize("width", [80, 120])
-def test_the_live_table_of_planar_cubes_fits_into(width):
+def live_table(width: int) -> tuple[str, list[str]]:
+    """The table of sixteen planar cubes as a terminal of this width shows it, and their rows."""
     console = pytest.importorskip("rich.console", reason="needs rich: run this with ./cube test")
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
@@ -283,11 +283,24 @@ def test_the_live_table_of_planar_cubes_fits_into(width):
     shown = console.Console(width=width, record=True, file=io.StringIO())
     shown.print(table.draw(n, width))
     text = shown.export_text()
+    rows = [line for line in text.splitlines() if any(name in line for name in skin.names)]
+    assert len(rows) == n
+    return text, rows
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_live_table_of_planar_cubes_fits_into(width):
+    text, rows = live_table(width)
     assert "…" not in text
     for word in ("pressure", "∂zz/∂z", "residual", "Hz", "state"):
         assert word in text
-    rows = [line for line in text.splitlines() if any(cube.name in line for cube in skin.cubes)]
-    assert len(rows) == n and all(
-        row.count("-123.00") == 3 and row.count("-12.00") == 2 for row in rows
-    )
+    assert all(row.count("-123.00") == 3 and row.count("-12.00") == 2 for row in rows)
     assert all("1.00" in row and "ok" in row for row in rows)
+
+
+@pytest.mark.parametrize("width", [60, 40])
+def test_the_live_table_of_a_narrow_terminal_keeps_the_state(width):
+    text, rows = live_table(width)
+    assert "…" not in text and all(len(line) <= width for line in text.splitlines())
+    assert "state" in text and all("ok" in row and "1.00" in row for row in rows)
+    assert all("-123.00" in row for row in rows)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .parser import Parser, count, not_negative, positive
+from .parser import Parser, count, not_negative, positive, sample_rate
 
 
 def arguments(parser: Parser) -> None:
@@ -74,7 +74,7 @@ def _add_cubes(parser: Parser, default: int) -> None:
 def _add_time(parser: Parser) -> None:
     parser.add_argument(
         "--rate",
-        type=positive,
+        type=sample_rate,
         default=1000.0,
         metavar="HZ",
         help="scans per second (default: %(default)g)",

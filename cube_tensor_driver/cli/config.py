@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from .parser import Parser, count, positive
+from .parser import Parser, count, positive, sample_rate
 
 
 def arguments(parser: Parser) -> None:
@@ -31,7 +31,7 @@ def arguments(parser: Parser) -> None:
     )
     grid.add_argument(
         "--rate",
-        type=positive,
+        type=sample_rate,
         default=100.0,
         metavar="HZ",
         help="samples per second (default: %(default)g)",

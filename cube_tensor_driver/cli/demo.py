@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .parser import Parser, count, positive
+from .parser import Parser, count, positive, sample_rate
 
 MEASURE_S = 10.0
 """How long a demo that measures runs."""
@@ -29,7 +29,7 @@ def arguments(parser: Parser) -> None:
     )
     parser.add_argument(
         "--rate",
-        type=positive,
+        type=sample_rate,
         metavar="HZ",
         help="samples per second (default: those of the skin file, else 100)",
     )

@@ -183,6 +183,12 @@ def positive(text: str) -> float:
     return float(_number(float, text, "a number above 0", lambda x: 0 < x < math.inf))
 
 
+def sample_rate(text: str) -> float:
+    """What hubs and skin files take."""
+    what = "a rate from 0.1 to 10000 samples per second"
+    return float(_number(float, text, what, lambda x: 0.1 <= x <= 10_000))
+
+
 def not_negative(text: str) -> float:
     return float(_number(float, text, "a number of at least 0", lambda x: 0 <= x < math.inf))
 

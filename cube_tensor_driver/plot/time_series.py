@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from ..core.status import INVALID, RESIDUAL
 from .style import MARKERS, print_style
 
 DASHES = ("-", "--", "-.", ":")
+GAP = 3.0
+"""Times the usual step: a longer one is a gap, which no line bridges."""
 MARKS = 12
 """Markers on a line."""
 POINTS = 20_000
@@ -92,6 +94,7 @@ def cube_series(
 @print_style()
 def draw_series(series: TimeSeries, title: str) -> Figure:
     """Four panels over one axis of time; components that are not observed are left out."""
+    series = _with_breaks(series)
     figure = Figure(figsize=(8, 9))
     axes = figure.subplots(4, 1, sharex=True)
     seconds, stresses = series.seconds, len(STRESS)
@@ -112,6 +115,22 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
     axes[3].set(ylabel="residual / noise", xlabel="time after the start of the bag / s")
     axes[3].legend(loc="upper right", fontsize=7)
     return figure
+
+
+def _with_breaks(series: TimeSeries) -> TimeSeries:
+    """The series with a row of NaN in each gap, where a line breaks off."""
+    step = np.diff(series.seconds)
+    if not len(step):
+        return series
+    at = np.flatnonzero(step > GAP * np.median(step)) + 1
+    return replace(
+        series,
+        seconds=np.insert(series.seconds, at, np.nan),
+        frequency=np.insert(series.frequency, at, np.nan, axis=0),
+        values=np.insert(series.values, at, np.nan, axis=0),
+        residual=np.insert(series.residual, at, np.nan),
+        status=np.insert(series.status, at, 0),
+    )
 
 
 def _draw_columns(axes: Any, seconds: np.ndarray, columns: np.ndarray, names: list[str]) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,28 @@ WIDEST = 1000
 """Columns to measure the table's own width with."""
 
 
+@dataclass(frozen=True)
+class _Form:
+    """What the table has beside names, rates and states, which it always has."""
+
+    components: tuple[str, ...]
+    has_bar: bool = True
+    has_residual: bool = True
+    has_lines: bool = True
+
+
+def _forms(components: Sequence[str]) -> Iterator[_Form]:
+    """From the widest to the narrowest."""
+    names = tuple(components)
+    yield _Form(names)
+    # Without lines a planar skin fits into 80 columns.
+    yield _Form(names, has_lines=False)
+    for n in range(len(names), 0, -1):
+        yield _Form(names[:n], has_bar=False, has_lines=False)
+    yield _Form((), has_bar=False, has_lines=False)
+    yield _Form((), has_bar=False, has_residual=False, has_lines=False)
+
+
 class LiveTable:
     """Last tensor and rate of each cube, drawn ten times a second; a context that gives the
     terminal back."""
@@ -64,6 +88,9 @@ class LiveTable:
     def __exit__(self, *_: object) -> None:
         if self._live:
             self._live.stop()
+            if not self._console.is_terminal:
+                # There rich leaves the last line open, and what follows would stand in it.
+                self._console.line()
 
     @property
     def seen(self) -> int:
@@ -95,45 +122,58 @@ class LiveTable:
     def draw(self, most: int, width: int) -> Table:
         """The table for a terminal of `width` columns.
 
-        Of more than `most` cubes it shows those under the greatest normal stress.
+        Of more than `most` cubes it shows those under the greatest normal stress. In a narrow
+        terminal it leaves out lines, the bar, and components from the last on.
         """
         pressure = np.nan_to_num(-self._values[:, 2])
         self._peak = max(self._peak * PEAK_DECAY, float(pressure.max()), 1.0)
         shown = np.arange(len(pressure))
-        components = [name for name in SHOWN if np.isfinite(self._component(name)).any()]
-        table = self._empty_table(components)
+        caption = None
         if len(shown) > most:
             shown = np.sort(np.argsort(-np.abs(pressure), kind="stable")[:most])
-            table.caption = f"the {most} cubes under the greatest normal stress of {len(pressure)}"
-        for number in shown.tolist():
-            bar = "█" * int(BAR * min(1.0, max(0.0, pressure[number] / self._peak)))
-            values = [_in_kpa(name, self._component(name)[number]) for name in components]
-            table.add_row(
-                self._skin.cubes[number].name,
-                Text(bar, "blue"),
-                *values,
-                _number(self._residual[number], ".2f"),
-                _number(self._rate[number], ".0f"),
-                self._state(number),
-            )
-        options = self._console.options.update(max_width=WIDEST)
-        if Measurement.get(self._console, options, table).maximum > width:
-            # Without lines a planar skin fits into 80 columns.
-            table.box, table.padding, table.show_edge = SIMPLE_HEAD, 0, False
+            caption = f"the {most} cubes under the greatest normal stress of {len(pressure)}"
+        components = [name for name in SHOWN if np.isfinite(self._component(name)).any()]
+        table = Table()
+        for form in _forms(components):
+            table = self._table(form, shown, pressure)
+            table.caption = caption
+            options = self._console.options.update(max_width=WIDEST)
+            if Measurement.get(self._console, options, table).maximum <= width:
+                break
         return table
 
-    def _empty_table(self, components: list[str]) -> Table:
+    def _table(self, form: _Form, shown: NDArray[np.intp], pressure: NDArray[np.float64]) -> Table:
+        """The table of the cubes `shown`."""
+        table = self._empty_table(form)
+        for number in shown.tolist():
+            cells: list[str | Text] = [self._skin.cubes[number].name]
+            if form.has_bar:
+                part = min(1.0, max(0.0, pressure[number] / self._peak))
+                cells.append(Text("█" * int(BAR * part), "blue"))
+            for name in form.components:
+                cells.append(_in_kpa(name, self._component(name)[number]))
+            if form.has_residual:
+                cells.append(_number(self._residual[number], ".2f"))
+            cells += [_number(self._rate[number], ".0f"), self._state(number)]
+            table.add_row(*cells)
+        return table
+
+    def _empty_table(self, form: _Form) -> Table:
         cubes = len(self._count)
         title = f"skin {self._skin.name}: {cubes} cubes. Tension is positive; "
         table = Table(title=f"{title}{UNOBSERVED} is not observed{self.note}")
+        if not form.has_lines:
+            table.box, table.padding, table.show_edge = SIMPLE_HEAD, (0, 0), False
         table.add_column("cube")
-        table.add_column("pressure", width=BAR)
-        for name in components:
+        if form.has_bar:
+            table.add_column("pressure", width=BAR)
+        for name in form.components:
             label, unit = name, "kPa"
             if is_gradient(name):
                 label, unit = f"∂{name[:2]}/∂{name[3]}", "kPa/mm"
             table.add_column(f"{label}\n{unit}", justify="right", min_width=7)
-        table.add_column("residual", justify="right")
+        if form.has_residual:
+            table.add_column("residual", justify="right")
         table.add_column("Hz", justify="right", min_width=4)
         table.add_column("state")
         return table
