@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cube_tensor_driver.device.clock import WINDOW, ClockMap
+from cube_tensor_driver.device.clock import LYING, STANDS_STILL, WINDOW, ClockMap, HostClockWatch
 from cube_tensor_driver.device.sequence import Arrival, SequenceTracker
 
 BASE_S = 0.3e-3  # delay that every sample has; stamps are late by it, and compared with it
@@ -131,6 +131,85 @@ def test_host_clock_set() -> None:
             errors.append(clock.update([10_000 * k], true_ns + 100_000)[0] - true_ns)
         assert clock.resets == 1
         assert max(abs(np.array(errors[1300:]))) <= 101_000
+
+
+def test_a_clock_that_stands_still_is_named_and_arrival_is_the_stamp() -> None:
+    """Within 0.25 s; and it is believed again when it goes on, wherever that is."""
+    clock = ClockMap()
+    for k in range(1000):  # 100 Hz, from 3 s to 6 s the clock stands still and then goes on
+        device_us = 10_000 * min(k, max(300, k - 300)) + 5_000_000
+        arrival_ns = EPOCH_NS + 10_000_000 * k + 100_000
+        (stamp_ns,) = clock.update([device_us], arrival_ns)
+        if 325 <= k <= 600:
+            assert stamp_ns == arrival_ns and clock.problems == {STANDS_STILL}
+        if k == 601:
+            clock.problems = set()
+        if k < 300 or k > 601:
+            assert not clock.problems
+            assert abs(stamp_ns - (arrival_ns - 100_000)) <= 101_000
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5, 0.9, 1.1, 2.0, 50.0, -1.0])
+def test_a_clock_of_a_wrong_rate_is_named_and_arrival_is_the_stamp(speed: float) -> None:
+    clock = ClockMap()
+    for k in range(3000):
+        arrival_ns = EPOCH_NS + 10_000_000 * k
+        (stamp_ns,) = clock.update([10**9 + round(10_000 * k * speed)], arrival_ns)
+        if k >= 1000:
+            assert arrival_ns - stamp_ns < 1_000_000
+    assert clock.problems <= {LYING, STANDS_STILL} and clock.problems
+
+
+def test_a_clock_of_random_times_is_named_and_arrival_is_the_stamp() -> None:
+    random = np.random.default_rng(1)
+    clock = ClockMap()
+    for k in range(1000):
+        arrival_ns = EPOCH_NS + 10_000_000 * k
+        (stamp_ns,) = clock.update([int(random.integers(0, 2**63))], arrival_ns)
+        assert stamp_ns == arrival_ns
+    assert clock.problems == {LYING}
+
+
+def test_three_restarts_far_apart_are_no_lie() -> None:
+    clock = ClockMap()
+    for k in range(6000):  # a new start each 12 s
+        clock.update([10_000 * (k % 1200)], EPOCH_NS + 10_000_000 * k)
+    assert clock.resets == 4 and not clock.problems
+
+
+@pytest.mark.parametrize("step_ns", [5_000_000, -5_000_000, 15_000_000, -2 * 10**9, 3600 * 10**9])
+def test_setting_the_host_clock_shows_at_once(step_ns: int) -> None:
+    """No stamp is wrong in between, and no drift is forgotten."""
+    steady_ns, set_ns = 0, 0
+    watch = HostClockWatch(lambda: EPOCH_NS + steady_ns + set_ns, lambda: steady_ns)
+    clock = ClockMap()
+    steps = []
+    for k in range(3000):
+        steady_ns = 10_000_000 * k
+        set_ns = step_ns if k >= 1000 else 0
+        now_ns, step = watch.look()
+        if step:
+            steps.append((k, step))
+            clock.shift(step)
+        (stamp_ns,) = clock.update([10_000 * k], now_ns)
+        assert abs(stamp_ns - (EPOCH_NS + steady_ns + set_ns)) <= 1000
+    assert steps == [(1000, step_ns)] and clock.resets == 0
+
+
+def test_a_pause_between_two_readings_does_not_set_the_clock() -> None:
+    """The scheduler may stop the thread just there."""
+    steady_ns, pause_ns = 0, 0
+
+    def clock_ns() -> int:
+        nonlocal steady_ns
+        steady_ns += pause_ns
+        return EPOCH_NS + steady_ns
+
+    watch = HostClockWatch(clock_ns, lambda: steady_ns)
+    for pause in (0, 50_000_000, 0, 10_000, 2_000_000, 0):
+        pause_ns = pause
+        steady_ns += 10_000_000
+        assert watch.look() == (EPOCH_NS + steady_ns, 0)
 
 
 def test_sample_out_of_order_gets_its_own_time() -> None:

@@ -3,6 +3,8 @@ complete."""
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -451,3 +453,30 @@ def test_rows_that_the_data_path_forgets_without_an_error_are_unaccounted(monkey
     monkeypatch.setattr(ScanBuilder, "add", lambda self, link, samples, stamps_ns: None)
     live.receive([LinkFrames(0, 0, [timed(0, 0)])])
     assert live.row_counts() == RowCounts(unaccounted=1)
+
+
+@pytest.mark.parametrize("step_ns", [5_000_000, -3_600_000_000_000])
+def test_setting_the_host_clock_shows_in_the_report_and_in_no_stamp(step_ns):
+    set_ns = 0
+
+    def clock_ns():
+        return time.monotonic_ns() + set_ns + 10**18
+
+    given = []
+    address, config = CubeAddress("a", 0, 0, None, 2), LinkConfig("a", "/dev/none")
+    live = LiveLinks([config], [address], given.append, clock_ns=clock_ns)
+    live.start()
+    live.receive([LinkFrames(0, clock_ns(), [hello([1])])])
+    begun_ns = clock_ns()
+    for number in range(60):
+        sampled_us = (clock_ns() - set_ns - begun_ns) // 1000
+        arrival_ns = clock_ns()  # of the last one before the clock was set: in the old time
+        if number == 30:
+            set_ns = step_ns
+        live.receive([LinkFrames(0, arrival_ns, [timed(number, sampled_us)])])
+        (stamp_ns,) = given[-1].stamp_ns.tolist()
+        assert abs(stamp_ns - (begun_ns + 1000 * sampled_us + set_ns)) < 1_000_000
+    (report,) = live.report()
+    live.close()
+    assert any("the host's clock was set by" in note for note in report.notes)
+    assert report.values["clock resets"] == 0

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
-from .clock import ClockMap
+from .clock import ClockMap, HostClockWatch
 from .cube_table import CubeAddress
 from .link import Link, LinkConfig, LinkState
 from .link_log import LinkLog, Log
@@ -80,6 +80,7 @@ class LiveLinks:
     scans_per_call: how many scans are gathered for one call
     make_rows: makes the arrays that rows are written into
     clock_ns: the clock of `stamp_ns`
+    is_host_clock: whether that is the host's now, and not a simulated time
     log: for what happens to the links; None: Python's logging
     on_end: called in the reader's thread when it ends, after `close` or by an error
     """
@@ -94,6 +95,7 @@ class LiveLinks:
         scans_per_call: int = 1,
         make_rows: MakeRows = empty_rows,
         clock_ns: Callable[[], int] = time.time_ns,
+        is_host_clock: Callable[[], bool] = lambda: True,
         log: Log | None = None,
         on_end: Callable[[], None] = lambda: None,
     ) -> None:
@@ -107,6 +109,9 @@ class LiveLinks:
         self._max_scans = max(MAX_SCANS, scans_per_call + 1)
         self._make_rows = make_rows
         self._clock_ns = clock_ns
+        self._is_host_clock = is_host_clock
+        self._clock_watch = HostClockWatch(clock_ns)
+        self._clock_steps: deque[int] = deque(maxlen=EVENTS_KEPT)
         self._log: Log = log or logging.getLogger(__name__)
         self._link_logs = [LinkLog(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
@@ -177,7 +182,11 @@ class LiveLinks:
 
         The reader's thread calls this once per wake-up.
         """
+        now_ns, step_ns = self._see_clock()
         for link, arrival_ns, frames in received:
+            # Bytes that were read just before the clock was set have the old time.
+            if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
+                arrival_ns += step_ns
             self._rows.received += _count_rows(frames)
             try:
                 self._take(link, arrival_ns, frames)
@@ -185,6 +194,18 @@ class LiveLinks:
                 self._lose(error)
         self._deliver()
         self._rows.check()
+
+    def _see_clock(self) -> tuple[int, int]:
+        """The time, and by how much the host's clock was set since the last call, ns."""
+        now_ns, step_ns = self._clock_watch.look()
+        if not step_ns or not self._is_host_clock():
+            return now_ns, 0
+        text = f"the host's clock was set by {1e-9 * step_ns:+.6g} s: stamps follow it at once"
+        self._log.warning(text)
+        for record in self._records:
+            record.clock.shift(step_ns)
+            record.clock.problems.add(text)
+        return now_ns, step_ns
 
     def _take(self, link: int, arrival_ns: int, frames: Sequence[Frame]) -> None:
         """Count the frames of a link and give their samples to the scans."""
@@ -270,6 +291,9 @@ class LiveLinks:
                 record.logged_version = other
                 # Once a report at most, so it needs no other bound.
                 self._log.error(f"link {link.config.name}: {notes[-1]}")
+        # In one step, because the reader's thread adds to them.
+        problems, record.clock.problems = record.clock.problems, set()
+        notes += sorted(problems)
         past_states = []
         # Taken out one by one, because the reader's thread may add to them.
         while record.events:

@@ -8,13 +8,17 @@ the earliest point is kept. The line is the edge of the lower convex hull of the
 mean device time: of all lines below the points it has the smallest mean distance to them (Moon,
 Skelly, Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM
 1999). The smallest delay cannot be told from the offset: stamps are late by it.
+
+Where the host's clock was set shows at once, without any points: it moves against the monotonic
+clock. A hub's clock that stands still or jumps again and again is no clock: arrival is the stamp.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 BUCKET_NS = 1_000_000_000
@@ -33,7 +37,52 @@ MAX_DELAY_NS = 60_000_000_000
 """No sample waits longer. A stamp further back is no time at all: arrival is taken."""
 RESTART_US = 1_000_000
 """If device time falls back by more, the hub restarted; if by less, a sample is out of order."""
+FROZEN_NS = 200_000_000
+FROZEN_CALLS = 3
+"""A clock that has not moved for so long, and for so many calls, stands still."""
+LIES, LIES_NS = 3, 10_000_000_000
+"""A clock that was wrong so often within so long is not believed until that is over."""
+MIN_SET_NS = 1_000_000
+"""By less nobody sets a clock; and reading two clocks one after the other takes time."""
+READ_NS, READS = 100_000, 3
+"""Two clocks are compared if reading them took less; otherwise it is tried again so often."""
+STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
+LYING = (
+    f"the hub's clock jumped {LIES} times within {LIES_NS / 1e9:g} s: "
+    "rows are stamped by their arrival"
+)
 _NEVER = -(2**63)
+
+
+class HostClockWatch:
+    """Sees at once when the host's clock was set.
+
+    clock_ns: the clock that is watched; steady_ns: one that nobody sets.
+    """
+
+    def __init__(
+        self,
+        clock_ns: Callable[[], int],
+        steady_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._clock_ns, self._steady_ns = clock_ns, steady_ns
+        self._offset: int | None = None
+
+    def look(self) -> tuple[int, int]:
+        """The time, and by how much the clock was set since the last call, ns; mostly 0."""
+        for _ in range(READS):
+            before = self._steady_ns()
+            now = self._clock_ns()
+            if self._steady_ns() - before < READ_NS:
+                break
+        else:
+            return now, 0
+        offset = now - before
+        step = 0 if self._offset is None else offset - self._offset
+        if self._offset is not None and abs(step) < MIN_SET_NS:
+            return now, 0
+        self._offset = offset
+        return now, step
 
 
 class ClockMap:
@@ -54,6 +103,7 @@ class ClockMap:
     _earliest: tuple[float, float]  # point of the bucket being filled
     _least: float  # its height above the line; inf: the bucket is empty
     _bucket_end: int
+    _fallen: float  # how far the line fell in the bucket being filled
     _n_high: int  # buckets in a row with all points above the line by more than STEP_NS
 
     def __init__(self) -> None:
@@ -61,6 +111,11 @@ class ClockMap:
         self.resets = 0
         self._drift = 0.0
         self._last_stamp = self._last_arrival = _NEVER
+        self.problems: set[str] = set()
+        self._last_us = -1  # device time of the last call
+        self._moved_ns = 0  # when that came first
+        self._calls_still = 0  # since then
+        self._wrong_ns: deque[int] = deque(maxlen=LIES)  # arrivals where the map began anew
         self._begin()
 
     def reset(self) -> None:
@@ -68,8 +123,19 @@ class ClockMap:
 
         Drift is kept as a first guess, and stamps still do not go backward.
         """
-        self.resets += 1
+        self._count_reset()
         self._begin()
+
+    def shift(self, step_ns: int) -> None:
+        """The host's clock was set by step_ns: stamps go on in its new time."""
+        self._first_ns += step_ns
+        self._bucket_end += step_ns
+        self._moved_ns += step_ns
+        if self._last_arrival != _NEVER:
+            self._last_arrival += step_ns
+        if self._last_stamp != _NEVER:
+            self._last_stamp += step_ns
+        self._wrong_ns = deque((at + step_ns for at in self._wrong_ns), LIES)
 
     @property
     def drift_ppm(self) -> float:
@@ -106,6 +172,9 @@ class ClockMap:
             self._last_stamp = _NEVER
             self.reset()
         self._last_arrival = arrival_ns
+        problem = self._find_problem(max(times), arrival_ns)
+        if problem:
+            self.problems.add(problem)
         # Of samples that arrive together the newest waited least; only it can touch the line.
         newest = max(times)
         if not self._is_fresh and 1000 * (newest - self._first_us + RESTART_US) < self._newest:
@@ -120,16 +189,37 @@ class ClockMap:
             t = 1000 * (time_us - self._first_us)
             stamp = self._first_ns + t + round(self._offset + self._drift * t)
             stamp = min(stamp, arrival_ns)
-            if stamp < arrival_ns - MAX_DELAY_NS:
+            if problem or stamp < arrival_ns - MAX_DELAY_NS:
                 stamp = arrival_ns
-            if t > self._newest:
+            if t > self._newest or problem:
                 stamp = max(stamp, self._last_stamp)
-                self._newest = t
+                self._newest = max(t, self._newest)
                 self._last_stamp = stamp
             else:
                 stamp = min(stamp, self._last_stamp)
             stamps.append(stamp)
         return stamps
+
+    def _find_problem(self, newest_us: int, arrival_ns: int) -> str:
+        """Why device times are not to be believed now; empty if they are."""
+        if newest_us != self._last_us:
+            self._last_us = newest_us
+            if self._is_still(arrival_ns):
+                self.reset()  # nobody knows how long it stood still
+            self._moved_ns, self._calls_still = arrival_ns, 0
+        else:
+            self._calls_still += 1
+            if self._is_still(arrival_ns):
+                return STANDS_STILL
+        wrong = self._wrong_ns
+        return LYING if len(wrong) == LIES and arrival_ns - wrong[0] < LIES_NS else ""
+
+    def _is_still(self, arrival_ns: int) -> bool:
+        return self._calls_still >= FROZEN_CALLS and arrival_ns - self._moved_ns > FROZEN_NS
+
+    def _count_reset(self) -> None:
+        self.resets += 1
+        self._wrong_ns.append(self._last_arrival)
 
     def _begin(self) -> None:
         self._is_fresh = True
@@ -138,6 +228,7 @@ class ClockMap:
         self._offset = 0.0
         self._points = deque(maxlen=WINDOW)
         self._least = math.inf
+        self._fallen = 0.0
 
     def _add_point(self, t: float, arrival_ns: int) -> None:
         """Lower the line to a point at device time t if need be, and close the bucket when it is
@@ -145,8 +236,11 @@ class ClockMap:
         point = t, arrival_ns - self._first_ns - t
         height = self._height(point)
         if height < 0:
-            if height < -STEP_NS:
-                self.resets += 1
+            # Before the first bucket is full, the line falls because the least delay is not known.
+            self._fallen -= height if self._points else 0.0
+            if max(-height, self._fallen) > STEP_NS:
+                self._fallen = 0.0
+                self._count_reset()
                 self._points.clear()
             self._offset += height
             height = 0.0
@@ -157,6 +251,7 @@ class ClockMap:
             self._earliest = point
         if arrival_ns >= self._bucket_end:
             self._bucket_end = arrival_ns + BUCKET_NS
+            self._fallen = 0.0
             self._close_bucket(self._earliest)
             self._least = math.inf
 
@@ -164,7 +259,7 @@ class ClockMap:
         self._n_high = self._n_high + 1 if self._height(earliest) > STEP_NS else 0
         if self._n_high >= STEP_BUCKETS:
             self._n_high = 0
-            self.resets += 1
+            self._count_reset()
             self._points.clear()
         self._points.append(earliest)
         points = sorted(self._points)

@@ -58,6 +58,7 @@ class Driver(CubeNode):
             scans_per_call=scans,
             make_rows=self._frequencies.make_rows,
             clock_ns=self._node_clock.now_ns,
+            is_host_clock=lambda: not self._node_clock.is_simulated,
             log=self.get_logger(),
         )
         self._link_statuses = LinkStatuses(skin.name)

@@ -262,10 +262,10 @@ class NodeClock:
     def update(self) -> None:
         """See whether time is simulated; to be called now and then."""
         clock = self._node.get_clock()
-        self._is_simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
+        self.is_simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
 
     def now_ns(self) -> int:
-        if self._is_simulated:
+        if self.is_simulated:
             return int(self._node.get_clock().now().nanoseconds)
         return time.time_ns()
 
