@@ -295,7 +295,9 @@ def build(env: dict[str, str], python: str) -> None:
         for path in (ROOT / folder).rglob("*")
         if "__pycache__" not in path.parts
     ]
-    value = digest(str(ROOT), env["AMENT_PREFIX_PATH"], python, "\n".join(sorted(linked)), *sorted(sources))
+    value = digest(
+        str(ROOT), env["AMENT_PREFIX_PATH"], python, "\n".join(sorted(linked)), *sorted(sources)
+    )
     with step(STATE / "build.stamp", value) as needed:
         if not needed:
             return
