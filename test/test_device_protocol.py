@@ -27,6 +27,7 @@ from cube_tensor_driver.device.protocol import (
     join,
     sample_bytes,
 )
+from cube_tensor_driver.simulation.hub import SimulatedHub
 
 DOC = (Path(__file__).parent.parent / "docs" / "protocol.md").read_text(encoding="utf-8")
 
@@ -431,3 +432,34 @@ def test_arrays_of_several_frames_are_those_of_each_in_order() -> None:
         np.testing.assert_array_equal(
             found, np.concatenate([getattr(sample, name) for sample in samples])
         )
+
+
+def answers(hub: SimulatedHub, request: int, argument: int = 0, now_us: int = 0) -> list[Frame]:
+    return Decoder().feed(hub.receive(encode(Request(request, argument)), now_us))
+
+
+def test_a_simulated_hub_keeps_the_rules_of_the_page():
+    """By their numbers in docs/protocol.md."""
+    hub = SimulatedHub(1, [2], 3, period_us=1000)
+    assert not hub.started  # R8
+    assert hub.receive(encode(Request(2))[:-3] + b"\0", 0) == b""  # F2: damaged
+    assert hub.receive(encode(Request(2), version=2), 0) == b""  # F2: another version
+    assert not hub.started
+    ack, hello = answers(hub, 1, 77)
+    assert ack == Ack(1) and isinstance(hello, Hello)  # H1, R2
+    assert answers(hub, 2, 77) == [Ack(2)]
+    assert hub.next_us == 1000
+    hub.sample(np.ones((1, 3), "<u4"))
+    # R6: the sample of 2000 has not been taken yet, and START must not leave it out.
+    assert answers(hub, 2, now_us=2500) == [Ack(2)]
+    assert (hub.next_us, hub.sequence) == (2000, 1)
+    (stats,) = Decoder().feed(hub.stats(2500))
+    assert stats.taken == hub.sequence  # S7
+    assert answers(hub, 4, 50) == [Ack(4, 2, 1000)]  # R4
+    assert answers(hub, 4, 500, now_us=2500) == [Ack(4, 0, 500)]  # R3, R7
+    assert hub.next_us == 3000
+    assert answers(hub, 5, 3) == [Ack(5)]
+    assert answers(hub, 9, 3) == [Ack(9, 1)]  # R2
+    assert answers(hub, 3) == answers(hub, 3) == [Ack(3)]  # R6
+    answers(hub, 2, now_us=10_000)
+    assert hub.sequence == 1  # S1

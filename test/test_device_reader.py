@@ -32,6 +32,7 @@ from cube_tensor_driver.device.protocol import (
     Frame,
     Hello,
     Request,
+    Result,
     Sample,
     Stats,
     encode,
@@ -72,6 +73,21 @@ class FakeHub:
             if not ready:
                 raise TimeoutError(f"no {command.name} request")
             self._inbox += self._decoder.feed(self._receive())
+
+    def before(self, command: Command) -> list[int]:
+        """The requests that come before the next one of this kind."""
+        passed: list[int] = []
+        until = time.monotonic() + WAIT_S
+        while time.monotonic() < until:
+            while self._inbox:
+                frame = self._inbox.pop(0)
+                if isinstance(frame, Request):
+                    if frame.request == command:
+                        return passed
+                    passed.append(frame.request)
+            if select.select([self._fd], [], [], 0.1)[0]:
+                self._inbox += self._decoder.feed(self._receive())
+        raise TimeoutError(f"no {command.name} request")
 
     def hello(self, uid: int = 0xC0FFEE, period_us: int = 10_000) -> None:
         self.send(encode(Hello(uid, 1, 8, period_us, np.arange(2, dtype="<u8"))))
@@ -389,6 +405,36 @@ def test_silence_is_noticed_and_healed(start: Start, hub: PtyHub) -> None:
     hub.sample(2)
     watch.state(LinkState.OPEN)
     assert watch.reader.links[0].counters["silences"] == 1
+
+
+@pytest.mark.parametrize(
+    ("result", "period_us", "problem"),
+    [
+        (Result.DONE, 2501, ""),
+        (Result.DONE, 3000, "every 3000 µs, asked for were 2500 µs: set a rate that it can do"),
+        (Result.REFUSED, 10_000, "every 10000 µs, asked for were 2500 µs, which it refused"),
+        (Result.UNKNOWN, 10_000, "every 10000 µs, asked for were 2500 µs, and it cannot change"),
+    ],
+)
+def test_a_hub_with_another_period_is_asked_once_and_named(
+    start: Start, hub: PtyHub, result: Result, period_us: int, problem: str
+) -> None:
+    """It may round, and it may refuse: each HELLO says so again, and is not answered."""
+    watch = start(LinkConfig("a", hub.port), period_us=2500)
+    hub.greet()
+    hub.send(encode(Ack(Command.SET_PERIOD, result, period_us)))
+    for _ in range(3):
+        hub.hello(period_us=period_us)
+    hub.sample(1)
+    watch.frame(Sample)
+    watch.reader.send(0, Request(Command.IDENTIFY, 1))
+    between = hub.before(Command.IDENTIFY)
+    assert Command.SET_PERIOD not in between
+    assert problem in watch.reader.links[0].period_problem
+    assert bool(problem) == bool(watch.reader.links[0].period_problem)
+    # A hub that restarted and forgot it is told again.
+    hub.hello(period_us=period_us + 7)
+    assert hub.expect(Command.SET_PERIOD).argument == 2500
 
 
 def test_hub_that_does_not_answer_is_asked_again(start: Start, hub: PtyHub, monkeypatch) -> None:

@@ -281,6 +281,8 @@ class LiveLinks:
         notes = [*record.problems, *record.contradictions]
         if link.error is not None:
             notes.insert(0, str(link.error))
+        if link.period_problem:
+            notes.append(link.period_problem)
         other = link.decoder.other_version
         if other is not None:
             notes.append(

@@ -92,6 +92,7 @@ class Link:
     """One link, opened and closed many times.
 
     state, error: set by the reader.
+    period_problem: set by the reader: what the hub made of the sample period, if that is wrong.
     decoder, hello, counters: kept over reconnects; hello is the hub's last, None before the first.
     """
 
@@ -103,6 +104,7 @@ class Link:
         self.decoder = Decoder()
         self.hello: Hello | None = None
         self.opened = self.lost = self.silences = self.before_hello = self.bytes_out = 0
+        self.period_problem = ""
         self.path = config.port
         self.is_pattern = "://" not in config.port and glob.has_magic(config.port)
         self._tcp = config.port.startswith(TCP)

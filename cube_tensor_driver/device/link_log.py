@@ -23,7 +23,7 @@ class Log(Protocol):
 
 
 class LinkLog:
-    """A `Log` of lines about one link. Lines beyond the bound are left out and counted, and the next
+    """A `Log` of lines about one link. Lines beyond the bound are left out and counted; the next
     one says how many.
 
     left_out: lines so far.

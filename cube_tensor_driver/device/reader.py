@@ -46,6 +46,8 @@ NO_WAIT_S = 5e-5
 """If waiting for data took less than this, data was there already."""
 DRAIN_S = 0.05
 """How long closing waits for the last requests to leave the serial ports."""
+ROUNDING = 0.01
+"""A hub may round the sample period by so much of it without a note."""
 CLOSE_S = 1.5
 """How long closing waits for the thread to end."""
 
@@ -79,6 +81,7 @@ class _Session:
         self.period_us = period_us  # asked for; None leaves the hub's own
         self.started = True  # samples are asked for
         self.actual_us = period_us or 0  # in force, as the hub says
+        self.answered_us: int | None = None  # what the hub made of the period that was asked for
         self.greeted = False  # HELLO has come since the port was opened
         self.opened_at = 0.0
         self.last_byte = 0.0
@@ -322,16 +325,15 @@ class Reader:
             link.hello = frame
             link.reset_pause()
             session.actual_us = frame.period_us
-            other_period = session.period_us is not None and frame.period_us != session.period_us
+            # A hub may round the period, or refuse it. It has answered then: it is not asked again.
+            known = (session.period_us, session.answered_us)
+            other_period = session.period_us is not None and frame.period_us not in known
             if not session.greeted or link.state is LinkState.SILENT or other_period:
                 session.greeted = True
                 self._configure(i)
-        elif (
-            isinstance(frame, Ack)
-            and frame.request == Command.SET_PERIOD
-            and frame.result == Result.DONE
-        ):
-            session.actual_us = frame.argument
+        elif isinstance(frame, Ack) and frame.request == Command.SET_PERIOD:
+            session.actual_us = session.answered_us = frame.argument
+            link.period_problem = _period_problem(session.period_us, frame)
         return True
 
     def _configure(self, i: int) -> None:
@@ -348,6 +350,7 @@ class Reader:
             link, session = self.links[i], self._sessions[i]
             if request.request == Command.SET_PERIOD:
                 session.period_us = request.argument
+                session.answered_us = None
                 session.actual_us = max(session.actual_us, request.argument)
             elif request.request in (Command.START, Command.STOP):
                 session.started = request.request == Command.START
@@ -431,6 +434,8 @@ class Reader:
         now = time.monotonic()
         session.opened_at = session.last_byte = session.last_sample = now
         session.greeted = session.watching_writes = False
+        session.answered_us = None
+        link.period_problem = ""
         selector.register(link, selectors.EVENT_READ, i)
         self._set_state(i, LinkState.OPEN, None)
         self._ask_hello(selector, i, now)
@@ -490,3 +495,17 @@ class Reader:
             os.close(wake_read)
             os.close(self._wake_write)
             self._wake_write = -1
+
+
+def _period_problem(asked_us: int | None, answer: Ack) -> str:
+    """What is wrong with the hub's answer to request 4, with the fix; empty if nothing is."""
+    if asked_us is None:
+        return ""
+    in_force = f"the hub samples every {answer.argument} µs, asked for were {asked_us} µs"
+    if answer.result == Result.REFUSED:
+        return f"{in_force}, which it refused: set a rate that it can do"
+    if answer.result != Result.DONE:
+        return f"{in_force}, and it cannot change that: leave the rate to it"
+    if abs(answer.argument - asked_us) > ROUNDING * asked_us:
+        return f"{in_force}: set a rate that it can do"
+    return ""

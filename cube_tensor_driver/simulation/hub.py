@@ -175,8 +175,9 @@ class SimulatedHub:
         if request.request == Command.HELLO:
             return encode(Ack(request.request), self.version) + self.hello()
         if request.request == Command.START:
+            if not self.started:
+                self._schedule(now_us)
             self.started = True
-            self._schedule(now_us)
         elif request.request == Command.STOP:
             self.started = False
         elif request.request == Command.SET_PERIOD:
