@@ -129,7 +129,7 @@ def test_a_stopped_oscillator_and_pads_that_a_cube_does_not_have_are_nan(tmp_pat
     skin = {
         "name": "mixed",
         "parent_frame": "base",
-        "links": [{"name": name, "port": "/dev/null"} for name in ("a", "b")],
+        "links": [{"name": name, "port": f"/dev/none_{name}"} for name in ("a", "b")],
         "cubes": [
             {
                 "name": f"c{number}",
