@@ -183,17 +183,20 @@ class LiveLinks:
         The reader's thread calls this once per wake-up.
         """
         now_ns, step_ns = self._see_clock()
+        account = self._rows
         for link, arrival_ns, frames in received:
             # Bytes that were read just before the clock was set have the old time.
             if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
                 arrival_ns += step_ns
-            self._rows.received += _count_rows(frames)
+            for frame in frames:
+                if isinstance(frame, Sample):
+                    account.received += frame.shape[0]
             try:
                 self._take(link, arrival_ns, frames)
             except Exception as error:  # noqa: BLE001  (the rows of other links go on)
                 self._lose(error)
         self._deliver()
-        self._rows.check()
+        account.check()
 
     def _see_clock(self) -> tuple[int, int]:
         """The time, and by how much the host's clock was set since the last call, ns."""
@@ -311,10 +314,6 @@ class LiveLinks:
             notes=tuple(notes),
             values=_values(link, record, log),
         )
-
-
-def _count_rows(frames: Sequence[Frame]) -> int:
-    return sum(frame.n_cubes for frame in frames if isinstance(frame, Sample))
 
 
 def _period_us(rate: float | None) -> int | None:

@@ -112,6 +112,7 @@ class ClockMap:
         self._drift = 0.0
         self._last_stamp = self._last_arrival = _NEVER
         self.problems: set[str] = set()
+        self._is_doubtful = False  # whether `_find_problem` has to look
         self._last_us = -1  # device time of the last call
         self._moved_ns = 0  # when that came first
         self._calls_still = 0  # since then
@@ -159,6 +160,8 @@ class ClockMap:
         """
         if not device_us:
             return []
+        if len(device_us) == 1:  # as it mostly is
+            return self._stamps(device_us, arrival_ns)
         stamps: list[int] = []
         start = 0
         for k in range(1, len(device_us)):
@@ -172,11 +175,13 @@ class ClockMap:
             self._last_stamp = _NEVER
             self.reset()
         self._last_arrival = arrival_ns
-        problem = self._find_problem(max(times), arrival_ns)
-        if problem:
-            self.problems.add(problem)
         # Of samples that arrive together the newest waited least; only it can touch the line.
         newest = max(times)
+        problem = ""
+        if newest != self._last_us and not self._is_doubtful:
+            self._last_us, self._moved_ns = newest, arrival_ns
+        else:
+            problem = self._find_problem(newest, arrival_ns)
         if not self._is_fresh and 1000 * (newest - self._first_us + RESTART_US) < self._newest:
             self.reset()
         if self._is_fresh:
@@ -202,17 +207,24 @@ class ClockMap:
 
     def _find_problem(self, newest_us: int, arrival_ns: int) -> str:
         """Why device times are not to be believed now; empty if they are."""
+        problem = ""
         if newest_us != self._last_us:
-            self._last_us = newest_us
             if self._is_still(arrival_ns):
                 self.reset()  # nobody knows how long it stood still
-            self._moved_ns, self._calls_still = arrival_ns, 0
+            self._last_us, self._moved_ns, self._calls_still = newest_us, arrival_ns, 0
         else:
             self._calls_still += 1
             if self._is_still(arrival_ns):
-                return STANDS_STILL
+                problem = STANDS_STILL
         wrong = self._wrong_ns
-        return LYING if len(wrong) == LIES and arrival_ns - wrong[0] < LIES_NS else ""
+        if wrong and arrival_ns - wrong[0] > LIES_NS:
+            wrong.popleft()
+        if len(wrong) == LIES and not problem:
+            problem = LYING
+        if problem:
+            self.problems.add(problem)
+        self._is_doubtful = self._calls_still > 0 or len(wrong) == LIES
+        return problem
 
     def _is_still(self, arrival_ns: int) -> bool:
         return self._calls_still >= FROZEN_CALLS and arrival_ns - self._moved_ns > FROZEN_NS
@@ -220,6 +232,7 @@ class ClockMap:
     def _count_reset(self) -> None:
         self.resets += 1
         self._wrong_ns.append(self._last_arrival)
+        self._is_doubtful = True
 
     def _begin(self) -> None:
         self._is_fresh = True
