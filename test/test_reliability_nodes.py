@@ -6,6 +6,7 @@ import fcntl
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -29,7 +30,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
-from conftest import decoded
+from conftest import ROOT, decoded
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
@@ -241,10 +242,57 @@ def test_parameters_live(stage):
     stage.children.check()
 
 
-def test_the_security_policy_allows_what_the_nodes_do(stage):
+def test_the_security_policy_has_the_structure_that_sros2_asks_for():
+    """As policy.xsd of version 0.2.0 says: elements, their order of nesting, attributes."""
+    policy = ElementTree.parse(package_data() / "config" / "security" / "policy.xml").getroot()
+    assert (policy.tag, policy.attrib) == ("policy", {"version": "0.2.0"})
+    (enclaves,) = policy
+    assert (enclaves.tag, enclaves.attrib) == ("enclaves", {})
+    lists = {
+        "topics": ("topic", {"publish", "subscribe"}),
+        "services": ("service", {"reply", "request"}),
+        "actions": ("action", {"call", "execute"}),
+    }
+    for enclave in enclaves:
+        assert (enclave.tag, set(enclave.attrib)) == ("enclave", {"path"})
+        assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", enclave.get("path"))
+        (profiles,) = enclave
+        assert profiles.tag == "profiles" and set(profiles.attrib) <= {"type"}
+        names = [(profile.get("ns"), profile.get("node")) for profile in profiles]
+        assert names and len(set(names)) == len(names)
+        for profile in profiles:
+            assert (profile.tag, set(profile.attrib)) == ("profile", {"ns", "node"})
+            for part in profile:
+                item, allowed = lists[part.tag]
+                assert part.attrib and set(part.attrib) <= allowed
+                assert set(part.attrib.values()) <= {"ALLOW", "DENY"}
+                assert len(part) > 0
+                for each in part:
+                    assert (each.tag, each.attrib, len(each)) == (item, {}, 0)
+                    assert re.fullmatch(r"(~/|/)?[A-Za-z0-9_/*]+", each.text), each.text
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+PLAIN = {"view", "recorder", "player"}
+"""Nodes without a lifecycle."""
+
+
+def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
     """Each topic and service of each node, as SROS 2 names them, and nothing that no node has."""
     for name in ("markers", "contacts"):
         stage.children.start(Process(name, f"cube_tensor_driver.ros.{name}"))
+    bag = str(ROOT / "test" / "data" / "bag_v2")
+    for name, *arguments in (
+        ("view", "view", "--port", str(free_port())),
+        ("recorder", "record", "-o", str(tmp_path / "bag")),
+        ("player", "replay", bag, "--stress", "--clock", "--loop"),
+    ):
+        command = Process(name, "cube_tensor_driver.cli", False, arguments=tuple(arguments))
+        stage.children.start(command)
     stage.start()
     node = stage.ros.node
     profiles = list(
@@ -254,18 +302,22 @@ def test_the_security_policy_allows_what_the_nodes_do(stage):
         "publish": node.get_publisher_names_and_types_by_node,
         "subscribe": node.get_subscriber_names_and_types_by_node,
         "reply": node.get_service_names_and_types_by_node,
+        "request": node.get_client_names_and_types_by_node,
     }
     assert {profile.get("node") for profile in profiles} == {
         "driver",
         "reconstruction",
         "markers",
         "contacts",
+        "view",
+        "recorder",
+        "player",
     }
     for profile in profiles:
         name = profile.get("node")
         stage.wait(lambda name=name: (name, "/") in node.get_node_names_and_namespaces())
         stage.wait(
-            lambda name=name: len(found["reply"](name, "/")) >= 11
+            lambda name=name: len(found["reply"](name, "/")) >= (6 if name in PLAIN else 11)
         )  # 6 of parameters, 5 of the lifecycle
         for part in (*profile.iter("topics"), *profile.iter("services")):
             (what,) = part.attrib
@@ -280,7 +332,8 @@ def test_the_security_policy_allows_what_the_nodes_do(stage):
 
             # Discovery tells of a node before it tells of its last topic. The clock is there with
             # use_sim_time, topics of cubes when somebody listens.
-            stage.wait(lambda idle=idle: idle() <= {"/clock", "/cubes/*"})
+            may_be_idle = {"/clock", "/cubes/*"} | ({"/diagnostics"} if name == "player" else set())
+            stage.wait(lambda idle=idle, allowed=may_be_idle: idle() <= allowed)
             more = [one for one in there() if not any(fnmatch(one, each) for each in allowed)]
             assert more == [], (name, what)
     stage.children.check()
