@@ -10,6 +10,7 @@ import runpy
 import shutil
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,24 @@ def test_each_recording_has_a_folder_of_its_own():
         for name in ("history", "reliability", "durability"):
             policy = getattr(policies, f"{name.title()}Policy")
             assert policy.get_from_short_key(profile[name]) != policy.UNKNOWN
+
+
+def test_temporary_folders_end_with_the_process(tmp_path):
+    program = """
+from pathlib import Path
+from cube_tensor_driver.processes.skin_processes import record_command
+command = record_command("skin", "left/arm")
+print(Path(command[command.index("--qos-profile-overrides-path") + 1]).is_file())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "True\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["skin.launch.py", "cube.launch.py"])

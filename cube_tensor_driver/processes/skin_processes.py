@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
 from ..config.package_data import package_data
 from ..config.yaml import read_yaml, write_yaml
+from .temporary import temporary_folder
 
 Value = str | float | bool
 RECORDED = ("frequencies", "stress", "info")
@@ -125,6 +125,6 @@ def _qos_overrides(prefix: str) -> Path:
     if not prefix:
         return path
     profiles = {prefix + topic: profile for topic, profile in read_yaml(path).items()}
-    own = Path(tempfile.mkdtemp(prefix="cube_record_")) / path.name
+    own = temporary_folder("cube_record_") / path.name
     write_yaml(own, profiles)
     return own

@@ -6,7 +6,6 @@ Imports launch, which every ROS 2 installation has. The ROS 2 wheels lack it.
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
@@ -21,6 +20,7 @@ from ..config.skin import Skin, read_skin
 from ..config.urdf import skin_urdf
 from ..core.errors import ConfigError
 from ..processes.skin_processes import Process, SimulatedHubs, record_command, skin_processes
+from ..processes.temporary import temporary_folder
 
 
 def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
@@ -67,7 +67,7 @@ def _processes(config: Path, given: dict[str, str]) -> list[Process]:
         read_script(load)  # so that a mistake in it is told before anything starts
     simulated = None
     if wanted("simulate"):
-        simulated = SimulatedHubs(Path(tempfile.mkdtemp(prefix="cube_ports_")), load)
+        simulated = SimulatedHubs(temporary_folder("cube_ports_"), load)
     return skin_processes(
         config,
         port=given.get("port", ""),
