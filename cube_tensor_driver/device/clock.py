@@ -31,6 +31,9 @@ MAX_DRIFT = 1e-3
 """No two clocks differ by more. A steeper line comes from a stall."""
 STEP_NS = 20e6
 """If all points lie further above the line, one of the clocks was set. USB bursts take 16 ms."""
+FALL_NS = 4e6
+"""If a point lies further below the line, one of the clocks was set: no delay is negative. A step
+of 5 ms shows, with 1 ms for the line's own error."""
 STEP_BUCKETS = 2
 """It must last for so many buckets, because a stall looks the same at first."""
 MAX_DELAY_NS = 60_000_000_000
@@ -47,6 +50,7 @@ MIN_SET_NS = 1_000_000
 READ_NS, READS = 100_000, 3
 """Two clocks are compared if reading them took less; otherwise it is tried again so often."""
 STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
+JUMPED = "the hub's clock jumped: it is fitted again"
 LYING = (
     f"the hub's clock jumped {LIES} times within {LIES_NS / 1e9:g} s: "
     "rows are stamped by their arrival"
@@ -251,8 +255,9 @@ class ClockMap:
         if height < 0:
             # Before the first bucket is full, the line falls because the least delay is not known.
             self._fallen -= height if self._points else 0.0
-            if max(-height, self._fallen) > STEP_NS:
+            if self._fallen > FALL_NS or -height > STEP_NS:
                 self._fallen = 0.0
+                self.problems.add(JUMPED)
                 self._count_reset()
                 self._points.clear()
             self._offset += height
@@ -272,6 +277,7 @@ class ClockMap:
         self._n_high = self._n_high + 1 if self._height(earliest) > STEP_NS else 0
         if self._n_high >= STEP_BUCKETS:
             self._n_high = 0
+            self.problems.add(JUMPED)
             self._count_reset()
             self._points.clear()
         self._points.append(earliest)
