@@ -1,0 +1,39 @@
+"""./cube tare: the present load of a running skin becomes zero load."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from .parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "cubes", nargs="*", metavar="CUBE", help="names of cubes to tare (default: all)"
+    )
+    parser.add_argument(
+        "--clear",
+        action="store_true",
+        help="go back to the rest frequencies of the calibration, for all cubes",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """1 if a reconstruction refuses, else 0."""
+    from ..core.errors import TareError
+    from ..ros.tare_request import request_tare
+
+    if options.clear and options.cubes:
+        raise TareError(
+            f"--clear with {' '.join(options.cubes)}: it clears the tare of all cubes; "
+            "leave out their names"
+        )
+    what = "clearing the tare" if options.clear else "tare"
+    answers = request_tare(options.cubes, options.clear)
+    for answer in answers:
+        if answer.success:
+            print(f"{answer.node}: {what} done: {answer.message}")
+        else:
+            print(f"cube: {answer.node}: {what} refused: {answer.message}", file=sys.stderr)
+    return 0 if all(answer.success for answer in answers) else 1

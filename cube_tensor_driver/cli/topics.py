@@ -1,0 +1,24 @@
+"""./cube topics: which topics there are, and what comes on them."""
+
+from __future__ import annotations
+
+import argparse
+
+from .parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.epilog = (
+        "Listens for one second. Topics of single cubes are sent while somebody listens."
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..ros.topic_list import list_topics
+
+    topics = list_topics()
+    width = max(len(topic.name) for topic in topics)
+    for topic in topics:
+        rate = "not installed here" if topic.rate is None else f"{topic.rate:.0f} Hz"
+        print(f"{topic.name:{width}}  {rate:>8}  {', '.join(topic.kinds)}")
+    return 0

@@ -1,0 +1,187 @@
+"""./cube tare and its neighbours, which need no ros2: with one simulated skin that runs for all
+tests, and with none."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from conftest import free_domain
+from cube_tensor_driver.cli.main import main
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.terminal.echo import Reading, reading_json, reading_line
+
+pytestmark = pytest.mark.xdist_group("ros commands")
+STILL = {
+    "indenters": [
+        {
+            "name": "weight",
+            "shape": "disc",
+            "radius": 0.006,
+            "does": [{"press": {"from": 0.0, "to": 3600.0, "at": [0, 0, 0], "force": [1.0, 1.0]}}],
+        }
+    ]
+}
+"""1 N on the middle, for an hour."""
+
+
+@pytest.fixture(scope="module")
+def skin(tmp_path_factory):
+    """A skin of two cubes, c0 and c1, under a load that does not change; gives the folder of
+    its ports."""
+    folder = tmp_path_factory.mktemp("skin")
+    write_yaml(folder / "skin.yaml", grid(nx=2, ny=1, pitch=0.012, links=1, rate=50.0))
+    write_yaml(folder / "load.yaml", STILL)
+    hubs = SimulatedHubs(folder / "ports", load=folder / "load.yaml")
+    with free_domain(), pytest.MonkeyPatch.context() as patch, Children(folder) as children:
+        patch.setenv("ROS_HOME", str(folder))
+        for process in skin_processes(folder / "skin.yaml", composed=True, simulated=hubs):
+            children.start(process)
+        children.wait_for_line("composed", "with 2 cubes", 30.0)
+        yield folder / "ports"
+        children.check()
+
+
+@pytest.fixture(autouse=True)
+def signals():
+    """Commands that end by Ctrl-C catch it themselves."""
+    names = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(name) for name in names]
+    yield
+    for name, handler in zip(names, before, strict=True):
+        signal.signal(name, handler)
+
+
+@pytest.fixture
+def nobody(domain, monkeypatch):
+    """A domain without a skin, where commands do not wait as long as they would."""
+    monkeypatch.setattr("cube_tensor_driver.ros.asking.FIND_S", 0.5)
+    return domain
+
+
+def test_tare_is_done_or_refused_in_words(skin, capfd):
+    assert main(["tare", "nope"]) == 1
+    captured = capfd.readouterr()
+    assert not captured.out
+    assert captured.err == (
+        "cube: /reconstruction: tare refused: no cube 'nope' in the skin; its cubes: c0, c1\n"
+    )
+    wait_for_tare(capfd)
+    assert main(["tare", "c1"]) == 0
+    assert "tare done: 1 cubes, rest frequencies moved by up to " in capfd.readouterr().out
+    assert main(["tare", "--clear"]) == 0
+    assert "clearing the tare done: rest freq" in capfd.readouterr().out
+
+
+def wait_for_tare(capfd):
+    """The skin has just started: there are data enough after a second or two."""
+    for _ in range(10):
+        if main(["tare"]) == 0:
+            break
+    said = capfd.readouterr()
+    assert "/reconstruction: tare done: 2 cubes" in said.out, said.err
+
+
+def test_without_a_skin_tare_says_that_in_one_line(nobody, capfd):
+    assert main(["tare"]) == 1
+    said = capfd.readouterr().err
+    assert said == (
+        f"cube: no reconstruction runs in DDS domain {nobody}; "
+        "start ./cube demo or the launch file\n"
+    )
+
+
+def test_tare_clears_all_cubes_or_none(capfd):
+    assert main(["tare", "c1", "--clear"]) == 1
+    assert "leave out their names" in capfd.readouterr().err
+
+
+def test_a_reading_as_a_line_and_as_json():
+    values = [np.nan] * 15
+    values[2], values[4], values[14] = -1234.56, 7.0, 3e5
+    reading = Reading(12_345_000_000, "c05", values, np.nan, status=1 | 16)
+    assert reading_line(reading) == (
+        "12.345 s  c05  zz   -1234.6  zx       7.0 Pa  zz_z     300000 Pa/m  PAD_FAULT, pad open"
+    )
+    read = json.loads(reading_json(reading))
+    assert read["stress_pa"] == dict.fromkeys(["xx", "yy", "yz", "xy"]) | {"zz": -1234.56, "zx": 7}
+    assert read["gradient_pa_per_m"]["zz_z"] == 3e5 and read["residual"] is None
+    assert read["status"] == ["PAD_FAULT", "pad open"] and read["stamp_ns"] == 12_345_000_000
+
+
+def test_echo_of_a_skin_has_a_line_per_cube_with_names_and_units(skin, capfd):
+    assert main(["echo", "stress", "--once"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert [line.split()[2] for line in lines] == ["c0", "c1"]
+    assert all(" Pa  " in line and " Pa/m  " in line for line in lines)
+
+
+def test_echo_of_one_cube_as_json(skin, capfd):
+    assert main(["echo", "/cubes/c1/stress", "--once", "--json"]) == 0
+    [line] = capfd.readouterr().out.splitlines()
+    read = json.loads(line)
+    assert read["cube"] == "c1" and read["status"] == []
+    assert abs(read["stamp_ns"] * 1e-9 - time.time()) < 30
+
+
+def test_echo_of_other_topics_is_yaml_or_json(skin, capfd):
+    assert main(["echo", "info", "--once"]) == 0
+    said = capfd.readouterr().out
+    assert said.endswith("---\n")
+    assert parse_yaml(said.removesuffix("---\n"), "echo")["cubes"][1]["name"] == "c1"
+    assert main(["echo", "/diagnostics", "--once", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["status"][0]["level"] in (0, 1, 2, 3)
+
+
+def test_echo_ends_well_by_ctrl_c_and_when_its_reader_has_enough(skin):
+    command = [sys.executable, "-m", "cube_tensor_driver.cli", "echo", "stress"]
+    for how in ("ctrl-c", "reader"):
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            assert " c0 " in process.stdout.readline()
+            if how == "ctrl-c":
+                os.kill(process.pid, signal.SIGINT)
+                process.stdout.read()
+            else:
+                process.stdout.close()
+            assert process.stderr.read() == "" and process.wait(10) == 0, how
+
+
+def test_echo_of_nothing_says_so_in_one_line(nobody, capfd):
+    assert main(["echo", "cubes/c05/stress", "--once"]) == 1
+    assert capfd.readouterr().err == (
+        f"cube: nobody publishes /cubes/c05/stress in DDS domain {nobody}; "
+        "./cube topics lists what there is\n"
+    )
+    assert main(["echo", "bad topic"]) == 1
+    assert "topic 'bad topic', allowed: " in capfd.readouterr().err
+
+
+def test_topics_are_listed_with_rate_and_type(skin, capfd):
+    assert main(["topics"]) == 0
+    lines = [line.split() for line in capfd.readouterr().out.splitlines()]
+    listed = {name: (float(rate), kind) for name, rate, _, kind in lines}
+    assert listed["/info"] == (0, "cube_tensor_driver/msg/SkinInfo")
+    rate, kind = listed["/stress"]
+    assert 25 < rate < 75 and kind == "cube_tensor_driver/msg/SkinStress"
+    assert {"/cubes/c0/stress", "/cubes/c1/wrench", "/diagnostics"} <= listed.keys()
+
+
+def test_no_topics_is_said_in_one_line(nobody, capfd):
+    assert main(["topics"]) == 1
+    assert capfd.readouterr().err == (
+        f"cube: nobody publishes in DDS domain {nobody}; start ./cube demo or a skin\n"
+    )
