@@ -86,6 +86,7 @@ def test_check_says_what_is_wrong(tmp_path):
 def test_a_grid_of_another_layout_has_its_calibration_and_replaces_no_file(tmp_path):
     arguments = "--nx", 2, "--ny", 1, "--layout", "cube", "--port", "/dev/{name}", "-o"
     path = tmp_path / "skin.yaml"
+    (tmp_path / "cube").write_text("a program of that name, as in a checkout")
     done = cube("config", "grid", *arguments, path)
     assert done.returncode == 0, done.stderr
     assert {cube.calibration.layout.name for cube in read_skin(path).cubes} == {"cube"}

@@ -51,9 +51,8 @@ def demo(*arguments: str) -> subprocess.Popen:
 
 def test_demo_loses_nothing_and_is_right(domain, tmp_path):
     path = tmp_path / "demo.json"
-    process = demo(
-        "--headless", "--cubes", "16", "--rate", "100", "--duration", "3", "--json", str(path)
-    )
+    skin = "--cubes", "16", "--rate", "100", "--noise", "0"
+    process = demo("--headless", *skin, "--duration", "3", "--json", str(path))
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 0, output + errors
     result = json.loads(path.read_text())
@@ -64,6 +63,7 @@ def test_demo_loses_nothing_and_is_right(domain, tmp_path):
     # float32 carries 6e-8; pads at a strain of 0.1 have 1e-6 of their stress, times what the
     # inversion adds
     assert result["error_rel_rms"] < 1e-5
+    assert result["error_over_noise"] < 0.05
     assert 0 < result["latency_p50_ms"] <= result["latency_p99_ms"]
     for name in ("driver", "reconstruction"):
         assert 0 < result[f"rss_{name}_mb"] < 150

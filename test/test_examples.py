@@ -46,6 +46,8 @@ def demo(tmp_path: Path, skin: str, load: str, *arguments: str) -> dict:
     path = tmp_path / "figures.json"
     command = [
         "demo",
+        "--noise",
+        "0",
         "--config",
         str(FOLDER / skin),
         "--load",

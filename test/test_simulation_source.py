@@ -7,13 +7,16 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 from conftest import ROOT
+from cube_tensor_driver.config.calibration import find_calibration, read_calibration
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
@@ -21,13 +24,19 @@ from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.oscillator import pad_frequency, stress_slope
 from cube_tensor_driver.core.reconstructor import Reconstructor
-from cube_tensor_driver.core.rows import concatenate
+from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.live import open_links
 from cube_tensor_driver.device.protocol import Sample
-from cube_tensor_driver.simulation.cubes import hub_cubes, skin_components, true_state
+from cube_tensor_driver.simulation.cubes import (
+    SimulatedCubes,
+    hub_cubes,
+    skin_components,
+    true_state,
+)
 from cube_tensor_driver.simulation.hub import SimulatedHub
 from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load_verification import component_noise
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.source import simulate
 
@@ -90,7 +99,7 @@ def test_values_are_those_of_a_live_link(tmp_path):
     """To the bit what `open_links` gives of the simulator in another process, at the same times."""
     ports, log = tmp_path / "ports", tmp_path / "log.json"
     command = [sys.executable, "-m", "cube_tensor_driver.simulation.main", "--config", str(FILE)]
-    command += ["--ports", str(ports), "--log", str(log)]
+    command += ["--ports", str(ports), "--log", str(log), "--noise", "0"]
     process = subprocess.Popen(command)
     try:
         with open_links(SKIN, port_directory=ports) as source:
@@ -179,3 +188,21 @@ def test_the_program_of_the_page_runs(tmp_path, monkeypatch, capsys):
 def test_what_cannot_be_simulated_is_refused(asked, words):
     with pytest.raises(ConfigError, match=words):
         simulate(SKIN, **asked)
+
+
+@pytest.mark.parametrize("layout", ["planar", "cube"])
+def test_noise_of_the_calibration_gives_a_residual_of_one_and_the_stated_deviations(layout):
+    calibration = read_calibration(find_calibration(layout, Path()))
+    n = 2000
+    cubes = SimulatedCubes([calibration] * n, noise=None)
+    millihertz = cubes.frequency(np.zeros((n, 6)), np.zeros((n, 6, 3)), 0.0)
+    rows = Reconstructor([calibration] * n).process(
+        FrequencyRows.of(np.arange(n), (millihertz * 1e-3).astype(np.float32))
+    )
+    assert np.sqrt(np.mean(rows.residual**2)) == pytest.approx(1.0, abs=0.05)
+    skin = replace(SKIN, cubes=(replace(SKIN.cubes[0], calibration=calibration),))
+    components = np.hstack([rows.stress, rows.gradient])
+    stated = component_noise(skin)[0]
+    np.testing.assert_array_equal(np.isnan(stated), np.isnan(components[0]))
+    observed = np.isfinite(stated)
+    np.testing.assert_allclose(components[:, observed].std(axis=0), stated[observed], rtol=0.1)

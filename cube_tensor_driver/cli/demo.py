@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .parser import Parser, count, positive, sample_rate
+from .parser import Parser, count, not_negative, positive, sample_rate
 
 MEASURE_S = 10.0
 """How long a demo that measures runs."""
@@ -32,6 +32,13 @@ def arguments(parser: Parser) -> None:
         type=sample_rate,
         metavar="HZ",
         help="samples per second (default: those of the skin file, else 100)",
+    )
+    parser.add_argument(
+        "--noise",
+        type=not_negative,
+        metavar="X",
+        help="noise of the pads relative to their frequencies, 0 for none "
+        "(default: as the calibrations state)",
     )
     parser.add_argument(
         "--duration",
@@ -63,6 +70,7 @@ def run(options: argparse.Namespace) -> int:
         cubes=options.cubes,
         load=options.load,
         rate=options.rate,
+        noise=options.noise,
         duration=duration,
         headless=options.headless,
         view=options.view,

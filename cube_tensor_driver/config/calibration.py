@@ -13,11 +13,12 @@ from .yaml import read_yaml, to_yaml, write_yaml
 def find_calibration(name: str, folder: Path) -> Path:
     """The calibration file that `name` means.
 
-    That is a path relative to `folder` (where the skin file is), or else the name of one of the
-    calibrations in the package. Raises ConfigError if there is neither, and lists these names.
+    That is the name of one of the calibrations in the package, or else a path relative to `folder`
+    (where the skin file is). Raises ConfigError if there is neither, and lists these names. A name
+    comes first: a folder may well have a program called cube.
     """
     shipped = package_data() / "config" / "calibration"
-    for path in (folder / name, shipped / f"{name}.yaml"):
+    for path in (shipped / f"{name}.yaml", folder / name):
         if path.is_file():
             return path
     names = ", ".join(sorted(path.stem for path in shipped.glob("*.yaml")))

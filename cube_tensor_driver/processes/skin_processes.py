@@ -38,12 +38,14 @@ class SimulatedHubs:
     ports: folder for its pseudo-terminals. load: its load script; None: the one in the package.
     sample_log: file for a record of every sample it sends; None: none. instants: how many instants
     of the load it computes in advance, see `simulation.simulator.Simulator`; None: its default.
+    noise: of the pads, relative to their frequencies; None: as the calibrations state.
     """
 
     ports: Path
     load: Path | None = None
     sample_log: Path | None = None
     instants: int | None = None
+    noise: float | None = 0.0
 
     def process(self, config: Path) -> Process:
         """The simulator of the skin file `config`."""
@@ -54,6 +56,8 @@ class SimulatedHubs:
             arguments += ["--log", str(self.sample_log)]
         if self.instants is not None:
             arguments += ["--instants", str(self.instants)]
+        if self.noise is not None:
+            arguments += ["--noise", str(self.noise)]
         module = "cube_tensor_driver.simulation.main"
         return Process("simulator", module, node=False, arguments=tuple(arguments))
 

@@ -67,7 +67,7 @@ def _processes(config: Path, given: dict[str, str]) -> list[Process]:
         read_script(load)  # so that a mistake in it is told before anything starts
     simulated = None
     if wanted("simulate"):
-        simulated = SimulatedHubs(temporary_folder("cube_ports_"), load)
+        simulated = SimulatedHubs(temporary_folder("cube_ports_"), load, noise=None)
     return skin_processes(
         config,
         port=given.get("port", ""),

@@ -13,7 +13,7 @@ from ..config.skin import Skin, SkinLink
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
 from ..core.modes import COMPONENTS, to_matrix
-from ..core.oscillator import pad_frequency
+from ..core.oscillator import pad_frequency, stress_slope
 from ..device.protocol import NOT_MEASURED
 from .sample_log import ABSENT
 
@@ -21,21 +21,27 @@ from .sample_log import ABSENT
 class SimulatedCubes:
     """Cubes with the same number of pads.
 
-    noise: standard deviation of a frequency relative to itself, 0 for none; drift: relative change
-    of every rest frequency per second; seed: of the noise.
+    noise: standard deviation of a frequency relative to itself, 0 for none; None: what the
+    calibration of each cube states. drift: relative change of every rest frequency per second;
+    seed: of the noise.
     """
 
     def __init__(
         self,
         calibrations: Sequence[Calibration],
         *,
-        noise: float = 0.0,
+        noise: float | None = 0.0,
         drift: float = 0.0,
         seed: int = 0,
     ) -> None:
         self.n_pads = calibrations[0].layout.n_pads
-        self._noise, self._drift, self._random = noise, drift, np.random.default_rng(seed)
+        self._drift, self._random = drift, np.random.default_rng(seed)
         self._groups = calibration_groups(calibrations)
+        self._noise = np.full((len(calibrations), self.n_pads), noise or 0.0)
+        if noise is None:
+            for calibration, rows in self._groups:
+                self._noise[rows] = frequency_noise(calibration)
+        self._is_noisy = bool(self._noise.any())
 
     def frequency(
         self, stress: NDArray[np.float64], gradient: NDArray[np.float64], seconds: float
@@ -52,7 +58,7 @@ class SimulatedCubes:
             hertz[rows] = pad_frequency(
                 state @ calibration.response.T, rest, calibration.beta, calibration.modulus
             )
-        if self._noise:
+        if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
         return np.nan_to_num(np.rint(hertz * 1e3), nan=NOT_MEASURED).astype("<u4")
 
@@ -88,7 +94,16 @@ class HubCubes:
         return frequency
 
 
-def hub_cubes(skin: Skin, *, noise: float = 0.0, drift: float = 0.0) -> list[HubCubes]:
+def frequency_noise(calibration: Calibration) -> NDArray[np.float64]:
+    """(pads,) standard deviation of a frequency relative to itself that makes, at rest, the noise
+    in Pa that the calibration states."""
+    rest = calibration.rest_frequency
+    slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
+    relative: NDArray[np.float64] = calibration.noise / (slope * rest)
+    return relative
+
+
+def hub_cubes(skin: Skin, *, noise: float | None = 0.0, drift: float = 0.0) -> list[HubCubes]:
     """The cubes of each simulated hub of a skin, in the order of its links; without those that
     carry none. noise and drift as in `SimulatedCubes`.
 

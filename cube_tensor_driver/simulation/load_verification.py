@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from ..config.skin import Skin
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.errors import MessageError
+from ..core.estimator import make_estimator
 from ..core.modes import COMPONENTS
 from ..core.rows import FrequencyRows, StressRows
 from ..elastic.surface import Contact, Surface
-from .cubes import skin_components
+from .cubes import calibration_groups, skin_components
 from .load import Load
 from .sample_log import SampleLog
 from .verification import Arrivals, Comparison, compare, percentile
@@ -102,9 +103,9 @@ class LoadVerification:
 
     def result(self) -> dict[str, object]:
         """Figures of the span: counts in rows (one cube, one sample), times in ms, errors relative
-        to the range of the script."""
+        to the range of the script, and relative to what the noise of the calibrations allows."""
         frequencies, stress = self._compared(self._frequencies), self._compared(self._stress)
-        rms, worst = self._errors(stress)
+        rms, worst, over_noise = self._errors(stress)
         return {
             "samples_sent": stress.sent,
             "samples_received": frequencies.received,
@@ -115,6 +116,7 @@ class LoadVerification:
             "stamp_error_p99_ms": percentile(stress.stamp_error_ms, 99),
             "error_rel_rms": rms,
             "error_rel_worst": worst,
+            "error_over_noise": over_noise,
         }
 
     def forces(self) -> Forces:
@@ -155,27 +157,51 @@ class LoadVerification:
         cube = self._stress.columns()[0]
         return cube[first], np.concatenate(self._components)[first], comparison.taken_ns[first]
 
-    def _errors(self, comparison: Comparison) -> tuple[float, float]:
+    def _errors(self, comparison: Comparison) -> tuple[float, float, float]:
         """Root mean square and worst deviation of observed components, relative to the range that
-        each has in the whole script."""
+        each has in the whole script; and the root mean square relative to the standard deviation
+        that the noise of the calibrations makes."""
         cube, components, taken_ns = self._received(comparison)
         if not len(cube):
-            return float("nan"), float("nan")
-        found, applied = [], []
+            return float("nan"), float("nan"), float("nan")
+        found, applied, allowed = [], [], []
+        noise = component_noise(self._skin)
         for time_ns in _some(np.unique(taken_ns)):
             rows = np.flatnonzero(taken_ns == time_ns)
             applied.append(self._truth((time_ns - self._log.start_time_ns) * 1e-9)[cube[rows]])
             found.append(components[rows])
+            allowed.append(noise[cube[rows]])
         script = [self._truth(time) for time in np.linspace(0, self._load.period, RANGE_TIMES)]
         lowest = np.nanmin(script, axis=(0, 1))
         span = np.nanmax(script, axis=(0, 1)) - lowest
         deviation = np.concatenate(found) - np.concatenate(applied)
         relative = deviation[:, span > 0] / span[span > 0]
-        return float(np.sqrt(np.nanmean(relative**2))), float(np.nanmax(np.abs(relative)))
+        over_noise = deviation / np.concatenate(allowed)
+        return (
+            float(np.sqrt(np.nanmean(relative**2))),
+            float(np.nanmax(np.abs(relative))),
+            float(np.sqrt(np.nanmean(over_noise**2))),
+        )
 
     def _truth(self, seconds: float) -> Array:
         """Components (cubes, 15) that the load makes at a simulated time."""
         return skin_components(self._skin, *self._load.at(seconds))
+
+
+def component_noise(skin: Skin) -> Array:
+    """(cubes, 15) standard deviations, Pa and Pa/m, that the noise of its pads makes in what each
+    cube reports; NaN: not observed."""
+    deviations = np.empty((len(skin.cubes), len(COMPONENTS)))
+    for calibration, rows in calibration_groups(skin.calibrations):
+        estimator = make_estimator(
+            calibration.response,
+            calibration.noise,
+            calibration.modes,
+            neglect=calibration.neglect,
+        )
+        scale = np.where(np.arange(len(COMPONENTS)) < 6, 1.0, 1 / calibration.half_side)
+        deviations[rows] = np.sqrt(np.diag(estimator.covariance)) * scale
+    return deviations
 
 
 def _some(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -32,8 +32,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--noise",
         type=float,
-        default=0.0,
-        help="relative standard deviation of a frequency (8e-6 is usual)",
+        help="relative standard deviation of a frequency, 0 for none (default: as the calibrations "
+        "state)",
     )
     parser.add_argument(
         "--drift", type=float, default=0.0, help="relative drift of the rest frequencies per second"

@@ -66,7 +66,7 @@ class Simulator:
         load: Load,
         ports: Path,
         *,
-        noise: float = 0.0,
+        noise: float | None = 0.0,
         drift: float = 0.0,
         instants: int = 0,
         faults: Sequence[Fault] = (),

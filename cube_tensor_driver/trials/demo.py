@@ -47,6 +47,7 @@ def run_demo(
     cubes: int | None = None,
     load: Path | None = None,
     rate: float | None = None,
+    noise: float | None = None,
     duration: float | None = None,
     headless: bool = False,
     view: bool = False,
@@ -58,6 +59,7 @@ def run_demo(
     config: skin file; None: the shipped one, or a grid of so many `cubes`
     load: load script; None: the shipped one
     rate: samples per second; None: the skin's, 100 where it has none
+    noise: of the pads, relative to their frequencies; None: as the calibrations state
     duration: s to measure, after which figures are given; None: until Ctrl-C, without figures
     headless: without the live table
     view: show it in the browser too
@@ -76,7 +78,7 @@ def run_demo(
             applied = Load(skin, read_script(load) if load else default_script())
             verification = LoadVerification(skin, applied) if duration else None
             log = folder / "log.json"
-            hubs = SimulatedHubs(folder / "ports", load=load, sample_log=log)
+            hubs = SimulatedHubs(folder / "ports", load=load, sample_log=log, noise=noise)
             processes = skin_processes(path, rate=rate, simulated=hubs)
             if view:
                 processes.append(VIEW)
