@@ -130,7 +130,9 @@ KEYS = {
     "pyserial": "python3-serial",
     "pyyaml": "python3-yaml",
     "rosbags": "python3-rosbags-pip",
-} | dict.fromkeys(("scikit-fem", "pyarrow", "viser", "distributed", "dask", "mcap", "lz4"))
+} | dict.fromkeys(
+    ("scikit-fem", "pyarrow", "viser", "distributed", "dask", "mcap", "lz4", "websockets")
+)
 
 
 def test_every_dependency_is_declared_and_pinned():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol
 
@@ -35,12 +36,15 @@ class ColourControls:
 
     @property
     def quantity(self) -> Quantity:
-        return next(one for one in QUANTITIES.values() if one.label == self._quantity.value)
+        chosen = [one for one in QUANTITIES.values() if one.label == self._quantity.value]
+        # A browser may send any text.
+        return chosen[0] if chosen else next(iter(QUANTITIES.values()))
 
     @property
     def top(self) -> float:
         """The top of the range that the user wants, SI; 0: it follows what is there."""
-        return float(self._range.value) * self.quantity.size
+        value = float(self._range.value)
+        return value * self.quantity.size if math.isfinite(value) and value > 0 else 0.0
 
     def write_legend(self, top: float) -> None:
         """top: of the range in use, SI."""
@@ -66,7 +70,7 @@ class ReplayControls:
         @self._slider.on_update
         def _(event: viser.GuiEvent) -> None:
             # Updates that `show` makes have no client.
-            if event.client is not None:
+            if event.client is not None and math.isfinite(self._slider.value):
                 jump(self._slider.value)
 
     def show(self, replay: ReplayState | None) -> None:

@@ -131,14 +131,16 @@ class Page:
 
         @layers.on_click
         def _(_: object) -> None:
-            self._scene.shown ^= {layers.value}
+            self._scene.shown ^= {layers.value} & set(LAYERS)
 
         selected = self._names[self._scene.selected]
         self._cube = gui.add_dropdown("cube", self._names, initial_value=selected)
 
         @self._cube.on_update
         def _(_: object) -> None:
-            self._scene.selected = self._names.index(self._cube.value)
+            # A browser may send any text.
+            if self._cube.value in self._names:
+                self._scene.selected = self._names.index(self._cube.value)
 
         with gui.add_folder("numbers"):
             self._numbers = gui.add_html("")
@@ -155,7 +157,12 @@ class Page:
             "record": buttons.record,
         }
         group = gui.add_button_group("", tuple(actions))
-        group.on_click(lambda _: actions[group.value]())
+
+        @group.on_click
+        def _(_: object) -> None:
+            action = actions.get(group.value)
+            if action is not None:
+                action()
 
     def _toggle_pause(self) -> None:
         self._paused = not self._paused

@@ -26,11 +26,13 @@ from cube_tensor_driver.srv import Tare
 from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ConfigError
 from ..ros.executor import make_executor
+from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros
 from ..ros.skin_subscriber import STALE_S, FollowedSkin, SkinSubscriber
 from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S
+from .gate import guarded_server
 from .history import History, RowRate
 from .markup import PageStatus
 from .page import Buttons, Page, WaitingPage
@@ -67,9 +69,10 @@ class Viewer:
         self._server = _serve(port)
         self._depth = depth
         self._node = rclpy.create_node("view")
+        self._guard = CallbackGuard(self._node)
         self._subscriber = SkinSubscriber(self._node, self._show_skin)
         self._node.create_subscription(
-            DiagnosticArray, "/diagnostics", self._receive_diagnostics, 10
+            DiagnosticArray, "/diagnostics", self._guard.wrap(self._receive_diagnostics), 10
         )
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
         self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
@@ -96,7 +99,7 @@ class Viewer:
             wait = min(next_picture - time.monotonic(), 1 / PICTURES_HZ)
             self._executor.spin_once(timeout_sec=max(0.0, wait))
             while not self._pressed.empty():
-                self._pressed.get()()
+                self._guard.wrap(self._pressed.get())()
             now = time.monotonic()
             if now < next_picture:
                 continue
@@ -106,7 +109,7 @@ class Viewer:
             if with_numbers:
                 next_numbers = now + 1 / NUMBERS_HZ
             if self._shown is not None:
-                self._update(self._shown, with_numbers)
+                self._guard.wrap(self._update)(self._shown, with_numbers)
             elif now >= say_waiting_at:
                 say_waiting_at = math.inf
                 print(markup.waiting(_domain()), flush=True)
@@ -205,7 +208,8 @@ def _serve(port: int) -> viser.ViserServer:
     """ConfigError: the port is in use."""
     logging.getLogger("websockets").setLevel(logging.ERROR)
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        # viser prints a banner
+        with contextlib.redirect_stdout(io.StringIO()), guarded_server():
             return viser.ViserServer(HOST, port, label="cube_tensor_driver", verbose=False)
     except OSError as error:
         raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
