@@ -8,6 +8,8 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 
 import numpy as np
@@ -15,10 +17,14 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
+from played_hub import PlayedHub, greeting
+from serial.tools import list_ports
+
 from conftest import free_domain
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
+from cube_tensor_driver.device.protocol import Command
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 from cube_tensor_driver.terminal.echo import Reading, reading_json, reading_line
@@ -184,4 +190,49 @@ def test_no_topics_is_said_in_one_line(nobody, capfd):
     assert main(["topics"]) == 1
     assert capfd.readouterr().err == (
         f"cube: nobody publishes in DDS domain {nobody}; start ./cube demo or a skin\n"
+    )
+
+
+@pytest.fixture
+def ports(tmp_path, monkeypatch):
+    """The folder for ports of a demo on a machine that has no others."""
+    folder = tmp_path / "cube_demo_x" / "ports"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(list_ports, "comports", lambda: [])
+    return folder
+
+
+def test_ports_that_answer_are_silent_or_busy_are_told_apart(skin, ports, capfd):
+    hub, silent = PlayedHub(ports, "a"), PlayedHub(ports, "b")
+    (ports / "c").symlink_to((skin / "hub0").resolve())
+    answered = threading.Event()
+
+    def answer():
+        while not answered.is_set() and not hub.asked(Command.HELLO):
+            time.sleep(0.01)
+        hub.send(greeting())
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    try:
+        assert main(["ports"]) == 0
+        asked = hub.listen(), silent.listen()
+    finally:
+        answered.set()
+        thread.join()
+        hub.close()
+        silent.close()
+    lines = capfd.readouterr().out.splitlines()
+    a, b, c = (str(ports / name) for name in "abc")
+    assert lines[0] == f"{a} (demo): hub 0xab, 1 cubes of 8 pads, 100 Hz, firmware 0x1"
+    assert lines[1] == f"{b} (demo): no answer within 1 s; not a hub, or no power"
+    assert lines[2].startswith(c) and "another program has it open" in lines[2]
+    assert asked == ([Command.HELLO], [Command.HELLO])
+
+
+def test_no_port_is_said_in_one_line(ports, capfd):
+    assert main(["ports"]) == 1
+    assert capfd.readouterr().err == (
+        "cube: no serial port on this machine; plug a hub in, or start ./cube demo\n"
     )

@@ -1,0 +1,42 @@
+"""./cube ports: which serial ports there are, and which answer as hubs."""
+
+from __future__ import annotations
+
+import argparse
+
+from .parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.epilog = (
+        "Asks each port for one second who is there, and starts nothing. Ports that a running "
+        "driver has open are busy: its diagnostics name their hubs."
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """1 if there is no serial port, else 0."""
+    from ..core.errors import CubeError
+    from ..device.search import ask_ports, find_ports
+
+    ports = find_ports()
+    if not ports:
+        raise CubeError("no serial port on this machine; plug a hub in, or start ./cube demo")
+    ask_ports(ports)
+    for port in ports:
+        name = f"{port.path} ({port.description})" if port.description else port.path
+        hello = port.hello
+        if hello is not None:
+            print(
+                f"{name}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} pads, "
+                f"{rate(hello.period_us)}, firmware 0x{hello.firmware:x}"
+            )
+        elif port.problem:
+            print(port.problem)
+        else:
+            print(f"{name}: no answer within 1 s; not a hub, or no power")
+    return 0
+
+
+def rate(period_us: int) -> str:
+    return f"{1e6 / period_us:.4g} Hz" if period_us else "rate not set"
