@@ -404,3 +404,31 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
     assert said[1] == [(f"cube c02: pad {pad} short", True)]
     assert [line for lines in said[2:] for line in lines] == [("cube c02: fine", False)]
     assert not said[0]
+
+
+def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():
+    """Statuses say it at once, the log when hubs had time to start."""
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from cube_tensor_driver.ros.cube_health import TIMES_TO_START, CubeHealth
+
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    n = len(skin.cubes)
+    reconstructor = Reconstructor(skin)
+    words = CubeHealth(skin, reconstructor)
+    rest = np.array([cube.calibration.rest_frequency for cube in skin.cubes])
+
+    def step(number: int, cubes: int) -> list[tuple[str, bool]]:
+        rows = np.arange(cubes)
+        stamps = np.full(cubes, number * 1_000_000_000)
+        reconstructor(stamped(rows, rest[:cubes], np.zeros(cubes, np.uint32), stamps))
+        return words.statuses({})[1]
+
+    statuses, lines = words.statuses({})
+    assert len(statuses) == n and all("missing" in one.message for one in statuses)
+    assert not lines
+    for number in range(2, TIMES_TO_START + 1):
+        assert not step(number, n - 1)
+    late = [(f"cube {skin.cubes[-1].name}: missing: no row yet, see its link", True)]
+    assert step(TIMES_TO_START + 1, n - 1) == late
+    assert not step(TIMES_TO_START + 2, n - 1)
+    assert step(TIMES_TO_START + 3, n) == [(f"cube {skin.cubes[-1].name}: fine", False)]

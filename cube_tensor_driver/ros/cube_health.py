@@ -19,6 +19,12 @@ MAX_STATUSES = 64
 nobody."""
 
 
+MISSING = "missing: no row yet, see its link"
+TIMES_TO_START = 5
+"""Times that `statuses` is called, before a cube that has sent nothing yet gets a line: hubs may
+start after us."""
+
+
 class CubeHealth:
     """Turns what `Health` found since the last time into words."""
 
@@ -27,6 +33,8 @@ class CubeHealth:
         self._health = reconstructor.health
         self._came = np.zeros(len(skin.cubes), bool)
         self._words: dict[int, str] = {}
+        self._said: dict[int, str] = {}
+        self._times = 0
 
     def statuses(
         self, uids: Mapping[int, int]
@@ -34,6 +42,7 @@ class CubeHealth:
         """Statuses of cubes that are not fine or were not the last time; of what changed a line,
         and if it is bad."""
         bits, strained, rows = self._health.collect()
+        self._times += 1
         self._came |= rows > 0
         levels = np.zeros(len(rows), int)
         levels[strained | (bits != 0).any(axis=1)] = 1
@@ -51,7 +60,9 @@ class CubeHealth:
             text = words.get(cube, "fine")
             level = int(levels[cube]) if cube in words else 0
             name = self._skin.cubes[cube].name
-            if text != self._words.get(cube, "fine"):
+            starting = self._times <= TIMES_TO_START and text == MISSING
+            if text != self._said.get(cube, "fine") and not starting:
+                self._said[cube] = text
                 lines.append((f"cube {name}: {text}", level > 0))
             uid = self._skin.cubes[cube].uid or uids.get(cube, 0)
             values = {"rows since the last": int(rows[cube])}
@@ -81,11 +92,7 @@ class CubeHealth:
         suspects: dict[int, list[str]],
     ) -> str:
         if not came:
-            return (
-                "stale: no rows any more, see its link"
-                if self._came[cube]
-                else "missing: no row yet, see its link"
-            )
+            return "stale: no rows any more, see its link" if self._came[cube] else MISSING
         pads = self._skin.cubes[cube].calibration.layout.pads
         texts = [
             f"pad {pads[pad]} {_words(int(bits[pad]))}" for pad in np.flatnonzero(bits).tolist()
