@@ -236,3 +236,28 @@ def test_no_port_is_said_in_one_line(ports, capfd):
     assert capfd.readouterr().err == (
         "cube: no serial port on this machine; plug a hub in, or start ./cube demo\n"
     )
+
+
+def test_parameters_are_listed_read_and_set(skin, capfd):
+    assert main(["param"]) == 0
+    assert capfd.readouterr().out.splitlines() == ["/driver", "/reconstruction"]
+    assert main(["param", "reconstruction"]) == 0
+    assert "\ntare_duration: " in capfd.readouterr().out
+    assert main(["param", "/reconstruction", "use_sim_time"]) == 0
+    assert capfd.readouterr().out == "use_sim_time: false\n"
+    assert main(["param", "reconstruction", "tare_duration", "1.5"]) == 0
+    assert capfd.readouterr().out == "tare_duration: 1.5\n"
+
+
+def test_parameters_that_are_not_there_or_refused_are_said(skin, capfd):
+    assert main(["param", "nope"]) == 1
+    assert "no node /nope in DDS domain" in capfd.readouterr().err
+    assert main(["param", "reconstruction", "nope"]) == 1
+    assert "/reconstruction has no parameter nope; it has: " in capfd.readouterr().err
+    assert main(["param", "reconstruction", "tare_duration", "banana"]) == 1
+    assert "tare_duration is not set to banana: " in capfd.readouterr().err
+
+
+def test_parameters_of_nobody(nobody, capfd):
+    assert main(["param"]) == 1
+    assert "no node runs in DDS domain" in capfd.readouterr().err

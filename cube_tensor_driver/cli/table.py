@@ -6,6 +6,7 @@ GROUPS = {
     "Run a skin": {
         "demo": "run simulated cubes, driver and reconstruction, with a live table",
         "view": "show a running skin in the browser: 3-D, plots, tare, recording",
+        "param": "list, read or set the parameters of nodes that run",
         "ports": "list the serial ports, and which of them answer as hubs",
         "topics": "list the topics that are published, with types and rates",
         "echo": "print what comes on a topic: stress as lines with units, others as YAML",

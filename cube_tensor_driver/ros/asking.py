@@ -46,11 +46,15 @@ def discover(executor: Any, found: Callable[[], object]) -> bool:
 
 
 def find_services(node: Node, executor: Any, kind: str) -> list[str]:
-    """Full names of the services of a type, as in std_srvs/srv/Trigger, sorted; may be empty."""
+    """Full names of the services of a type, as in std_srvs/srv/Trigger, sorted, without
+    those of the node itself; may be empty."""
+    own = f"{node.get_fully_qualified_name()}/"
 
     def found() -> list[str]:
         services = node.get_service_names_and_types()
-        return sorted(name for name, kinds in services if kind in kinds)
+        return sorted(
+            name for name, kinds in services if kind in kinds and not name.startswith(own)
+        )
 
     discover(executor, found)
     return found()

@@ -1,0 +1,34 @@
+"""./cube param: parameters of nodes that run."""
+
+from __future__ import annotations
+
+import argparse
+
+from .parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_argument("node", nargs="?", metavar="NODE", help="as in reconstruction")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="the parameter (default: all)")
+    parser.add_argument("value", nargs="?", metavar="VALUE", help="set it to this, as in YAML")
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..ros.live_parameters import list_nodes, read_parameters, set_parameter
+
+    if options.node is None:
+        print("\n".join(list_nodes()))
+    elif options.value is not None:
+        value = set_parameter(options.node, options.name, options.value)
+        print(f"{options.name}: {shown(value)}")
+    else:
+        for name, value in read_parameters(options.node, options.name).items():
+            print(f"{name}: {shown(value)}")
+    return 0
+
+
+def shown(value: object) -> str:
+    """As it would be written in YAML."""
+    from ..config.yaml import to_yaml
+
+    return to_yaml([value]).strip()[1:-1]

@@ -1,0 +1,86 @@
+"""Parameters of running nodes, listed, read and set through their services: `./cube param`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rcl_interfaces.msg import Parameter
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rclpy.node import Node
+from rclpy.parameter import get_parameter_value, parameter_value_to_python
+
+from ..core.errors import ConfigError
+from .asking import ask, domain_text, find_services
+from .session import node_session
+
+LIST = "/list_parameters"
+
+
+def list_nodes() -> list[str]:
+    """Full names of the nodes that have parameters. ConfigError: none runs."""
+    with node_session("parameters") as (node, executor):
+        return _nodes(node, executor)
+
+
+def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
+    """Parameters of a node and their values: one of them, or all.
+
+    ConfigError: no such node or parameter.
+    """
+    with node_session("parameters") as (node, executor):
+        full = _find(name, _nodes(node, executor))
+        known = _names(node, executor, full)
+        if parameter is not None:
+            _check(full, parameter, known)
+        names = known if parameter is None else [parameter]
+        return _values(node, executor, full, names)
+
+
+def set_parameter(name: str, parameter: str, text: str) -> Any:
+    """Set a parameter to what the text says as YAML; returns its value from now on.
+
+    ConfigError: no such node or parameter, or the node refuses the value.
+    """
+    with node_session("parameters") as (node, executor):
+        full = _find(name, _nodes(node, executor))
+        _check(full, parameter, _names(node, executor, full))
+        value = Parameter(name=parameter, value=get_parameter_value(text))
+        request = SetParameters.Request(parameters=[value])
+        answer = ask(node, executor, SetParameters, f"{full}/set_parameters", request)
+        result = answer.results[0]
+        if not result.successful:
+            raise ConfigError(f"{full}: {parameter} is not set to {text}: {result.reason}")
+        return _values(node, executor, full, [parameter])[parameter]
+
+
+def _nodes(node: Node, executor: Any) -> list[str]:
+    services = find_services(node, executor, "rcl_interfaces/srv/ListParameters")
+    nodes = [service.removesuffix(LIST) for service in services]
+    if not nodes:
+        raise ConfigError(f"no node runs in {domain_text()}; start ./cube demo or a skin")
+    return nodes
+
+
+def _find(name: str, nodes: list[str]) -> str:
+    full = f"/{name.removeprefix('/')}"
+    if full not in nodes:
+        raise ConfigError(f"no node {full} in {domain_text()}; its nodes: {', '.join(nodes)}")
+    return full
+
+
+def _names(node: Node, executor: Any, full: str) -> list[str]:
+    request = ListParameters.Request()
+    answer = ask(node, executor, ListParameters, f"{full}{LIST}", request)
+    return sorted(answer.result.names)
+
+
+def _check(full: str, parameter: str, known: list[str]) -> None:
+    if parameter not in known:
+        raise ConfigError(f"{full} has no parameter {parameter}; it has: {', '.join(known)}")
+
+
+def _values(node: Node, executor: Any, full: str, names: list[str]) -> dict[str, Any]:
+    request = GetParameters.Request(names=names)
+    answer = ask(node, executor, GetParameters, f"{full}/get_parameters", request)
+    values = [parameter_value_to_python(value) for value in answer.values]
+    return dict(zip(names, values, strict=True))
