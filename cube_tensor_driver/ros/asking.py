@@ -45,9 +45,10 @@ def discover(executor: Any, found: Callable[[], object]) -> bool:
     return True
 
 
-def find_services(node: Node, executor: Any, kind: str) -> list[str]:
+def find_services(node: Node, executor: Any, kind: str, wanted: str = "") -> list[str]:
     """Full names of the services of a type, as in std_srvs/srv/Trigger, sorted, without
-    those of the node itself; may be empty."""
+    those of the node itself; may be empty. wanted: one that is waited for, as long as any would be.
+    """
     own = f"{node.get_fully_qualified_name()}/"
 
     def found() -> list[str]:
@@ -56,7 +57,7 @@ def find_services(node: Node, executor: Any, kind: str) -> list[str]:
             name for name, kinds in services if kind in kinds and not name.startswith(own)
         )
 
-    discover(executor, found)
+    discover(executor, lambda: wanted in found() if wanted else found())
     return found()
 
 

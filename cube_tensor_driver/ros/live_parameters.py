@@ -28,7 +28,7 @@ def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
     ConfigError: no such node or parameter.
     """
     with node_session("parameters") as (node, executor):
-        full = _find(name, _nodes(node, executor))
+        full = _find(node, executor, name)
         known = _names(node, executor, full)
         if parameter is not None:
             _check(full, parameter, known)
@@ -42,7 +42,7 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
     ConfigError: no such node or parameter, or the node refuses the value.
     """
     with node_session("parameters") as (node, executor):
-        full = _find(name, _nodes(node, executor))
+        full = _find(node, executor, name)
         _check(full, parameter, _names(node, executor, full))
         value = Parameter(name=parameter, value=get_parameter_value(text))
         request = SetParameters.Request(parameters=[value])
@@ -53,16 +53,17 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
         return _values(node, executor, full, [parameter])[parameter]
 
 
-def _nodes(node: Node, executor: Any) -> list[str]:
-    services = find_services(node, executor, "rcl_interfaces/srv/ListParameters")
+def _nodes(node: Node, executor: Any, wanted: str = "") -> list[str]:
+    services = find_services(node, executor, "rcl_interfaces/srv/ListParameters", wanted)
     nodes = [service.removesuffix(LIST) for service in services]
     if not nodes:
         raise ConfigError(f"no node runs in {domain_text()}; start ./cube demo or a skin")
     return nodes
 
 
-def _find(name: str, nodes: list[str]) -> str:
+def _find(node: Node, executor: Any, name: str) -> str:
     full = f"/{name.removeprefix('/')}"
+    nodes = _nodes(node, executor, f"{full}{LIST}")
     if full not in nodes:
         raise ConfigError(f"no node {full} in {domain_text()}; its nodes: {', '.join(nodes)}")
     return full
