@@ -35,7 +35,7 @@ KEYS = {
 
 @pytest.mark.alone
 def test_skin_counts_what_was_sent(domain, tmp_path):
-    """In batches of two, where a message is as long as the latency of its first rows at least."""
+    """In batches of two: the first row of each waits a period, 10 ms, for the second."""
     path = tmp_path / "figures.json"
     # Pauses and a second floor are for figures only.
     code = f"""
@@ -55,7 +55,7 @@ bench.bench_skin(
     # The measured time ends where a loop of the receiver does.
     assert 3 * 50 <= figures["samples_sent"] <= 3 * 150 and figures["samples_sent"] % 3 == 0
     assert figures["lost"] == figures["samples_sent"] - figures["tensors_received"] == 0
-    assert figures["latency_p50_ms"] > 5.0
+    assert figures["latency_p99_ms"] > 9.0
 
 
 def test_growth_of_memory_and_its_error():

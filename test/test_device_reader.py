@@ -232,6 +232,7 @@ def test_one_callback_for_all_that_is_there(start: Start, hub: PtyHub) -> None:
     )
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("period_us", [1_000, 1_000_000])
 def test_who_comes_first_waits_for_those_that_deliver(
     start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch, period_us: int

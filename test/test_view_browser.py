@@ -162,7 +162,7 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path):
 
         ros.wait(lambda: "Waiting" not in text(page), 40)
         ros.wait(lambda: f"{N} of {N} cubes" in text(page) and "live" in text(page), 40)
-        assert "pressure −σzz in kPa" in text(page)
+        ros.wait(lambda: "pressure −σzz in kPa" in text(page), 40)
         ros.wait(lambda: "state" in text(page), 40)
         assert len(yellow(page)) == 0
 
