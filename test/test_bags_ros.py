@@ -143,7 +143,8 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
         cube("record", "-o", path),
         cube("record", "-o", tmp_path / "other", "--storage", "sqlite3"),
     )
-    running.wait(lambda: grown(path, 800_000))
+    # The one that starts later has to have recorded for a while, too.
+    running.wait(lambda: grown(path, 800_000) and grown(tmp_path / "other", 400_000))
     output = end(recorder)
     assert "/frequencies" in end(other) and other.returncode == 0
     assert recorder.returncode == 0 and "/frequencies" in output, output
