@@ -75,7 +75,9 @@ def end(process: subprocess.Popen, number: int = signal.SIGINT) -> str:
 
 
 def grown(folder: Path, size: int) -> bool:
-    return sum(path.stat().st_size for path in folder.glob("**/*.mcap")) > size
+    """Whether the storage files of a folder hold so many bytes."""
+    files = [path for path in folder.glob("**/*") if path.name.endswith((".mcap", ".db3"))]
+    return sum(path.stat().st_size for path in files) > size
 
 
 def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
