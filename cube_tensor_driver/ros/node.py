@@ -224,6 +224,8 @@ class CubeNode(LifecycleNode):
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
         result = self.attempt(self.configure)
         self.configured = result == TransitionCallbackReturn.SUCCESS
+        if not self.configured:
+            self.cleanup()  # of what was made before the error
         return result
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:

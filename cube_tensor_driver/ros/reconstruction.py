@@ -6,7 +6,6 @@ import threading
 from contextlib import ExitStack
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import SubscriptionEventCallbacks
 
@@ -14,21 +13,18 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
 from ..bags.message_codec import frequency_codec
 from ..config.skin import read_skin
-from ..core.errors import CubeError, MessageError
+from ..core.errors import CubeError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows
 from .diagnostics import Diagnostics
+from .message_limit import check_scans, scan_limit
 from .messages import info_message
-from .node import LATCHED, CubeNode, batch_queue, run, scans_per_message
+from .node import LATCHED, CubeNode, batch_queue, run
 from .parameters import RECONSTRUCTION
 from .reconstruction_diagnostics import ReconstructionDiagnostics, log_changes
 from .recorded import open_recording
 from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
-
-MAX_SCANS = 1000
-"""Rows of one cube in one message, if publish_period does not need more. Each may take 0.3 ms of a
-skin of 1280 cubes, and the node does nothing else meanwhile."""
 
 
 class Reconstruction(CubeNode):
@@ -46,16 +42,12 @@ class Reconstruction(CubeNode):
 
     def configure(self) -> None:
         made = self._configured
-        self._recorded = open_recording(self.config())
-        if self._recorded is not None:
-            made.callback(self._recorded.close)
+        self._recorded = open_recording(self.config(), made)
         skin = self._skin = self._recorded.skin if self._recorded else read_skin(self.config())
         reconstructor = self._reconstructor = Reconstructor(skin)
         reconstructor.drift_time = float(self.value("drift_time"))
         quality = batch_queue(self, skin.rate, len(skin.cubes))
-        # One more than asked for, as drivers may gather it; twice, because rates are not exact.
-        scans = scans_per_message(self.value("publish_period"), skin.rate)
-        self._max_scans = max(MAX_SCANS, 2 * (scans + 1))
+        self._scan_limit = scan_limit(self, skin.rate)
         side = self.value("wrench_side") or None
         self._publisher = StressPublisher(self, skin, reconstructor, quality, side)
         made.callback(self._publisher.close)
@@ -93,7 +85,6 @@ class Reconstruction(CubeNode):
         self._configured.close()
 
     def _on_frequencies(self, data: bytes) -> None:
-        """One message, serialised."""
         try:
             message = frequency_codec.decode(data)
         except CubeError as error:
@@ -112,7 +103,7 @@ class Reconstruction(CubeNode):
         if not self._active:
             return
         try:
-            _check_scans(rows, self._max_scans)
+            check_scans(rows, self._scan_limit)
             with self._lock:
                 recorded = self._recorded
                 verdicts = recorded.verdicts(rows, self._reconstructor) if recorded else None
@@ -134,9 +125,8 @@ class Reconstruction(CubeNode):
         newest_ns = self._reconstructor.health.newest_ns
         since_ns = newest_ns + 1 if newest_ns else self.get_clock().now().nanoseconds
         self._rest_published = self._reconstructor.rest_changes
-        self._info.publish(
-            info_message(self._skin, self._reconstructor.pipeline, since_ns, self._taring.uids)
-        )
+        info = info_message(self._skin, self._reconstructor.pipeline, since_ns, self._taring.uids)
+        self._info.publish(info)
 
     def _on_lost(self, event: Any) -> None:
         """Messages are gone for good: the network or this node was away longer than queues hold."""
@@ -149,18 +139,6 @@ class Reconstruction(CubeNode):
             statuses, changes = self._diagnostics.statuses()
         log_changes(self.get_logger(), changes)
         return statuses
-
-
-def _check_scans(rows: FrequencyRows, limit: int) -> None:
-    """MessageError: more rows of one cube in a message than may be."""
-    if len(rows) <= limit:
-        return
-    counts = np.bincount(rows.cube)
-    if counts.max() > limit:
-        raise MessageError(
-            f"a message has {counts.max()} rows of cube {counts.argmax()}, the limit is {limit}: "
-            "set parameter publish_period to the driver's"
-        )
 
 
 def main() -> None:
