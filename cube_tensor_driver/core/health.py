@@ -79,7 +79,7 @@ class Health:
         self._strained_since = np.zeros(n_cubes, bool)  # since `collect`
         self.refresh()
         self._statistics = WindowStatistics(pipeline.rest_frequency)
-        self._statistics.bound[:] = self._diagnosis.bound
+        self._statistics.bound = self._diagnosis.bound
 
     @property
     def state(self) -> np.ndarray:
@@ -220,7 +220,7 @@ class Health:
         self.history.append(window)
         self.closed += 1
         found = self._diagnosis.examine(window, self.state)
-        self._statistics.bound[:] = self._diagnosis.bound
+        self._statistics.bound = self._diagnosis.bound
         self.strained = still_strained(self.strained, self._over_limit, window.rows)
         self._strained_since |= self.strained
         self._conditions.end_window(found, window.rows > 0)

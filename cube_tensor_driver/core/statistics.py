@@ -12,6 +12,9 @@ jitter; w is 0 across a gap. Roughness is 3 for noise, and (2 pi F T)² for a lo
 frequency F, sampled with period T.
 
 All arrays are (cubes, pads); nothing loops over cubes.
+
+Nobody looks at the sums before the window ends, so single scans wait until several can be added in
+one go: a call of numpy costs as much as the arithmetic of 64 cubes.
 """
 
 from __future__ import annotations
@@ -28,9 +31,8 @@ GAP_NS = 50_000_000
 often."""
 EVEN = 1.5
 """Two intervals count as equal up to this ratio: stamps jitter, but a missing row makes it 2."""
-
-
-ONE = np.ones((1, 1, 1), np.float32)
+TOGETHER = 8
+"""Single scans that are added in one go: more of 1260 cubes would leave the processor's cache."""
 
 
 class Window(NamedTuple):
@@ -62,7 +64,7 @@ class WindowStatistics:
         above it, so that float32 is enough."""
         self._pads = np.full((9, *rest_frequency.shape), np.nan, np.float32)
         (
-            self.last,
+            self._last,
             self._difference,
             self._first_squares,
             self._second_squares,
@@ -70,17 +72,41 @@ class WindowStatistics:
             self._lowest,
             self._highest,
             self._base,
-            self.bound,
+            self._bound,
         ) = self._pads
         self._base[:] = np.nan_to_num(rest_frequency)
         self._count = np.zeros(len(rest_frequency), int)
         self._gap_before, self._gap_within = np.zeros((2, len(rest_frequency)), np.int64)
         # When the newest row of each cube came, and how long after the one before: 0 is unknown.
         self._time_ns, self._interval_ns = np.zeros((2, len(rest_frequency)), np.int64)
+        self._waiting = _WaitingScans(slice(0), np.empty((0, 0, 0)), np.empty((0, 0)))
         self.clear()
+
+    @property
+    def last(self) -> np.ndarray:
+        """(cubes, P) Hz, newest frequencies."""
+        self._add_waiting()
+        return self._last
+
+    @property
+    def newest_ns(self) -> np.ndarray:
+        """(cubes,) stamp of the newest row; 0 before the first."""
+        self._add_waiting()
+        return self._time_ns
+
+    @property
+    def bound(self) -> np.ndarray:
+        """(cubes, P) Hz², the largest term of the noise."""
+        return self._bound
+
+    @bound.setter
+    def bound(self, value: np.ndarray) -> None:
+        self._add_waiting()
+        self._bound[:] = value
 
     def clear(self) -> None:
         """Begin a window."""
+        self._add_waiting()
         for total in (self._first_squares, self._second_squares, self._sum, self._count):
             total[:] = 0
         self._lowest[:] = self._highest[:] = np.nan
@@ -91,15 +117,39 @@ class WindowStatistics:
 
         Sums go scan by scan, so their bits do not depend on how many scans are added at a time.
         """
+        frequency = frequency.astype(np.float32, copy=False)
+        if len(frequency) > 1:
+            self._add_waiting()
+            self._add(cubes, frequency, stamp_ns)
+            return
+        if cubes is not self._waiting.cubes:
+            self._add_waiting()
+            self._waiting = _WaitingScans.room(cubes, frequency.shape[1:])
+        self._waiting.append(frequency[0], stamp_ns[0])
+        if self._waiting.count == TOGETHER:
+            self._add_waiting()
+
+    def _add_waiting(self) -> None:
+        waiting, count = self._waiting, self._waiting.count
+        if count:
+            waiting.count = 0
+            self._add(waiting.cubes, waiting.frequency[:count], waiting.stamp_ns[:count])
+
+    def _add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
         chosen = self._pads[:, cubes]  # a view for a slice, a copy for an index
         last, difference, first_squares, second_squares, total, lowest, highest, base, bound = (
             chosen
         )
-        ratio, weight = self._pace(cubes, stamp_ns)
+        pace = self._pace(cubes, stamp_ns)
         first = _differences(last, frequency)
-        second = first - ratio * np.concatenate([difference[None], first[:-1]])
-        second *= second
-        second *= weight
+        if pace is None:
+            second = _differences(difference, first)
+            second *= second
+        else:
+            ratio, weight = pace
+            second = first - ratio * np.concatenate([difference[None], first[:-1]])
+            second *= second
+            second *= weight
         np.minimum(second, bound, out=second)
         _add_in_order(second_squares, second)
         _add_in_order(first_squares, first * first)
@@ -113,6 +163,7 @@ class WindowStatistics:
 
     def window(self) -> Window:
         """The statistics so far."""
+        self._add_waiting()
         count = np.maximum(self._count, 1)[:, None]
         with np.errstate(invalid="ignore"):
             mean = np.where(self._count[:, None] > 0, self._base + self._sum / count, np.nan)
@@ -127,23 +178,18 @@ class WindowStatistics:
             gap_within=self._gap_within.copy(),
         )
 
-    @property
-    def newest_ns(self) -> np.ndarray:
-        """(cubes,) stamp of the newest row; 0 before the first."""
-        return self._time_ns
-
     def _pace(
         self, cubes: slice | np.ndarray, stamp_ns: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """r and w of B scans from the intervals between the rows of a cube: (B, N, 1), or one for
-        all."""
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """r and w (B, N, 1) of B scans from the intervals between the rows of a cube; None where
+        all are 1."""
         interval = _differences(self._time_ns[cubes], stamp_ns)
         before = np.concatenate([self._interval_ns[cubes][None], interval[:-1]])
         self._time_ns[cubes], self._interval_ns[cubes] = stamp_ns[-1], interval[-1]
         even = (interval < EVEN * before) & (before < EVEN * interval)
         short = max(interval.max(), before.max()) < GAP_NS
         if short and even.all():  # as it mostly is: saves a third of the time of `add`
-            return ONE, ONE
+            return None
         self._note_gaps(cubes, interval)
         known = (np.minimum(interval, before) > 0) & (np.maximum(interval, before) < GAP_NS)
         ratio = np.where(known & ~even, interval / np.where(known, before, 1), 1.0)
@@ -161,10 +207,38 @@ class WindowStatistics:
         self._gap_within[cubes] = np.take_along_axis(widest, chosen[None], axis=0)[0]
 
 
+class _WaitingScans:
+    """Copies of scans of the same cubes, until they are added.
+
+    count: how many wait; cubes: of a scan; frequency (TOGETHER, N, P), stamp_ns (TOGETHER, N)
+    """
+
+    def __init__(
+        self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray
+    ) -> None:
+        self.cubes, self.frequency, self.stamp_ns = cubes, frequency, stamp_ns
+        self.count = 0
+
+    @classmethod
+    def room(cls, cubes: slice | np.ndarray, shape: tuple[int, ...]) -> _WaitingScans:
+        """For scans of frequencies of this shape (N, P)."""
+        return cls(
+            cubes,
+            np.empty((TOGETHER, *shape), np.float32),
+            np.empty((TOGETHER, shape[0]), np.int64),
+        )
+
+    def append(self, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
+        self.frequency[self.count], self.stamp_ns[self.count] = frequency, stamp_ns
+        self.count += 1
+
+
 def _differences(before: np.ndarray, values: np.ndarray) -> np.ndarray:
     """(B, ...) of each value to the one before it; `before` is the one before the first."""
-    row = np.concatenate([before[None], values])
-    return row[1:] - row[:-1]
+    result = np.empty_like(values)
+    np.subtract(values[0], before, out=result[0])
+    np.subtract(values[1:], values[:-1], out=result[1:])
+    return result
 
 
 def _add_in_order(total: np.ndarray, terms: np.ndarray) -> None:
