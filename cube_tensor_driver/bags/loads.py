@@ -85,25 +85,25 @@ def _reference(
     bag: Bag, topic: str, number: int, layout: Layout, area: float | None, half_side: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Times (N,) ns, rising, and states (N, M) in Pa."""
-    kinds = {one.msgtype for one in bag.connections if one.topic == topic}
-    kind = kinds.pop() if kinds else None
-    if kind == BATCH_TYPE:
+    types = {one.msgtype for one in bag.connections if one.topic == topic}
+    msgtype = types.pop() if types else None
+    if msgtype == BATCH_TYPE:
         parts = []
         for messages, _ in bag.stress(topic):
             rows = messages.rows.select(messages.rows.cube == number)
             parts.append((rows.stamp_ns, np.hstack([rows.stress, rows.gradient]).astype(float)))
         at, values = (np.concatenate(column) for column in zip(*parts, strict=True))
-    elif kind in (WRENCH, TENSOR):
+    elif msgtype in (WRENCH, TENSOR):
         measured = [bag.decode(entry) for entry in bag.entries({topic})]
         stamps = [one.header.stamp for one in measured]
         at = np.array([stamp.sec * SECOND + stamp.nanosec for stamp in stamps], np.int64)
         values = np.array(
-            [_force(one) if kind == WRENCH else _components(one.tensor) for one in measured]
+            [_force(one) if msgtype == WRENCH else _components(one.tensor) for one in measured]
         )
     else:
         there = ", ".join(sorted({one.topic for one in bag.connections}))
         raise BagError(
-            f"{bag.path}: --reference {topic} is {kind or 'not there'}; needed is a "
+            f"{bag.path}: --reference {topic} is {msgtype or 'not there'}; needed is a "
             f"WrenchStamped, a StressTensorStamped or a SkinStress. Topics: {there}"
         )
     at, first = np.unique(at, return_index=True)
@@ -113,7 +113,7 @@ def _reference(
         )
     values = values[first]
     modes = default_modes(layout)
-    if kind == WRENCH:
+    if msgtype == WRENCH:
         if area is None:
             raise BagError(
                 f"{bag.path}: {topic} gives forces; give the area they act on in m² (--area)"
@@ -140,6 +140,6 @@ def _components(tensor: Any) -> list[float]:
 def _means(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Means of `size` neighbours each along the first axis; what does not fill the last is left
     out."""
-    whole = values[: len(values) // size * size]
-    means: NDArray[np.float64] = whole.reshape(-1, size, *values.shape[1:]).mean(axis=1)
+    complete = values[: len(values) // size * size]
+    means: NDArray[np.float64] = complete.reshape(-1, size, *values.shape[1:]).mean(axis=1)
     return means

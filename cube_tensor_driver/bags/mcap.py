@@ -307,7 +307,7 @@ class McapOutput(McapWriter):
         self.chunks.append(
             in_summary(first, last, begin, behind, bio.tell(), places, "", len(data), len(data))
         )
-        # Without its indexes a chunk is lost to whoever repairs.
+        # Without its indexes a chunk cannot be repaired.
         bio.flush()
         self.chunk = PendingChunk(2**63 - 1, 0, BytesIO(), defaultdict(list))
         self.indexes.clear()

@@ -157,13 +157,13 @@ class Bag:
 
     def skin(self) -> str:
         """The prefix of the skin's topics, which ends in /. BagError: no skin, or several."""
-        found = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
-        if len(found) != 1:
+        names = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
+        if len(names) != 1:
             raise BagError(
-                f"{self.path}: {len(found)} topics of {FREQUENCIES} "
-                f"({', '.join(found) or 'none'}); needed is one"
+                f"{self.path}: {len(names)} topics of {FREQUENCIES} "
+                f"({', '.join(names) or 'none'}); needed is one"
             )
-        return found[0]
+        return names[0]
 
     def entries(
         self,

@@ -2,8 +2,8 @@
 row.
 
 `Health` remembers more than a bag holds: what it saw before the recording began, and where its
-windows begin. So its verdicts are taken from the recorded stress, and whoever makes the same stress
-again uses them.
+windows begin. So its verdicts are taken from the recorded stress, and used when the same stress is
+made again.
 """
 
 from __future__ import annotations

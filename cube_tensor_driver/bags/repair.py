@@ -123,20 +123,20 @@ def _seal(path: Path, keep_rest: bool) -> tuple[int, int]:
     with path.open("r+b") as bio:
         bio.seek(max(-len(MAGIC), -size), 2)
         complete = bio.read() == MAGIC and size > 2 * len(MAGIC)
-        found = _Salvaged(bio)
-        if complete and not found.damaged:
+        salvaged = _Salvaged(bio)
+        if complete and not salvaged.damaged:
             return 0, 0
-        if keep_rest and not complete and size > found.end:
-            bio.seek(found.end)
+        if keep_rest and not complete and size > salvaged.end:
+            bio.seek(salvaged.end)
             with path.with_name(path.name + REST).open("wb") as rest:
                 shutil.copyfileobj(bio, rest)
-        if found.chunks:
-            bio.seek(found.end)
+        if salvaged.chunks:
+            bio.seek(salvaged.end)
             bio.truncate()
-            found.write_summary(bio, path.name)
-    if not found.chunks:
+            salvaged.write_summary(bio, path.name)
+    if not salvaged.chunks:
         path.unlink()
-    return 0 if complete else size - found.end, found.damaged
+    return 0 if complete else size - salvaged.end, salvaged.damaged
 
 
 class _Salvaged:

@@ -58,7 +58,7 @@ class BagSource:
 
     def __iter__(self) -> Iterator[FrequencyRows]:
         """All rows in the order of recording: of several messages at a time where that is the same
-        to whoever processes them. BagError: damaged."""
+        to those who process them. BagError: damaged."""
         for segment in self.segments():
             yield segment.messages.rows
 
@@ -67,7 +67,7 @@ class BagSource:
         return {"messages": self.messages, "rows": self.rows}
 
     def segments(self) -> Iterator[Segment]:
-        """The stream as messages, for whoever needs their stamps. BagError: damaged."""
+        """The stream as messages, for those who need their stamps. BagError: damaged."""
         for messages, recorded_ns in self.bag.frequencies(self.topic):
             cube = messages.by_message(messages.rows.cube)
             times_ns = messages.by_message(messages.rows.stamp_ns)

@@ -115,8 +115,8 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None or not issubclass(kind, BagError):
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is None or not issubclass(error, BagError):
             self.close()
 
     def add_topic(self, topic: str, msgtype: str, qos: Iterable[Qos] = ()) -> None:
@@ -253,15 +253,15 @@ def write_metadata(folder: Path) -> int:
     """Write metadata.yaml from what the storage files of a folder hold; returns the number of
     messages.
 
-    BagError: no storage file, both kinds, or one that cannot be read.
+    BagError: no storage file, .mcap beside .db3, or one that cannot be read.
     """
     paths = sorted(
         (path for path in folder.iterdir() if path.suffix in SUFFIXES.values()), key=part_number
     )
-    kinds = {path.suffix for path in paths}
-    if len(kinds) != 1:
+    suffixes = {path.suffix for path in paths}
+    if len(suffixes) != 1:
         raise BagError(
-            f"{folder}: storage files of {len(kinds)} kinds; a bag's folder has .mcap files or "
+            f"{folder}: storage files with {len(suffixes)} suffixes; a bag's folder has .mcap files or "
             ".db3 files, one or more"
         )
     files: list[dict[str, Any]] = []
@@ -278,8 +278,8 @@ def write_metadata(folder: Path) -> int:
                     (connection.topic, connection.msgtype), _topic(connection)
                 )
                 topic["message_count"] += connection.msgcount
-    kind = next(name for name, suffix in SUFFIXES.items() if suffix in kinds)
-    described = describe(kind, files, list(topics.values()))
+    storage = next(name for name, suffix in SUFFIXES.items() if suffix in suffixes)
+    described = describe(storage, files, list(topics.values()))
     write_yaml(folder / "metadata.yaml", {"rosbag2_bagfile_information": described})
     return int(described["message_count"])
 

@@ -16,7 +16,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Until Ctrl-C, or until whoever reads has enough: neither is an error."""
+    """Until Ctrl-C, or until the reader of a pipe has enough: neither is an error."""
     from ..config.yaml import to_yaml
     from ..ros.listening import listen
     from ..terminal.echo import Reading, message_json, reading_json, reading_line

@@ -13,7 +13,7 @@ from ..core.errors import ConfigError
 def check_regular(path: Path) -> None:
     """Raise ConfigError if the path leads to something else than a file of a disk.
 
-    A device has no end, and opening a pipe waits for whoever writes into it. OSError: nothing is
+    A device has no end, and opening a pipe waits for a writer. OSError: nothing is
     there, or it cannot be looked at.
     """
     _check_mode(path, path.stat().st_mode)

@@ -1,4 +1,4 @@
-"""Poses that no skin has: what can be read, but is most likely a slip of whoever typed it."""
+"""Poses that no skin has: what can be read, but is most likely a slip of the hand."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The log of a simulator: which samples its hubs took, when, and which faults were carried out.
 
-The simulator writes it when it ends. Whoever checks what arrived reads it and asks here.
+The simulator writes it when it ends. Checks of what arrived read it.
 """
 
 from __future__ import annotations

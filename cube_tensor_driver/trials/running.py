@@ -22,7 +22,7 @@ from ..ros.session import node_session, on_stop_signal
 from ..simulation.sample_log import SampleLog
 
 STEP_S = 0.05
-"""How often whoever spins looks whether it is done, interrupted, or a process has ended."""
+"""How often a loop that spins looks whether it is done, interrupted, or a process has ended."""
 
 
 class Interrupted(CubeError):
