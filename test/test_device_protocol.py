@@ -23,6 +23,7 @@ from cube_tensor_driver.device.protocol import (
     Result,
     Sample,
     Stats,
+    Time,
     encode,
     join,
     sample_bytes,
@@ -42,6 +43,7 @@ FRAMES: dict[str, Frame] = {
         temperature=np.array([2150, -32768], "<i2"),
     ),
     "stats": Stats(3_600_000, 360_000, 2, 4_980),
+    "time": Time(77, 123_456_789),
     "request": Request(Command.SET_PERIOD, 2_000),
     "ack": Ack(Command.SET_PERIOD, Result.DONE, 2_000),
 }
@@ -158,7 +160,7 @@ def test_decoded_values() -> None:
     assert (sample.n_cubes, sample.n_pads) == (2, 2)
     assert sample.frequency.tolist() == [[98_765_432, 100_000_000], [0, 101_000_001]]
     assert (sample.pad_fault.tolist(), sample.temperature.tolist()) == ([0, 1], [2150, -32768])
-    for simple in ("stats", "request", "ack"):
+    for simple in ("stats", "time", "request", "ack"):
         assert Decoder().feed(dump("wire", simple)) == [FRAMES[simple]]
 
 
@@ -207,7 +209,7 @@ BAD = {
     "checksum": (b"\0" + cobs_of(HEADER_1 + STATS_PAYLOAD + b"\0\0\0\0") + b"\0", "crc"),
     "version 2": (wire(bytes([0x03, 2, 18, 0]) + STATS_PAYLOAD), "version"),
     "version 2 of a type to come": (wire(bytes([0x77, 2, 9, 9]) + bytes(5)), "version"),
-    "unknown type": (wire(bytes([0x04, 1, 18, 0]) + STATS_PAYLOAD), "unknown_type"),
+    "unknown type": (wire(bytes([0x05, 1, 18, 0]) + STATS_PAYLOAD), "unknown_type"),
     "length says less": (wire(bytes([0x03, 1, 17, 0]) + STATS_PAYLOAD), "length"),
     "length says more": (wire(bytes([0x03, 1, 19, 0]) + STATS_PAYLOAD), "length"),
     "stats too long": (wire(bytes([0x03, 1, 19, 0]) + STATS_PAYLOAD + b"\0"), "length"),
@@ -263,6 +265,7 @@ def test_other_version_is_remembered() -> None:
             np.full(1, -(2**15), "<i2"),
         ),
         Stats(2**64 - 1, 2**32 - 1, 2**32 - 1, 2**16 - 1),
+        Time(2**32 - 1, 2**64 - 1),
         Request(255, 2**32 - 1),
         Ack(255, 255, 2**32 - 1),
     ],
@@ -463,3 +466,8 @@ def test_a_simulated_hub_keeps_the_rules_of_the_page():
     assert answers(hub, 3) == answers(hub, 3) == [Ack(3)]  # R6
     answers(hub, 2, now_us=10_000)
     assert hub.sequence == 1  # S1
+    hub.boot_us = 50_000
+    assert answers(hub, 6, 77, now_us=3000) == [Time(77, 53_000)]  # R1, T1, T2
+    assert answers(hub, 3) == [Ack(3)]
+    assert answers(hub, 6, 2**32 - 1, now_us=9000) == [Time(2**32 - 1, 59_000)]  # T2: stopped
+    assert answers(hub, 7, 77) == [Ack(7, Result.UNKNOWN)]

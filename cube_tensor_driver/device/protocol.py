@@ -39,6 +39,7 @@ _SAMPLE = struct.Struct("<IHHQB3x")
 _STATS = struct.Struct("<QIIH")
 REQUEST = struct.Struct("<BI")
 _ACK = struct.Struct("<BBI")
+_TIME = struct.Struct("<IQ")
 _U16, _U32, _U64, _I16 = (np.dtype(code) for code in ("<u2", "<u4", "<u8", "<i2"))
 _Arrays = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.int16]]
 OVERHEAD = HEADER.size + 4
@@ -53,6 +54,7 @@ class Command(IntEnum):
     STOP = 3  # 0
     SET_PERIOD = 4  # sample period, µs
     IDENTIFY = 5  # how long the hub shows itself, s
+    TIME = 6  # a number, which the answer repeats; the answer is a `Time`
 
 
 class Result(IntEnum):
@@ -264,7 +266,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """From hub to host, one for each REQUEST.
+    """From hub to host, one for each REQUEST but TIME.
 
     request: the one answered, u8
     result: a `Result`, u8
@@ -283,9 +285,35 @@ class Ack:
         return cls(*_ACK.unpack_from(raw, 4)) if size == _ACK.size else None
 
 
-Frame = Hello | Sample | Stats | Request | Ack
+@dataclass(frozen=True, slots=True)
+class Time:
+    """From hub to host: the answer to request TIME, in place of an `Ack`.
 
-_TYPES: dict[int, type[Frame]] = {0x01: Hello, 0x02: Sample, 0x03: Stats, 0x10: Request, 0x11: Ack}
+    number: the argument of the request, u32
+    device_us: hub clock between the end of the request and the beginning of the answer, µs, u64
+    """
+
+    number: int
+    device_us: int
+
+    def _pack(self) -> bytes:
+        return _TIME.pack(self.number, self.device_us)
+
+    @classmethod
+    def _unpack(cls, raw: bytes, size: int) -> Time | None:
+        return cls(*_TIME.unpack_from(raw, 4)) if size == _TIME.size else None
+
+
+Frame = Hello | Sample | Stats | Time | Request | Ack
+
+_TYPES: dict[int, type[Frame]] = {
+    0x01: Hello,
+    0x02: Sample,
+    0x03: Stats,
+    0x04: Time,
+    0x10: Request,
+    0x11: Ack,
+}
 _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
 UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
     code: frame_type._unpack for code, frame_type in _TYPES.items()

@@ -20,6 +20,7 @@ from ..device.protocol import (
     Result,
     Sample,
     Stats,
+    Time,
     encode,
 )
 from .prepared_frames import PreparedFrame
@@ -188,6 +189,8 @@ class SimulatedHub:
             else:
                 result = Result.REFUSED
             argument = self.period_us
+        elif request.request == Command.TIME:
+            return encode(Time(request.argument, max(0, self.device_us(now_us))), self.version)
         elif request.request != Command.IDENTIFY:
             result = Result.UNKNOWN
         return encode(Ack(request.request, result, argument), self.version)
