@@ -228,6 +228,11 @@ static bool parse(cube_frame *frame) {
             .supply_mv = load_u16(at + 16),
         };
         return true;
+    case CUBE_TIME:
+        if (size != CUBE_TIME_SIZE)
+            return false;
+        frame->as.time = (cube_time){.number = load_u32(at), .device_us = load_u64(at + 4)};
+        return true;
     case CUBE_REQUEST:
         if (size != CUBE_REQUEST_SIZE)
             return false;
@@ -243,7 +248,7 @@ static bool parse(cube_frame *frame) {
 }
 
 static bool is_known(uint8_t type) {
-    return (type >= CUBE_HELLO && type <= CUBE_STATS) || type == CUBE_REQUEST || type == CUBE_ACK;
+    return (type >= CUBE_HELLO && type <= CUBE_TIME) || type == CUBE_REQUEST || type == CUBE_ACK;
 }
 
 /* Where an unfinished run is kept: CUBE_GAP behind its decoded bytes. */
@@ -468,6 +473,15 @@ size_t cube_build_stats(uint8_t *out, size_t capacity, const cube_stats *stats) 
     at = store_u32(at, stats->dropped);
     at = store_u16(at, stats->supply_mv);
     return close_frame(out, at, CUBE_STATS_SIZE);
+}
+
+size_t cube_build_time(uint8_t *out, size_t capacity, const cube_time *time) {
+    uint8_t *at = open_frame(out, capacity, CUBE_TIME, CUBE_TIME_SIZE);
+    if (at == NULL)
+        return 0;
+    at = store_u32(at, time->number);
+    at = store_u64(at, time->device_us);
+    return close_frame(out, at, CUBE_TIME_SIZE);
 }
 
 size_t cube_build_request(uint8_t *out, size_t capacity, const cube_request *request) {

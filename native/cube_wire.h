@@ -47,6 +47,7 @@ extern "C" {
 #define CUBE_SAMPLE_ROW(n_pads) (4u * (n_pads) + 6u)
 #define CUBE_SAMPLE_SIZE(n_cubes, n_pads) (20u + (n_cubes) * CUBE_SAMPLE_ROW(n_pads))
 #define CUBE_STATS_SIZE 18u
+#define CUBE_TIME_SIZE 12u
 #define CUBE_REQUEST_SIZE 5u
 #define CUBE_ACK_SIZE 6u
 
@@ -64,6 +65,7 @@ enum cube_type {
     CUBE_HELLO = 0x01,
     CUBE_SAMPLE = 0x02,
     CUBE_STATS = 0x03,
+    CUBE_TIME = 0x04,
     CUBE_REQUEST = 0x10,
     CUBE_ACK = 0x11,
 };
@@ -74,6 +76,7 @@ enum cube_command {
     CUBE_STOP = 3,
     CUBE_SET_PERIOD = 4, /* argument: sample period, us */
     CUBE_IDENTIFY = 5,   /* argument: how long the hub shows itself, s */
+    CUBE_ASK_TIME = 6,   /* argument: a number; CUBE_TIME with that number is the answer, no ACK */
 };
 
 enum cube_result {
@@ -107,6 +110,11 @@ typedef struct {
 } cube_stats;
 
 typedef struct {
+    uint32_t number;    /* argument of the request */
+    uint64_t device_us; /* now, by the clock of samples */
+} cube_time;
+
+typedef struct {
     uint8_t request; /* enum cube_command, or any other number */
     uint32_t argument;
 } cube_request;
@@ -127,6 +135,7 @@ typedef struct {
         cube_hello hello;
         cube_sample sample;
         cube_stats stats;
+        cube_time time;
         cube_request request;
         cube_ack ack;
     } as;
@@ -197,6 +206,7 @@ size_t cube_build_sample(
     uint8_t *out, size_t capacity, const cube_sample *sample, const uint32_t *frequency,
     const uint32_t *pad_fault, const int16_t *temperature);
 size_t cube_build_stats(uint8_t *out, size_t capacity, const cube_stats *stats);
+size_t cube_build_time(uint8_t *out, size_t capacity, const cube_time *time);
 size_t cube_build_request(uint8_t *out, size_t capacity, const cube_request *request);
 size_t cube_build_ack(uint8_t *out, size_t capacity, const cube_ack *ack);
 

@@ -48,7 +48,7 @@ static cube_counters feed(
 
 /* A right checksum around the bytes; returns their length on the wire. */
 static size_t wrap(const uint8_t *data, size_t size, uint8_t *out) {
-    static const uint8_t types[] = {1, 2, 3, 0x10, 0x11, 4};
+    static const uint8_t types[] = {1, 2, 3, 4, 0x10, 0x11, 5};
     uint8_t *raw = malloc(size + 8);
     raw[0] = size ? types[data[0] % sizeof types] : CUBE_SAMPLE;
     raw[1] = CUBE_VERSION;

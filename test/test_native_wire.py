@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from test_device_protocol import BAD, FRAMES, cobs_of, crc_of, dump, wire
 
 from cube_tensor_driver.device.decoder import MAX_RUN, Counters, Decoder
-from cube_tensor_driver.device.protocol import Ack, Hello, Request, Sample, Stats, encode
+from cube_tensor_driver.device.protocol import Ack, Hello, Request, Sample, Stats, Time, encode
 
 ROOT = Path(__file__).resolve().parent.parent
 NATIVE = ROOT / "native"
@@ -160,6 +160,7 @@ frames = st.one_of(
     samples(),
     st.builds(Hello, U64, U32, U8, U32, uids, U8),
     st.builds(Stats, U64, U32, U32, U16),
+    st.builds(Time, U32, U64),
     st.builds(Request, U8, U32),
     st.builds(Ack, U8, U8, U32),
 )
@@ -178,7 +179,7 @@ def sound_but_wrong(draw: st.DrawFn) -> bytes:
     """A right checksum around anything."""
     payload = draw(st.binary(max_size=60))
     says = draw(st.one_of(st.just(len(payload)), st.integers(0, 70)))
-    kind = draw(st.sampled_from([0, 1, 2, 3, 4, 0x0F, 0x10, 0x11, 0x12, 255]))
+    kind = draw(st.sampled_from([0, 1, 2, 3, 4, 5, 0x0F, 0x10, 0x11, 0x12, 255]))
     version = draw(st.sampled_from([1, 1, 1, 0, 2, 255]))
     return wire(bytes([kind, version]) + says.to_bytes(2, "little") + payload)
 

@@ -56,6 +56,8 @@ static size_t build(const cube_frame *frame, uint8_t *out, size_t capacity) {
     }
     if (frame->type == CUBE_STATS)
         return cube_build_stats(out, capacity, &frame->as.stats);
+    if (frame->type == CUBE_TIME)
+        return cube_build_time(out, capacity, &frame->as.time);
     if (frame->type == CUBE_REQUEST)
         return cube_build_request(out, capacity, &frame->as.request);
     return cube_build_ack(out, capacity, &frame->as.ack);
