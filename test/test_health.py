@@ -180,8 +180,13 @@ def set_pad(value):
     return harm
 
 
-def noisy(frequency, row):
-    frequency[2, 5] *= 1 + 3e-4 * np.random.default_rng(row).standard_normal()
+def noisy(noise):
+    """noise: standard deviation relative to the frequency."""
+
+    def harm(frequency, row):
+        frequency[2, 5] *= 1 + noise * np.random.default_rng(row).standard_normal()
+
+    return harm
 
 
 FAULTS = {
@@ -192,7 +197,8 @@ FAULTS = {
     "squeezed": (set_pad(20e3), RANGE, 0.01),
     "stretched": (set_pad(180e3), RANGE, 0.01),
     "stuck": (set_pad(101_234.567), STUCK, 1.02),
-    "noisy": (noisy, NOISY, 1.02),
+    "noisy": (noisy(3e-4), NOISY, 1.02),
+    "very noisy": (noisy(1e-2), NOISY, 1.02),
 }
 
 

@@ -6,10 +6,11 @@
     roughness            sum(w e²) / sum(d²)
 
 Second differences of white noise with variance s² have variance 6 s² (r = 1). A load that moves
-slowly leaves nothing in them, also where rows are missing. Each term w e² is bounded, so that one
-jump does not look like noise. r is 1 while two intervals are equal within EVEN, because stamps
-jitter; w is 0 across a gap. Roughness is 3 for noise, and (2 pi F T)² for a load that moves with
-frequency F, sampled with period T.
+slowly leaves nothing in them, also where rows are missing. For the noise each term w e² is bounded,
+so that one jump does not look like noise; for the roughness it is not, else great noise would look
+like a load that moves. r is 1 while two intervals are equal within EVEN, because stamps jitter; w
+is 0 across a gap. Roughness is 3 for noise, and (2 pi F T)² for a load that moves with frequency F,
+sampled with period T.
 
 All arrays are (cubes, pads); nothing loops over cubes.
 
@@ -62,12 +63,13 @@ class WindowStatistics:
     def __init__(self, rest_frequency: np.ndarray) -> None:
         """rest_frequency: (cubes, P) Hz, NaN where a cube has no such pad; sums are of what is
         above it, so that float32 is enough."""
-        self._pads = np.full((9, *rest_frequency.shape), np.nan, np.float32)
+        self._pads = np.full((10, *rest_frequency.shape), np.nan, np.float32)
         (
             self._last,
             self._difference,
             self._first_squares,
             self._second_squares,
+            self._bounded_squares,
             self._sum,
             self._lowest,
             self._highest,
@@ -107,7 +109,8 @@ class WindowStatistics:
     def clear(self) -> None:
         """Begin a window."""
         self._add_waiting()
-        for total in (self._first_squares, self._second_squares, self._sum, self._count):
+        squares = self._first_squares, self._second_squares, self._bounded_squares
+        for total in (*squares, self._sum, self._count):
             total[:] = 0
         self._lowest[:] = self._highest[:] = np.nan
         self._gap_before[:] = self._gap_within[:] = 0
@@ -137,9 +140,8 @@ class WindowStatistics:
 
     def _add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
         chosen = self._pads[:, cubes]  # a view for a slice, a copy for an index
-        last, difference, first_squares, second_squares, total, lowest, highest, base, bound = (
-            chosen
-        )
+        last, difference, first_squares, second_squares, bounded_squares = chosen[:5]
+        total, lowest, highest, base, bound = chosen[5:]
         pace = self._pace(cubes, stamp_ns)
         first = _differences(last, frequency)
         if pace is None:
@@ -150,8 +152,9 @@ class WindowStatistics:
             second = first - ratio * np.concatenate([difference[None], first[:-1]])
             second *= second
             second *= weight
-        np.minimum(second, bound, out=second)
         _add_in_order(second_squares, second)
+        np.minimum(second, bound, out=second)
+        _add_in_order(bounded_squares, second)
         _add_in_order(first_squares, first * first)
         _add_in_order(total, frequency - base)
         np.fmin(lowest, np.fmin.reduce(frequency, axis=0), out=lowest)
@@ -172,7 +175,7 @@ class WindowStatistics:
             mean=mean,
             lowest=self._lowest.copy(),
             highest=self._highest.copy(),
-            noise=np.sqrt(self._second_squares / count / 6),
+            noise=np.sqrt(self._bounded_squares / count / 6),
             rough=self._second_squares > ROUGH * self._first_squares,
             gap_before=self._gap_before.copy(),
             gap_within=self._gap_within.copy(),
