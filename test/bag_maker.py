@@ -34,7 +34,7 @@ def info_of(
     pipeline: Pipeline,
     stamp_ns: int,
     sender: str = "reconstruction",
-    version: int = 2,
+    version: int = 3,
 ) -> object:
     kinds = {cube.calibration.id: cube.calibration for cube in skin.cubes}
     pose = message(
@@ -84,6 +84,7 @@ def frequencies_of(k: int, stamp_ns: int, frequency: np.ndarray) -> object:
         frequency=frequency.astype(np.float32).ravel(),
         temperature=np.full(n, np.nan, np.float32),
         pad_fault=np.zeros(n, np.uint32),
+        status=np.zeros(n, np.uint16),
     )
 
 

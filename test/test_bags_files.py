@@ -23,7 +23,7 @@ from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
 from cube_tensor_driver.bags.mcap import HEAD, BagReader
-from cube_tensor_driver.bags.message_codec import upgrade_stress
+from cube_tensor_driver.bags.message_codec import upgrade_frequencies, upgrade_stress
 from cube_tensor_driver.bags.read import FREQUENCIES, INFO, STRESS, Bag, typestore
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess import Overrides, ReprocessJob, reconstruct, reprocess
@@ -270,6 +270,18 @@ def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
     with open_bag(path) as source:
         ((_, rows), *_) = reconstruct(source, Overrides(tare=(0.0, 0.1)))
     assert not rows.left_out.any() and (rows.status & STUCK == 0).all()
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_frequencies_of_old_versions_are_made_ones_of_today(version):
+    with Bag(ROOT / "test" / "data" / f"bag_v{version}") as bag:
+        entry = next(bag.entries({"/frequencies"}))
+        old = bag.decode(entry)
+        new = typestore().deserialize_cdr(upgrade_frequencies(entry.data), FREQUENCIES)
+    np.testing.assert_array_equal(old.frequency, new.frequency)
+    np.testing.assert_array_equal(old.pad_fault, new.pad_fault)
+    assert new.header.stamp == old.header.stamp and old.time_offset.size
+    assert len(new.status) == len(old.cube) and not new.status.any()
 
 
 def test_stress_of_version_1_is_made_one_of_today():
@@ -565,7 +577,7 @@ def test_the_kept_bag_of_each_version_can_be_read(tmp_path, version):
         ).all()
     with Bag(kept) as bag, Bag(tmp_path / "out") as made:
         assert bag.version == bag.infos("/info")[0].version == version
-        assert made.version == made.infos("/info")[0].version == 2
+        assert made.version == made.infos("/info")[0].version == 3
 
 
 def test_fit_from_a_bag(tmp_path, capsys):

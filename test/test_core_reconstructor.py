@@ -7,8 +7,9 @@ import numpy as np
 from conftest import stamped
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.reconstructor import Reconstructor, Verdicts
+from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.statistics import WindowStatistics
-from cube_tensor_driver.core.status import PAD_FAULT, SHORT, STUCK
+from cube_tensor_driver.core.status import PAD_FAULT, SHORT, STAMP, STUCK
 
 CALIBRATION = illustrative("planar")
 
@@ -40,6 +41,16 @@ def test_a_broken_pad_is_left_out_and_named_in_the_status():
     stress = Reconstructor([CALIBRATION] * 2)(rows)
     assert stress.left_out.tolist() == [0, 1 << 3]
     assert stress.status.tolist() == [0, PAD_FAULT | SHORT]
+
+
+def test_doubt_of_a_stamp_goes_with_the_row():
+    """Nothing else that a peer writes there does."""
+    doubt = np.array([STAMP, STAMP | STUCK])
+    rows = FrequencyRows.of(np.arange(2), frequencies(), status=doubt)
+    reconstruct = Reconstructor([CALIBRATION] * 2)
+    assert reconstruct(rows).status.tolist() == [STAMP, STAMP | PAD_FAULT | SHORT]
+    recorded = Verdicts(np.ones(2, bool), np.zeros(2, np.uint32), np.zeros(2, np.uint16))
+    assert reconstruct.process_known(rows, recorded).status.tolist()[0] == STAMP
 
 
 def test_recorded_verdicts_replace_those_made_now_where_they_are_known():

@@ -147,7 +147,7 @@ def test_all_that_the_hubs_sent_comes_out_bit_for_bit(play: Play, tmp_path: Path
         assert source.is_live is True
         got = first_rows(source, 500)
         statistics = source.statistics()
-    cube, sequence, stamp_ns, frequency, temperature, pad_fault = (
+    cube, sequence, stamp_ns, frequency, temperature, pad_fault, status = (
         np.concatenate([getattr(rows, name) for rows in got])
         for name in FrequencyRows.__dataclass_fields__
     )
@@ -165,7 +165,7 @@ def test_all_that_the_hubs_sent_comes_out_bit_for_bit(play: Play, tmp_path: Path
         sampled_ns = 1000 * np.array([hubs[link].sampled_us[int(k)] for k in numbers])
         assert np.ptp(stamp_ns[rows]) == pytest.approx(np.ptp(sampled_ns), abs=BUSY_S * 1e9)
     assert np.isnan(temperature).all()
-    assert not pad_fault.any()
+    assert not pad_fault.any() and not status.any()
     assert abs(time.time_ns() - int(stamp_ns.max())) < WAIT_S * 1e9
     sizes = [len(rows) for rows in got]
     assert 5 in sizes, "a scan of both links, where nothing was held up"

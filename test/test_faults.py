@@ -293,6 +293,7 @@ def verified(
             frequency=verification.table[(k + 1) % INSTANTS].copy(),
             temperature=np.full(4, np.nan, np.float32),
             pad_fault=np.zeros(4, np.uint32),
+            status=np.zeros(4, np.uint16),
         )
         frequencies, stress = spoil(k, rows, reconstruct(rows))
         verification.frequencies(frequencies)

@@ -46,6 +46,7 @@ def rows_of(cubes, sequence, stamp_ns) -> FrequencyRows:
         frequency=np.zeros((n, 8), np.float32),
         temperature=np.zeros(n, np.float32),
         pad_fault=np.zeros(n, np.uint32),
+        status=np.zeros(n, np.uint16),
     )
 
 

@@ -114,6 +114,7 @@ class Skin(threading.Thread):
                 frequency.astype(np.float32),
                 np.full(N, np.nan, np.float32),
                 none,
+                none.astype(np.uint16),
             )
             self._publisher.publish(frequency_codec.encode(scan, b"skin_base\0"))
             self.sent += 1

@@ -45,7 +45,7 @@ class _Field(NamedTuple):
     width: int
 
 
-_FREQUENCIES = (
+_FREQUENCIES_2 = (
     _Field("cube", "<u2", 1),
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
@@ -54,6 +54,7 @@ _FREQUENCIES = (
     _Field("temperature", "<f4", 1),
     _Field("pad_fault", "<u4", 1),
 )
+_FREQUENCIES = (*_FREQUENCIES_2, _Field("status", "<u2", 1))
 _STRESS_1 = (
     _Field("cube", "<u2", 1),
     _Field("sequence", "<u4", 1),
@@ -228,8 +229,11 @@ class MessageCodec(Generic[AnyRows]):
         """The rows of records (M,): views of a single one, copies of several."""
         columns: list[NDArray[Any]] = [_flat(record, "cube"), _flat(record, "sequence"), stamp_ns]
         columns += [_flat(record, name) for name in self._values]
+        # The last field of older versions is missing.
         if self._fields is _STRESS_1:
             columns.append(np.zeros(len(stamp_ns), np.uint32))
+        elif self._fields is _FREQUENCIES_2:
+            columns.append(np.zeros(len(stamp_ns), np.uint16))
         return self._rows(*columns)
 
     def write_constants(self, record: NDArray[Any], layout: _Layout, frame_id: bytes) -> None:
@@ -368,9 +372,17 @@ def _aligned(place: int) -> int:
 
 
 frequency_codec = MessageCodec("SkinFrequencies", FrequencyRows, _FREQUENCIES)
+frequency_codec_2 = MessageCodec("SkinFrequencies, version 2", FrequencyRows, _FREQUENCIES_2)
+"""Of versions 1 and 2, which have no status: it reads as 0."""
 stress_codec = MessageCodec("SkinStress", StressRows, _STRESS)
 stress_codec_1 = MessageCodec("SkinStress, version 1", StressRows, _STRESS_1)
 """Of version 1, which has no left_out: it reads as 0."""
+
+
+def upgrade_frequencies(data: bytes) -> bytes:
+    """A serialised SkinFrequencies of version 1 or 2 in today's version. MessageError: damaged."""
+    old = frequency_codec_2.decode(data)
+    return frequency_codec.encode(old.rows, old.frame_id, int(old.stamp_ns[0]))
 
 
 def upgrade_stress(data: bytes) -> bytes:

@@ -26,6 +26,7 @@ from .message_codec import (
     Decoded,
     MessageCodec,
     frequency_codec,
+    frequency_codec_2,
     stress_codec,
     stress_codec_1,
 )
@@ -35,7 +36,7 @@ PACKAGE = "cube_tensor_driver"
 FREQUENCIES, STRESS, INFO = (
     f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo")
 )
-VERSIONS = (1, 2)
+VERSIONS = (1, 2, 3)
 """Versions of SkinInfo that this package reads."""
 TOGETHER, TOGETHER_BYTES = 64, 1 << 19
 """Most messages that are decoded at once: the cost of calling numpy no longer counts, and they fit
@@ -199,8 +200,14 @@ class Bag:
     @property
     def version(self) -> int:
         """Of this package's messages, as the bag defines them."""
-        _, fields = self._types.fielddefs.get(STRESS, ((), ()))
-        return 1 if fields and all(name != "left_out" for name, _ in fields) else max(VERSIONS)
+        if self._lacks(STRESS, "left_out"):
+            return 1
+        return 2 if self._lacks(FREQUENCIES, "status") else max(VERSIONS)
+
+    def _lacks(self, msgtype: str, field: str) -> bool:
+        """Whether the bag defines a type, and without this field."""
+        _, fields = self._types.fielddefs.get(msgtype, ((), ()))
+        return bool(fields) and all(name != field for name, _ in fields)
 
     def decode(self, entry: Entry) -> Any:
         """The message. BagError: its bytes do not fit its type."""
@@ -232,7 +239,8 @@ class Bag:
         Messages of one shape that follow each other come together, at most `TOGETHER`. BagError: a
         message contradicts itself.
         """
-        return self._decoded(topic, frequency_codec, frequency_codec.decode)
+        codec = frequency_codec if self.version > 2 else frequency_codec_2
+        return self._decoded(topic, codec, codec.decode)
 
     def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], NDArray[np.int64]]]:
         """As `frequencies`, of a topic with stress."""

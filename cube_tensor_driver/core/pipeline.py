@@ -24,7 +24,7 @@ from .modes import COMPONENTS, STRESS
 from .oscillator import highest_frequency
 from .pattern import PatternCache, count_repeats
 from .rows import FrequencyRows, StressRows
-from .status import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE
+from .status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 
 N = len(COMPONENTS)
 MASKS_KEPT = 1024
@@ -181,6 +181,7 @@ class Pipeline:
             status[observed == 0] |= INVALID
         if law.no_temperature is not None:
             status[law.no_temperature.ravel()] |= TEMPERATURE
+        status |= rows.status & np.uint16(STAMP)
         out = out.reshape(-1, out.shape[2])
         return StressRows(
             cube=rows.cube,

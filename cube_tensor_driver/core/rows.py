@@ -41,6 +41,7 @@ class FrequencyRows(_Rows):
     frequency: (N, P) Hz; NaN where nothing was measured and where the cube has no such pad
     temperature: (N,) °C; NaN where it is unknown
     pad_fault: (N,) bit p: the device reports that pad p is broken
+    status: (N,) bits of `status.py`; only STAMP, which says that stamp_ns is in doubt
     """
 
     cube: NDArray[np.uint16]
@@ -49,6 +50,7 @@ class FrequencyRows(_Rows):
     frequency: NDArray[np.float32]
     temperature: NDArray[np.float32]
     pad_fault: NDArray[np.uint32]
+    status: NDArray[np.uint16]
 
     @classmethod
     def of(
@@ -60,6 +62,7 @@ class FrequencyRows(_Rows):
         sequence: Any = 0,
         temperature: Any = np.nan,
         pad_fault: Any = 0,
+        status: Any = 0,
     ) -> FrequencyRows:
         """Rows from plain numbers: cube (N,), frequency (N, P), the others (N,) or one for all."""
         cube = np.asarray(cube)
@@ -70,6 +73,7 @@ class FrequencyRows(_Rows):
             frequency=np.asarray(frequency),
             temperature=_column(cube, temperature, np.float32),
             pad_fault=_column(cube, pad_fault, np.uint32),
+            status=_column(cube, status, np.uint16),
         )
 
 

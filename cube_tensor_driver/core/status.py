@@ -10,11 +10,14 @@ INVALID = 4
 """Nothing was recovered: all components are NaN."""
 TEMPERATURE = 8
 """The calibration needs the temperature, which is unknown; its reference was assumed."""
+STAMP = 2048
+"""The stamp is in doubt: the device's clock seems to have been set, or is no clock."""
 STATUS = {
     "PAD_FAULT": PAD_FAULT,
     "RESIDUAL": RESIDUAL,
     "INVALID": INVALID,
     "TEMPERATURE": TEMPERATURE,
+    "STAMP": STAMP,
 }
 
 OPEN, SHORT, RANGE, STUCK, NOISY, REPORTED, DRIFT = 16, 32, 64, 128, 256, 512, 1024

@@ -40,15 +40,18 @@ def empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
         frequency=np.empty((n_rows, n_pads), np.float32),
         temperature=np.empty(n_rows, np.float32),
         pad_fault=np.empty(n_rows, np.uint32),
+        status=np.empty(n_rows, np.uint16),
     )
 
 
 class _Part(NamedTuple):
-    """The rows of one sample: index in the skin of each cube, the sample, and when it was taken."""
+    """The rows of one sample: index in the skin of each cube, the sample, when it was taken, and
+    the status bits of the rows."""
 
     cubes: NDArray[np.uint16]
     sample: Sample
     stamp_ns: int
+    status: int
 
 
 class ScanBuilder:
@@ -60,8 +63,8 @@ class ScanBuilder:
     def __init__(self, n_links: int, addresses: Sequence[CubeAddress]) -> None:
         self.cubes = CubeTable(n_links, addresses)
         self._live: set[int] = set()
-        # Scans not built yet: of each link its first sample, with its time; then its second ...
-        self._pending: list[dict[int, tuple[Sample, int]]] = []
+        # Scans not built yet: of each link its first sample, with time and status; then its second
+        self._pending: list[dict[int, tuple[Sample, int, int]]] = []
         self._too_late: list[_Part] = []  # to be built next: beyond MAX_SPAN_NS of the last
         self._pending_ns: list[int] = []  # when the first sample of each pending scan was taken
         self._n_pending = [0] * n_links  # how many pending scans each link has reached
@@ -75,8 +78,13 @@ class ScanBuilder:
             self._live.discard(link)
             self.cubes.forget(link)
 
-    def add(self, link: int, samples: Sequence[Sample], stamps_ns: Sequence[int]) -> None:
-        """Samples of one link in order, and when they were taken, ns, in the clock of the rows."""
+    def add(
+        self, link: int, samples: Sequence[Sample], stamps_ns: Sequence[int], status: int = 0
+    ) -> None:
+        """Samples of one link in order, and when they were taken, ns, in the clock of the rows.
+
+        status: bits of status.py that all their rows get
+        """
         self._live.add(link)
         for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
             # What a link has not sent, because it began later or lost it, leaves a gap. Its samples
@@ -85,7 +93,7 @@ class ScanBuilder:
             if scan == len(self._pending):
                 self._pending.append({})
                 self._pending_ns.append(stamp_ns)
-            self._pending[scan][link] = sample, stamp_ns
+            self._pending[scan][link] = sample, stamp_ns, status
             self._n_pending[link] = scan + 1
 
     def is_complete(self, n_scans: int = 1) -> bool:
@@ -131,7 +139,7 @@ class ScanBuilder:
 
     def rows_waiting(self) -> int:
         """How many rows came in and were neither built nor left out yet."""
-        gathered = sum(sample.n_cubes for scan in self._pending for sample, _ in scan.values())
+        gathered = sum(sample.n_cubes for scan in self._pending for sample, _, _ in scan.values())
         return gathered + sum(len(part.cubes) for part in self._too_late)
 
     def _take(self, max_scans: int | None) -> list[_Part]:
@@ -146,11 +154,11 @@ class ScanBuilder:
         parts: list[_Part] = []
         for scan in scans:
             for link in sorted(scan):
-                sample, stamp_ns = scan[link]
+                sample, stamp_ns, status = scan[link]
                 self._built_ns[link] = stamp_ns
                 found = self.cubes.find(link, sample)
                 if found is not None:
-                    parts.append(_Part(*found, stamp_ns))
+                    parts.append(_Part(*found, stamp_ns, status))
         return parts
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
@@ -161,7 +169,7 @@ class ScanBuilder:
         have a built sample nearer to it in time than its own last one is.
         """
         middles = []
-        for link, (_, stamp_ns) in self._pending[0].items():
+        for link, (_, stamp_ns, _) in self._pending[0].items():
             last_ns = self._built_ns[link]
             # A further frame of the sample that was built last is late, too.
             middles.append((stamp_ns + last_ns) / 2 if stamp_ns > last_ns else 0.0)
@@ -206,6 +214,9 @@ def _fill(rows: FrequencyRows, parts: Sequence[_Part]) -> None:
     rows.sequence[:] = np.repeat([sample.sequence for sample in samples], counts)
     rows.stamp_ns[:] = np.repeat([part.stamp_ns for part in parts], counts)
     rows.pad_fault[:] = pad_fault
+    rows.status[:] = 0
+    if any(part.status for part in parts):
+        rows.status[:] = np.repeat([part.status for part in parts], counts)
     _CELSIUS.take(temperature.view(np.uint16), out=rows.temperature, mode="clip")
     measured = rows.frequency[:, :width]
     # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.

@@ -47,6 +47,7 @@ class BareSource(CubeNode):
             frequency=packed("f", self._frequency),
             temperature=packed("f", self._temperature),
             pad_fault=packed("I", self._zeros),
+            status=packed("H", self._zeros),
         )
         self._publisher.publish(message)
 

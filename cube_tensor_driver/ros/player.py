@@ -12,8 +12,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from ..bags.message_codec import upgrade_stress
-from ..bags.read import PACKAGE, STRESS, Bag, Entry
+from ..bags.message_codec import upgrade_frequencies, upgrade_stress
+from ..bags.read import FREQUENCIES, PACKAGE, STRESS, Bag, Entry
 from ..core.errors import BagError
 from .messages import SECOND
 from .recorder import DEPTH, message_class
@@ -221,6 +221,10 @@ class Player:
             self._clock.publish(Clock(clock=Time(sec=bag_ns // SECOND, nanosec=bag_ns % SECOND)))
 
     def _publish(self, entry: Entry) -> None:
-        old = entry.msgtype == STRESS and self._bag.version == 1
-        self._publishers[entry.topic].publish(upgrade_stress(entry.data) if old else entry.data)
+        data, version = entry.data, self._bag.version
+        if entry.msgtype == FREQUENCIES and version < 3:
+            data = upgrade_frequencies(data)
+        elif entry.msgtype == STRESS and version < 2:
+            data = upgrade_stress(data)
+        self._publishers[entry.topic].publish(data)
         self.published += 1

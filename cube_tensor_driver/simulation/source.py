@@ -116,6 +116,7 @@ class SimulatedSource:
                 frequency=frequency,
                 temperature=np.full(len(cube), np.nan, np.float32),
                 pad_fault=np.zeros(len(cube), np.uint32),
+                status=np.zeros(len(cube), np.uint16),
             )
 
     def __enter__(self) -> SimulatedSource:
