@@ -256,7 +256,7 @@ def test_who_comes_first_waits_for_those_that_deliver(
     if period_us == 1_000:
         assert together <= 2  # the scheduler may have held up the reader
     else:
-        assert together >= 8  # the reader may have been awake already
+        assert together >= 5  # without waiting it is 0; the reader may have been awake already
         watch.reader.send(1, Request(Command.STOP))
         later.expect(Command.STOP)
         sent = time.monotonic()
