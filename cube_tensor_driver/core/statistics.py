@@ -202,6 +202,8 @@ class WindowStatistics:
     def _note_gaps(self, cubes: slice | np.ndarray, interval: np.ndarray) -> None:
         """Keep the longest of intervals (B, N), ns, forward or back."""
         gap = np.where((interval < 0) | (interval >= GAP_NS), interval, 0)
+        if not gap.any():
+            return
         is_first = self._count[cubes] == 0
         self._gap_before[cubes] = np.where(is_first, gap[0], self._gap_before[cubes])
         gap[0] = np.where(is_first, 0, gap[0])
