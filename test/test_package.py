@@ -28,7 +28,7 @@ FLOORS = [
     ["plot", "terminal"],
     ["processes"],
     ["simulation"],
-    ["bags", "research"],
+    ["bags", "conformance", "research"],
     ["device", "elastic"],
     ["config"],
     ["core"],

@@ -160,6 +160,11 @@ class Sample:
     def temperature(self) -> NDArray[np.int16]:
         return self._made_arrays()[2]
 
+    @property
+    def spare(self) -> bytes:
+        """The spare bytes as they came, which hubs send as 0."""
+        return self._raw[_FREQUENCY - 3 : _FREQUENCY] or bytes(3)
+
     def _made_arrays(self) -> _Arrays:
         # Made late, because `join` makes the arrays of several samples at once.
         if self._arrays is None:
