@@ -129,16 +129,19 @@ def test_example_of_the_readme_runs(folder, hubs):
     assert np.isfinite([float(number) for number in numbers]).all()
 
 
-def test_subscriber_of_the_page_prints_the_pressure_of_its_cube(folder, domain):
+def test_subscribers_of_the_pages_print_pressures(folder, domain):
     pytest.importorskip("rclpy")
-    [program] = [block for block in blocks(PAGE, "python") if "import rclpy" in block]
-    (folder / "pressure.py").write_text(program)
+    pages = {PAGE: r"-?\d+ Pa", ROOT / "docs" / "messages.md": r"c\d\d: .* kPa, shear zx .* kPa"}
     demo = ["-m", "cube_tensor_driver.cli", "demo", "--config", "skin.yaml", "--headless"]
-    skin = start([*demo, "--duration", str(TIMEOUT_S)], folder)
-    listener = start(["pressure.py"], folder)
+    running = [start([*demo, "--duration", str(TIMEOUT_S)], folder)]
     try:
-        said = lines(listener, 20)
+        for page in pages:
+            [program] = [block for block in blocks(page, "python") if "import rclpy" in block]
+            (folder / f"{page.stem}.py").write_text(program)
+            running.append(start([f"{page.stem}.py"], folder))
+        for listener, expected in zip(running[1:], pages.values(), strict=True):
+            said = lines(listener, 20)
+            assert len(said) == 20 and all(re.fullmatch(expected, line) for line in said), said
     finally:
-        end(listener)
-        end(skin)
-    assert len(said) == 20 and all(re.fullmatch(r"-?\d+ Pa", line) for line in said), said
+        for process in reversed(running):
+            end(process)

@@ -1,0 +1,176 @@
+"""docs/messages.md and docs/parameters.md against the messages and the nodes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_maker import make_bag
+from test_docs_python import blocks
+
+from conftest import ROOT
+from cube_tensor_driver.ros.parameters import (
+    CONTACTS,
+    DRIVER,
+    MARKERS,
+    RECONSTRUCTION,
+    Parameter,
+)
+
+PAGE = ROOT / "docs" / "messages.md"
+INTERFACES = sorted([*ROOT.glob("msg/*.msg"), *ROOT.glob("srv/*.srv")])
+PARAMETERS = ROOT / "docs" / "parameters.md"
+NODES = {
+    "driver": DRIVER,
+    "reconstruction": RECONSTRUCTION,
+    "markers": MARKERS,
+    "contacts": CONTACTS,
+}
+ENTRIES = 900
+"""Of an array whose length is free: a multiple of all widths."""
+RCLCPP = """
+#pragma once
+#include <cstdio>
+#include <functional>
+#include <memory>
+#define RCLCPP_INFO(logger, ...) (void)(logger), std::printf(__VA_ARGS__)
+namespace rclcpp {
+template<class M> struct Subscription { using SharedPtr = std::shared_ptr<Subscription>; };
+struct QoS { explicit QoS(size_t) {} QoS & transient_local() { return *this; } };
+struct Node {
+  explicit Node(const char *) {}
+  int get_logger() { return 0; }
+  template<class M>
+  typename Subscription<M>::SharedPtr create_subscription(
+    const char *, const QoS &, std::function<void (const M &)>) { return {}; }
+};
+inline void init(int, char **) {}
+inline void spin(std::shared_ptr<Node>) {}
+inline void shutdown() {}
+}
+"""
+"""What the page's program calls of rclcpp, for a machine without it."""
+
+
+def table(page: Path, heading: str) -> list[list[str]]:
+    """The rows of the first table below a heading, without its head."""
+    section = page.read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    lines = section[section.index("|---") :].split("\n\n")[0].splitlines()[1:]
+    return [re.split(r"\s*\|\s*", line)[1:-1] for line in lines]
+
+
+def fields(path: Path) -> list[tuple[str, str]]:
+    """Name and type of each field of a message, or of a service's request and answer."""
+    lines = (line.split("#")[0].split() for line in path.read_text().splitlines())
+    return [(words[1], words[0]) for words in lines if len(words) == 2 and "=" not in words[1]]
+
+
+def filled(kind: Any) -> Any:
+    """A message with something in each of its arrays."""
+    message = kind()
+    for name, of in kind.get_fields_and_field_types().items():
+        array = re.fullmatch(r"sequence<(?:(\w+)/)?(\w+)>", of)
+        if array and array[1]:
+            inner = getattr(importlib.import_module(f"{array[1]}.msg"), array[2])
+            setattr(message, name, [filled(inner)] * ENTRIES)
+        elif array:
+            setattr(message, name, ["" if array[2] == "string" else 0] * ENTRIES)
+    return message
+
+
+def parameter_table() -> list[str]:
+    """The parameters of all nodes as a table. What several nodes share has one line."""
+    nodes: dict[Parameter, list[str]] = {}
+    for node, parameters in NODES.items():
+        for parameter in parameters:
+            nodes.setdefault(parameter, []).append(f"`{node}`")
+    lines = ["| parameter | node | default | allowed | live | |", "|---|---|---|---|---|---|"]
+    for each, of in nodes.items():
+        default = f"`{each.default}`" if each.default != "" else "empty"
+        allowed = each.choices or {bool: "true, false"}.get(type(each.default), "text")
+        if each.span:
+            low, high = each.span
+            least = f"0, {each.least:g}" if each.least else f"{low:g}"
+            allowed = f"{least} to {high:g}"
+        live = "yes" if each.live else "no"
+        shown = ["`" + each.name + "`", ", ".join(of), default.lower(), allowed, live]
+        lines.append(f"| {' | '.join(shown)} | {each.description} |")
+    return lines
+
+
+@pytest.mark.parametrize("path", INTERFACES, ids=lambda path: path.stem)
+def test_table_of_a_message_has_its_fields(path):
+    rows = table(PAGE, path.stem)
+    assert [(row[0].strip("`"), row[1]) for row in rows] == fields(path)
+    assert all(len(row) == 6 and row[4] and row[5] for row in rows)
+
+
+def test_examples_of_the_tables_read_a_message():
+    messages = importlib.import_module("cube_tensor_driver.msg")
+    services = importlib.import_module("cube_tensor_driver.srv")
+    there = {"np": np, "row": 1, "cube": 0, "pad": 2, "info": filled(messages.SkinInfo)}
+    there |= {"SkinInfo": messages.SkinInfo, "SkinStress": messages.SkinStress}
+    for path in INTERFACES:
+        if path.suffix == ".srv":
+            kind = getattr(services, path.stem)
+            there |= {"request": filled(kind.Request), "response": filled(kind.Response)}
+        elif path.stem == "StressTensor":
+            there["message"] = filled(messages.StressTensorStamped)
+        else:
+            there["message"] = filled(getattr(messages, path.stem))
+        if path.stem == "SkinFrequencies":
+            there["message"].n_pads = 3
+        if path.stem == "ReplayState":
+            there["message"].length = 1.0
+        for name, _, size, _, example, _ in table(PAGE, path.stem):
+            value = eval(example.strip("`"), there)
+            of = name.strip("`")
+            assert of in example, f"{path.stem}.{of}: {example} reads another field"
+            assert np.size(value) <= ENTRIES, f"{path.stem}.{of}: {size}"
+
+
+def test_status_bits_of_the_page_are_those_of_the_message():
+    text = (ROOT / "msg" / "SkinStress.msg").read_text()
+    defined = dict(re.findall(r"^uint16 (\w+)=(\d+)", text, re.MULTILINE))
+    shown = dict(re.findall(r"^\| `(\w+)` \| (\d+) \|", PAGE.read_text(), re.MULTILINE))
+    assert shown == defined
+
+
+def test_recorded_messages_are_read_as_the_page_says(tmp_path, monkeypatch, capsys):
+    make_bag(tmp_path / "run1", ROOT / "config" / "skin_demo.yaml", 2)
+    monkeypatch.chdir(tmp_path)
+    [program] = [block for block in blocks(PAGE, "python") if "rclpy" not in block]
+    exec(compile(program, PAGE, "exec"), {})
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 16 and re.fullmatch(r"c05: \d+\.\d\d Hz on pad \+z-x", said[5])
+
+
+def test_program_in_cpp_fits_the_messages(tmp_path):
+    """Against the generated messages; with the real rclcpp where there is one."""
+    compiler = shutil.which("c++")
+    found = [Path(path) for path in os.environ["AMENT_PREFIX_PATH"].split(os.pathsep)]
+    folders = [folder for path in found for folder in path.glob("include/*") if folder.is_dir()]
+    if not any((folder / "rclcpp" / "rclcpp.hpp").is_file() for folder in folders):
+        (tmp_path / "rclcpp").mkdir()
+        (tmp_path / "rclcpp" / "rclcpp.hpp").write_text(RCLCPP)
+        folders.append(tmp_path)
+    [program] = blocks(PAGE, "cpp")
+    (tmp_path / "listen.cpp").write_text(program)
+    command = [compiler, "-std=c++17", "-fsyntax-only", "-Wall", "-Wextra", "-Werror"]
+    includes = [f"-I{folder}" for folder in folders]
+    done = subprocess.run(
+        [*command, *includes, "listen.cpp"], cwd=tmp_path, text=True, capture_output=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_table_of_parameters_is_that_of_the_nodes():
+    [section] = re.findall(r"(?s)\n(\| parameter .*?)\n\n", PARAMETERS.read_text())
+    assert section.splitlines() == parameter_table()
