@@ -8,8 +8,8 @@
         for rows in source:
             print(reconstruct(rows).stress[:, 2])
 
-Sources yield `FrequencyRows`, a `Reconstructor` makes `StressRows` of them, and publishers, bags and
-plots take those. docs/python.md goes on from here.
+Sources yield `FrequencyRows`, a `Reconstructor` makes `StressRows` of them, and publishers, bags
+and plots take those. docs/python.md goes on from here.
 """
 
 from __future__ import annotations

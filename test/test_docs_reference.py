@@ -1,7 +1,8 @@
-"""docs/messages.md and docs/parameters.md against the messages and the nodes."""
+"""docs/messages.md, docs/parameters.md and docs/troubleshooting.md against the package."""
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import re
@@ -174,3 +175,21 @@ def test_program_in_cpp_fits_the_messages(tmp_path):
 def test_table_of_parameters_is_that_of_the_nodes():
     [section] = re.findall(r"(?s)\n(\| parameter .*?)\n\n", PARAMETERS.read_text())
     assert section.splitlines() == parameter_table()
+
+
+def test_quoted_messages_are_those_of_the_package():
+    """… on the page stands for a value, so the longest piece between two of them is looked up."""
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    symptoms = re.findall(r"^\| (?!you see)([^|]*`[^|]*) \|", page, re.MULTILINE)
+    quoted = [text for cell in symptoms for text in re.findall(r"`([^`]+)`", cell) if " " in text]
+    assert len(quoted) > 40
+    files = [*ROOT.glob("cube_tensor_driver/**/*.py"), ROOT / "tools" / "environment.py"]
+    said = {
+        node.value
+        for path in files
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    pieces = {text: max(text.split("…"), key=len) for text in quoted}
+    unknown = [text for text, piece in pieces.items() if not any(piece in each for each in said)]
+    assert not unknown
