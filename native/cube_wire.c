@@ -247,6 +247,13 @@ static bool parse(cube_frame *frame) {
     }
 }
 
+bool cube_parse_sample(cube_frame *frame) {
+    if (frame->size < CUBE_HEADER + CUBE_CRC || frame->raw[0] != CUBE_SAMPLE)
+        return false;
+    frame->type = CUBE_SAMPLE;
+    return parse(frame);
+}
+
 static bool is_known(uint8_t type) {
     return (type >= CUBE_HELLO && type <= CUBE_TIME) || type == CUBE_REQUEST || type == CUBE_ACK;
 }

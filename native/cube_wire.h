@@ -181,6 +181,10 @@ size_t cube_decode(cube_decoder *decoder, const uint8_t *data, size_t size, cube
 /* The stream ended: an unfinished run is thrown away and counts as framing. */
 void cube_decoder_reset(cube_decoder *decoder);
 
+/* Reads the fields of a frame again, from `raw` and `size` alone. false: they are no SAMPLE. The
+ * checksum is not looked at. */
+bool cube_parse_sample(cube_frame *frame);
+
 /* Fields of a decoded frame. HELLO: uid of a cube, cube < n_cubes. SAMPLE: cube < n_cubes counts
  * from first_cube on, pad < n_pads; mHz, bits and 0.01 degrees Celsius. */
 uint64_t cube_uid(const cube_frame *hello, size_t cube);

@@ -15,8 +15,7 @@ import zlib
 import atheris
 
 with atheris.instrument_imports(include=["cube_tensor_driver.device"]):
-    from cobs import cobs
-
+    from cube_tensor_driver.device import cobs
     from cube_tensor_driver.device.decoder import Decoder
     from cube_tensor_driver.device.protocol import Sample, Stats, encode
     from cube_tensor_driver.device.sequence import Account

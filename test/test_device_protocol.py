@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cube_tensor_driver.core.errors import CubeError, ProtocolError
-from cube_tensor_driver.device.decoder import MAX_RUN, Decoder
+from cube_tensor_driver.device.decoder import MAX_RUN, Decoder, PythonDecoder
 from cube_tensor_driver.device.protocol import (
     Ack,
     Command,
@@ -297,7 +297,7 @@ def test_longest_frame_passes() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    decoder = Decoder()
+    decoder = PythonDecoder()
     for _ in range(50):
         decoder.feed(b"\1" * 10_000)
         assert len(decoder._tail) <= MAX_RUN

@@ -19,11 +19,10 @@ from typing import TypeVar
 
 import numpy as np
 import pytest
-from cobs import cobs  # type: ignore[import-untyped]
 
 from cube_tensor_driver.core.errors import LinkError
+from cube_tensor_driver.device import cobs, tcp
 from cube_tensor_driver.device import reader as reader_module
-from cube_tensor_driver.device import tcp
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.link import LinkConfig, LinkState
 from cube_tensor_driver.device.protocol import (

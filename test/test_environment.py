@@ -81,12 +81,12 @@ def test_a_sourced_ros_that_lacks_something_is_told_how_to_get_it(monkeypatch):
     monkeypatch.setenv("ROS_DISTRO", "jazzy")
     monkeypatch.setattr(environment.shutil, "which", lambda name: None)
     monkeypatch.setattr(
-        environment.importlib.util, "find_spec", lambda name: None if name == "cobs" else object()
+        environment.importlib.util, "find_spec", lambda name: None if name == "numpy" else object()
     )
     with pytest.raises(environment.SetupError) as caught:
         environment.sourced_ros()
     for word in (
-        "missing: cobs, colcon",
+        "missing: numpy, colcon",
         "rosdep install --from-paths",
         "python3-colcon-common-extensions",
     ):

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from test_device_protocol import BAD, FRAMES, cobs_of, crc_of, dump, wire
 
-from cube_tensor_driver.device.decoder import MAX_RUN, Counters, Decoder
+from cube_tensor_driver.device.decoder import MAX_RUN, Counters, PythonDecoder
 from cube_tensor_driver.device.protocol import Ack, Hello, Request, Sample, Stats, Time, encode
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -206,7 +206,7 @@ thorough = settings(
 @given(parts=st.lists(pieces, max_size=12), cuts=st.lists(U16, max_size=12), ends=st.booleans())
 def test_c_and_python_agree(c: Wire, parts: list[bytes], cuts: list[int], ends: bool) -> None:
     data = b"".join(parts)
-    python = Decoder()
+    python = PythonDecoder()
     c.new()
     at = 0
     for cut in [*sorted(cut % (len(data) + 1) for cut in cuts), len(data)]:

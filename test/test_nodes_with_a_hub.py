@@ -8,7 +8,8 @@ import zlib
 
 import numpy as np
 import pytest
-from cobs import cobs
+
+from cube_tensor_driver.device import cobs
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 

@@ -37,7 +37,6 @@ FLOORS = [
 HOMES = {
     "rclpy": {"ros", "browser", "trials"},
     "serial": {"device"},
-    "cobs": {"device", "simulation"},
     "yaml": {"config"},
     "jsonschema": {"config"},
     "rich": {"terminal", "trials"},
@@ -126,12 +125,10 @@ WHEELS = {
     "mpl_toolkits": "matplotlib",
 }
 KEYS = {
-    "cobs": "python-cobs-pip",
     "pyserial": "python3-serial",
     "pyyaml": "python3-yaml",
-    "rosbags": "python3-rosbags-pip",
 } | dict.fromkeys(
-    ("scikit-fem", "pyarrow", "viser", "distributed", "dask", "mcap", "lz4", "websockets")
+    ("rosbags", "scikit-fem", "pyarrow", "viser", "distributed", "dask", "mcap", "lz4", "websockets")
 )
 
 
@@ -167,6 +164,8 @@ from cube_tensor_driver.config.skin import read_skin
 print(cube_tensor_driver.__file__)
 print(package_data())
 print(len(read_skin(package_data() / "config" / "skin_demo.yaml").cubes))
+from cube_tensor_driver.device.native import wire
+print(wire and wire.__file__)
 """
 
 
@@ -182,41 +181,48 @@ def test_installed_by_colcon_it_has_module_and_messages(tmp_path):
         "from cube_tensor_driver.srv import Tare\n"
     )
     said = python(script + USES_ITS_DATA, tmp_path, PYTHONPATH=os.pathsep.join(elsewhere))
-    file, _, cubes = said.splitlines()
+    file, _, cubes, wire = said.splitlines()
     assert cubes == "16" and not Path(file).is_relative_to(PACKAGE)
+    assert Path(wire).parent == Path(file).parent and Path(wire).name == "_wire.abi3.so"
 
 
-def test_installed_by_pip_it_finds_its_data(tmp_path):
+def test_installed_by_pip_it_finds_its_data_and_the_wire_in_c(tmp_path):
     """All of config/, launch/, msg/, rviz/ and srv/ is there, and found where it was installed."""
+    said = python(USES_ITS_DATA, tmp_path, PYTHONPATH=str(installed_by_pip(tmp_path)))
+    file, found, cubes, wire = said.splitlines()
+    prefix = tmp_path / "prefix"
+    assert Path(file).is_relative_to(prefix) and cubes == "16"
+    assert Path(found) == prefix / "share" / PACKAGE.name
+    assert Path(wire).parent == Path(file).parent and Path(wire).name == "_wire.abi3.so"
+    for name in DATA:
+        assert listing(Path(found, name)) == listing(tmp_path / "source" / name)
+
+
+def test_installed_by_pip_without_a_compiler_it_decodes_in_python(tmp_path):
+    site = installed_by_pip(tmp_path, CC="no_such_compiler")
+    *_, cubes, wire = python(USES_ITS_DATA, tmp_path, PYTHONPATH=str(site)).splitlines()
+    assert (cubes, wire) == ("16", "None")
+
+
+DATA = ("config", "launch", "msg", "rviz", "srv")
+
+
+def installed_by_pip(tmp_path: Path, **variables: str) -> Path:
+    """Install a copy of the sources below tmp_path/prefix; the folder for PYTHONPATH."""
     source, prefix = tmp_path / "source", tmp_path / "prefix"
     source.mkdir()
     for name in ("pyproject.toml", "package.xml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    data = ("config", "launch", "msg", "rviz", "srv")
-    for name in (PACKAGE.name, *data):
+    for name in (PACKAGE.name, "native", *DATA):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-index",
-        "--no-deps",
-        "--no-compile",
-    ]
-    pip += ["--no-build-isolation", "--disable-pip-version-check"]
-    environment = {**os.environ, "PYTHONPATH": "", "PIP_ROOT_USER_ACTION": "ignore"}
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
+    pip += ["--no-compile", "--no-build-isolation", "--disable-pip-version-check"]
+    environment = {**os.environ, "PYTHONPATH": "", "PIP_ROOT_USER_ACTION": "ignore", **variables}
     subprocess.run(
         [*pip, "--ignore-installed", "--prefix", prefix, source], check=True, env=environment
     )
     (site,) = prefix.glob("**/cube_tensor_driver/core")
-    said = python(USES_ITS_DATA, tmp_path, PYTHONPATH=str(site.parents[1]))
-    file, found, cubes = said.splitlines()
-    assert Path(file).is_relative_to(prefix) and cubes == "16"
-    assert Path(found) == prefix / "share" / PACKAGE.name
-    for name in data:
-        assert listing(Path(found, name)) == listing(source / name)
+    return site.parents[1]
 
 
 def listing(folder: Path) -> list[Path]:

@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import tracemalloc
 
-import numpy as np
 import pytest
-from cobs import cobs  # type: ignore[import-untyped]
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,7 +14,7 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.device.decoder import MAX_RUN, Decoder
-from cube_tensor_driver.device.protocol import Ack, Request, Sample, Stats, encode
+from cube_tensor_driver.device.protocol import Ack, Request, Stats, encode
 from cube_tensor_driver.trials.bench_decode import NOISE, READ
 
 EACH = 2_000_000
@@ -47,32 +45,6 @@ def test_two_million_bytes_of_noise(name: str, effort: int) -> None:
     for run in noise.split(b"\0"):
         alone.feed(run + b"\0")
     assert alone.counters == counters
-
-
-@pytest.mark.parametrize("name", list(NOISE))
-def test_noise_is_no_more_work_than_frames(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attempts to decode a run, per byte. ./cube bench decode measures the times."""
-    attempts = 0
-    decode = cobs.decode
-
-    def counting(run: bytes) -> bytes:
-        nonlocal attempts
-        attempts += 1
-        return decode(run)
-
-    monkeypatch.setattr(cobs, "decode", counting)
-
-    def attempts_per_byte(data: bytes) -> float:
-        nonlocal attempts
-        attempts = 0
-        feed(Decoder(), data)
-        return attempts / len(data)
-
-    one_cube = np.full((1, 8), 10**8, "<u4"), np.zeros(1, "<u4"), np.zeros(1, "<i2")
-    smallest = encode(Sample(0, 0, 0, *one_cube))
-    clean = attempts_per_byte(smallest * (EACH // len(smallest)))
-    assert clean == pytest.approx(1 / len(smallest), rel=0.05)
-    assert attempts_per_byte(NOISE[name](EACH)) <= clean
 
 
 @pytest.mark.parametrize("name", list(NOISE))

@@ -34,13 +34,12 @@ OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
 LINKED = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
 """Folders that are installed as links to their files: a new file needs a build, a changed one does
 not."""
-BUILT = ("msg", "srv", "CMakeLists.txt", "package.xml")
+BUILT = ("msg", "srv", "native", "CMakeLists.txt", "package.xml")
 """What needs a build after every change."""
 NEEDED = {
     "rclpy": "rclpy",
     "numpy": "python3-numpy",
     "serial": "python3-serial",
-    "cobs": "python-cobs-pip",
     "transforms3d": "python3-transforms3d",
     "yaml": "python3-yaml",
     "jsonschema": "python3-jsonschema",
@@ -287,7 +286,7 @@ def private_variables() -> dict[str, str]:
 
 def build(env: dict[str, str], python: str) -> None:
     """colcon build of this folder, when what it is built from has changed."""
-    sources = [*ROOT.glob("msg/*"), *ROOT.glob("srv/*")]
+    sources = [path for folder in ("msg", "srv", "native") for path in ROOT.glob(f"{folder}/*.*")]
     sources += [ROOT / "CMakeLists.txt", ROOT / "package.xml"]
     linked = [
         str(path.relative_to(ROOT))
@@ -301,7 +300,7 @@ def build(env: dict[str, str], python: str) -> None:
     with step(STATE / "build.stamp", value) as needed:
         if not needed:
             return
-        say("[3/3] building the messages with colcon; log: .cube/build.log")
+        say("[3/3] building the messages and the wire with colcon; log: .cube/build.log")
         # CMake refuses include paths below the source folder, where the venv is: build from a
         # folder of links.
         source = STATE / "src" / "cube_tensor_driver"

@@ -36,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         # Not every command needs every library; those without a rosdep key are installed by hand.
         print(
-            f"cube: this command needs the Python module {error.name}: install it with pip",
+            f"cube: this command needs the Python module {error.name}, which is not there: "
+            f"pip install {error.name}",
             file=sys.stderr,
         )
         return 1

@@ -19,6 +19,7 @@ from .clock import ClockMap, HostClockWatch
 from .cube_table import CubeAddress
 from .link import Link, LinkConfig, LinkState
 from .link_log import LinkLog, Log
+from .native import SLOWER, wire
 from .protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats
 from .reader import LinkFrames, Reader
 from .row_account import RowAccount, RowCounts
@@ -113,6 +114,8 @@ class LiveLinks:
         self._clock_watch = HostClockWatch(clock_ns)
         self._clock_steps: deque[int] = deque(maxlen=EVENTS_KEPT)
         self._log: Log = log or logging.getLogger(__name__)
+        if wire is None:
+            self._log.warning(SLOWER)
         self._link_logs = [LinkLog(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
         self._errors = 0

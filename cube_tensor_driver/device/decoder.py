@@ -1,7 +1,8 @@
 """From the bytes of a link to frames, whatever the bytes are.
 
 `Decoder.feed` never raises. Each non-empty run of bytes that a zero closes becomes one frame, or is
-counted in exactly one counter of `Counters`.
+counted in exactly one counter of `Counters`. `PythonDecoder` is for reading and for where nothing
+was compiled; `Decoder` is the one in C where there is one. Both give the same.
 """
 
 from __future__ import annotations
@@ -9,21 +10,14 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 
-import numpy as np
-from cobs import cobs  # type: ignore[import-untyped]
-from numpy.typing import NDArray
-
+from . import cobs
+from .native import SLOWER, wire
 from .protocol import HEADER, MAX_FRAME, OVERHEAD, REQUEST, UNPACK, VERSION, Frame
 
 MAX_RUN = MAX_FRAME + (MAX_FRAME + 253) // 254
 """Longest run of bytes between two zeros that can be a frame. COBS adds one byte to each 254."""
 MIN_RUN = OVERHEAD + REQUEST.size + 1
-"""Shortest run that can be a frame of any version. Trying shorter ones would let noise slow the
-decoder down."""
-SHORT_RUN = 32
-"""Any SAMPLE is longer."""
-MANY_RUNS = 32
-"""More short runs than this in one feed are taken for noise, and sorted out together."""
+"""Shortest run that can be a frame of any version."""
 # The CRC-32 of data followed by its own CRC is this constant, so the CRC need not be cut off.
 _CRC_RESIDUE = 0x2144DF1C
 
@@ -46,7 +40,7 @@ class Counters:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
-class Decoder:
+class PythonDecoder:
     """Bytes in, frames out. Keeps at most MAX_RUN bytes between calls.
 
     counters: `Counters` of all bytes since the decoder was made.
@@ -63,30 +57,16 @@ class Decoder:
     def feed(self, data: bytes | bytearray) -> list[Frame]:
         """The frames that `data` completes, in order. Never raises, whatever the bytes are."""
         self.counters.bytes += len(data)
-        last = len(data) - 1
-        is_single_run = last > MIN_RUN and data[0] == 0 and data.find(0, 1) == last
-        if is_single_run and not (self._tail or self._discarding):
-            # The common case, and quick: one frame and nothing else.
-            only = self._decode(data[1:last])
-            return [] if only is None else [only]
-        data = bytes(data)
-        if data.count(0) > MANY_RUNS:
-            data = self._without_noise(data)
-        runs = data.split(b"\0")
-        rest = runs.pop()
+        *runs, rest = bytes(data).split(b"\0")
         frames: list[Frame] = []
         if runs:
-            if self._tail or self._discarding:
-                runs[0] = b"" if self._discarding else bytes(self._tail + runs[0])
-                self._tail.clear()
-                self._discarding = False
-            for run in runs:
-                if len(run) >= MIN_RUN:
-                    frame = self._decode(run)
-                    if frame is not None:
-                        frames.append(frame)
-                elif run:
-                    self.counters.length += 1
+            runs[0] = b"" if self._discarding else bytes(self._tail + runs[0])
+            self._tail.clear()
+            self._discarding = False
+        for run in runs:
+            frame = self._decode(run)
+            if frame is not None:
+                frames.append(frame)
         if not self._discarding:
             self._tail += rest
             if len(self._tail) > MAX_RUN:
@@ -102,42 +82,16 @@ class Decoder:
         self._tail.clear()
         self._discarding = False
 
-    def _without_noise(self, data: bytes) -> bytes:
-        """The data without short runs that are no frame, if there are many; they are counted.
-
-        Trying them one by one would take longer than decoding good frames of the same size. A short
-        run with a right checksum whose type or version is 0, which no version has, counts as crc
-        here.
-        """
-        # One byte more, so that a code word that leads beyond the data leads to the last index.
-        code = np.frombuffer(data + b"\0", np.uint8)
-        zeros = np.flatnonzero(code[:-1] == 0)
-        length = np.diff(zeros) - 1
-        n_tiny = np.count_nonzero(length < MIN_RUN) - np.count_nonzero(length == 0)
-        kept = length >= MIN_RUN
-        short = np.flatnonzero(kept & (length < SHORT_RUN))
-        if len(short) > MANY_RUNS:
-            is_cobs, is_hopeful = _check_short_runs(code, zeros[short], zeros[short + 1])
-            kept[short] = is_hopeful
-            n_cobs, n_hopeful = int(is_cobs.sum()), int(is_hopeful.sum())
-            self.counters.framing += len(short) - n_cobs
-            self.counters.crc += n_cobs - n_hopeful
-        elif n_tiny <= MANY_RUNS:
-            return data
-        self.counters.length += n_tiny
-        starts = (zeros[:-1][kept] + 1).tolist()
-        ends = zeros[1:][kept].tolist()
-        runs = [data[start:end] for start, end in zip(starts, ends, strict=True)]
-        return b"\0".join([data[: zeros[0]], *runs, data[zeros[-1] + 1 :]])
-
-    def _decode(self, run: bytes | bytearray) -> Frame | None:
+    def _decode(self, run: bytes) -> Frame | None:
         counters = self.counters
+        if len(run) < MIN_RUN:
+            counters.length += len(run) > 0
+            return None
         if len(run) > MAX_RUN:
             counters.overrun += 1
             return None
-        try:
-            raw = cobs.decode(run)
-        except cobs.DecodeError:
+        raw = cobs.decode_in_python(run)
+        if raw is None:
             counters.framing += 1
             return None
         if zlib.crc32(raw) != _CRC_RESIDUE:
@@ -160,20 +114,34 @@ class Decoder:
         return frame
 
 
-def _check_short_runs(
-    code: NDArray[np.uint8], before: NDArray[np.intp], end: NDArray[np.intp]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which runs between the zeros `before` and `end` are COBS, and which of these can be frames.
+class NativeDecoder:
+    """The same in C, where it was compiled; see `PythonDecoder`."""
 
-    code: the bytes, and one more.
-    """
-    # Each code word tells where the next one is, and a run is COBS if following them leads to its
-    # end. A zero leads to itself. Each step below follows twice as many as the one before.
-    at = np.minimum(np.arange(len(code)) + code, len(code) - 1)
-    for _ in range((SHORT_RUN - 1).bit_length()):
-        at = at[at]
-    first = before + 1
-    is_cobs = at[first] == end
-    # Of a short frame's header only the fourth byte, the high one of the length, is 0.
-    has_length = code[first + 3] == end - first - 1 - OVERHEAD
-    return is_cobs, is_cobs & (code[first] == 4) & has_length
+    def __init__(self) -> None:
+        """RuntimeError: it was not compiled."""
+        if wire is None:
+            raise RuntimeError(SLOWER)
+        self.wire = wire.Decoder()
+
+    @property
+    def counters(self) -> Counters:
+        return Counters(*self.wire.counters())
+
+    @property
+    def other_version(self) -> int | None:
+        return self.wire.other_version()
+
+    def feed(self, data: bytes | bytearray) -> list[Frame]:
+        return unpacked(self.wire.feed(data))
+
+    def reset(self) -> None:
+        self.wire.reset()
+
+
+def unpacked(raws: list[bytes]) -> list[Frame]:
+    """The frames of what the decoder in C gives, which has looked at their lengths."""
+    frames = [UNPACK[raw[0]](raw, len(raw) - OVERHEAD) for raw in raws]
+    return [frame for frame in frames if frame is not None]
+
+
+Decoder = PythonDecoder if wire is None else NativeDecoder

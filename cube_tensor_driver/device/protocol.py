@@ -21,10 +21,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from cobs import cobs  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from ..core.errors import ProtocolError
+from . import cobs
 
 VERSION = 1
 MAX_PAYLOAD = 0xFFFF
@@ -356,7 +356,7 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
             f"the limit is {MAX_PAYLOAD}: split the cubes over several frames with first_cube"
         )
     body = HEADER.pack(code, version, len(payload)) + payload
-    code_words: bytes = cobs.encode(body + zlib.crc32(body).to_bytes(4, "little"))
+    code_words = cobs.encode(body + zlib.crc32(body).to_bytes(4, "little"))
     return b"\0" + code_words + b"\0"
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.decoder import Decoder
+from ..device.decoder import PythonDecoder
 from ..device.protocol import (
     TEMPERATURE_UNKNOWN,
     VERSION,
@@ -62,7 +62,7 @@ class SimulatedHub:
     next_us: int = 0
     sequence: int = 0
     dropped: int = 0
-    decoder: Decoder = field(default_factory=Decoder)
+    decoder: PythonDecoder = field(default_factory=PythonDecoder)
     boots: int = 0
     drift_ppm: float = 0.0
     version: int = VERSION
@@ -110,7 +110,7 @@ class SimulatedHub:
         self.boots += 1
         self.boot_us, self._drift_since_us = -now_us, now_us
         self.sequence, self.dropped = sequence, 0
-        self.decoder = Decoder()
+        self.decoder = PythonDecoder()
 
     def receive(self, data: bytes, now_us: int) -> bytes:
         """What the hub answers to bytes that the host sends at simulated time now_us."""

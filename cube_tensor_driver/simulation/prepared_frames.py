@@ -6,8 +6,7 @@ from __future__ import annotations
 import struct
 import zlib
 
-from cobs import cobs  # type: ignore[import-untyped]
-
+from ..device import cobs
 from ..device.protocol import Sample, encode
 
 _HEAD = 24
@@ -27,7 +26,7 @@ class PreparedFrame:
 
     def __init__(self, sample: Sample) -> None:
         frame = encode(sample)
-        body = cobs.decode(frame[1:-1])[:-4]
+        body = (cobs.decode(frame[1:-1]) or b"")[:-4]
         self._head, self._tail = bytearray(body[:_HEAD]), body[_HEAD:]
         last_zero = body.rfind(b"\0", _HEAD)
         self._middle = cobs.encode(body[_HEAD:last_zero])
