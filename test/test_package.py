@@ -128,7 +128,17 @@ KEYS = {
     "pyserial": "python3-serial",
     "pyyaml": "python3-yaml",
 } | dict.fromkeys(
-    ("rosbags", "scikit-fem", "pyarrow", "viser", "distributed", "dask", "mcap", "lz4", "websockets")
+    (
+        "rosbags",
+        "scikit-fem",
+        "pyarrow",
+        "viser",
+        "distributed",
+        "dask",
+        "mcap",
+        "lz4",
+        "websockets",
+    )
 )
 
 
