@@ -17,6 +17,7 @@ from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.surface import Surface
 from cube_tensor_driver.research.field_study import field_study
+from cube_tensor_driver.research.pads_example import sweep
 
 DEPTH = SURFACE_DEPTH
 
@@ -247,3 +248,15 @@ def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_i
     assert not is_flat(far, skin.rotation[surface.cube], surface.spacing)
     raised = surface.points + np.where(surface.cube == 3, 0.003, 0.0)[:, None] * turn[:, 2]
     assert not is_flat(raised, skin.rotation[surface.cube], surface.spacing)
+
+
+def test_two_pads_take_a_gradient_for_shear_and_eight_do_not():
+    """As docs/stress_tensor.md says and draws."""
+    found = sweep(129)
+    step = found.place[1] - found.place[0]
+    assert found.slope == pytest.approx(np.gradient(found.profile, step)[64], rel=1e-3)
+    assert found.profile[64] == pytest.approx(found.value)
+    # Without friction the load pulls nowhere: its shear is odd about the place of the ball.
+    assert np.allclose(found.truth, -found.truth[::-1], atol=1e-6)
+    assert np.allclose(found.cube, found.truth, atol=1e-6)
+    assert np.abs(found.pair).max() > 3 * np.abs(found.truth).max()

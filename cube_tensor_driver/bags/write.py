@@ -261,8 +261,8 @@ def write_metadata(folder: Path) -> int:
     suffixes = {path.suffix for path in paths}
     if len(suffixes) != 1:
         raise BagError(
-            f"{folder}: storage files with {len(suffixes)} suffixes; a bag's folder has .mcap files "
-            "or .db3 files, one or more"
+            f"{folder}: storage files with {len(suffixes)} suffixes; a bag's folder has .mcap "
+            "files or .db3 files, one or more"
         )
     files: list[dict[str, Any]] = []
     topics: dict[tuple[str, str], dict[str, Any]] = {}

@@ -19,10 +19,12 @@ from ..core.errors import ConfigError, CubeError
 from ..plot.experiments import draw_prototype
 from ..plot.field import draw_field, draw_field_study, field_tables
 from ..plot.markers import draw_markers
+from ..plot.pads_example import draw_pads, draw_sweep
 from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..research.field_study import field_example, field_study
+from ..research.pads_example import planar_calibration, sweep
 from ..research.paper import experiments
 from ..ros.session import node_session
 from .bench import bench_scale
@@ -64,6 +66,8 @@ def make_pictures(folder: Path) -> None:
         json_path=folder / "scale.json",
         figure=folder / "scale.png",
     )
+    save(draw_pads(planar_calibration()), folder / "pads.png")
+    save(draw_sweep(sweep()), folder / "mistaken_shear.png")
     a, _, b, _, c, _ = experiments()
     save(draw_prototype([a, b, c]), folder / "prototype.png")
     save(draw_field(field_example()), folder / "field.png")
