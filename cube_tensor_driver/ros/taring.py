@@ -56,6 +56,8 @@ class Taring:
         self._lock, self._on_change = lock, on_change
         self.uids: dict[int, int] = {}
         self.created: dict[int, datetime] = {}
+        # Cubes that were tared, and when, or cleared (None), before their uid was known.
+        self._decided: dict[int, datetime | None] = {}
         # Uids of the skin file are known at once; nobody has seen the rest frequencies yet.
         restored = self._restore({n: cube.uid for n, cube in enumerate(skin.cubes) if cube.uid})
         if restored is not None:
@@ -96,7 +98,10 @@ class Taring:
             if number in self.uids:
                 self._forget(number, rest)
             self.uids[number] = uid
-            self._restore_cube(number, uid, rest)
+            if number in self._decided:
+                self._keep_decision(number, uid, rest)
+            else:
+                self._restore_cube(number, uid, rest)
         return None if np.array_equal(before, rest, equal_nan=True) else rest
 
     def _restore_cube(self, number: int, uid: int, rest: np.ndarray) -> None:
@@ -111,6 +116,20 @@ class Taring:
             rest[number, : cube.calibration.layout.n_pads] = stored.rest_frequency
             self.created[number] = stored.created
             log.info(f"cube {cube.name}: tare of {stored.created} restored")
+
+    def _keep_decision(self, number: int, uid: int, rest: np.ndarray) -> None:
+        """The uid of a cube has become known: what was decided of it before goes to disk."""
+        created, cube = self._decided.pop(number), self._skin.cubes[number]
+        if self._folder is None:
+            return
+        try:
+            if created is None:
+                remove_tare(self._folder, uid)
+            else:
+                of_cube = rest[number, : cube.calibration.layout.n_pads]
+                write_tare(self._folder, uid, cube.calibration, of_cube, created)
+        except ConfigError as error:
+            self._node.get_logger().warning(f"cube {cube.name}: tare not kept: {error}")
 
     def _on_tare(self, request: Tare.Request, response: Tare.Response) -> Tare.Response:
         try:
@@ -140,6 +159,7 @@ class Taring:
             self._reconstructor.clear_tare()
             self._on_change()
         self.created.clear()
+        self._decided = {n: None for n in range(len(self._skin.cubes)) if n not in self.uids}
         try:
             if self._folder is not None:
                 for uid in self.uids.values():
@@ -167,6 +187,7 @@ class Taring:
         if self._folder is None:
             return "; not kept"
         without_uid = [self._skin.names[number] for number in cubes if number not in self.uids]
+        self._decided.update({number: created for number in cubes if number not in self.uids})
         for number in cubes:
             if number not in self.uids:
                 continue
@@ -177,7 +198,7 @@ class Taring:
             except ConfigError as error:
                 return f"; in force, but not kept: {error}"
         if without_uid:
-            return f"; not kept, since their uid is not known: {', '.join(without_uid)}"
+            return f"; kept when their uid is known: {', '.join(without_uid)}"
         return "; kept on disk"
 
     def _forget(self, number: int, rest: np.ndarray) -> None:
