@@ -269,6 +269,7 @@ def test_device_time_of_64_bits() -> None:
 # (sequence, device time in ms) -> arrival; then delivered, missing, duplicate, out of order,
 # resets.
 N, L, D, R = Arrival.NEW, Arrival.LATE, Arrival.DUPLICATE, Arrival.RESET
+B = Arrival.SET_BACK
 TOP = 2**32 - 1
 SEQUENCES = {
     "in order": ([(5, 50), (6, 60), (7, 70)], [N, N, N], (3, 0, 0, 0, 0)),
@@ -297,7 +298,7 @@ SEQUENCES = {
     ),
     "before the first": ([(5, 50), (4, 40), (6, 60)], [N, L, N], (3, 0, 0, 1, 0)),
     "two before the first": ([(5, 50), (3, 30), (4, 40)], [N, L, L], (3, 0, 0, 2, 0)),
-    "clock set back, count goes on": ([(5, 5000), (6, 1), (7, 11)], [N, R, N], (3, 0, 0, 0, 1)),
+    "clock set back, count goes on": ([(5, 5000), (6, 1), (7, 11)], [N, B, N], (3, 0, 0, 0, 1)),
     "far ahead is a restart": ([(TOP // 4, 50_000), (TOP // 2, 1)], [N, R], (2, 0, 0, 0, 1)),
 }
 

@@ -34,6 +34,7 @@ from cube_tensor_driver.device.protocol import (
     Result,
     Sample,
     Stats,
+    Time,
     encode,
 )
 from cube_tensor_driver.device.reader import LinkBytes, LinkFrames, Reader
@@ -142,7 +143,11 @@ class Watch:
 
     def _on_frames(self, received: list[LinkFrames]) -> None:
         self.batches.append(
-            [(link, arrival_ns, frame) for link, arrival_ns, frames in received for frame in frames]
+            [
+                (link, arrival_ns, frame)
+                for link, arrival_ns, frames, _ in received
+                for frame in frames
+            ]
         )
         for item in self.batches[-1]:
             self.frames.put(item)
@@ -277,7 +282,9 @@ def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     lost, data = LinkError("gone", "lost"), encode(make_sample(1))
     reads = [(5, data), (6, lost), (7, lost), (8, data)]
     received, failed = reader._decode(selector, [LinkBytes(0, at, read) for at, read in reads])
-    assert [(at, [frame.sequence for frame in frames]) for _, at, frames in received] == [(5, [1])]
+    assert [(at, [frame.sequence for frame in frames]) for _, at, frames, _ in received] == [
+        (5, [1])
+    ]
     assert failed == {0: lost}
     # Closed after the frames are delivered: a link that delivers is waited for.
     assert link.is_open
@@ -657,11 +664,60 @@ def test_close_in_the_middle_of_a_reconnect(start: Start, port: str, deaf: str) 
     watch.state(LinkState.CLOSED)
 
 
+def test_the_answer_to_the_last_question_for_the_time_is_delivered(
+    start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rule T5. Neither twice nor with another number; with the time of the question."""
+    monkeypatch.setattr(reader_module, "ASK_TIME_S", 0.05)
+    clock = iter(range(1, 1_000_000))
+    watch = start(LinkConfig("a", hub.port), clock_ns=lambda: next(clock))
+    asked: list[tuple[int, int]] = []
+    watch.reader._on_frames = lambda received: (
+        asked.extend(
+            (batch.asked_ns, batch.arrival_ns)
+            for batch in received
+            for frame in batch.frames
+            if isinstance(frame, Time)
+        ),
+        watch._on_frames(received),
+    )
+    hub.greet()
+    hub.sample(1)
+    first = hub.expect(Command.TIME)
+    wrong, right = Time(first.argument + 1, 5), Time(first.argument, 7)
+    hub.send(encode(wrong) + encode(right) + encode(right) + encode(Stats(1, 2, 3)))
+    watch.frame(Stats)
+    times = [frame for batch in watch.batches for _, _, frame in batch if isinstance(frame, Time)]
+    assert times == [right]
+    ((asked_ns, arrival_ns),) = asked
+    assert 0 < asked_ns < arrival_ns
+    assert hub.expect(Command.TIME).argument == first.argument + 1
+
+
+def test_a_hub_that_does_not_know_the_time_is_not_asked_again_until_it_restarts(
+    start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rule T4. The link falls silent after many times the interval of the questions."""
+    monkeypatch.setattr(reader_module, "ASK_TIME_S", 0.01)
+    watch = start(LinkConfig("a", hub.port))
+    hub.greet()
+    hub.sample(1)
+    hub.expect(Command.TIME)
+    hub.send(encode(Ack(Command.TIME, Result.UNKNOWN)))
+    watch.frame(Ack)
+    hub.before(Command.HELLO)
+    assert hub.before(Command.HELLO) == []
+    hub.hello()
+    hub.expect(Command.START)
+    hub.sample(2)
+    hub.expect(Command.TIME)
+
+
 def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, caplog) -> None:
     seen: queue.Queue[int] = queue.Queue()
 
     def on_frames(received: list[LinkFrames]) -> None:
-        for frame in (frame for _, _, frames in received for frame in frames):
+        for frame in (frame for _, _, frames, _ in received for frame in frames):
             if isinstance(frame, Sample):
                 seen.put(frame.sequence)
                 raise RuntimeError("bug of the caller")

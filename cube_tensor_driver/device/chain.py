@@ -15,12 +15,13 @@ from dataclasses import dataclass, field
 
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
+from ..core.status import STAMP
 from .clock import ClockMap, HostClockWatch
 from .cube_table import CubeAddress
 from .link import Link, LinkConfig, LinkState
 from .link_log import LinkLog, Log
 from .native import SLOWER, wire
-from .protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats
+from .protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
 from .reader import LinkFrames, Reader
 from .row_account import RowAccount, RowCounts
 from .scan import MakeRows, ScanBuilder, empty_rows
@@ -187,15 +188,18 @@ class LiveLinks:
         """
         now_ns, step_ns = self._see_clock()
         account = self._rows
-        for link, arrival_ns, frames in received:
+        for link, arrival_ns, frames, asked_ns in received:
             # Bytes that were read just before the clock was set have the old time.
             if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
                 arrival_ns += step_ns
+            # A round trip during which the clock was set says nothing.
+            if step_ns:
+                asked_ns = 0
             for frame in frames:
                 if isinstance(frame, Sample):
                     account.received += frame.shape[0]
             try:
-                self._take(link, arrival_ns, frames)
+                self._take(link, arrival_ns, frames, asked_ns)
             except Exception as error:  # noqa: BLE001  (the rows of other links go on)
                 self._lose(error)
         self._deliver()
@@ -211,9 +215,11 @@ class LiveLinks:
         for record in self._records:
             record.clock.shift(step_ns)
             record.clock.problems.add(text)
+        if self._reader is not None:
+            self._reader.forget_questions()
         return now_ns, step_ns
 
-    def _take(self, link: int, arrival_ns: int, frames: Sequence[Frame]) -> None:
+    def _take(self, link: int, arrival_ns: int, frames: Sequence[Frame], asked_ns: int) -> None:
         """Count the frames of a link and give their samples to the scans."""
         record = self._records[link]
         samples: list[Sample] = []
@@ -221,6 +227,8 @@ class LiveLinks:
             if isinstance(frame, Sample):
                 arrival = record.account.sample(frame)
                 if arrival is Arrival.RESET:
+                    self._give(link, arrival_ns, samples)
+                    samples = []
                     record.clock.reset()
                 if arrival is Arrival.DUPLICATE:
                     self._rows.duplicate += frame.n_cubes
@@ -228,13 +236,23 @@ class LiveLinks:
                     samples.append(frame)
             elif isinstance(frame, Hello):
                 self._learn_cubes(link, frame)
+            elif isinstance(frame, Time):
+                if asked_ns:
+                    record.clock.answer(asked_ns, frame.device_us, arrival_ns)
             elif isinstance(frame, Stats):
                 record.account.stats(frame)
                 record.contradictions = record.account.contradictions()
-        if samples:
-            device_us = [sample.device_us for sample in samples]
-            stamps_ns = record.clock.update(device_us, arrival_ns)
-            self._scans.add(link, samples, stamps_ns)
+        self._give(link, arrival_ns, samples)
+
+    def _give(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
+        """Samples of one run of a hub, which arrived together, to the scans."""
+        if not samples:
+            return
+        clock = self._records[link].clock
+        device_us = [sample.device_us for sample in samples]
+        numbers = [sample.sequence for sample in samples]
+        stamps_ns = clock.update(device_us, arrival_ns, numbers)
+        self._scans.add(link, samples, stamps_ns, STAMP if clock.in_doubt else 0)
 
     def _deliver(self) -> None:
         """Call back with all scans that are complete. Scans without a row of the skin end here."""
@@ -325,12 +343,15 @@ def _period_us(rate: float | None) -> int | None:
 
 def _values(link: Link, record: _LinkRecord, log: LinkLog) -> dict[str, object]:
     clock = record.clock
+    bound_ns = clock.bound_ns
     values: dict[str, object] = {
         **link.counters,
         **record.account.counters(),
         "clock offset s": round(1e-9 * clock.offset_ns, 6),
         "clock drift ppm": round(clock.drift_ppm, 2),
         "clock jitter us": round(1e-3 * clock.jitter_ns, 1),
+        "clock delay us": "unknown" if bound_ns is None else round(1e-3 * clock.delay_ns, 1),
+        "clock error at most us": "unknown" if bound_ns is None else round(1e-3 * bound_ns, 1),
         "clock resets": clock.resets,
         "hub changes": record.hub_changes,
         "log lines left out": log.left_out,

@@ -7,10 +7,13 @@ points from below is the clock, and the height of a point above it is its delay.
 the earliest point is kept. The line is the edge of the lower convex hull of these points over their
 mean device time: of all lines below the points it has the smallest mean distance to them (Moon,
 Skelly, Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM
-1999). The smallest delay cannot be told from the offset: stamps are late by it.
+1999). Arrival cannot tell the smallest delay from the offset: stamps are late by it, unless the hub
+answers questions for its time (`round_trips.py`), which bound the offset from both sides.
 
 Where the host's clock was set shows at once, without any points: it moves against the monotonic
-clock. A hub's clock that stands still or jumps again and again is no clock: arrival is the stamp.
+clock. Where a hub's clock was set, device times no longer follow the numbers of the samples
+(`clock_step.py`). A hub's clock that stands still or jumps again and again is no clock: arrival is
+the stamp.
 """
 
 from __future__ import annotations
@@ -21,12 +24,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
+from .clock_step import StepWatch, Suspicion, Verdict
+from .round_trips import RoundTrip, RoundTrips
+
 BUCKET_NS = 1_000_000_000
 """Length of a bucket, of which the earliest point is kept."""
 WINDOW = 120
 """Buckets kept: two minutes."""
 DRIFT_AFTER = 5
 """Buckets before drift is estimated. Over a shorter time, delay looks like drift."""
+FIRST_GUESS = 1e-4
+"""Drift is 0 to within this as long as it is not known: crystals are that good."""
 MAX_DRIFT = 1e-3
 """No two clocks differ by more. A steeper line comes from a stall."""
 STEP_NS = 20e6
@@ -36,6 +44,10 @@ FALL_NS = 4e6
 of 5 ms shows, with 1 ms for the line's own error."""
 STEP_BUCKETS = 2
 """It must last for so many buckets, because a stall looks the same at first."""
+MAX_CONSTANT_NS = 1e9
+"""No line delays all samples by more than this beyond its answers."""
+CONTRARY = 3
+"""So many answers in a row that contradict the samples are named."""
 MAX_DELAY_NS = 60_000_000_000
 """No sample waits longer. A stamp further back is no time at all: arrival is taken."""
 RESTART_US = 1_000_000
@@ -50,7 +62,8 @@ MIN_SET_NS = 1_000_000
 READ_NS, READS = 100_000, 3
 """Two clocks are compared if reading them took less; otherwise it is tried again so often."""
 STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
-JUMPED = "the hub's clock jumped: it is fitted again"
+JUMPED = "the hub's clock was set: stamps follow its new time"
+CONTRARY_ANSWERS = "the hub's answers to TIME contradict its samples: they are not used"
 LYING = (
     f"the hub's clock jumped {LIES} times within {LIES_NS / 1e9:g} s: "
     "rows are stamped by their arrival"
@@ -93,7 +106,9 @@ class ClockMap:
     """Maps one hub's clock to the host's. Bounded memory; amortised constant time per sample.
 
     jitter_ns: mean delay above the line, over about the last 64 calls.
-    resets: how often the map was fitted from the start.
+    resets: how often the map was fitted from the start, or the hub's clock was set.
+    in_doubt: whether the stamps of the last update may be wrong, because the hub's clock seems to
+    have been set or is no clock.
     """
 
     # Times are in ns since the first point; a point is (device time, arrival - device time).
@@ -109,12 +124,21 @@ class ClockMap:
     _bucket_end: int
     _fallen: float  # how far the line fell in the bucket being filled
     _n_high: int  # buckets in a row with all points above the line by more than STEP_NS
+    _last_least: float  # least height in the last full bucket
+    _suspicion: Suspicion | None
+    _trips: RoundTrips
+    _true_offset: float  # as the round trips say; inf: there are none
+    _bound: float  # how far it can be off
 
     def __init__(self) -> None:
         self.jitter_ns = 0.0
         self.resets = 0
+        self.in_doubt = False
         self._drift = 0.0
+        self._steps = StepWatch()
+        self._n_contrary = 0  # answers in a row that contradicted the samples
         self._last_stamp = self._last_arrival = _NEVER
+        self._doubtful_stamp = _NEVER  # the last one that was in doubt when the clock was set
         self.problems: set[str] = set()
         self._is_doubtful = False  # whether `_find_problem` has to look
         self._last_us = -1  # device time of the last call
@@ -140,6 +164,7 @@ class ClockMap:
             self._last_arrival += step_ns
         if self._last_stamp != _NEVER:
             self._last_stamp += step_ns
+            self._doubtful_stamp += step_ns
         self._wrong_ns = deque((at + step_ns for at in self._wrong_ns), LIES)
 
     @property
@@ -153,10 +178,62 @@ class ClockMap:
         if self._is_fresh:
             return 0
         at_first = self._first_ns - 1000 * self._first_us
-        return at_first + round(self._offset + self._drift * self._newest)
+        offset = min(self._offset, self._true_offset)
+        return at_first + round(offset + self._drift * self._newest)
 
-    def update(self, device_us: Sequence[int], arrival_ns: int) -> list[int]:
+    @property
+    def delay_ns(self) -> float:
+        """The smallest delay of samples, as round trips show it; 0 without them."""
+        return max(0.0, self._offset - self._true_offset)
+
+    @property
+    def bound_ns(self) -> float | None:
+        """How far stamps can be off while nothing is in doubt; None without round trips."""
+        return self._bound if self._trips else None
+
+    @property
+    def round_trip_ns(self) -> float:
+        """The shortest round trip of the last minute; 0 without."""
+        return self._trips.least_ns
+
+    def answer(self, sent_ns: int, device_us: int, arrival_ns: int) -> None:
+        """The hub read device_us after a question was sent at sent_ns, and its answer arrived at
+        arrival_ns.
+
+        A round trip during which the host's clock was set must not be given.
+        """
+        if self._is_fresh or self.in_doubt or not sent_ns <= arrival_ns:
+            return
+        t = 1000.0 * (device_us - self._first_us)
+        since_first = -self._first_ns - t
+        trip = RoundTrip(t, sent_ns + since_first, arrival_ns + since_first)
+        line = self._offset + self._drift * t
+        if trip.low_ns > line + FALL_NS or trip.high_ns < line - MAX_CONSTANT_NS:
+            self._n_contrary += 1
+            if self._n_contrary >= CONTRARY:
+                self.problems.add(CONTRARY_ANSWERS)
+            return
+        self._n_contrary = 0
+        self._trips.add(trip)
+        self._find_true_offset()
+
+    def _find_true_offset(self) -> None:
+        if not self._trips:
+            self._true_offset, self._bound = math.inf, 0.0
+            return
+        uncertainty = FIRST_GUESS
+        if len(self._points) >= DRIFT_AFTER:
+            span = self._points[-1][0] - self._points[0][0]
+            uncertainty = min(uncertainty, self.jitter_ns / span) if span > 0 else uncertainty
+        self._true_offset, self._bound = self._trips.offset(self._drift, uncertainty)
+
+    def update(
+        self, device_us: Sequence[int], arrival_ns: int, numbers: Sequence[int] = ()
+    ) -> list[int]:
         """Host times, ns, of samples taken at device_us, µs, that arrived together at arrival_ns.
+
+        numbers: of the samples. Without them a step of the hub's clock shows later, and small steps
+        back do not show.
 
         Along device time stamps never go backward, and none is later than its arrival. The map
         starts again when device time falls back by more than 1 s, and when either clock was set.
@@ -164,15 +241,52 @@ class ClockMap:
         """
         if not device_us:
             return []
-        if len(device_us) == 1:  # as it mostly is
-            return self._stamps(device_us, arrival_ns)
+        self.in_doubt = False
         stamps: list[int] = []
         start = 0
-        for k in range(1, len(device_us)):
-            if device_us[k] < device_us[k - 1] - RESTART_US:
+        for k, time_us in enumerate(device_us):
+            step_us = self._steps.look(numbers[k], time_us) if numbers else 0
+            if k > start and (step_us or time_us < device_us[k - 1] - RESTART_US):
                 stamps += self._stamps(device_us[start:k], arrival_ns)
                 start = k
+            if step_us and not self._is_fresh:
+                self._suspect(step_us, arrival_ns)
         return stamps + self._stamps(device_us[start:], arrival_ns)
+
+    def _suspect(self, step_us: int, arrival_ns: int) -> None:
+        """The clock seems to have been set by step_us, perhaps not for the first time."""
+        before = self._suspicion
+        since_ns, newest = arrival_ns, float(self._newest)
+        if before is not None:
+            since_ns, newest = before.since_ns, before.newest_ns
+            step_us += before.step_us
+        least = min(self._least, self._last_least)
+        usual = least if math.isfinite(least) else 0.0
+        self._suspicion = Suspicion(step_us, since_ns, newest, usual) if step_us else None
+
+    def _judge(self, newest_us: int, arrival_ns: int) -> None:
+        """Decide about the suspicion, if that can be done now."""
+        suspicion = self._suspicion
+        # A clock that stands still would seem to be set again and again.
+        if suspicion is None or self._calls_still:
+            return
+        t = 1000.0 * (newest_us - self._first_us)
+        height = self._height((t, arrival_ns - self._first_ns - t))
+        verdict = suspicion.judge(t, height, arrival_ns, self.jitter_ns)
+        if verdict is Verdict.OPEN:
+            return
+        self._suspicion = None
+        if verdict is Verdict.NOT_SET:
+            self._steps.forget_period()
+            return
+        # Device times without the step go on as before, and so does all that was learned of them.
+        self._first_us += suspicion.step_us
+        self._newest = min(self._newest, round(suspicion.newest_ns))
+        self._doubtful_stamp = self._last_stamp
+        self._trips.forget_since(self._last_sound)
+        self._find_true_offset()
+        self.problems.add(JUMPED)
+        self._count_reset()
 
     def _stamps(self, times: Sequence[int], arrival_ns: int) -> list[int]:
         if arrival_ns < self._last_arrival:
@@ -186,21 +300,30 @@ class ClockMap:
             self._last_us, self._moved_ns = newest, arrival_ns
         else:
             problem = self._find_problem(newest, arrival_ns)
+        if problem:
+            self._suspicion = None
+        self._judge(newest, arrival_ns)
         if not self._is_fresh and 1000 * (newest - self._first_us + RESTART_US) < self._newest:
             self.reset()
         if self._is_fresh:
             self._is_fresh = False
             self._first_us, self._first_ns = newest, arrival_ns
             self._bucket_end = arrival_ns + BUCKET_NS
-        self._add_point(1000.0 * (newest - self._first_us), arrival_ns)
+        if self._suspicion is None:
+            self._add_point(1000.0 * (newest - self._first_us), arrival_ns)
+            self._last_sound = arrival_ns - self._first_ns
+        self.in_doubt |= bool(problem) or self._suspicion is not None
+        offset = min(self._offset, self._true_offset)
         stamps = []
         for time_us in times:
             t = 1000 * (time_us - self._first_us)
-            stamp = self._first_ns + t + round(self._offset + self._drift * t)
+            stamp = self._first_ns + t + round(offset + self._drift * t)
             stamp = min(stamp, arrival_ns)
             if problem or stamp < arrival_ns - MAX_DELAY_NS:
                 stamp = arrival_ns
             if t > self._newest or problem:
+                # Stamps that were in doubt may hold back those after them.
+                self.in_doubt |= stamp < self._doubtful_stamp
                 stamp = max(stamp, self._last_stamp)
                 self._newest = max(t, self._newest)
                 self._last_stamp = stamp
@@ -244,8 +367,13 @@ class ClockMap:
         self._newest = _NEVER
         self._offset = 0.0
         self._points = deque(maxlen=WINDOW)
-        self._least = math.inf
+        self._least = self._last_least = math.inf
         self._fallen = 0.0
+        self._steps.reset()
+        self._suspicion = None
+        self._trips = RoundTrips()
+        self._true_offset, self._bound = math.inf, 0.0
+        self._last_sound = 0  # arrival of the newest sample whose clock was not in doubt
 
     def _add_point(self, t: float, arrival_ns: int) -> None:
         """Lower the line to a point at device time t if need be, and close the bucket when it is
@@ -270,6 +398,7 @@ class ClockMap:
         if arrival_ns >= self._bucket_end:
             self._bucket_end = arrival_ns + BUCKET_NS
             self._fallen = 0.0
+            self._last_least = self._least
             self._close_bucket(self._earliest)
             self._least = math.inf
 
@@ -285,6 +414,7 @@ class ClockMap:
         if len(points) >= DRIFT_AFTER:
             self._drift = min(max(_middle_slope(points), -MAX_DRIFT), MAX_DRIFT)
         self._offset = min(d - self._drift * t for t, d in points)
+        self._find_true_offset()
 
     def _height(self, point: tuple[float, float]) -> float:
         """Of a point above the line."""

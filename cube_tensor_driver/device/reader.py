@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 from ..core.errors import LinkError
 from .link import Link, LinkConfig, LinkState
-from .protocol import Ack, Command, Frame, Hello, Request, Result, Sample, encode
+from .protocol import Ack, Command, Frame, Hello, Request, Result, Sample, Time, encode
 
 TICK_S = 0.02
 """Interval of the timers: silence, back-off, connections under way."""
@@ -31,6 +31,9 @@ SILENT_S = 0.2
 longer."""
 HELLO_S = 1.0
 """Interval at which a hub that does not answer is asked again."""
+ASK_TIME_S = 0.983
+"""Interval at which a hub is asked for its time. It is no whole number of usual sample periods, so
+that the questions come at all times between two samples."""
 REOPEN_S = 5.0
 """A link without a single byte for so long is opened again. Hubs say HELLO every second."""
 LOOK_S = 0.25
@@ -61,11 +64,15 @@ class LinkBytes(NamedTuple):
 
 
 class LinkFrames(NamedTuple):
-    """Frames that one read of a link completed: index of the link, time of arrival in ns."""
+    """Frames that one read of a link completed: index of the link, time of arrival in ns.
+
+    asked_ns: when the question was sent that a TIME among the frames answers
+    """
 
     link: int
     arrival_ns: int
     frames: list[Frame]
+    asked_ns: int = 0
 
 
 OnFrames = Callable[[list[LinkFrames]], None]
@@ -89,8 +96,18 @@ class _Session:
         self.retry_at = 0.0
         self.look_at = 0.0
         self.hello_at = 0.0
+        self.ask_time_at = 0.0
+        self.knows_time = True  # the hub has not refused to say its time
+        self.question = 0  # number of the last question for the time
+        self.asked_ns: int | None = None  # when it was sent; None: it is answered
         self.fingerprint: tuple[object, ...] = ()
         self.watching_writes = False
+
+    def has_question(self, now: float) -> bool:
+        """Whether to ask for the hub's time: not before the first sample, with which its answer is
+        compared."""
+        has_sample = self.last_sample > self.opened_at
+        return self.knows_time and has_sample and now >= self.ask_time_at
 
     def silent_after(self) -> float:
         return max(3e-6 * self.actual_us, SILENT_S) - TICK_S
@@ -164,6 +181,11 @@ class Reader:
             )
         self._requests.append((link, request))
         self._wake()
+
+    def forget_questions(self) -> None:
+        """Deliver no answer to what was asked until now; to be called by `on_frames`."""
+        for session in self._sessions:
+            session.asked_ns = None
 
     def close(self) -> None:
         """Stop the hubs, close all links and end the thread, within CLOSE_S. Safe to call twice."""
@@ -269,7 +291,9 @@ class Reader:
                 failed[i] = data
                 continue
             frames: list[Frame] = []
-            self._sessions[i].last_byte = now
+            session = self._sessions[i]
+            session.last_byte = now
+            asked_ns = session.asked_ns or 0
             try:
                 for frame in link.decoder.feed(data):
                     if self._handle(i, frame):
@@ -279,7 +303,7 @@ class Reader:
             except LinkError as error:
                 failed[i] = error
             if frames:
-                received.append(LinkFrames(i, arrival_ns, frames))
+                received.append(LinkFrames(i, arrival_ns, frames, asked_ns))
         return received, failed
 
     def _gather_time(self, reads: list[LinkBytes]) -> float:
@@ -334,10 +358,18 @@ class Reader:
         elif isinstance(frame, Ack) and frame.request == Command.SET_PERIOD:
             session.actual_us = session.answered_us = frame.argument
             link.period_problem = _period_problem(session.period_us, frame)
+        elif isinstance(frame, Ack) and frame.request == Command.TIME:
+            session.knows_time = False
+        elif isinstance(frame, Time):
+            is_answer = session.asked_ns is not None and frame.number == session.question
+            if is_answer:
+                session.asked_ns = None
+            return is_answer
         return True
 
     def _configure(self, i: int) -> None:
         link, session = self.links[i], self._sessions[i]
+        session.knows_time = True
         if session.period_us is not None:
             link.write(encode(Request(Command.SET_PERIOD, session.period_us)))
         link.write(encode(Request(Command.START if session.started else Command.STOP)))
@@ -384,9 +416,11 @@ class Reader:
                     f"{link.config.port}",
                     "wrong_hub",
                 )
-            unanswered = link.state is LinkState.SILENT or not session.greeted
-            if unanswered and now >= session.hello_at:
-                self._ask_hello(selector, i, now)
+            if link.state is LinkState.SILENT or not session.greeted:
+                if now >= session.hello_at:
+                    self._ask_hello(selector, i, now)
+            elif session.has_question(now):
+                self._ask_time(selector, i, now)
         except LinkError as error:
             self._drop(selector, i, error)
 
@@ -416,6 +450,15 @@ class Reader:
         self.links[i].write(encode(Request(Command.HELLO)))
         self._watch(selector, i)
 
+    def _ask_time(self, selector: selectors.BaseSelector, i: int, now: float) -> None:
+        link, session = self.links[i], self._sessions[i]
+        session.ask_time_at = now + ASK_TIME_S
+        session.question = (session.question + 1) % (1 << 32)
+        request = encode(Request(Command.TIME, session.question))
+        session.asked_ns = self._clock_ns()  # no later than true
+        link.write(request)
+        self._watch(selector, i)
+
     def _try_open(self, selector: selectors.BaseSelector, i: int, now: float) -> None:
         link, session = self.links[i], self._sessions[i]
         if now >= session.look_at:
@@ -434,7 +477,7 @@ class Reader:
         now = time.monotonic()
         session.opened_at = session.last_byte = session.last_sample = now
         session.greeted = session.watching_writes = False
-        session.answered_us = None
+        session.answered_us = session.asked_ns = None
         link.period_problem = ""
         selector.register(link, selectors.EVENT_READ, i)
         self._set_state(i, LinkState.OPEN, None)

@@ -25,13 +25,14 @@ class Arrival(str, Enum):
 
     new: the next one, or the first after a gap. late: out of order, and counted as missing until
     now. duplicate: it has come before; do not deliver it. reset: the hub restarted, and this is the
-    first sample of its new count.
+    first sample of its new count. set_back: the next one, but its device time went back.
     """
 
     NEW = "new"
     LATE = "late"
     DUPLICATE = "duplicate"
     RESET = "reset"
+    SET_BACK = "set_back"
 
 
 @dataclass(slots=True)
@@ -81,9 +82,8 @@ class SequenceTracker:
         number = self._next + ahead
         if 0 <= ahead <= MAX_GAP:
             self.counters.missing += ahead
-            # The count goes on but the clock went back: the clock's map must start again.
-            arrival = Arrival.NEW if device_us >= self._newest_us else Arrival.RESET
-            self.counters.resets += arrival is Arrival.RESET
+            arrival = Arrival.NEW if device_us >= self._newest_us else Arrival.SET_BACK
+            self.counters.resets += arrival is Arrival.SET_BACK
             self._next = number + 1
             self._newest_us = device_us
             return self._deliver(number, device_us, arrival)
