@@ -17,6 +17,11 @@ from bag_maker import make_bag
 from test_docs_python import blocks
 
 from conftest import ROOT
+from cube_tensor_driver.core.defaults import FOAM_MODULUS, FREQUENCY_NOISE, POISSONS_RATIO
+from cube_tensor_driver.core.estimator import make_estimator
+from cube_tensor_driver.core.modes import COMPONENTS
+from cube_tensor_driver.elastic import contact
+from cube_tensor_driver.research.pads_example import planar_calibration
 from cube_tensor_driver.ros.parameters import (
     CONTACTS,
     DRIVER,
@@ -193,3 +198,26 @@ def test_quoted_messages_are_those_of_the_package():
     pieces = {text: max(text.split("…"), key=len) for text in quoted}
     unknown = [text for text, piece in pieces.items() if not any(piece in each for each in said)]
     assert not unknown
+
+
+def test_computed_numbers_of_the_build_page_are_right():
+    page = (ROOT / "docs" / "build.md").read_text()
+    planar = planar_calibration()
+    every_pad = make_estimator(planar.response, planar.noise, planar.modes)
+    pressed = every_pad.matrix * planar.response[:, planar.modes.names.index("zz")]
+    zz, zx = (100 * 0.01 * np.linalg.norm(pressed[COMPONENTS.index(name)]) for name in ("zz", "zx"))
+    assert f"shear of {zx:.1f} % and σzz off by {zz:.1f} % of the pressure" in page
+    assert f"shear of {100 * np.sin(np.radians(1)):.1f} % of σzz − σxx" in page
+
+    def below(depth: float, radius: float) -> float:
+        ball = contact.hertz(radius, (0.0, 0.0, -1.0), np.zeros(2))
+        return contact.field(np.array([[0.0, 0.0, -depth]]), *ball, POISSONS_RATIO)[0][0, 2]
+
+    deeper = {mm: 100 * (1 - below(4.1e-3, 1e-3 * mm) / below(4e-3, 1e-3 * mm)) for mm in (4, 8)}
+    assert f"σzz −{deeper[4]:.1f} % under a contact of 4 mm radius, −{deeper[8]:.1f} %" in page
+    foam, noise = 1.5 * 8.854e-12, FREQUENCY_NOISE * FOAM_MODULUS
+    for area, thickness in ((0.8 * 0.8, 0.2), (0.8 * 4, 0.2), (0.8 * 4, 0.1)):
+        pad = foam * 1e-3 * area / thickness
+        small, large = 0.1e-12 / pad, 3e-12 / pad
+        cells = f"{1e12 * pad:.2f} pF | β = {small:.2g}"
+        assert cells in page and f"β = {large:.2g}, {noise * (1 + large):.0f} Pa" in page

@@ -16,6 +16,7 @@ from visualization_msgs.msg import MarkerArray
 
 from ..config.package_data import package_data
 from ..core.errors import ConfigError, CubeError
+from ..plot.cube_drawing import draw_cube
 from ..plot.experiments import draw_prototype
 from ..plot.field import draw_field, draw_field_study, field_tables
 from ..plot.markers import draw_markers
@@ -66,6 +67,7 @@ def make_pictures(folder: Path) -> None:
         json_path=folder / "scale.json",
         figure=folder / "scale.png",
     )
+    save(draw_cube(planar_calibration()), folder / "cube.png")
     save(draw_pads(planar_calibration()), folder / "pads.png")
     save(draw_sweep(sweep()), folder / "mistaken_shear.png")
     a, _, b, _, c, _ = experiments()
