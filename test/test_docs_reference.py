@@ -97,14 +97,13 @@ def parameter_table() -> list[str]:
     for node, parameters in NODES.items():
         for parameter in parameters:
             nodes.setdefault(parameter, []).append(f"`{node}`")
-    lines = ["| parameter | node | default | allowed | live | |", "|---|---|---|---|---|---|"]
+    lines = ["| parameter | node | default | allowed | live | what it sets |", "|---|---|---|---|---|---|"]
     for each, of in nodes.items():
         default = f"`{each.default}`" if each.default != "" else "empty"
         allowed = each.choices or {bool: "true, false"}.get(type(each.default), "text")
         if each.span:
-            low, high = each.span
-            least = f"0, {each.least:g}" if each.least else f"{low:g}"
-            allowed = f"{least} to {high:g}"
+            low, high = (np.format_float_positional(limit, trim="-") for limit in each.span)
+            allowed = f"0, {each.least:g} to {high}" if each.least else f"{low} to {high}"
         live = "yes" if each.live else "no"
         shown = ["`" + each.name + "`", ", ".join(of), default.lower(), allowed, live]
         lines.append(f"| {' | '.join(shown)} | {each.description} |")
@@ -114,8 +113,8 @@ def parameter_table() -> list[str]:
 @pytest.mark.parametrize("path", INTERFACES, ids=lambda path: path.stem)
 def test_table_of_a_message_has_its_fields(path):
     rows = table(PAGE, path.stem)
-    assert [(row[0].strip("`"), row[1]) for row in rows] == fields(path)
-    assert all(len(row) == 6 and row[4] and row[5] for row in rows)
+    assert [(row[0].strip("`"), row[1].split(",")[0]) for row in rows] == fields(path)
+    assert all(len(row) == 4 and all(row) for row in rows)
 
 
 def test_examples_of_the_tables_read_a_message():
@@ -135,11 +134,10 @@ def test_examples_of_the_tables_read_a_message():
             there["message"].n_pads = 3
         if path.stem == "ReplayState":
             there["message"].length = 1.0
-        for name, _, size, _, example, _ in table(PAGE, path.stem):
-            value = eval(example.strip("`"), there)
+        for name, _, _, example in table(PAGE, path.stem):
             of = name.strip("`")
             assert of in example, f"{path.stem}.{of}: {example} reads another field"
-            assert np.size(value) <= ENTRIES, f"{path.stem}.{of}: {size}"
+            eval(example.strip("`"), there)
 
 
 def test_status_bits_of_the_page_are_those_of_the_message():

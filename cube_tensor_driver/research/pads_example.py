@@ -44,7 +44,7 @@ def simple_loads(calibration: Calibration) -> dict[str, Array]:
     states = {
         rf"pressure: $\sigma_{{zz}} = -{size}": {"zz": LOAD},
         rf"shear: $\sigma_{{zx}} = {size}": {"zx": -LOAD},
-        rf"pressure with a gradient: $\sigma_{{zz}} = -{size} $(1 + x / d_0)$": {
+        rf"growing pressure: $-{abs(LOAD) / 1e3:g}\,(1 + x/d_0)$ kPa": {
             "zz": LOAD,
             "zz_x": LOAD,
         },
