@@ -97,7 +97,10 @@ def parameter_table() -> list[str]:
     for node, parameters in NODES.items():
         for parameter in parameters:
             nodes.setdefault(parameter, []).append(f"`{node}`")
-    lines = ["| parameter | node | default | allowed | live | what it sets |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| parameter | node | default | allowed | live | what it sets |",
+        "|---|---|---|---|---|---|",
+    ]
     for each, of in nodes.items():
         default = f"`{each.default}`" if each.default != "" else "empty"
         allowed = each.choices or {bool: "true, false"}.get(type(each.default), "text")
