@@ -61,19 +61,29 @@ def test_a_platform_without_wheels_is_told_the_way_out(monkeypatch, machine, ver
     with pytest.raises(environment.SetupError) as caught:
         environment.check_system()
     assert f"{machine} with Python {version[0]}.{version[1]}" in str(caught.value)
-    assert "install ROS 2 Jazzy or newer" in str(caught.value)
+    assert "install ROS 2 Humble or newer" in str(caught.value)
 
 
 def test_which_sourced_ros_is_used(monkeypatch, capsys):
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/x")
     monkeypatch.setattr(environment.shutil, "which", lambda name: "/usr/bin/colcon")
     monkeypatch.setattr(environment.importlib.util, "find_spec", lambda name: object())
-    for distro, used in {"humble": False, "jazzy": True, "kilted": True, "rolling": True}.items():
+    for distro, used in {"foxy": False, "humble": True, "jazzy": True, "rolling": True}.items():
         monkeypatch.setenv("ROS_DISTRO", distro)
         assert environment.sourced_ros() is used
-    assert "humble is older than jazzy" in capsys.readouterr().err
+    assert "foxy is older than humble" in capsys.readouterr().err
     monkeypatch.delenv("ROS_DISTRO")
     assert not environment.sourced_ros()
+
+
+@pytest.mark.parametrize("words", ["--distro kilted demo", "--distro=kilted demo"])
+def test_a_distribution_is_named_in_front_of_the_command(monkeypatch, words):
+    monkeypatch.delenv(environment.VARIABLE, raising=False)
+    assert environment.split_distro(["demo", "--distro", "kilted"])[0] == ""
+    assert environment.split_distro(words.split()) == ("kilted", ["demo"])
+    monkeypatch.setenv(environment.VARIABLE, "kilted")
+    assert environment.split_distro(["demo"]) == ("kilted", ["demo"])
+    assert environment.split_distro(["--distro", "jazzy", "demo"]) == ("jazzy", ["demo"])
 
 
 def test_a_sourced_ros_that_lacks_something_is_told_how_to_get_it(monkeypatch):
@@ -98,7 +108,7 @@ def test_an_older_ros_leaves_no_trace_in_the_private_environment(monkeypatch):
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/humble")
     monkeypatch.setenv("PYTHONPATH", "/opt/ros/humble/lib")
     monkeypatch.setenv("COLCON_PREFIX_PATH", "/opt/ros/humble")
-    assert "humble" not in " ".join(environment.private_variables().values())
+    assert "humble" not in " ".join(environment.private_variables(Path("/x")).values())
 
 
 def test_a_step_is_done_again_until_it_succeeded_with_these_inputs(tmp_path):
@@ -136,7 +146,7 @@ def test_what_was_built_in_another_folder_is_built_again(tmp_path):
 
 
 def test_a_folder_of_another_user_is_one_line(monkeypatch, capsys):
-    def refuse():
+    def refuse(distro):
         raise PermissionError(13, "Permission denied", "/x/.cube/lock")
 
     monkeypatch.setattr(environment, "prepare", refuse)
@@ -274,6 +284,8 @@ def test_version_is_that_of_the_package():
         ("fit x --layout cube -o y --uid 0xg", "--uid: '0xg' is not a uid, 0 to 2^64 - 1"),
         ("urdf a b", "urdf: unrecognized arguments: b"),
         ("exec", "exec: name a command to run"),
+        ("--distro humble demo", "--distro humble: there are wheels of jazzy and kilted"),
+        ("--distor kilted demo", "unknown option --distor; did you mean --distro?"),
     ],
 )
 def test_a_usage_error_is_short_and_needs_no_environment(arguments, said):

@@ -150,8 +150,9 @@ def test_every_dependency_is_declared_and_pinned():
         for element in ElementTree.parse(ROOT / "package.xml").iter()
         if "depend" in element.tag
     }
-    lock = (ROOT / "tools/requirements.lock").read_text()
-    locked = set(re.findall(r"^([a-z0-9-]+)==", lock, re.MULTILINE))
+    locks = [path.read_text() for path in (ROOT / "tools").glob("requirements-*.lock")]
+    pinned = [set(re.findall(r"^([a-z0-9-]+)==", lock, re.MULTILINE)) for lock in locks]
+    locked = set.intersection(*pinned)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     by_pip = list(project["dependencies"])
     for extra in project["optional-dependencies"].values():
@@ -162,7 +163,7 @@ def test_every_dependency_is_declared_and_pinned():
         wheel = WHEELS.get(module, module)
         key = KEYS.get(wheel, f"python3-{wheel}")
         assert key is None or key in of_ros, f"package.xml does not name {key}"
-        assert wheel in locked, f"requirements.lock does not pin {wheel}"
+        assert wheel in locked, f"a lock file does not pin {wheel}"
         assert wheel in of_pip, f"pyproject.toml does not name {wheel}"
 
 

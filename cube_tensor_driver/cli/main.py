@@ -66,7 +66,7 @@ def command_parser(name: str) -> Parser:
     """SystemExit: there is no such command."""
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
-        close = nearest(name, [*COMMANDS, "help", "--help", "--version"])
+        close = nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
         Parser(prog=PROGRAM).error(f"unknown {kind} {name}; {close}")
     module = importlib.import_module(f".{name}", __package__)
     parser = Parser(prog=f"{PROGRAM} {name}", description=sentence(COMMANDS[name]))
@@ -91,7 +91,10 @@ def help_text() -> str:
             lines += textwrap.wrap(
                 text, width, initial_indent=first, subsequent_indent=" " * indent
             )
-    last = f"{PROGRAM} COMMAND --help explains a command, {PROGRAM} --version prints the version."
+    last = (
+        f"{PROGRAM} COMMAND --help explains a command, {PROGRAM} --version prints the version, "
+        f"{PROGRAM} --distro kilted COMMAND runs it with another ROS 2."
+    )
     return "\n".join([*lines, "", *textwrap.wrap(last, width)])
 
 
