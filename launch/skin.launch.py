@@ -3,43 +3,125 @@
 Starts driver and reconstruction, and on demand what shows and records the skin.
 """
 
+from typing import Any
+
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
+from launch.actions import ExecuteProcess, OpaqueFunction
+from launch.conditions import IfCondition, UnlessCondition
+from launch.substitutions import LaunchConfiguration, OrSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import ExecutableInPackage
 
-from cube_tensor_driver.ros.launching import start_skin, switch
+from cube_tensor_driver.config.urdf import skin_urdf
+from cube_tensor_driver.ros.launching import (
+    DEMO_LOAD,
+    FromSkin,
+    check_arguments,
+    rviz_file,
+    skin_name,
+    switch,
+    text,
+)
 
+PACKAGE = "cube_tensor_driver"
+RESPAWN_DELAY_S = 2.0
 
-def text(name: str, description: str, default: str = "") -> DeclareLaunchArgument:
-    return DeclareLaunchArgument(name, default_value=default, description=description)
+given = LaunchConfiguration
 
 
 def generate_launch_description() -> LaunchDescription:
     arguments = [
-        DeclareLaunchArgument(
-            "config", description="Skin file (YAML): links, cubes, poses, calibrations."
-        ),
-        text("namespace", "Namespace of the nodes and their topics."),
+        text("config", "Skin file (YAML); empty with simulate:=true: the demo skin."),
+        text("namespace", "Namespace of the nodes and their topics, below any that is pushed."),
+        text("port", "Port of the hub instead of the file's, for a skin with one link."),
         text("rate", "Samples per second; 0.0: as in the skin file.", "0.0"),
         text("publish_period", "Time that one message covers, s; 0.0: one for each scan.", "0.0"),
-        switch(
-            "simulate", "Simulate the skin's hubs on pseudo-terminals instead of opening its ports."
-        ),
-        text("load", "Load script (YAML) for the simulated skin; empty: a load that wanders."),
+        switch("simulate", "Simulate the skin's hubs instead of opening its ports."),
+        text("load", "Load script (YAML) for a simulated skin.", str(DEMO_LOAD)),
         switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
-        switch(
-            "autostart",
-            "Nodes configure and activate themselves; false: others do it (lifecycle).",
-            default="true",
-        ),
+        switch("autostart", "Nodes configure and activate themselves (lifecycle).", "true"),
+        switch("respawn", "Start a node again that has ended by itself.", "true"),
         switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),
-        switch(
-            "state_publisher",
-            "Publish the cubes' frames (robot_state_publisher with the URDF of the skin).",
-        ),
-        switch("record", "Record frequencies, stress and info into a bag with ros2 bag (mcap)."),
+        switch("state_publisher", "Publish the cubes' frames (robot_state_publisher)."),
+        switch("record", "Record the skin into a new bag below the current folder (mcap)."),
         switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
     ]
-    values = {argument.name: LaunchConfiguration(argument.name) for argument in arguments}
-    return LaunchDescription([*arguments, OpaqueFunction(function=start_skin, kwargs=values)])
+    autostart = {"autostart": ParameterValue(given("autostart"), value_type=bool)}
+    reconstruction = {
+        **autostart,
+        "config": given("config"),
+        "publish_period": ParameterValue(given("publish_period"), value_type=float),
+    }
+    driver = {
+        **reconstruction,
+        "port": ParameterValue(given("port"), value_type=str),
+        "rate": ParameterValue(given("rate"), value_type=float),
+        "port_directory": given("port_directory"),
+    }
+    separate, composed = UnlessCondition(given("composed")), IfCondition(given("composed"))
+    urdf = {"robot_description": ParameterValue(FromSkin(skin_urdf), value_type=str)}
+    return LaunchDescription(
+        [
+            *arguments,
+            OpaqueFunction(function=check_arguments),
+            simulator(),
+            node("reconstruction", reconstruction, separate),
+            node("driver", driver, separate),
+            node("composed", driver, composed),
+            node("contacts", autostart, IfCondition(given("contacts"))),
+            node("markers", autostart, wanted("markers", "rviz")),
+            node("recorder", {"skin": FromSkin(skin_name)}, wanted("record"), respawn=False),
+            Node(
+                package="robot_state_publisher",
+                executable="robot_state_publisher",
+                namespace=given("namespace"),
+                parameters=[urdf],
+                output="screen",
+                condition=wanted("state_publisher", "rviz"),
+            ),
+            Node(
+                package="rviz2",
+                executable="rviz2",
+                namespace=given("namespace"),
+                arguments=["-d", FromSkin(rviz_file)],
+                condition=wanted("rviz"),
+            ),
+        ]
+    )
+
+
+def wanted(argument: str, other: str | None = None) -> IfCondition:
+    """If one of the arguments is true."""
+    return IfCondition(OrSubstitution(given(argument), given(other or argument)))
+
+
+def node(executable: str, parameters: dict[str, Any], condition: Any, **options: Any) -> Node:
+    """A node of this package. `composed` holds several, which keep their own names."""
+    return Node(
+        package=PACKAGE,
+        executable=executable,
+        name=None if executable == "composed" else executable,
+        namespace=given("namespace"),
+        parameters=[parameters],
+        condition=condition,
+        output="screen",
+        emulate_tty=True,
+        **{"respawn": given("respawn"), "respawn_delay": RESPAWN_DELAY_S, **options},
+    )
+
+
+def simulator() -> ExecuteProcess:
+    """The hubs of the skin; not a ROS node."""
+    return ExecuteProcess(
+        cmd=[
+            ExecutableInPackage("simulator", PACKAGE),
+            *("--config", given("config")),
+            *("--ports", given("port_directory")),
+            *("--load", given("load")),
+        ],
+        name="simulator",
+        condition=IfCondition(given("simulate")),
+        output="screen",
+    )

@@ -35,7 +35,6 @@ from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import (
     Process,
     SimulatedHubs,
-    record_command,
     skin_processes,
 )
 from cube_tensor_driver.ros.messages import to_ns
@@ -192,14 +191,15 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
 
 @needs_ros2_bag
 def test_ros2_bag_records_what_is_published(running, tmp_path):
-    """As record:=true has it recorded: info from before the recording and every scan, reprocessed
-    to the bit."""
-    _, _, verb, *options = record_command("skin")
-    path = tmp_path / options[options.index("-o") + 1]
-    options[options.index("-o") + 1] = str(path)
+    """As docs/bags.md says. The bag has the info from before, every scan, and gives the same bits
+    again."""
+    path = tmp_path / "bag"
+    overrides = package_data() / "config" / "record_qos.yaml"
+    options = ["--storage", "mcap", "-o", path, "--qos-profile-overrides-path", overrides]
+    options += ["--topics", "/frequencies", "/stress", "/info"]
     heard = running.listen(SkinFrequencies, "frequencies", 1000)
     running.wait(lambda: heard)
-    recorder = ros2_bag(verb, *options)
+    recorder = ros2_bag("record", *options)
     running.wait(lambda: len(running.node.get_subscriptions_info_by_topic("/frequencies")) == 3)
     begun = len(heard)
     running.wait(lambda: len(heard) > begun + 100)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import select
 import signal
@@ -231,6 +232,26 @@ def test_a_slow_consumer_loses_the_oldest_rows_and_is_told(
     # What waits is what came in the last 0.2 s, but for the scheduler; a second has passed.
     assert isinstance(waiting, int)
     assert 0 < waiting < 2 * RATE * 0.8
+
+
+def test_a_port_that_a_simulator_will_make_is_no_news_while_it_is_missing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of a hub on a serial port it is."""
+
+    def notes(source: LinkSource) -> list[str]:
+        return source.statistics()["links"]["hub0"]["notes"]
+
+    def warned(skin: Skin, **where: Path) -> list[str]:
+        caplog.clear()
+        with open_links(skin, rate=RATE, **where) as source:
+            until = time.monotonic() + WAIT_S
+            while not notes(source) and time.monotonic() < until:
+                time.sleep(0.01)
+        return [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+
+    assert warned(make_skin(1), port_directory=tmp_path) == []
+    assert "/dev/none: No such file" in warned(make_skin(1))[0]
 
 
 def test_close_ends_an_iteration_that_waits(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import os
@@ -17,12 +18,7 @@ import pytest
 
 from conftest import ROOT
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.yaml import read_yaml
-from cube_tensor_driver.processes.skin_processes import (
-    SimulatedHubs,
-    record_command,
-    skin_processes,
-)
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 
@@ -45,45 +41,24 @@ def test_every_executable_of_the_list_is_installed_and_runs_its_module(monkeypat
     installed = Path(packages.get_package_prefix("cube_tensor_driver")) / "lib/cube_tensor_driver"
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # scripts set up their own Ctrl-C
     started: list[str] = []
-    every = skin_processes(
-        SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True
-    ) + skin_processes(SKIN, composed=True)
+    every = [
+        *skin_processes(SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True),
+        *skin_processes(SKIN, composed=True),
+        Process("recorder", "cube_tensor_driver.ros.recording"),
+    ]
     for process in every:
         module, name = importlib.import_module(process.module), process.executable
         monkeypatch.setattr(module, "main", functools.partial(started.append, name))
         assert os.access(installed / name, os.X_OK)
-        runpy.run_path(str(installed / name), run_name="__main__")
+        with contextlib.suppress(SystemExit):
+            runpy.run_path(str(installed / name), run_name="__main__")
         assert started.pop() == name
-
-
-def test_each_recording_has_a_folder_of_its_own():
-    """ros2 bag refuses a folder that exists. It also records the info that was published before it
-    started, which is asked for in the words that ros2 bag knows."""
-    command = record_command("skin", "left/arm")
-    assert re.fullmatch(
-        r"left_arm_skin_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", command[command.index("-o") + 1]
-    )
-    assert command[-3:] == ["/left/arm/frequencies", "/left/arm/stress", "/left/arm/info"]
-    profiles = read_yaml(Path(command[command.index("--qos-profile-overrides-path") + 1]))
-    assert [profiles[topic]["durability"] for topic in command[-3:]] == [
-        "volatile",
-        "volatile",
-        "transient_local",
-    ]
-    assert record_command("skin")[-1] == "/info" and record_command("skin")[6].startswith("skin_")
-    policies = pytest.importorskip("rclpy.qos", reason="needs rclpy")
-    for profile in profiles.values():
-        for name in ("history", "reliability", "durability"):
-            policy = getattr(policies, f"{name.title()}Policy")
-            assert policy.get_from_short_key(profile[name]) != policy.UNKNOWN
 
 
 def test_temporary_folders_end_with_the_process(tmp_path):
     program = """
-from pathlib import Path
-from cube_tensor_driver.processes.skin_processes import record_command
-command = record_command("skin", "left/arm")
-print(Path(command[command.index("--qos-profile-overrides-path") + 1]).is_file())
+from cube_tensor_driver.processes.temporary import temporary_folder
+print(temporary_folder("cube_").is_dir())
 """
     done = subprocess.run(
         [sys.executable, "-c", program],
@@ -96,53 +71,177 @@ print(Path(command[command.index("--qos-profile-overrides-path") + 1]).is_file()
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["skin.launch.py", "cube.launch.py"])
-def test_every_argument_is_described(name):
+def start_recorder(folder: Path) -> subprocess.Popen[str]:
+    """In the namespace that a launch file gives it."""
+    return subprocess.Popen(
+        [
+            *(sys.executable, "-m", "cube_tensor_driver.ros.recording"),
+            *("--ros-args", "-r", "__ns:=/robot1/hand", "-p", "skin:=palm"),
+        ],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_the_recorder_records_the_skin_of_its_namespace(ros, tmp_path):
+    from cube_tensor_driver.bags.read import Bag
+    from cube_tensor_driver.msg import SkinFrequencies
+
+    publisher = ros.node.create_publisher(SkinFrequencies, "/robot1/hand/frequencies", 10)
+    recorder = start_recorder(tmp_path)
+    try:
+        ros.wait(publisher.get_subscription_count)
+        for _ in range(3):
+            publisher.publish(SkinFrequencies())
+        ros.wait(lambda: publisher.wait_for_all_acked())
+        recorder.send_signal(signal.SIGINT)
+        output, _ = recorder.communicate(timeout=20)
+    finally:
+        recorder.kill()
+    assert recorder.returncode == 0, output
+    (folder,) = tmp_path.iterdir()
+    assert re.fullmatch(r"robot1_hand_palm_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", folder.name)
+    with Bag(folder) as bag:
+        assert len(list(bag.entries({"/robot1/hand/frequencies"}))) == 3
+
+
+@pytest.mark.usefixtures("domain")
+def test_a_recording_that_cannot_be_made_is_an_error():
+    """Nobody can make a folder in /proc, root included."""
+    output, _ = (recorder := start_recorder(Path("/proc"))).communicate(timeout=20)
+    assert recorder.returncode == 1 and "recorder: /proc/robot1_hand_palm" in output, output
+
+
+def declared(name: str) -> dict[str, object]:
+    """The arguments of a launch file, as `ros2 launch FILE --show-args` lists them."""
     pytest.importorskip("launch", reason="needs launch and launch_ros, which the wheels lack")
     pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
     from launch.launch_description_sources import get_launch_description_from_python_launch_file
 
     description = get_launch_description_from_python_launch_file(str(ROOT / "launch" / name))
-    arguments = description.get_launch_arguments()
-    assert {"config", "namespace"} <= {argument.name for argument in arguments}
-    for argument in arguments:
-        assert len(argument.description) > 15 and "no description" not in argument.description, (
-            argument.name
+    return {argument.name: argument for argument in description.get_launch_arguments()}
+
+
+@pytest.mark.parametrize("name", ["skin.launch.py", "cube.launch.py"])
+def test_every_argument_is_described(name):
+    arguments = declared(name)
+    assert {"config", "port", "namespace", "simulate", "record", "rviz", "respawn"} <= set(
+        arguments
+    )
+    for argument in arguments.values():
+        assert len(argument.description) > 15 and "no description" not in argument.description
+
+
+def test_pages_use_arguments_that_launch_files_have():
+    text = "\n".join(
+        page.read_text() for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    )
+    launches = re.findall(r"ros2 launch cube_tensor_driver (\S+)((?: \S+:=[^\s`]+)*)", text)
+    assert launches
+    for file, arguments in launches:
+        assert set(re.findall(r"(\w+):=", arguments)) <= set(declared(file)), file
+
+
+def arguments_refused(**given: str) -> str:
+    """Why skin.launch.py starts nothing with these arguments."""
+    declared("skin.launch.py")  # or skips
+    from launch import LaunchContext
+
+    from cube_tensor_driver.core.errors import ConfigError
+    from cube_tensor_driver.ros.launching import check_arguments
+
+    context = LaunchContext()
+    for argument in declared("skin.launch.py").values():
+        context.launch_configurations[argument.name] = given.get(
+            argument.name, argument.default_value[0].text
         )
+    with pytest.raises(ConfigError) as refused:
+        check_arguments(context)
+    return str(refused.value)
 
 
-def test_a_simulated_skin_starts_and_ends(domain):
+def test_arguments_that_cannot_work_are_refused_before_anything_starts():
+    assert "config is missing" in arguments_refused()
+    assert "gone.yaml" in arguments_refused(config="gone.yaml")
+    assert "gone.yaml" in arguments_refused(simulate="true", load="gone.yaml")
+    assert "rate:=fast" in arguments_refused(simulate="true", rate="fast")
+    assert "port: " in arguments_refused(config=str(SKIN), port="socket://::::")
+
+
+ROBOT = """
+<launch>
+  <group>
+    <push_ros_namespace namespace="robot1"/>
+    <set_parameter name="drift_time" value="33.0"/>
+    <set_remap from="stress" to="touch"/>
+    <include file="$(find-pkg-share cube_tensor_driver)/launch/skin.launch.py">
+      <arg name="simulate" value="true"/>
+      <arg name="namespace" value="hand"/>
+      <arg name="record" value="true"/>
+    </include>
+  </group>
+</launch>
+"""
+
+
+def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
+    """Its namespace, remaps and parameters reach the nodes and the recorder; a driver that dies
+    starts again; one Ctrl-C ends all and leaves a whole bag."""
     pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
     if shutil.which("ros2") is None:
         pytest.skip("needs the command ros2 (ros2cli and ros2launch), which the wheels lack")
-    command = [
-        "ros2",
-        "launch",
-        "cube_tensor_driver",
-        "skin.launch.py",
-        f"config:={SKIN}",
-        "simulate:=true",
-    ]
+    from cube_tensor_driver.bags.read import Bag
+    from cube_tensor_driver.msg import SkinStress
+
+    (tmp_path / "robot.launch.xml").write_text(ROBOT)
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
     process = subprocess.Popen(
-        command,
+        ["ros2", "launch", str(tmp_path / "robot.launch.xml")],
+        cwd=tmp_path,
+        env=os.environ | {"TMPDIR": str(temporary)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    try:
-        lines = []
+    lines: list[str] = []
+
+    def wait_for(text: str) -> str:
         for line in process.stdout:
             lines.append(line)
-            if "link hub1: hub 0x2 with 8 cubes of 8 pads" in line:
-                break
+            if text in line:
+                return line
+        raise AssertionError("".join(lines))
+
+    try:
+        driver = int(re.findall(r"pid \[(\d+)\]", wait_for("[driver-3]: process started"))[0])
+        wait_for("link hub1: hub 0x2 with 8 cubes of 8 pads")
+        heard = ros.listen(SkinStress, "/robot1/hand/touch", 100)
+        ros.wait(lambda: len(heard) > 20)
+        os.kill(driver, signal.SIGKILL)
+        wait_for("link hub1: hub 0x2 with 8 cubes of 8 pads")
+        begun = len(heard)
+        ros.wait(lambda: len(heard) > begun + 20)
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=10)
-        assert process.returncode == 0, "".join(lines) + output
-        assert output.count("process has finished cleanly") == 3
+        output, _ = process.communicate(timeout=20)
     finally:
         process.kill()
+    output = "".join(lines) + output
+    assert process.returncode == 0, output
+    assert output.count("process has finished cleanly") == 4
+    assert "No such file" not in output
+    (folder,) = tmp_path.glob("robot1_hand_skin_*")
+    with Bag(folder) as bag:
+        recorded = {connection.topic for connection in bag.connections}
+    assert recorded == {
+        *(f"/robot1/hand/{topic}" for topic in ("frequencies", "touch", "info")),
+        "/diagnostics",
+    }
+    assert not [path for path in temporary.iterdir() if path.name.startswith("cube_")]
 
 
 def test_transitions_by_events_of_launch(domain):

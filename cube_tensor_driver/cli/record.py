@@ -7,10 +7,10 @@ from pathlib import Path
 
 from .parser import Parser, positive
 
-TOPICS = ("frequencies", "stress", "info", "/diagnostics")
-
 
 def arguments(parser: Parser) -> None:
+    from ..processes.skin_processes import RECORDED
+
     parser.add_argument(
         "-o",
         "--output",
@@ -22,9 +22,9 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "--topics",
         nargs="+",
-        default=TOPICS,
+        default=RECORDED,
         metavar="T",
-        help=f"topics to record (default: {' '.join(TOPICS)})",
+        help=f"topics to record (default: {' '.join(RECORDED)})",
     )
     parser.add_argument(
         "--duration", type=positive, metavar="S", help="end after S seconds (default: Ctrl-C)"

@@ -62,6 +62,7 @@ class _LinkRecord:
     events: states other than open since the last report, and the reason of each
     logged_version: the last other protocol version that was logged
     hub_changes: how often a hub said that it has other cubes than before, the first time included
+    was_open: the link has been open before
     """
 
     account: Account = field(default_factory=Account)
@@ -71,6 +72,7 @@ class _LinkRecord:
     events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     logged_version: int | None = None
     hub_changes: int = 0
+    was_open: bool = False
 
 
 class LiveLinks:
@@ -289,17 +291,25 @@ class LiveLinks:
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
         """The state of a link, or why it waits, has changed."""
+        record = self._records[link]
+        record.was_open |= state is LinkState.OPEN
         if state is not LinkState.OPEN:
             # Without an error a link waits because it is about to be opened for the first time.
             if error is not None or state is LinkState.CLOSED:
-                self._records[link].events.append((state, str(error or state.value)))
+                record.events.append((state, str(error or state.value)))
             self._scans.set_live(link, False)
             self._deliver()
         log = self._link_logs[link]
+        if error is not None and error.kind == "no_port" and self._is_expected(link):
+            return
         if error is not None:
             log.warning(f"{state.value}: {error}")
         else:
             log.info(state.value)
+
+    def _is_expected(self, link: int) -> bool:
+        """Whether a simulator has yet to make the port of a link."""
+        return self._configs[link].is_simulated and not self._records[link].was_open
 
     def _report(self, link: Link, record: _LinkRecord, log: LinkLog) -> LinkReport:
         notes = [*record.problems, *record.contradictions]

@@ -80,12 +80,15 @@ class LinkConfig:
     hub that comes back under another name.
     baud: ignored by USB and TCP.
     hub_uid: the hub that must answer; None for any.
+    is_simulated: a simulator that may start later makes the port. It is no news that the port is
+        missing until then.
     """
 
     name: str
     port: str
     baud: int = 921_600
     hub_uid: int | None = None
+    is_simulated: bool = False
 
 
 class Link:

@@ -64,7 +64,8 @@ def link_configs(skin: Skin, port: str = "", port_directory: str | Path = "") ->
         problem = port_problem(chosen)
         if problem:
             raise ConfigError(f"link {link.name}: port: {problem}")
-        configs.append(LinkConfig(link.name, chosen, link.baud, link.hub_uid))
+        simulated = bool(port_directory) and not port
+        configs.append(LinkConfig(link.name, chosen, link.baud, link.hub_uid, simulated))
     return configs
 
 

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 
-from ..config.package_data import package_data
-from ..config.yaml import read_yaml, write_yaml
-from .temporary import temporary_folder
-
 Value = str | float | bool
-RECORDED = ("frequencies", "stress", "info")
+RECORDED = ("frequencies", "stress", "info", "/diagnostics")
 """The topics of a recording. `frequencies` and `info` are enough to reconstruct everything again;
-`stress` is what was published at the time."""
+`stress` is what was published at the time, `/diagnostics` what the driver said about its links."""
 
 
 @dataclass(frozen=True)
@@ -102,33 +97,3 @@ def skin_processes(
 
 def _node(name: str, parameters: dict[str, Value]) -> Process:
     return Process(name, f"cube_tensor_driver.ros.{name}", parameters=dict(parameters))
-
-
-def record_command(skin: str, namespace: str = "") -> list[str]:
-    """The command of `ros2 bag record` for a running skin.
-
-    It writes into a new folder below the current one, named [namespace_]skin_date-time.
-    """
-    parts = [part for part in namespace.split("/") if part]
-    prefix = "".join(f"/{part}" for part in parts)
-    folder = "_".join([*parts, skin, f"{datetime.now():%Y_%m_%d-%H_%M_%S}"])
-    topics = [f"{prefix}/{topic}" for topic in RECORDED]
-    overrides = _qos_overrides(prefix)
-    return [
-        *("ros2", "bag", "record"),
-        *("--storage", "mcap"),
-        *("-o", folder),
-        *("--qos-profile-overrides-path", str(overrides)),
-        *("--topics", *topics),
-    ]
-
-
-def _qos_overrides(prefix: str) -> Path:
-    """The file of QoS profiles by topic; one of our own where topics have a namespace."""
-    path = package_data() / "config" / "record_qos.yaml"
-    if not prefix:
-        return path
-    profiles = {prefix + topic: profile for topic, profile in read_yaml(path).items()}
-    own = temporary_folder("cube_record_") / path.name
-    write_yaml(own, profiles)
-    return own

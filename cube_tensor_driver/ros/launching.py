@@ -1,26 +1,43 @@
-"""The processes of a skin as actions of a launch file.
+"""What the launch files need beside the actions of launch: arguments that are checked, and texts
+that are made from the skin file.
 
 Imports launch, which every ROS 2 installation has. The ROS 2 wheels lack it.
 """
 
 from __future__ import annotations
 
-import sys
+import os
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from launch import LaunchContext, LaunchDescriptionEntity
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo
+from launch import Action, LaunchContext, Substitution
+from launch.actions import DeclareLaunchArgument, SetLaunchConfiguration
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
 
 from ..config.load_script import read_script
 from ..config.package_data import package_data
+from ..config.port import port_problem
 from ..config.skin import Skin, read_skin
-from ..config.urdf import skin_urdf
+from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
-from ..processes.skin_processes import Process, SimulatedHubs, record_command, skin_processes
 from ..processes.temporary import temporary_folder
+
+_CONFIG = package_data() / "config"
+SINGLE, DEMO, DEMO_LOAD = (
+    _CONFIG / name for name in ("cube.yaml", "skin_demo.yaml", "load_demo.yaml")
+)
+SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
+NEEDS = {"rviz": ("rviz2", "robot_state_publisher"), "state_publisher": ("robot_state_publisher",)}
+"""The ROS packages beyond our own that an argument needs."""
+VIEW_DISTANCE, MIN_DISTANCE = 1.8, 0.05
+"""Of RViz's camera: in diagonals of the skin, and at least, in m."""
+
+
+def text(name: str, description: str, default: str = "") -> DeclareLaunchArgument:
+    """A launch argument."""
+    return DeclareLaunchArgument(name, default_value=default, description=description)
 
 
 def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
@@ -30,118 +47,99 @@ def switch(name: str, description: str, default: str = "false") -> DeclareLaunch
     )
 
 
-def start_skin(
-    context: LaunchContext, **arguments: LaunchConfiguration
-) -> list[LaunchDescriptionEntity]:
-    """The actions that start a skin, for an OpaqueFunction.
+class FromSkin(Substitution):
+    """A text that is made from the skin file of the launch argument `config`."""
 
-    arguments: config and namespace; also port, rate, publish_period, simulate, load, composed,
-    autostart, markers, contacts, record, rviz and state_publisher if the launch file has them.
+    def __init__(self, make: Callable[[Skin], str]) -> None:
+        super().__init__()
+        self._make = make
 
-    Raises ConfigError if the skin file, the load script or an argument is wrong.
+    def describe(self) -> str:
+        return f"{self._make.__name__} of config"
+
+    def perform(self, context: LaunchContext) -> str:
+        """ConfigError: the skin file is wrong."""
+        return self._make(read_skin(Path(_given(context, "config"))))
+
+
+def skin_name(skin: Skin) -> str:
+    return skin.name
+
+
+def parent_frame(skin: Skin) -> str:
+    return skin.parent_frame
+
+
+def rviz_file(skin: Skin) -> str:
+    """The path of rviz/skin.rviz as it fits this skin: its parent frame, a view of all of it, and
+    the wrench of the cube in its middle."""
+    view = read_yaml(package_data() / "rviz" / "skin.rviz")
+    manager = view["Visualization Manager"]
+    position = np.array([cube.xyz for cube in skin.cubes])
+    low, high = position.min(axis=0), position.max(axis=0)
+    centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    nearest = int(np.linalg.norm(position - centre, axis=1).argmin())
+    manager["Global Options"]["Fixed Frame"] = skin.parent_frame
+    displays = {display["Name"]: display for display in manager["Displays"]}
+    displays["Wrench"]["Topic"]["Value"] = f"cubes/{skin.cubes[nearest].name}/wrench"
+    camera = manager["Views"]["Current"]
+    camera["Focal Point"] = dict(zip("XYZ", centre.tolist(), strict=True))
+    camera["Distance"] = max(MIN_DISTANCE, VIEW_DISTANCE * size)
+    path = temporary_folder("cube_rviz_") / "skin.rviz"
+    write_yaml(path, view)
+    return str(path)
+
+
+def check_arguments(context: LaunchContext) -> list[Action]:
+    """The first action of a launch file: an argument that cannot work ends the launch before
+    anything starts.
+
+    It sets `config` to the path of the skin file, and `port_directory` to a new folder if hubs are
+    simulated. ConfigError: an argument, the skin file or the load script is wrong, or a ROS package
+    that is asked for is not installed.
     """
-    given = {name: str(argument.perform(context)) for name, argument in arguments.items()}
-    config = _path(given["config"])
-    skin = read_skin(config)
-    namespace = given["namespace"]
-    rviz = given.get("rviz") == "true"
-    actions = [
-        _process_action(process, namespace) for process in _nodes_first(_processes(config, given))
+    simulate = _given(context, "simulate") == "true"
+    config = _given(context, "config") or (str(DEMO) if simulate else "")
+    if not config:
+        raise ConfigError(
+            "config is missing: name a skin file, config:=skin.yaml, or try simulate:=true"
+        )
+    path = Path(config).expanduser().resolve()
+    read_skin(path)
+    read_script(Path(_given(context, "load")).expanduser())
+    problem = _given(context, "port") and port_problem(_given(context, "port"))
+    if problem:
+        raise ConfigError(f"port: {problem}")
+    for name in ("rate", "publish_period"):
+        _check_number(name, _given(context, name))
+    for name, packages in NEEDS.items():
+        if _given(context, name) == "true":
+            _check_installed(name, packages)
+    ports = str(temporary_folder("cube_ports_")) if simulate else ""
+    return [
+        SetLaunchConfiguration("config", str(path)),
+        SetLaunchConfiguration("port_directory", ports),
     ]
-    if rviz or given.get("state_publisher") == "true":
-        actions.append(_state_publisher(skin, namespace))
-    if given.get("record") == "true":
-        record = ExecuteProcess(cmd=record_command(skin.name, namespace), output="screen")
-        actions.append(_if_installed("ros2bag", record))
-    if rviz:
-        actions.append(_rviz(namespace))
-    return actions
 
 
-def _processes(config: Path, given: dict[str, str]) -> list[Process]:
-    def wanted(name: str) -> bool:
-        return given.get(name) == "true"
-
-    load = _path(given["load"]) if given.get("load") else None
-    if load is not None:
-        read_script(load)  # so that a mistake in it is told before anything starts
-    simulated = None
-    if wanted("simulate"):
-        simulated = SimulatedHubs(temporary_folder("cube_ports_"), load, noise=None)
-    return skin_processes(
-        config,
-        port=given.get("port", ""),
-        rate=_number(given, "rate", "samples per second"),
-        publish_period=_number(given, "publish_period", "seconds"),
-        composed=wanted("composed"),
-        autostart=given.get("autostart") != "false",
-        markers=wanted("markers") or wanted("rviz"),
-        contacts=wanted("contacts"),
-        simulated=simulated,
-    )
+def _given(context: LaunchContext, name: str) -> str:
+    return str(LaunchConfiguration(name).perform(context))
 
 
-def _nodes_first(processes: list[Process]) -> list[Process]:
-    """Where a node cannot be started, launch gives up and leaves running what it has started."""
-    return sorted(processes, key=lambda process: not process.node)
-
-
-def _path(text: str) -> Path:
-    return Path(text).expanduser().resolve()
-
-
-def _number(given: dict[str, str], name: str, unit: str) -> float:
+def _check_number(name: str, value: str) -> None:
     try:
-        return float(given.get(name, 0))
+        float(value)
     except ValueError:
-        raise ConfigError(f"{name}:={given[name]}: must be a number of {unit}") from None
+        raise ConfigError(f"{name}:={value}: must be a number") from None
 
 
-def _process_action(process: Process, namespace: str) -> LaunchDescriptionEntity:
-    if not process.node:
-        return ExecuteProcess(
-            cmd=[sys.executable, "-m", process.module, *process.arguments],
-            name=process.executable,
-            output="screen",
-        )
-    # `composed` holds several nodes, which keep their own names.
-    name = None if process.executable == "composed" else process.executable
-    return Node(
-        package="cube_tensor_driver",
-        executable=process.executable,
-        name=name,
-        namespace=namespace,
-        parameters=[process.parameters],
-        output="screen",
-        emulate_tty=True,
-    )
-
-
-def _if_installed(package: str, action: LaunchDescriptionEntity) -> LaunchDescriptionEntity:
-    """The action; or, if its package is missing, a line that says how to install it."""
-    try:
-        get_package_prefix(package)
-    except PackageNotFoundError:
-        name = package.replace("_", "-")
-        return LogInfo(
-            msg=f"{package} is not installed: left out (sudo apt install ros-$ROS_DISTRO-{name})"
-        )
-    return action
-
-
-def _state_publisher(skin: Skin, namespace: str) -> LaunchDescriptionEntity:
-    package = "robot_state_publisher"
-    node = Node(
-        package=package,
-        executable=package,
-        namespace=namespace,
-        parameters=[{"robot_description": skin_urdf(skin)}],
-        output="screen",
-    )
-    return _if_installed(package, node)
-
-
-def _rviz(namespace: str) -> LaunchDescriptionEntity:
-    arguments = ["-d", str(package_data() / "rviz" / "skin.rviz")]
-    node = Node(package="rviz2", executable="rviz2", namespace=namespace, arguments=arguments)
-    return _if_installed("rviz2", node)
+def _check_installed(name: str, packages: tuple[str, ...]) -> None:
+    for package in packages:
+        try:
+            get_package_prefix(package)
+        except PackageNotFoundError:
+            distro = os.environ.get("ROS_DISTRO", "$ROS_DISTRO")
+            raise ConfigError(
+                f"{name}:=true needs the ROS package {package}: "
+                f"sudo apt install ros-{distro}-{package.replace('_', '-')}"
+            ) from None

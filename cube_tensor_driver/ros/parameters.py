@@ -140,6 +140,7 @@ CONTACTS = (
         span=(0.0, 1e9),
     ),
 )
+RECORDER = (Parameter("skin", "skin", "Name of the skin, for the name of the bag's folder."),)
 ECHO = (
     AUTOSTART,
     Parameter("cubes", 64, "Rows of a message."),
