@@ -27,6 +27,7 @@ from cube_tensor_driver.ros.parameters import (
     DRIVER,
     MARKERS,
     RECONSTRUCTION,
+    RECORDER,
     Parameter,
 )
 
@@ -38,6 +39,7 @@ NODES = {
     "reconstruction": RECONSTRUCTION,
     "markers": MARKERS,
     "contacts": CONTACTS,
+    "recorder": RECORDER,
 }
 ENTRIES = 900
 """Of an array whose length is free: a multiple of all widths."""

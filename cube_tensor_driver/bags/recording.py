@@ -43,10 +43,7 @@ class Recording:
 
     def __init__(self, bag: Bag, topic: str) -> None:
         self._bag = bag
-        infos = bag.infos(topic.removesuffix("frequencies") + "info")
-        # The driver knows of no tare: what it says counts only where no reconstruction ran.
-        infos = [info for info in infos if info.sender == "reconstruction"] or infos
-        self.infos = sorted(infos, key=stamp_ns)
+        self.infos = sorted(skin_infos(bag, topic), key=stamp_ns)
         with damage(bag.path):
             self.settings = [settings_of(info) for info in self.infos]
         self._since_ns = np.array([stamp_ns(info) for info in self.infos])
@@ -81,6 +78,19 @@ class Recording:
                 f"{self._bag.path}: the calibrations change within the recording: "
                 "reprocess it instead"
             )
+
+
+def skin_infos(bag: Bag, topic: str) -> list[Any]:
+    """The infos of the skin whose frequencies are on `topic`. BagError: there is none.
+
+    They are the reconstruction's. The driver knows of no tare: what it says counts only where no
+    reconstruction ran. It says it on `driver/info`; bags of older versions have it on `info`, too.
+    """
+    skin = topic.removesuffix("frequencies")
+    own, of_driver = f"{skin}info", f"{skin}driver/info"
+    recorded = {connection.topic for connection in bag.connections if connection.msgcount}
+    infos = bag.infos(of_driver if of_driver in recorded and own not in recorded else own)
+    return [info for info in infos if info.sender == "reconstruction"] or infos
 
 
 def stamp_ns(info: Any) -> int:

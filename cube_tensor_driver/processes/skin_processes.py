@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 Value = str | float | bool
-RECORDED = ("frequencies", "stress", "info", "/diagnostics")
-"""The topics of a recording. `frequencies` and `info` are enough to reconstruct everything again;
-`stress` is what was published at the time, `/diagnostics` what the driver said about its links."""
+RECORDED = ("frequencies", "stress", "info", "driver/info", "/diagnostics")
+"""The topics of a recording. `frequencies` and `info` are enough to reconstruct everything again,
+`driver/info` where no reconstruction runs; `stress` is what was published at the time,
+`/diagnostics` what the nodes said about links and cubes."""
 
 
 @dataclass(frozen=True)

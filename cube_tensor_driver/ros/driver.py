@@ -22,7 +22,7 @@ from .parameters import DRIVER
 
 
 class Driver(CubeNode):
-    """Publishes `frequencies`, `info` and diagnostics. The reader's thread publishes the
+    """Publishes `frequencies`, `driver/info` and diagnostics. The reader's thread publishes the
     frequencies, the main thread spins."""
 
     def __init__(self, on_rows: Callable[[FrequencyRows], None] | None = None) -> None:
@@ -49,7 +49,7 @@ class Driver(CubeNode):
         self._frequencies = FrequenciesPublisher(
             self, skin.parent_frame, quality, always=self._on_rows is None
         )
-        self._info = self.create_publisher(SkinInfo, "info", LATCHED)
+        self._info = self.create_publisher(SkinInfo, "driver/info", LATCHED)
         self._links = LiveLinks(
             links,
             cube_addresses(skin),

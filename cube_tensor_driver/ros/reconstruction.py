@@ -57,7 +57,7 @@ class Reconstruction(CubeNode):
         self._taring = Taring(self, skin, reconstructor, folder, self._lock, self._publish_info)
         made.callback(self._taring.close)
         self._diagnostics = ReconstructionDiagnostics(skin, reconstructor, self._taring)
-        uids = self.create_subscription(SkinInfo, "info", self._taring.on_info, LATCHED)
+        uids = self.create_subscription(SkinInfo, "driver/info", self._taring.on_info, LATCHED)
         made.callback(self.destroy_subscription, uids)
         if self._subscribes:
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)

@@ -50,7 +50,7 @@ class Taring:
         on_change: Callable[[], None],
     ) -> None:
         """folder: where tares are kept, None: nowhere; lock: held while the reconstructor is used;
-        on_change: called, with the lock, when rest frequencies have changed."""
+        on_change: called, with the lock, when rest frequencies or uids have changed."""
         self._node, self._reconstructor = node, reconstructor
         self._skin, self._folder = skin, folder
         self._lock, self._on_change = lock, on_change
@@ -72,13 +72,17 @@ class Taring:
             self._node.destroy_service(service)
 
     def on_info(self, message: SkinInfo) -> None:
-        """The driver's `info`: uids of cubes that the skin file does not name. Our own says nothing
-        new."""
+        """The driver's info: uids of cubes that the skin file does not name, which our own info
+        says from then on."""
         if message.name != self._skin.name or len(message.cubes) != len(self._skin.cubes):
             return
+        before = dict(self.uids)
         restored = self._restore({n: cube.uid for n, cube in enumerate(message.cubes) if cube.uid})
-        if restored is not None:
-            self._set(restored)
+        with self._lock:
+            if restored is not None:
+                self._reconstructor.rest_frequency = restored
+            if self.uids != before:
+                self._on_change()
 
     def age(self) -> dict[str, str]:
         """For diagnostics: how many cubes are tared, and since when."""
@@ -205,8 +209,3 @@ class Taring:
         calibration = self._skin.cubes[number].calibration
         rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
         self.created.pop(number, None)
-
-    def _set(self, rest: np.ndarray) -> None:
-        with self._lock:
-            self._reconstructor.rest_frequency = rest
-            self._on_change()

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..bags.read import FREQUENCIES, Bag
+from ..bags.recording import skin_infos
 from ..bags.summary import cube_summaries, last_diagnostics
 from ..core.errors import BagError
 
@@ -50,7 +51,7 @@ def _topics(bag: Bag, seconds: float) -> Table:
 
 def _show_skin(bag: Bag, topic: str, console: Console) -> None:
     try:
-        info = bag.infos(topic.removesuffix("frequencies") + "info")[-1]
+        info = skin_infos(bag, topic)[-1]
     except BagError as error:
         console.print(str(error), style="red", markup=False)
         return
