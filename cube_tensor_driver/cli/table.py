@@ -39,6 +39,7 @@ GROUPS = {
         "paper": "repeat the source paper's experiments on a virtual bench",
     },
     "Develop": {
+        "firmware": "build, run or test the hubs in C",
         "test": "build and run the test suite",
         "lint": "check style and types (ruff, mypy)",
         "docs": "build the documentation as HTML",

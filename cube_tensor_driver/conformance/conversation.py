@@ -29,8 +29,8 @@ ANSWER_S = 1.0
 """How long a hub may take to answer; the host asks again after that."""
 GRACE_S = 0.15
 """How long an answer too many may take to come."""
-PERIOD_US, SLOWER_US = 20_000, 40_000
-"""Sample periods that any hub can do, on any line."""
+PERIOD_US, SLOWER_US = 40_000, 60_000
+"""Sample periods that any hub can do, on any line, and in an emulator."""
 FAST_US = 1_000
 """A period at which the line and all buffers are soon full when nobody reads."""
 QUIET_S, FLOW_S, NEW_PERIOD_S = 3.4, 4.4, 0.8
@@ -40,7 +40,7 @@ DURATION_S = 25.0
 """Of a whole conversation with a hub that answers, roughly."""
 ANY_ARGUMENT = 0xFF0D0A40
 """With bytes that Telnet, terminals and flow control treat in their own way."""
-BETWEEN_START_S = 0.107
+BETWEEN_START_S = 0.212
 """No whole number of periods, so that each START falls into another part of a period."""
 MAX_FRAMES = 200_000
 """Far more than a hub can be asked for; a conversation is kept in memory."""

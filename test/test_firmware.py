@@ -1,0 +1,185 @@
+"""The hub in C: as a process of this machine, and on an emulated microcontroller."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from conftest import ROOT, end
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.conformance.check import Checked, check
+from cube_tensor_driver.conformance.port_wire import PortWire
+from cube_tensor_driver.conformance.verdict import Outcome
+from cube_tensor_driver.processes.firmware import Emulator, build, missing
+from cube_tensor_driver.simulation.captures import COUNTER_HZ, WINDOW_US, Oscillators, edges
+from cube_tensor_driver.simulation.cubes import hub_cubes
+from cube_tensor_driver.simulation.load import Load, default_script
+
+SOURCE = ROOT / "firmware"
+SKIN = package_data() / "config" / "skin_firmware.yaml"
+NO_CC, NO_ARM = missing("make", "cc"), missing("make", "arm-none-eabi-gcc", "qemu-system-arm")
+
+pytestmark = [
+    pytest.mark.skipif(bool(NO_CC), reason=NO_CC),
+    pytest.mark.xdist_group("firmware"),
+]
+emulated = pytest.mark.skipif(bool(NO_ARM), reason=NO_ARM)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with cube_hub, and hub.elf where there is a cross compiler."""
+    folder = tmp_path_factory.mktemp("firmware")
+    build(SOURCE, folder, "posix")
+    if not NO_ARM:
+        build(SOURCE, folder, "an386")
+    return folder
+
+
+class Capture(ctypes.Structure):
+    _fields_ = (
+        ("first", ctypes.c_uint32),
+        ("last", ctypes.c_uint32),
+        ("periods", ctypes.c_uint32),
+    )
+
+
+@pytest.fixture(scope="module")
+def hub_frequency(tmp_path_factory: pytest.TempPathFactory):
+    """The function of hub.c: captures and counter frequency to mHz."""
+    library = tmp_path_factory.mktemp("library") / "hub.so"
+    sources = [SOURCE / "hub.c", SOURCE / "posix" / "line.c", ROOT / "native" / "cube_wire.c"]
+    includes = [f"-I{SOURCE}", f"-I{ROOT / 'native'}"]
+    command = ["cc", "-std=c11", "-O1", "-shared", "-fPIC", *includes, *sources, "-o", library]
+    subprocess.run(command, check=True, timeout=60)
+    function = ctypes.CDLL(str(library)).hub_frequency
+    function.restype = ctypes.c_uint32
+    return lambda first, last, periods, hertz: function(
+        ctypes.byref(Capture(first, last, periods)), ctypes.c_uint32(hertz)
+    )
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    hertz=st.integers(10_000, 4_000_000),
+    phase=st.fractions(0, Fraction(999_999, 1_000_000)),
+    counter=st.sampled_from([16_000_000, 25_000_000, 84_000_000, 125_000_000]),
+    begin=st.integers(0, 2**32 - 1),
+)
+def test_reciprocal_counting_resolves_one_tick(hub_frequency, hertz, phase, counter, begin):
+    """Against edges of an oscillator in exact fractions, wherever the counter wraps."""
+    period = Fraction(counter, hertz)
+    window = Fraction(counter, 400)
+    n = int(window / period - phase)
+    first, last = (int(begin + (phase + k) * period) for k in (0, n))
+    found = hub_frequency(first % 2**32, last % 2**32, n, counter)
+    if n == 0:
+        assert found == 0
+    else:
+        # 1/2 mHz of rounding
+        assert abs(found - 1000 * hertz) <= Fraction(1000 * found, last - first) + Fraction(1, 2)
+
+
+def test_a_pad_that_stands_still_or_is_too_fast_is_not_measured(hub_frequency):
+    assert hub_frequency(5, 5, 0, 10**6) == 0
+    assert hub_frequency(5, 5, 7, 10**6) == 0
+    assert hub_frequency(0, 1, 5, 10**6) == 0
+
+
+def test_captures_are_those_of_the_oscillators():
+    """To the tick; a pad without two edges in the window has none."""
+    millihertz = np.array([100_000_000, 0, 399_000, 3_000_000_000], np.uint32)
+    found = edges(millihertz, np.array([0.25, 0.5, 0.5, 0.0]))
+    ticks = [COUNTER_HZ * 1e3 / f for f in (1e8, 3e9)]
+    assert found["periods"].tolist() == [249, 0, 0, 7499]
+    assert found["first"].tolist() == [int(0.25 * ticks[0]), 0, 0, 0]
+    assert found["last"].tolist() == [int(249.25 * ticks[0]), 0, 0, int(7499 * ticks[1])]
+    assert (found["last"] < COUNTER_HZ * WINDOW_US // 10**6).all()
+
+
+@contextlib.contextmanager
+def cube_hub(program: Path, *options: str) -> Iterator[str]:
+    """The port of a hub as a process."""
+    process = subprocess.Popen([program, *options], stdout=subprocess.PIPE, text=True)
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        end(process)
+        process.stdout.close()
+
+
+@contextlib.contextmanager
+def simulated_hub(folder: Path) -> Iterator[str]:
+    """The port of a hub of the simulator."""
+    module = "cube_tensor_driver.simulation.main"
+    command = [sys.executable, "-m", module, "--config", str(SKIN), "--ports", str(folder)]
+    command += ["--instants", "50"]  # else the load takes more time than a busy machine has
+    process = subprocess.Popen(command)
+    try:
+        until = threading.Event()
+        while not (folder / "hub0").is_symlink():
+            assert process.poll() is None
+            until.wait(0.02)
+        yield str(folder / "hub0")
+    finally:
+        end(process)
+
+
+@contextlib.contextmanager
+def emulated_hub(image: Path) -> Iterator[tuple[str, Oscillators]]:
+    """The port of an emulated hub, and its pads under a load."""
+    skin = read_skin(SKIN)
+    (hub,) = hub_cubes(skin)
+    pads = Oscillators(hub, Load(skin, default_script()))
+    with Emulator(image) as emulator:
+        server = threading.Thread(target=pads.serve, args=(emulator.pads,))
+        server.start()
+        yield emulator.port, pads
+    server.join()
+
+
+def checked(port: str) -> Checked:
+    with PortWire(port, 921_600) as wire:
+        return check(wire)
+
+
+def free_tcp_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
+    """Checked at once, because a check mostly waits."""
+    with contextlib.ExitStack() as stack:
+        split = ("--cubes", "5", "--cubes-per-frame", "2")
+        ports = {
+            "terminal": stack.enter_context(
+                cube_hub(out / "cube_hub", "--ports", str(tmp_path), *split)
+            ),
+            "TCP": stack.enter_context(cube_hub(out / "cube_hub", "--tcp", str(free_tcp_port()))),
+            "simulator": stack.enter_context(simulated_hub(tmp_path / "ports")),
+        }
+        if not NO_ARM:
+            ports["emulator"], _ = stack.enter_context(emulated_hub(out / "hub.elf"))
+        with ThreadPoolExecutor(len(ports)) as pool:
+            results = dict(zip(ports, pool.map(checked, ports.values()), strict=True))
+    assert {name: result.failed() for name, result in results.items()} == {
+        name: [] for name in ports
+    }
+    assert results["terminal"].verdicts["S3"].outcome is Outcome.PASSED
+    assert results["terminal"].verdicts["S9"].outcome is Outcome.PASSED
+    assert results["simulator"].verdicts["S9"].outcome is Outcome.PASSED
