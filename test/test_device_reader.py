@@ -705,7 +705,8 @@ def test_a_hub_that_does_not_know_the_time_is_not_asked_again_until_it_restarts(
     hub.expect(Command.TIME)
     hub.send(encode(Ack(Command.TIME, Result.UNKNOWN)))
     watch.frame(Ack)
-    hub.before(Command.HELLO)
+    watch.reader.send(0, Request(Command.IDENTIFY))
+    hub.expect(Command.IDENTIFY)
     assert hub.before(Command.HELLO) == []
     hub.hello()
     hub.expect(Command.START)
