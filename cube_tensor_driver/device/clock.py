@@ -242,6 +242,11 @@ class ClockMap:
         if not device_us:
             return []
         self.in_doubt = False
+        if len(device_us) == 1:  # as it mostly is
+            step_us = self._steps.look(numbers[0], device_us[0]) if numbers else 0
+            if step_us and not self._is_fresh:
+                self._suspect(step_us, arrival_ns)
+            return self._stamps(device_us, arrival_ns)
         stamps: list[int] = []
         start = 0
         for k, time_us in enumerate(device_us):
@@ -264,11 +269,13 @@ class ClockMap:
         usual = least if math.isfinite(least) else 0.0
         self._suspicion = Suspicion(step_us, since_ns, newest, usual) if step_us else None
 
-    def _judge(self, newest_us: int, arrival_ns: int) -> None:
+    def _judge(self, newest_us: int, arrival_ns: int, problem: str) -> None:
         """Decide about the suspicion, if that can be done now."""
         suspicion = self._suspicion
+        if problem:
+            self._suspicion = None
         # A clock that stands still would seem to be set again and again.
-        if suspicion is None or self._calls_still:
+        if suspicion is None or self._calls_still or problem:
             return
         t = 1000.0 * (newest_us - self._first_us)
         height = self._height((t, arrival_ns - self._first_ns - t))
@@ -300,9 +307,8 @@ class ClockMap:
             self._last_us, self._moved_ns = newest, arrival_ns
         else:
             problem = self._find_problem(newest, arrival_ns)
-        if problem:
-            self._suspicion = None
-        self._judge(newest, arrival_ns)
+        if self._suspicion is not None:
+            self._judge(newest, arrival_ns, problem)
         if not self._is_fresh and 1000 * (newest - self._first_us + RESTART_US) < self._newest:
             self.reset()
         if self._is_fresh:
@@ -312,8 +318,9 @@ class ClockMap:
         if self._suspicion is None:
             self._add_point(1000.0 * (newest - self._first_us), arrival_ns)
             self._last_sound = arrival_ns - self._first_ns
-        self.in_doubt |= bool(problem) or self._suspicion is not None
-        offset = min(self._offset, self._true_offset)
+        if problem or self._suspicion is not None:
+            self.in_doubt = True
+        offset = self._offset if self._offset < self._true_offset else self._true_offset
         stamps = []
         for time_us in times:
             t = 1000 * (time_us - self._first_us)
@@ -323,7 +330,8 @@ class ClockMap:
                 stamp = arrival_ns
             if t > self._newest or problem:
                 # Stamps that were in doubt may hold back those after them.
-                self.in_doubt |= stamp < self._doubtful_stamp
+                if stamp < self._doubtful_stamp:
+                    self.in_doubt = True
                 stamp = max(stamp, self._last_stamp)
                 self._newest = max(t, self._newest)
                 self._last_stamp = stamp
@@ -378,8 +386,8 @@ class ClockMap:
     def _add_point(self, t: float, arrival_ns: int) -> None:
         """Lower the line to a point at device time t if need be, and close the bucket when it is
         full."""
-        point = t, arrival_ns - self._first_ns - t
-        height = self._height(point)
+        delay = arrival_ns - self._first_ns - t
+        height = delay - self._offset - self._drift * t
         if height < 0:
             # Before the first bucket is full, the line falls because the least delay is not known.
             self._fallen -= height if self._points else 0.0
@@ -394,7 +402,7 @@ class ClockMap:
         self.jitter_ns += (height - self.jitter_ns) / 64
         if height < self._least:
             self._least = height
-            self._earliest = point
+            self._earliest = t, delay
         if arrival_ns >= self._bucket_end:
             self._bucket_end = arrival_ns + BUCKET_NS
             self._fallen = 0.0

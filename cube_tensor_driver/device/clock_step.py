@@ -17,6 +17,8 @@ STEP_US = 4000.0
 """A smaller deviation is no step. Steps of 5 ms show, with 1 ms for the hub's own jitter."""
 SLACK = 1e-3
 """Of the time since the last sample: the period is known no better."""
+QUIET_US = 2.0
+"""A smaller deviation is rounding."""
 MEMORY_US = 50_000.0
 """Deviations add up over so long: a clock that stands still deviates by one period at a time."""
 SMOOTHING = 64
@@ -40,17 +42,31 @@ class StepWatch:
 
     def reset(self) -> None:
         """Forget the samples before: the hub restarted."""
-        self._number = -1
+        self._number = self._next = -1
         self._device_us = 0
+        self._due_us = 0.0
         self.forget_period()
 
     def forget_period(self) -> None:
         """Take the sample period from the next two samples."""
         self._period_us = 0.0
         self._lag_us = 0.0
+        self._next = -1
 
     def look(self, number: int, device_us: int) -> int:
         """By how much the clock seems to have been set before this sample, µs; mostly 0."""
+        # A sample that comes when it should is the common case, and it is quick.
+        if number == self._next and -QUIET_US < device_us - self._due_us < QUIET_US:
+            self._number, self._next = number, number + 1
+            self._device_us, self._due_us = device_us, device_us + self._period_us
+            return 0
+        step = self._compare(number, device_us)
+        self._next = -1
+        if self._number == number and self._period_us and abs(self._lag_us) < QUIET_US:
+            self._next, self._due_us, self._lag_us = number + 1, device_us + self._period_us, 0.0
+        return step
+
+    def _compare(self, number: int, device_us: int) -> int:
         last, self._number = self._number, number
         ahead = (number - last + _WRAP // 2) % _WRAP - _WRAP // 2
         if (
