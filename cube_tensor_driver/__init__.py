@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .core.reconstructor import Reconstructor
     from .core.rows import FrequencyRows, StressRows
     from .device.live import open_links
+    from .elastic.inverse import SurfaceInverse
     from .simulation.source import simulate
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "FrequencyRows",
     "Reconstructor",
     "StressRows",
+    "SurfaceInverse",
     "open_bag",
     "open_links",
     "read_skin",
@@ -48,6 +50,7 @@ _HOMES = {
     "FrequencyRows": ".core.rows",
     "Reconstructor": ".core.reconstructor",
     "StressRows": ".core.rows",
+    "SurfaceInverse": ".elastic.inverse",
     "open_bag": ".bags.source",
     "open_links": ".device.live",
     "read_skin": ".config.skin",

@@ -77,7 +77,7 @@ class Surface:
         self.poses, self.depth, self.pitch = poses, depth, poses.pitch
         self.spacing = self.pitch / side
         self.area = self.spacing**2
-        self._patches = _patches(poses, self.spacing, side)
+        self._patches = patches(poses, self.spacing, side)
         self.points = self._patches.reshape(-1, 3)
         self.cube = np.repeat(np.arange(len(poses.position)), side**2)
         self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
@@ -207,7 +207,7 @@ class _LoadedSurface(NamedTuple):
     sees_shear: bool
 
 
-def _patches(poses: CubePoses, spacing: float, side: int) -> Array:
+def patches(poses: CubePoses, spacing: float, side: int) -> Array:
     """(cubes, side², 3) m: a square of points around each cube, in its x-y plane."""
     line = (np.arange(side) - (side - 1) / 2) * spacing
     x, y = np.meshgrid(line, line)

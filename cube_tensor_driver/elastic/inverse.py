@@ -1,0 +1,384 @@
+"""Traction on the whole surface of a skin from all of its cubes, and how sure it is.
+
+What the cubes see of a traction t is linear (layer.py), y = H t + e. With the Gaussian prior of
+kernels.py, of standard deviation AMPLITUDE, and noise N, the posterior of the traction is::
+
+    t = G y,   G = K_ty P,   P = (K_yy + N)^-1,   covariance K_tt - G K_yt
+
+Every cube has a window of its nearest cubes, which make the points on its patch: a matrix that is
+computed once, so that a scan is one product. Windows that look alike share it. On a bent skin a
+window is laid flat: distances from its middle are kept.
+
+Values that are missing (D; R are the others) change a matrix and not what it is made from. The
+estimate without them is the one with what the others predict in their place::
+
+    y_D = -P_DD^-1 P_DR y_R,      covariance + G_D P_DD^-1 G_D'
+
+The prior's size follows the data: with s^2 = y' P y / n, standard deviations are s times those of
+AMPLITUDE, plus what the pads' noise makes. Source: C. E. Rasmussen, C. K. I. Williams, Gaussian
+Processes for Machine Learning (2006), 2.2, 5.4 and (leaving out) 5.4.2.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial import cKDTree
+
+from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
+from ..core.errors import ElasticError
+from ..core.modes import STRESS
+from ..core.pipeline import Pipeline
+from ..core.scene import CubePoses
+from ..core.tensor import rotation_from_rpy
+from .kernels import Kernels
+from .layer import Layer
+from .surface import patches
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+WINDOW = 25
+"""Cubes of a window: 5 x 5 of a square grid."""
+AMPLITUDE = 20e3
+"""Prior standard deviation of the pressure, Pa: that of a firm touch."""
+MODEL_ERROR = 0.01
+"""Of every component over its size: what response, depth and noise of the load leave uncertain."""
+_ROWS = 4
+"""Of a point: the traction along x, y, z and the pressure at the cubes' depth."""
+_SAME = 1e-6
+"""Places (m) and angles (rad) closer than this are the same."""
+
+
+class TractionField(NamedTuple):
+    """On the M points of the surface, in the frame of the point's cube.
+
+    traction: (M, 3) Pa on the skin along x, y, z; pressing is negative along z
+    below: (M,) Pa the pressure at the depth of the cubes
+    """
+
+    traction: Array
+    below: Array
+
+    @property
+    def pressure(self) -> Array:
+        """(M,) Pa on the surface."""
+        return -self.traction[:, 2]
+
+
+class FieldDeviation(NamedTuple):
+    """Standard deviations of a TractionField: pressure (M,) and below (M,), Pa."""
+
+    pressure: Array
+    below: Array
+
+
+class SurfaceInverse:
+    """Traction on the surface of a skin from its stress rows; set up once for a skin.
+
+    points: (M, 3) m on the surface in the parent frame, `side` x `side` on the patch of each cube
+    cube: (M,) whose patch it is; poses: of the cubes; kernels: of the layer
+
+    Parameters: skin: as `read_skin` gives it. depth: from the cubes' centres to the surface, m.
+    thickness: of the elastomer over rigid ground, m; inf: a half space. poisson: of the elastomer.
+    Raises ElasticError for what no layer is, and where no cube observes anything.
+    """
+
+    def __init__(
+        self,
+        skin: Any,
+        *,
+        depth: float = SURFACE_DEPTH,
+        thickness: float = np.inf,
+        poisson: float = POISSONS_RATIO,
+        side: int = 2,
+    ) -> None:
+        poses = CubePoses(
+            position=np.array([cube.xyz for cube in skin.cubes]),
+            rotation=np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes]),
+            half_side=np.array([calibration.half_side for calibration in skin.calibrations]),
+        )
+        pipeline = Pipeline(skin.calibrations)
+        noise = np.array([pipeline.covariance(cube) for cube in range(len(skin.cubes))])
+        self._set_up(poses, noise, Layer(thickness, poisson), depth, side)
+
+    @classmethod
+    def of_cubes(
+        cls, poses: CubePoses, noise: Array, layer: Layer, depth: float, side: int = 2
+    ) -> SurfaceInverse:
+        """The same from poses and noise (cubes, 15, 15): the covariance of the components of each
+        cube in Pa and Pa/m, NaN where a component is not observed."""
+        inverse = cls.__new__(cls)
+        inverse._set_up(poses, noise, layer, depth, side)
+        return inverse
+
+    def _set_up(
+        self, poses: CubePoses, noise: Array, layer: Layer, depth: float, side: int
+    ) -> None:
+        if side < 1:
+            raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
+        self.poses, self.depth, self.pitch, self.side = poses, depth, poses.pitch, side
+        scale = float(np.median(poses.half_side))
+        self.kernels = Kernels(layer, depth, scale)
+        self.spacing = poses.pitch / side
+        self.area = self.spacing**2
+        flat = patches(poses, self.spacing, side)
+        self.points = (flat + depth * poses.rotation[:, None, :, 2]).reshape(-1, 3)
+        self.cube = np.repeat(np.arange(len(flat)), side**2)
+        self._patch = _square(self.spacing, side)
+        observed = np.isfinite(noise[:, np.arange(15), np.arange(15)])
+        self.columns = np.flatnonzero(observed.any(axis=0))
+        if not len(self.columns):
+            raise ElasticError("no cube of the skin observes any component; check the calibrations")
+        self._units = np.where(self.columns < len(STRESS), 1.0, scale)
+        units = np.where(np.arange(15) < len(STRESS), 1.0, scale)
+        scaled = noise * np.outer(units, units)
+        self.noise = scaled[:, self.columns][:, :, self.columns]
+        self.observed = observed[:, self.columns]
+        self._windows = _Windows(self)
+        self._known = self.observed
+        self._changed: dict[int, _Reduced] = {}
+
+    def scaled(self, values: Array) -> Array:
+        """(cubes, C) in Pa of values (cubes, 15): only what some cube observes."""
+        return np.asarray(values)[:, self.columns] * self._units
+
+    def flattened(self, middle: int, cubes: Index) -> tuple[Array, Array]:
+        """Places (n, 2) m of cubes laid flat about the middle one, in its frame, and the angle (n,)
+        rad by which each is turned."""
+        return _flattened(self.poses, np.array([middle]), cubes[None])
+
+    def field(self, values: Array) -> TractionField:
+        """The traction that the values (cubes, 15) tell, NaN where a component is not known.
+
+        Values as in `StressRows`: Pa and Pa/m. Where no cube of a window is known, the traction
+        is 0.
+        """
+        return self.field_of(self.scaled(values))
+
+    def field_of(self, scaled: Array) -> TractionField:
+        """The same of `scaled` values."""
+        y = self._filled(scaled)
+        result = self._windows.product(y)
+        for row, window in self._changed.items():
+            result[row] = window.gain @ y[self._windows.near[row]].ravel()
+        rows: Array = result.reshape(len(self.points), _ROWS).astype(np.float64)
+        return TractionField(rows[:, :3], rows[:, 3])
+
+    def deviation(self, values: Array) -> FieldDeviation:
+        """How far the field of these values may be off. Takes several times as long as `field`."""
+        return self.deviation_of(self.scaled(values))
+
+    def deviation_of(self, scaled: Array) -> FieldDeviation:
+        """The same of `scaled` values."""
+        windows, y = self._windows, self._filled(scaled)
+        variance = windows.size(y)[:, None] ** 2 * windows.prior[windows.kind]
+        for row, window in self._changed.items():
+            size = window.size(windows.precision[windows.kind[row]], y[windows.near[row]])
+            variance[row] = size**2 * (windows.prior[windows.kind[row]] + window.variance)
+        variance += windows.noise[windows.kind]
+        return FieldDeviation(*np.sqrt(variance).reshape(-1, 2).T)
+
+    def _filled(self, scaled: Array) -> Single:
+        """Values (cubes, C), 0 where unknown. What became unknown or known changes windows."""
+        known = np.isfinite(scaled) & self.observed
+        if not np.array_equal(known, self._known):
+            self._known, self._changed = known, self._windows.without(known)
+        return np.where(known, scaled, 0.0).astype(np.float32)
+
+
+class _Reduced(NamedTuple):
+    """A window without some of its values.
+
+    gain: (rows, W C), 0 for them; variance: (points x 2) what variances at the size 1 gain
+    out: (W C,) which they are; fill: (out, W C) predicts them; known: how many others there are
+    """
+
+    gain: Single
+    variance: Array
+    out: Mask
+    fill: Array
+    known: int
+
+    def size(self, precision: Single, y: Single) -> float:
+        """s of this window, see `_Windows.size`."""
+        filled = y.ravel().astype(float)
+        filled[self.out] = self.fill @ filled
+        return float(np.sqrt(max(filled @ (precision @ filled), 0.0) / max(self.known, 1)))
+
+
+class _Windows:
+    """The matrices of all windows, each kind of window once.
+
+    near: (cubes, W) cubes of each window; kind: (cubes,) which matrix is its own
+    gain: (kinds, rows, W C) float32; precision: P of each kind, float32
+    prior, noise: (kinds, points x 2) variances of pressure and pressure below, at the size 1 and
+    by the noise of the pads
+    """
+
+    def __init__(self, inverse: SurfaceInverse) -> None:
+        poses = inverse.poses
+        self._columns = len(inverse.columns)
+        self.near = _nearest(poses)
+        middles = np.arange(len(self.near))
+        place, angle = _flattened(poses, middles, self.near)
+        self._known = inverse.observed[self.near].reshape(len(self.near), -1)
+        noise_kind = _distinct(np.nan_to_num(inverse.noise.reshape(len(middles), -1), nan=-1.0))
+        looks = [place.reshape(len(middles), -1), np.cos(angle), np.sin(angle)]
+        looks = [np.round(look / _SAME / 10) for look in looks]
+        self.kind = _distinct(np.concatenate([*looks, noise_kind[self.near]], axis=1))
+        kinds, first = np.unique(self.kind, return_index=True)
+        parts = [
+            _solve(inverse, place[one], angle[one], inverse.noise[self.near[one]]) for one in first
+        ]
+        self.gain = np.array([part.gain for part in parts])
+        self.precision = np.array([part.precision for part in parts])
+        self.prior = np.array([part.variance for part in parts])
+        self.noise = np.array([part.noise for part in parts])
+        counts = np.bincount(self.kind)
+        self._many = [
+            (kind, np.flatnonzero(self.kind == kind)) for kind in kinds if counts[kind] > 1
+        ]
+        self._single = np.flatnonzero(counts[self.kind] == 1)
+        self._single_gain = self.gain[self.kind[self._single]]
+        self._n_known = np.maximum(self._known.sum(axis=1), 1)
+
+    def product(self, y: Single) -> Single:
+        """(cubes, rows) of values y (cubes, C) that are 0 where unknown."""
+        gathered = y[self.near].reshape(len(self.near), -1)
+        result = np.empty((len(self.near), self.gain.shape[1]), np.float32)
+        for kind, rows in self._many:
+            result[rows] = gathered[rows] @ self.gain[kind].T
+        if len(self._single):
+            single = gathered[self._single][:, :, None]
+            result[self._single] = (self._single_gain @ single)[:, :, 0]
+        return result
+
+    def size(self, y: Single) -> Array:
+        """(cubes,) s: how large the values of each window are against the prior's."""
+        gathered = y[self.near].reshape(len(self.near), -1)
+        square = np.empty(len(gathered))
+        for kind in np.unique(self.kind):
+            rows = np.flatnonzero(self.kind == kind)
+            square[rows] = ((gathered[rows] @ self.precision[kind]) * gathered[rows]).sum(axis=1)
+        return np.sqrt(np.maximum(square, 0) / self._n_known)
+
+    def without(self, known: Mask) -> dict[int, _Reduced]:
+        """The windows that miss values of cubes, known (cubes, C), by the number of their cube."""
+        missing = self._known & ~known[self.near].reshape(len(self.near), -1)
+        reduced = {}
+        for row in np.flatnonzero(missing.any(axis=1)).tolist():
+            out, kind = missing[row], self.kind[row]
+            gain, precision = self.gain[kind].astype(float), self.precision[kind].astype(float)
+            fill = -np.linalg.solve(precision[np.ix_(out, out)], precision[out])
+            fill[:, out] = 0.0
+            lost = gain[:, out]
+            gain += lost @ fill
+            gain[:, out] = 0.0
+            inside = np.linalg.solve(precision[np.ix_(out, out)], lost.T)
+            more = _of_pressure(np.einsum("rd,dr->r", lost, inside))
+            n_known = int(self._known[row].sum() - out.sum())
+            reduced[row] = _Reduced(gain.astype(np.float32), more, out, fill, n_known)
+        return reduced
+
+
+class _Window(NamedTuple):
+    gain: Single
+    precision: Single
+    variance: Array
+    noise: Array
+
+
+def _solve(inverse: SurfaceInverse, place: Array, angle: Array, noise: Array) -> _Window:
+    """One window: matrix (rows, W C), P (W C, W C), variances (points x 2) at AMPLITUDE and by the
+    pads' noise. noise: (W, C, C), NaN where nothing is observed."""
+    kernels, columns = inverse.kernels, inverse.columns
+    n, size = len(place), len(place) * len(columns)
+    known = np.isfinite(noise[:, np.arange(len(columns)), np.arange(len(columns))]).ravel()
+    prior = AMPLITUDE**2 * covariance_matrix(kernels, columns, place, angle)
+    total, pads = prior.copy(), np.zeros_like(prior)
+    for cube in range(n):
+        part = slice(cube * len(columns), (cube + 1) * len(columns))
+        pads[part, part] = np.nan_to_num(noise[cube])
+    total += pads
+    total[np.diag_indices(size)] += MODEL_ERROR**2 * np.diag(prior)
+    points = inverse._patch
+    offset = (place[:, None] - points[None]).reshape(-1, 2)
+    turned = np.repeat(angle, len(points))
+    cross = np.empty((len(points), _ROWS, n, len(columns)))
+    of_traction = kernels.cross(offset, turned)[:, columns].reshape(n, len(points), -1, 3)
+    cross[:, :3] = of_traction.transpose(1, 3, 0, 2)
+    below = kernels.pressure(offset, turned)[:, columns].reshape(n, len(points), -1)
+    cross[:, 3] = below.transpose(1, 0, 2)
+    cross = AMPLITUDE**2 * cross.reshape(-1, size)[:, known]
+    factor = cho_factor(total[np.ix_(known, known)])
+    inside = cho_solve(factor, cross.T).T
+    own = np.array([*kernels.variance, kernels.pressure_variance])
+    variance = AMPLITUDE**2 * np.tile(own, len(points)) - (inside * cross).sum(axis=1)
+    by_noise = np.einsum("ra,ab,rb->r", inside, pads[np.ix_(known, known)], inside, optimize=True)
+    gain, precision = np.zeros((len(inside), size), np.float32), np.zeros((size, size), np.float32)
+    gain[:, known] = inside
+    precision[np.ix_(known, known)] = cho_solve(factor, np.eye(known.sum()))
+    return _Window(gain, precision, np.maximum(_of_pressure(variance), 0), _of_pressure(by_noise))
+
+
+def covariance_matrix(kernels: Kernels, columns: Index, place: Array, angle: Array) -> Array:
+    """(n C, n C) prior covariance of the components of cubes, for unit variance of the pressure."""
+    n = len(place)
+    offset = (place[:, None] - place[None]).reshape(-1, 2)
+    table = kernels.covariance(offset, np.repeat(angle, n), np.tile(angle, n))
+    table = table[:, columns][:, :, columns].reshape(n, n, len(columns), len(columns))
+    matrix = table.transpose(0, 2, 1, 3).reshape(n * len(columns), -1)
+    return (matrix + matrix.T) / 2
+
+
+def _of_pressure(rows: Array) -> Array:
+    """(points x 2) of the rows of a window: those of the pressure and of the pressure below."""
+    return rows.reshape(-1, _ROWS)[:, 2:].ravel()
+
+
+def _square(spacing: float, side: int) -> Array:
+    """(side^2, 2) m: the points of a patch about its cube, in the order of surface.patches."""
+    line = (np.arange(side) - (side - 1) / 2) * spacing
+    x, y = np.meshgrid(line, line)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def _nearest(poses: CubePoses) -> Index:
+    """(cubes, W) the nearest cubes, the own one first; those equally far in a fixed order."""
+    n = len(poses.position)
+    count = min(WINDOW, n)
+    wanted = min(3 * count, n)
+    near = cKDTree(poses.position).query(poses.position, wanted)[1].reshape(n, -1)
+    offset = np.einsum(
+        "nji,nkj->nki", poses.rotation, poses.position[near] - poses.position[:, None]
+    )
+    offset = np.round(offset / poses.pitch, 4)
+    distance = np.round(np.linalg.norm(offset, axis=2), 4)
+    order = np.lexsort((offset[..., 1], offset[..., 0], distance))[:, :count]
+    return np.take_along_axis(near, order, axis=1)
+
+
+def _flattened(poses: CubePoses, middles: Index, near: Index) -> tuple[Array, Array]:
+    """Places (n, W, 2) and angles (n, W) of near cubes (n, W) about middles (n,); (W, 2) and (W,)
+    for one middle."""
+    rotation = poses.rotation[middles]
+    apart = poses.position[near] - poses.position[middles][:, None]
+    local = np.einsum("nji,nkj->nki", rotation, apart)
+    distance, across = np.linalg.norm(local, axis=2), np.hypot(local[..., 0], local[..., 1])
+    place = local[..., :2] * (distance / np.where(across > 0, across, 1.0))[..., None]
+    relative = np.einsum("nji,nkjl->nkil", rotation, poses.rotation[near])
+    sine = relative[..., 1, 0] - relative[..., 0, 1]
+    angle = np.arctan2(sine, relative[..., 0, 0] + relative[..., 1, 1])
+    return (place[0], angle[0]) if len(middles) == 1 and len(near) == 1 else (place, angle)
+
+
+def _distinct(rows: Array) -> Index:
+    """(n,) number of each row among the different ones."""
+    _, number = np.unique(rows, axis=0, return_inverse=True)
+    return np.asarray(number).reshape(-1)
