@@ -18,15 +18,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from conftest import ROOT, end
+from conftest import ROOT, decoded, end
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.conformance.check import Checked, check
 from cube_tensor_driver.conformance.port_wire import PortWire
 from cube_tensor_driver.conformance.verdict import Outcome
+from cube_tensor_driver.core.estimator import make_estimator
+from cube_tensor_driver.core.oscillator import stress_slope
+from cube_tensor_driver.core.rows import concatenate
+from cube_tensor_driver.core.status import STAMP
+from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.firmware import Emulator, build, missing
+from cube_tensor_driver.processes.skin_processes import skin_processes
 from cube_tensor_driver.simulation.captures import COUNTER_HZ, WINDOW_US, Oscillators, edges
-from cube_tensor_driver.simulation.cubes import hub_cubes
+from cube_tensor_driver.simulation.cubes import hub_cubes, skin_components
 from cube_tensor_driver.simulation.load import Load, default_script
 
 SOURCE = ROOT / "firmware"
@@ -140,9 +146,8 @@ def simulated_hub(folder: Path) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def emulated_hub(image: Path) -> Iterator[tuple[str, Oscillators]]:
+def emulated_hub(image: Path, skin: Skin) -> Iterator[tuple[str, Oscillators]]:
     """The port of an emulated hub, and its pads under a load."""
-    skin = read_skin(SKIN)
     (hub,) = hub_cubes(skin)
     pads = Oscillators(hub, Load(skin, default_script()))
     with Emulator(image) as emulator:
@@ -174,7 +179,9 @@ def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
             "simulator": stack.enter_context(simulated_hub(tmp_path / "ports")),
         }
         if not NO_ARM:
-            ports["emulator"], _ = stack.enter_context(emulated_hub(out / "hub.elf"))
+            ports["emulator"], _ = stack.enter_context(
+                emulated_hub(out / "hub.elf", read_skin(SKIN))
+            )
         with ThreadPoolExecutor(len(ports)) as pool:
             results = dict(zip(ports, pool.map(checked, ports.values()), strict=True))
     assert {name: result.failed() for name, result in results.items()} == {
@@ -183,3 +190,50 @@ def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
     assert results["terminal"].verdicts["S3"].outcome is Outcome.PASSED
     assert results["terminal"].verdicts["S9"].outcome is Outcome.PASSED
     assert results["simulator"].verdicts["S9"].outcome is Outcome.PASSED
+
+
+@emulated
+def test_the_load_on_the_pads_comes_out_as_tensors(out, ros, tmp_path):
+    """Load, captures, firmware on an emulated Cortex-M4, UART, driver, DDS: right to the resolution
+    of the counter."""
+    from cube_tensor_driver.msg import SkinStress
+
+    skin = read_skin(SKIN)
+    messages = ros.listen(SkinStress, "stress")
+    with emulated_hub(out / "hub.elf", skin) as (port, pads), Children(tmp_path) as children:
+        for process in skin_processes(SKIN, port=port, composed=True):
+            children.start(process)
+        ros.wait(lambda: len(messages) > 100)
+        children.check()
+    rows = concatenate([decoded(message).rows for message in messages])
+    load, bound = Load(skin, default_script()), resolution(skin)
+    middles = np.array(pads.windows)[rows.sequence]
+    truth = np.array(
+        [
+            skin_components(skin, *load.at(1e-6 * middle))[cube]
+            for middle, cube in zip(middles.tolist(), rows.cube.tolist(), strict=True)
+        ]
+    )
+    error = np.abs(np.hstack((rows.stress, rows.gradient)) - truth)
+    seen = np.isfinite(error)
+    # A busy machine holds the emulator up, and then stamps are in doubt.
+    assert np.isin(rows.status, (0, STAMP)).all() and (seen.sum(axis=1) >= 6).all()
+    assert (error[seen] <= bound[rows.cube][seen]).all()
+    # and the load is far above that
+    assert np.abs(truth[:, 2]).max() > 100 * bound[0, 2]
+
+
+def resolution(skin: Skin) -> np.ndarray:
+    """(cubes, 15) error of each component, Pa and Pa/m, if all pads are wrong by one tick between
+    their first and last edge, in the worst directions."""
+    ticks = COUNTER_HZ * WINDOW_US * 1e-6
+    bounds = []
+    for calibration in (cube.calibration for cube in skin.cubes):
+        rest = calibration.rest_frequency
+        slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
+        # Less than two periods are missing at the ends; 1 % for slope and frequency under load.
+        relative = 1.01 / (ticks - 2 * COUNTER_HZ / rest) + 1e-7
+        matrix = make_estimator(calibration.response, calibration.noise, calibration.modes).matrix
+        scale = np.where(np.arange(15) < 6, 1.0, 1 / calibration.half_side)
+        bounds.append(scale * (np.abs(matrix) @ (slope * rest * relative)))
+    return np.array(bounds)
