@@ -1,5 +1,7 @@
 """The wire in C: native/python_wire.c. device/native.py says whether it is there."""
 
+from collections.abc import Callable
+
 class Decoder:
     """Bytes in, frames out: cube_decoder of native/cube_wire.h."""
 
@@ -12,10 +14,13 @@ class Decoder:
 
 def cobs_encode(data: bytes | bytearray) -> bytes: ...
 def cobs_decode(code: bytes | bytearray) -> bytes | None: ...
-def read_links(links: list[tuple[Decoder, int]]) -> list[tuple[int, list[bytes]]]:
+def read_links(
+    links: list[tuple[Decoder, int]], clock_ns: Callable[[], int]
+) -> tuple[int, list[tuple[int, list[bytes]]]]:
     """Read each file descriptor once, without blocking, and decode what came.
 
-    For each link: how many bytes came, or minus the number of the error; and their frames.
+    The time after reading; and for each link how many bytes came, or minus the number of the error,
+    and their frames. While it works, other threads run, and its decoders can do nothing else.
     """
 
 def place_rows(samples: list[bytes], stamps_ns: list[int], n_pads: int) -> bytearray:

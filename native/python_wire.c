@@ -19,12 +19,18 @@
 
 /* ------------------------------------------------------------------------------ Decoder ------- */
 
-/* frames: the decoded frames of one call, each behind its length as uint32_t. Neither the decoder
- * nor this object calls Python while it is filled. */
+/* counters, other_version: of the decoder after the last call, for other threads to read.
+ * is_busy: a call works on it without the interpreter's lock.
+ * input: what was read and is not decoded yet.
+ * frames: the decoded frames of one call, each behind its length as uint32_t. */
 typedef struct {
     PyObject_HEAD
     cube_decoder decoder;
+    cube_counters counters;
+    int other_version;
+    bool is_busy;
     uint8_t buffer[CUBE_DECODER_SIZE(CUBE_MAX_PAYLOAD)];
+    uint8_t input[READ_CHUNK];
     uint8_t *frames;
     size_t used, room;
 } Decoder;
@@ -37,8 +43,10 @@ static PyObject *decoder_new(PyTypeObject *type, PyObject *args, PyObject *keywo
         return NULL;
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
     Decoder *self = (Decoder *)allocate(type, 0);
-    if (self != NULL)
+    if (self != NULL) {
         cube_decoder_init(&self->decoder, self->buffer, sizeof self->buffer);
+        self->other_version = self->decoder.other_version;
+    }
     return (PyObject *)self;
 }
 
@@ -52,8 +60,8 @@ static void decoder_dealloc(PyObject *object) {
 
 /* Decodes bytes and adds their frames to `frames`; needs no lock. false: out of memory. */
 static bool decode(Decoder *self, const uint8_t *data, size_t size) {
-    /* A frame is not longer than its code, but for one kept from before and the lengths. */
-    size_t most = self->used + 2 * size + CUBE_MAX_RUN + sizeof(uint32_t);
+    /* A frame and its length are shorter than twice the code, and one may have begun before. */
+    size_t most = self->used + 2 * size + CUBE_MAX_RUN;
     if (most > self->room) {
         uint8_t *grown = realloc(self->frames, most);
         if (grown == NULL)
@@ -76,8 +84,15 @@ static bool decode(Decoder *self, const uint8_t *data, size_t size) {
     return true;
 }
 
+/* With the lock: what the decoder has counted. */
+static void publish_counters(Decoder *self) {
+    self->counters = self->decoder.counters;
+    self->other_version = self->decoder.other_version;
+}
+
 /* A list of the frames as bytes; they are forgotten here. */
 static PyObject *take_frames(Decoder *self) {
+    publish_counters(self);
     PyObject *list = PyList_New(0);
     for (size_t at = 0; list != NULL && at < self->used;) {
         uint32_t length;
@@ -109,11 +124,18 @@ static bool get_bytes(PyObject *object, const uint8_t **data, size_t *size) {
     return true;
 }
 
+/* false: another thread reads this link just now, and an exception is set. */
+static bool is_free(const Decoder *self) {
+    if (self->is_busy)
+        PyErr_SetString(PyExc_RuntimeError, "a call of read_links has this decoder");
+    return !self->is_busy;
+}
+
 static PyObject *decoder_feed(PyObject *object, PyObject *argument) {
     Decoder *self = (Decoder *)object;
     const uint8_t *data;
     size_t size;
-    if (!get_bytes(argument, &data, &size))
+    if (!is_free(self) || !get_bytes(argument, &data, &size))
         return NULL;
     /* With the lock, because another thread might resize a bytearray. */
     if (!decode(self, data, size))
@@ -123,13 +145,17 @@ static PyObject *decoder_feed(PyObject *object, PyObject *argument) {
 
 static PyObject *decoder_reset(PyObject *object, PyObject *nothing) {
     (void)nothing;
-    cube_decoder_reset(&((Decoder *)object)->decoder);
+    Decoder *self = (Decoder *)object;
+    if (!is_free(self))
+        return NULL;
+    cube_decoder_reset(&self->decoder);
+    publish_counters(self);
     Py_RETURN_NONE;
 }
 
 static PyObject *decoder_counters(PyObject *object, PyObject *nothing) {
     (void)nothing;
-    const cube_counters *c = &((Decoder *)object)->decoder.counters;
+    const cube_counters *c = &((Decoder *)object)->counters;
     return Py_BuildValue(
         "(KKKKKKKK)", c->bytes, c->frames, c->crc, c->framing, c->length, c->version,
         c->unknown_type, c->overrun);
@@ -137,7 +163,7 @@ static PyObject *decoder_counters(PyObject *object, PyObject *nothing) {
 
 static PyObject *decoder_other_version(PyObject *object, PyObject *nothing) {
     (void)nothing;
-    int version = ((Decoder *)object)->decoder.other_version;
+    int version = ((Decoder *)object)->other_version;
     if (version < 0)
         Py_RETURN_NONE;
     return PyLong_FromLong(version);
@@ -209,59 +235,88 @@ typedef struct {
     bool no_memory;
 } Link;
 
-static void read_link(Link *link, uint8_t *data) {
+static void read_link(Link *link) {
     do {
-        link->result = read(link->fd, data, READ_CHUNK);
+        link->result = read(link->fd, link->decoder->input, READ_CHUNK);
     } while (link->result < 0 && errno == EINTR);
     if (link->result < 0)
         link->result = -errno;
-    else
-        link->no_memory = !decode(link->decoder, data, (size_t)link->result);
 }
 
-/* false: the arguments are no list of pairs (Decoder, number), and an exception is set. */
-static bool get_links(PyObject *pairs, Link *links, Py_ssize_t count) {
+static void decode_link(Link *link) {
+    if (link->result > 0)
+        link->no_memory = !decode(link->decoder, link->decoder->input, (size_t)link->result);
+}
+
+/* Takes the decoders of a list of pairs (Decoder, file descriptor) for this call. Returns how many;
+ * fewer than `count`: an exception is set. */
+static Py_ssize_t take_links(PyObject *pairs, Link *links, Py_ssize_t count) {
     for (Py_ssize_t i = 0; i < count; i++) {
-        PyObject *decoder;
+        PyObject *pair = PyList_GetItem(pairs, i), *decoder;
         links[i] = (Link){.no_memory = false};
-        PyObject *pair = PyList_GetItem(pairs, i);
-        if (pair == NULL || !PyTuple_Check(pair)) {
+        if (!PyTuple_Check(pair)) {
             PyErr_SetString(PyExc_TypeError, "a link is a tuple (Decoder, file descriptor)");
-            return false;
+            return i;
         }
-        if (!PyArg_ParseTuple(pair, "O!i:read", decoder_type, &decoder, &links[i].fd))
-            return false;
+        if (!PyArg_ParseTuple(pair, "O!i:read_links", decoder_type, &decoder, &links[i].fd) ||
+            !is_free((Decoder *)decoder))
+            return i;
+        Py_INCREF(decoder);
         links[i].decoder = (Decoder *)decoder;
+        links[i].decoder->is_busy = true;
     }
-    return true;
+    return count;
 }
 
-static PyObject *read_links(PyObject *module, PyObject *pairs) {
+/* The results of all links, and their decoders are free again. NULL: an exception is set. */
+static PyObject *give_links(Link *links, Py_ssize_t count, bool is_read) {
+    PyObject *results = is_read ? PyList_New(count) : NULL;
+    for (Py_ssize_t i = 0; i < count; i++) {
+        links[i].decoder->is_busy = false;
+        if (results != NULL) {
+            PyObject *frames =
+                links[i].no_memory ? PyErr_NoMemory() : take_frames(links[i].decoder);
+            PyObject *result =
+                frames == NULL ? NULL : Py_BuildValue("(nN)", (Py_ssize_t)links[i].result, frames);
+            if (result == NULL || PyList_SetItem(results, i, result) < 0)
+                Py_CLEAR(results);
+        }
+        Py_DECREF(links[i].decoder);
+    }
+    return results;
+}
+
+static PyObject *read_links(PyObject *module, PyObject *args) {
     (void)module;
-    Py_ssize_t count = PyList_Size(pairs);
-    if (count < 0)
+    PyObject *pairs, *clock, *arrival = NULL;
+    if (!PyArg_ParseTuple(args, "O!O:read_links", &PyList_Type, &pairs, &clock))
         return NULL;
-    Link *links = PyMem_Malloc((size_t)count * sizeof *links + READ_CHUNK);
+    Py_ssize_t count = PyList_Size(pairs);
+    Link *links = PyMem_Malloc((size_t)count * sizeof *links);
     if (links == NULL)
         return PyErr_NoMemory();
-    uint8_t *data = (uint8_t *)(links + count);
-    PyObject *results = NULL;
-    if (get_links(pairs, links, count)) {
+    Py_ssize_t taken = take_links(pairs, links, count);
+    if (taken == count) {
         Py_BEGIN_ALLOW_THREADS
         for (Py_ssize_t i = 0; i < count; i++)
-            read_link(&links[i], data);
+            read_link(&links[i]);
         Py_END_ALLOW_THREADS
-        results = PyList_New(count);
+        /* Between reading and decoding, so that the time is that of the bytes. */
+        arrival = PyObject_CallNoArgs(clock);
     }
-    for (Py_ssize_t i = 0; results != NULL && i < count; i++) {
-        PyObject *frames = links[i].no_memory ? PyErr_NoMemory() : take_frames(links[i].decoder);
-        PyObject *result =
-            frames == NULL ? NULL : Py_BuildValue("(nN)", (Py_ssize_t)links[i].result, frames);
-        if (result == NULL || PyList_SetItem(results, i, result) < 0)
-            Py_CLEAR(results);
+    if (arrival != NULL) {
+        Py_BEGIN_ALLOW_THREADS
+        for (Py_ssize_t i = 0; i < count; i++)
+            decode_link(&links[i]);
+        Py_END_ALLOW_THREADS
     }
+    PyObject *results = give_links(links, taken, arrival != NULL);
     PyMem_Free(links);
-    return results;
+    if (results == NULL) {
+        Py_XDECREF(arrival);
+        return NULL;
+    }
+    return Py_BuildValue("(NN)", arrival, results);
 }
 
 /* ------------------------------------------------------------------------------ rows ---------- */
@@ -379,7 +434,7 @@ static PyObject *place_rows(PyObject *module, PyObject *args) {
 static PyMethodDef functions[] = {
     {"cobs_encode", cobs_encode, METH_O, NULL},
     {"cobs_decode", cobs_decode, METH_O, NULL},
-    {"read_links", read_links, METH_O, NULL},
+    {"read_links", read_links, METH_VARARGS, NULL},
     {"place_rows", place_rows, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };

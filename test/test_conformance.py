@@ -92,7 +92,7 @@ class SendsFlags(HubInMemory):
 class SendsSpare(HubInMemory):
     def sample(self, frequency):
         (sample,) = Decoder().feed(super().sample(frequency))
-        raw = bytearray(sample._raw[:-4])
+        raw = bytearray(sample.raw[:-4])
         raw[21:24] = b"\0\7\0"
         return wire(bytes(raw))
 

@@ -20,11 +20,9 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.device import live
+from cube_tensor_driver.device import live, reader
 from cube_tensor_driver.device.chain import MAX_SCANS
-from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.live import LinkSource, open_links
-from cube_tensor_driver.device.protocol import Frame
 from cube_tensor_driver.simulation.hub import SimulatedHub
 
 WAIT_S = 10.0  # ends a failing test; nothing is measured with it
@@ -324,14 +322,10 @@ def test_a_reader_that_fails_raises_its_error_in_the_iteration(
     with open_links(skin, port_directory=tmp_path) as source:
         first_rows(source, 5)
 
-        feed = Decoder.feed
+        def fail(*arguments: object) -> None:
+            raise broken
 
-        def fail(self: Decoder, data: bytes) -> list[Frame]:
-            if threading.current_thread().name == "cube reader":
-                raise broken
-            return feed(self, data)  # the hub's own
-
-        monkeypatch.setattr(Decoder, "feed", fail)
+        monkeypatch.setattr(reader, "take_in", fail)
         begun = time.monotonic()
         with pytest.raises(OSError, match="not foreseen") as raised:
             for _ in source:

@@ -37,7 +37,7 @@ from cube_tensor_driver.device.protocol import (
     Time,
     encode,
 )
-from cube_tensor_driver.device.reader import LinkBytes, LinkFrames, Reader
+from cube_tensor_driver.device.reader import LinkFrames, LinkRead, Reader
 
 WAIT_S = 5.0  # ends a failing test; nothing is measured with it
 BACK_S = 2.0  # limit of the issue: a link is back so soon after its port
@@ -279,9 +279,10 @@ def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     session.greeted = True
     selector = selectors.DefaultSelector()
     selector.register(link, selectors.EVENT_READ, 0)
-    lost, data = LinkError("gone", "lost"), encode(make_sample(1))
+    lost, data = LinkError("gone", "lost"), [make_sample(1)]
     reads = [(5, data), (6, lost), (7, lost), (8, data)]
-    received, failed = reader._decode(selector, [LinkBytes(0, at, read) for at, read in reads])
+    read = [LinkRead(0, at, result) for at, result in reads]
+    received, failed = reader._handle_reads(selector, read)
     assert [(at, [frame.sequence for frame in frames]) for _, at, frames, _ in received] == [
         (5, [1])
     ]
@@ -746,10 +747,10 @@ def test_a_thread_that_ends_unasked_says_why_and_lets_go_of_the_ports(
     )
     broken = OSError("not foreseen")
 
-    def fail(data: bytes) -> list[Frame]:
+    def fail(*arguments: object) -> None:
         raise broken
 
-    monkeypatch.setattr(reader.links[0].decoder, "feed", fail)
+    monkeypatch.setattr(reader_module, "take_in", fail)
     reader.start()
     hub.expect(Command.HELLO)
     assert reader.failure is None

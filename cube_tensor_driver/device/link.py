@@ -42,6 +42,8 @@ BACKOFF_TCP_S = 1.5
 """Longest pause for TCP. Nothing announces that a TCP peer is back, and a link shall be back within
 2 s."""
 
+END_OF_STREAM = OSError(errno.EIO, "end of stream")
+
 _NO_PERMISSION = (
     "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
 )
@@ -172,8 +174,12 @@ class Link:
         except OSError as error:
             raise self._lost(error) from error
         if not data:
-            raise self._lost(OSError(errno.EIO, "end of stream"))
+            raise self.read_error(0)
         return data
+
+    def read_error(self, number: int) -> LinkError:
+        """The LinkError for a read that failed with this error number; 0: the stream ended."""
+        return self._lost(OSError(number, os.strerror(number)) if number else END_OF_STREAM)
 
     def write(self, data: bytes) -> None:
         """Send without blocking. Bytes that the kernel does not accept now wait for `flush`.

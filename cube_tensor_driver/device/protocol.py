@@ -118,9 +118,10 @@ class Sample:
     frequency: (n_cubes, n_pads) uint32, mHz; 0 not measured
     pad_fault: (n_cubes,) uint32; bit p: the hub reports that pad p is faulty
     temperature: (n_cubes,) int16, 0.01 °C; -32768 unknown
+    raw: the decoded bytes, from type to CRC; empty if the sample was not decoded
     """
 
-    __slots__ = ("_arrays", "_raw", "device_us", "first_cube", "sequence", "shape")
+    __slots__ = ("_arrays", "device_us", "first_cube", "raw", "sequence", "shape")
 
     def __init__(
         self,
@@ -134,7 +135,7 @@ class Sample:
         self.sequence, self.first_cube, self.device_us = sequence, first_cube, device_us
         self.shape = frequency.shape
         self._arrays: _Arrays | None = (frequency, pad_fault, temperature)
-        self._raw = b""
+        self.raw = b""
 
     def __repr__(self) -> str:
         numbers = f"{self.sequence}, {self.first_cube}, {self.device_us}"
@@ -163,7 +164,7 @@ class Sample:
     @property
     def spare(self) -> bytes:
         """The spare bytes as they came, which hubs send as 0."""
-        return self._raw[_FREQUENCY - 3 : _FREQUENCY] or bytes(3)
+        return self.raw[_FREQUENCY - 3 : _FREQUENCY] or bytes(3)
 
     def _made_arrays(self) -> _Arrays:
         # Made late, because `join` makes the arrays of several samples at once.
@@ -194,7 +195,7 @@ class Sample:
         if size != _SAMPLE.size + n_cubes * (4 * n_pads + 6):
             return None
         sample.shape = n_cubes, n_pads
-        sample._raw, sample._arrays = raw, None
+        sample.raw, sample._arrays = raw, None
         return sample
 
 
@@ -213,12 +214,12 @@ def join(samples: Sequence[Sample]) -> _Arrays:
     width = samples[0].n_pads
     parts: list[bytes] = []
     for sample in samples:
-        if not sample._raw:
+        if not sample.raw:
             frequency, pad_fault, temperature = zip(
                 *(sample._made_arrays() for sample in samples), strict=True
             )
             return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
-        parts += _fields(*sample.shape).unpack(sample._raw)
+        parts += _fields(*sample.shape).unpack(sample.raw)
     return (
         np.frombuffer(b"".join(parts[::3]), _U32).reshape(
             sum(sample.n_cubes for sample in samples), width

@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from ..core.errors import LinkError
+from .intake import take_in
 from .link import Link, LinkConfig, LinkState
 from .protocol import Ack, Command, Frame, Hello, Request, Result, Sample, Time, encode
 
@@ -55,12 +56,12 @@ CLOSE_S = 1.5
 """How long closing waits for the thread to end."""
 
 
-class LinkBytes(NamedTuple):
-    """What one read of a link gave: index of the link, time of arrival in ns, bytes or error."""
+class LinkRead(NamedTuple):
+    """What one read of a link gave: index of the link, time of arrival in ns, frames or error."""
 
     link: int
     arrival_ns: int
-    data: bytes | LinkError
+    result: list[Frame] | LinkError
 
 
 class LinkFrames(NamedTuple):
@@ -232,7 +233,7 @@ class Reader:
                 while time.monotonic() - awake_at < self._gather_time(reads):
                     time.sleep(GATHER_STEP_S)
                     reads += self._read_ready(selector, selector.select(0), wake_read)
-            received, failed = self._decode(selector, reads)
+            received, failed = self._handle_reads(selector, reads)
             if received:
                 self._call(self._on_frames, received)
             # Only after its frames were delivered: they would make the link look alive again.
@@ -251,51 +252,55 @@ class Reader:
         selector: selectors.BaseSelector,
         ready: list[tuple[selectors.SelectorKey, int]],
         wake_read: int,
-    ) -> list[LinkBytes]:
-        """Read all links that are ready, and send what waits to be sent."""
-        reads: list[tuple[int, bytes | LinkError]] = []
+    ) -> list[LinkRead]:
+        """Read and decode all links that are ready, and send what waits to be sent."""
+        reads: list[LinkRead] = []
+        readable: list[int] = []
         for key, events in ready:
             if key.data is None:
                 os.read(wake_read, 4096)
                 continue
-            link = self.links[key.data]
-            try:
-                if events & selectors.EVENT_WRITE:
-                    link.flush()
+            if events & selectors.EVENT_WRITE:
+                try:
+                    self.links[key.data].flush()
                     self._watch(selector, key.data)
-                if events & selectors.EVENT_READ:
-                    data = link.read()
-                    if data:
-                        reads.append((key.data, data))
-            except LinkError as error:
-                reads.append((key.data, error))
-        arrival_ns = self._clock_ns() if reads else 0
-        return [LinkBytes(i, arrival_ns, data) for i, data in reads]
+                except LinkError as error:
+                    reads.append(LinkRead(key.data, 0, error))
+                    continue
+            if events & selectors.EVENT_READ:
+                readable.append(key.data)
+        if readable:
+            links = [self.links[i] for i in readable]
+            arrival_ns, results = take_in(links, self._clock_ns)
+            for i, result in zip(readable, results, strict=True):
+                if result is not None:
+                    reads.append(LinkRead(i, arrival_ns, result))
+        return reads
 
-    def _decode(
-        self, selector: selectors.BaseSelector, reads: list[LinkBytes]
+    def _handle_reads(
+        self, selector: selectors.BaseSelector, reads: list[LinkRead]
     ) -> tuple[list[LinkFrames], dict[int, LinkError]]:
-        """The frames in what was read, and the links to close, each with the reason.
+        """The frames to deliver, and the links to close, each with the reason.
 
-        All reads of a wake-up are decoded in one go, because after each wait Python's code and data
+        All reads of a wake-up are handled in one go, because after each wait Python's code and data
         have left the processor's caches.
         """
         received: list[LinkFrames] = []
         failed: dict[int, LinkError] = {}
         now = time.monotonic()
-        for i, arrival_ns, data in reads:
+        for i, arrival_ns, result in reads:
             link = self.links[i]
             if i in failed:
                 continue
-            if isinstance(data, LinkError):
-                failed[i] = data
+            if isinstance(result, LinkError):
+                failed[i] = result
                 continue
             frames: list[Frame] = []
             session = self._sessions[i]
             session.last_byte = now
             asked_ns = session.asked_ns or 0
             try:
-                for frame in link.decoder.feed(data):
+                for frame in result:
                     if self._handle(i, frame):
                         frames.append(frame)
                 if link.unsent:
@@ -306,10 +311,9 @@ class Reader:
                 received.append(LinkFrames(i, arrival_ns, frames, asked_ns))
         return received, failed
 
-    def _gather_time(self, reads: list[LinkBytes]) -> float:
+    def _gather_time(self, reads: list[LinkRead]) -> float:
         """How long to wait for links that deliver but have not come yet, s."""
-        # A zero that does not begin the data ends a frame.
-        came = {i for i, _, data in reads if isinstance(data, bytes) and data.find(0, 1) > 0}
+        came = {i for i, _, result in reads if isinstance(result, list) and result}
         if len(came) in (0, len(self.links)):
             return 0.0
         periods_us = [

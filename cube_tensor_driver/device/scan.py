@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.rows import FrequencyRows
 from .cube_table import CubeAddress, CubeTable
+from .native import wire
 from .protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample, join
 
 # °C of each of the 65536 bit patterns of a temperature.
@@ -206,17 +207,36 @@ def _split(parts: list[_Part]) -> tuple[list[_Part], list[_Part]]:
 def _fill(rows: FrequencyRows, parts: Sequence[_Part]) -> None:
     """Write samples with the same number of pads, one after the other; pads that a cube does not
     have are NaN."""
-    samples = [part.sample for part in parts]
     counts = [len(part.cubes) for part in parts]
-    frequency, pad_fault, temperature = join(samples)
-    width = frequency.shape[1]
     np.concatenate([part.cubes for part in parts], out=rows.cube)
-    rows.sequence[:] = np.repeat([sample.sequence for sample in samples], counts)
-    rows.stamp_ns[:] = np.repeat([part.stamp_ns for part in parts], counts)
-    rows.pad_fault[:] = pad_fault
     rows.status[:] = 0
     if any(part.status for part in parts):
         rows.status[:] = np.repeat([part.status for part in parts], counts)
+    if wire is not None and all(part.sample.raw for part in parts):
+        _fill_values_in_c(rows, parts)
+    else:
+        _fill_values(rows, parts, counts)
+
+
+def _fill_values_in_c(rows: FrequencyRows, parts: Sequence[_Part]) -> None:
+    """As `_fill_values`, of decoded samples."""
+    n_rows, n_pads = rows.frequency.shape
+    raws, stamps_ns = [part.sample.raw for part in parts], [part.stamp_ns for part in parts]
+    columns = wire.place_rows(raws, stamps_ns, n_pads)
+    rows.stamp_ns[:] = np.ndarray(n_rows, np.int64, columns)
+    rows.sequence[:] = np.ndarray(n_rows, np.uint32, columns, 8 * n_rows)
+    rows.pad_fault[:] = np.ndarray(n_rows, np.uint32, columns, 12 * n_rows)
+    rows.temperature[:] = np.ndarray(n_rows, np.float32, columns, 16 * n_rows)
+    rows.frequency[:] = np.ndarray((n_rows, n_pads), np.float32, columns, 20 * n_rows)
+
+
+def _fill_values(rows: FrequencyRows, parts: Sequence[_Part], counts: Sequence[int]) -> None:
+    samples = [part.sample for part in parts]
+    frequency, pad_fault, temperature = join(samples)
+    width = frequency.shape[1]
+    rows.sequence[:] = np.repeat([sample.sequence for sample in samples], counts)
+    rows.stamp_ns[:] = np.repeat([part.stamp_ns for part in parts], counts)
+    rows.pad_fault[:] = pad_fault
     _CELSIUS.take(temperature.view(np.uint16), out=rows.temperature, mode="clip")
     measured = rows.frequency[:, :width]
     # In double precision: 1 mHz of 100 kHz is below what float32 multiplies exactly.
