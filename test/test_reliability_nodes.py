@@ -242,34 +242,60 @@ def test_parameters_live(stage):
     stage.children.check()
 
 
-def test_the_security_policy_has_the_structure_that_sros2_asks_for():
-    """As policy.xsd of version 0.2.0 says: elements, their order of nesting, attributes."""
-    policy = ElementTree.parse(package_data() / "config" / "security" / "policy.xml").getroot()
-    assert (policy.tag, policy.attrib) == ("policy", {"version": "0.2.0"})
-    (enclaves,) = policy
-    assert (enclaves.tag, enclaves.attrib) == ("enclaves", {})
-    lists = {
-        "topics": ("topic", {"publish", "subscribe"}),
-        "services": ("service", {"reply", "request"}),
-        "actions": ("action", {"call", "execute"}),
-    }
-    for enclave in enclaves:
-        assert (enclave.tag, set(enclave.attrib)) == ("enclave", {"path"})
-        assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", enclave.get("path"))
-        (profiles,) = enclave
-        assert profiles.tag == "profiles" and set(profiles.attrib) <= {"type"}
-        names = [(profile.get("ns"), profile.get("node")) for profile in profiles]
-        assert names and len(set(names)) == len(names)
-        for profile in profiles:
-            assert (profile.tag, set(profile.attrib)) == ("profile", {"ns", "node"})
-            for part in profile:
-                item, allowed = lists[part.tag]
-                assert part.attrib and set(part.attrib) <= allowed
-                assert set(part.attrib.values()) <= {"ALLOW", "DENY"}
-                assert len(part) > 0
-                for each in part:
-                    assert (each.tag, each.attrib, len(each)) == (item, {}, 0)
-                    assert re.fullmatch(r"(~/|/)?[A-Za-z0-9_/*]+", each.text), each.text
+XS = "{http://www.w3.org/2001/XMLSchema}"
+
+
+def schema_errors(
+    element: ElementTree.Element, kind: str, schema: ElementTree.Element
+) -> list[str]:
+    """What an element has that its type does not allow, or lacks.
+
+    Of XML Schema only what the policy can break: names of elements, attributes and their values.
+    """
+    definition = schema.find(f"{XS}complexType[@name='{kind}']")
+    if definition is None:
+        return [f"{element.tag}: {element.attrib}"] if element.attrib or len(element) else []
+    errors = []
+    attributes = {each.get("name"): each for each in definition.iter(f"{XS}attribute")}
+    for name, attribute in attributes.items():
+        if attribute.get("use") == "required" and name not in element.attrib:
+            errors.append(f"{element.tag} lacks {name}")
+    for name, value in element.attrib.items():
+        attribute = attributes.get(name, ElementTree.Element("none"))
+        words = schema.find(f"{XS}simpleType[@name='{attribute.get('type')}']") or ()
+        allowed = [each.get("value") for word in words for each in word]
+        if name not in attributes or value not in (allowed or [attribute.get("fixed", value)]):
+            errors.append(f"{element.tag}: {name}={value}")
+    children = {each.get("name"): each.get("type") for each in definition.iter(f"{XS}element")}
+    errors += [f"{element.tag}: {child.tag}" for child in element if child.tag not in children]
+    if not len(element):
+        errors.append(f"{element.tag} is empty")
+    for child in element:
+        errors += schema_errors(child, children.get(child.tag, ""), schema)
+    return errors
+
+
+def test_the_security_policy_keeps_the_schema_of_sros2():
+    schema = ElementTree.parse(ROOT / "test" / "data" / "sros2_policy.xsd").getroot()
+    path = package_data() / "config" / "security" / "policy.xml"
+    policy = ElementTree.parse(path).getroot()
+    assert schema_errors(policy, "Policy", schema) == []
+    # What the schema cannot say: each node once, and names that ROS allows.
+    names = [(profile.get("ns"), profile.get("node")) for profile in policy.iter("profile")]
+    assert len(names) >= 7 and len(set(names)) == len(names)
+    for expression in (*policy.iter("topic"), *policy.iter("service")):
+        assert re.fullmatch(r"(~/|/)?[A-Za-z0-9_/*]+", expression.text), expression.text
+    text = path.read_text()
+    for right, wrong in (
+        ('version="0.2.0"', 'version="0.1.0"'),
+        ('<enclave path="', '<enclave name="'),
+        ('reply="ALLOW"', 'reply="allow"'),
+        ('publish="ALLOW"', 'write="ALLOW"'),
+        ("<topic>frequencies</topic>", "<name>frequencies</name>"),
+        (' ns="/" node="view"', ' node="view"'),
+    ):
+        broken = ElementTree.fromstring(text.replace(right, wrong))
+        assert schema_errors(broken, "Policy", schema) != [], wrong
 
 
 def free_port() -> int:
