@@ -25,7 +25,7 @@ from cube_tensor_driver.srv import Tare
 
 from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ConfigError
-from ..ros.executor import make_executor
+from ..ros.compat import make_executor
 from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros
 from ..ros.skin_subscriber import STALE_S, FollowedSkin, SkinSubscriber

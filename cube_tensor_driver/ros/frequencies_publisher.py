@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile
 
@@ -13,7 +11,11 @@ from cube_tensor_driver.msg import SkinFrequencies
 
 from ..bags.message_codec import MessageBuffer, frequency_codec
 from ..core.rows import FrequencyRows
+from .compat import on_matched
 from .node import BUFFERS_KEPT
+
+COUNT_S = 0.2
+"""How often subscribers are counted where rclpy does not tell."""
 
 
 class FrequenciesPublisher:
@@ -30,10 +32,11 @@ class FrequenciesPublisher:
         self._buffer = lru_cache(maxsize=BUFFERS_KEPT)(self._make_buffer)
         self._next: MessageBuffer[FrequencyRows] | None = None
         # DDS tells how many subscribe; asking at each message would cost more.
-        matched = PublisherEventCallbacks(matched=self._on_matched)
+        events = on_matched(self._on_count)
         self._publisher = node.create_lifecycle_publisher(
-            SkinFrequencies, "frequencies", quality, event_callbacks=matched
+            SkinFrequencies, "frequencies", quality, event_callbacks=events
         )
+        self._timer = None if events else node.create_timer(COUNT_S, self._count)
 
     def make_rows(self, n_rows: int, n_pads: int) -> FrequencyRows:
         """Rows to fill, in the memory of the next message; they are valid until the next call."""
@@ -47,10 +50,15 @@ class FrequenciesPublisher:
 
     def destroy(self) -> None:
         """End it."""
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
 
     def _make_buffer(self, n_rows: int, n_pads: int) -> MessageBuffer[FrequencyRows]:
         return frequency_codec.buffer(self._frame_id, n_rows, n_pads)
 
-    def _on_matched(self, event: Any) -> None:
-        self._has_subscribers = event.current_count > 0
+    def _on_count(self, subscribers: int) -> None:
+        self._has_subscribers = subscribers > 0
+
+    def _count(self) -> None:
+        self._on_count(self._publisher.get_subscription_count())

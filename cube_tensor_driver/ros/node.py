@@ -25,7 +25,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from ..core.errors import ConfigError, CubeError
-from .executor import make_executor
+from .compat import after_parameters_are_set, make_executor
 from .guard import CallbackGuard, refuse_errors
 from .parameters import Parameter
 from .session import start_ros
@@ -107,8 +107,8 @@ class CubeNode(LifecycleNode):
         self._guard_lifecycle_services()
         self.configured = False
         self._parameters_by_name = {parameter.name: parameter for parameter in parameters}
+        after_parameters_are_set(self, self._apply_parameters)
         self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._apply_parameters)
         for parameter in parameters:
             self._declare(parameter)
 

@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.event_handler import SubscriptionEventCallbacks
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
@@ -16,6 +15,7 @@ from ..config.skin import read_skin
 from ..core.errors import CubeError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows
+from .compat import SubscriptionEventCallbacks
 from .diagnostics import Diagnostics
 from .message_limit import check_scans, scan_limit
 from .messages import info_message

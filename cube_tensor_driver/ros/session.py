@@ -13,7 +13,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from ..core.errors import ConfigError
 from ..processes.domain import check_domain
-from .executor import make_executor
+from .compat import make_executor
 
 
 def start_ros() -> None:
