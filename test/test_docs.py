@@ -30,6 +30,9 @@ ELSEWHERE = {
     "./cube demo --config skin.yaml --headless --duration 3": (
         "test_docs_python.test_subscribers_of_the_pages_print_pressures"
     ),
+    "./cube bringup /dev/ttyACM0 -o hand.yaml": (
+        "test_bringup.test_a_turned_cube_is_found_and_written"
+    ),
     "./cube record -o run1": "test_bags_ros.test_recorded_is_published_and_reprocessed_is_live",
     "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml": (
         "test_bags_files.test_fit_from_a_bag"

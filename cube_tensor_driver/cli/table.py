@@ -8,6 +8,7 @@ GROUPS = {
         "view": "show a running skin in the browser: 3-D, plots, tare, recording",
         "param": "list, read or set the parameters of nodes that run",
         "ports": "list the serial ports, and which of them answer as hubs",
+        "bringup": "look at the pads of a new hub, find swapped ones by presses, write a skin file",
         "check": "go through every rule of the wire protocol against a hub",
         "topics": "list the topics that are published, with types and rates",
         "echo": "print what comes on a topic: stress as lines with units, others as YAML",
