@@ -27,6 +27,7 @@ FLOORS = [
     ["ros"],
     ["plot", "terminal"],
     ["processes"],
+    ["judge"],
     ["simulation"],
     ["bags", "conformance", "research"],
     ["device", "elastic"],

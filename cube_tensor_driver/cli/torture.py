@@ -22,10 +22,18 @@ def arguments(parser: Parser) -> None:
         metavar="N",
         help="seed of the random mix (default: %(default)s)",
     )
+    parser.add_argument(
+        "--mutate",
+        metavar="NAME",
+        help="put a fault into the driver or the reconstruction that must be found; all: one after "
+        "the other, each in a short torture of its own",
+    )
     parser.add_json()
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..trials.torture import run_torture
+    from ..trials.torture import run_mutations, run_torture
 
+    if options.mutate is not None:
+        return run_mutations(options.mutate, seed=options.seed, json_path=options.json)
     return run_torture(duration=options.duration, seed=options.seed, json_path=options.json)

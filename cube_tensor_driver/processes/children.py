@@ -55,7 +55,7 @@ class Children:
         command = [*END_WITH_PARENT, sys.executable, "-m", process.module, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]
-        with self._log_file(process.executable).open("wb") as log:
+        with self._log_file(process.executable).open("ab") as log:
             self._processes[process.executable] = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -63,6 +63,20 @@ class Children:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
+
+    def kill(self, executable: str) -> None:
+        """End a process by force, as a crash would."""
+        process = self._processes.pop(executable)
+        _signal(process, signal.SIGKILL)
+        process.wait()
+
+    def pause(self, executable: str) -> None:
+        """Stop a process where it is, until `resume`."""
+        _signal(self._processes[executable], signal.SIGSTOP)
+
+    def resume(self, executable: str) -> None:
+        """Let a process go on that was stopped."""
+        _signal(self._processes[executable], signal.SIGCONT)
 
     def pid(self, executable: str) -> int:
         """The process id."""

@@ -33,6 +33,8 @@ KINDS = {
     "short": "stop the oscillator of a pad for `seconds`",
     "stuck": "repeat the reading of a pad for `seconds`",
     "noisy": "add noise of `value` (relative, 1e-3) to a pad for `seconds`",
+    "report": "have the hub report a pad as failed for `seconds`",
+    "hold": "keep the load as it is for `seconds`",
     "temperature": "raise the temperature by `value` °C within `seconds`, "
     "and the rest frequencies by 50 ppm per °C",
     "uid": "name another hub uid for `seconds`",
@@ -41,7 +43,7 @@ KINDS = {
 }
 FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
 """What happens to the frames of single samples."""
-PAD_FAULTS = ("open", "short", "stuck", "noisy")
+PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """What is over as soon as it has begun; all others last `seconds`."""
 

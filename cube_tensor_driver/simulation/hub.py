@@ -51,6 +51,7 @@ class SimulatedHub:
     false_uid: what it says instead of its uid
     extra_pads: pads that it says it has beyond n_pads
     celsius: temperature in 0.01 °C
+    pad_fault: (cubes,) bit p: it reports that pad p has failed; None: it reports none
     """
 
     uid: int
@@ -69,6 +70,7 @@ class SimulatedHub:
     false_uid: int | None = None
     extra_pads: int = 0
     celsius: int = TEMPERATURE_UNKNOWN
+    pad_fault: NDArray[np.uint32] | None = None
     _drift_since_us: int = 0
     _ended_runs: list[SampleRun] = field(default_factory=list)
     _run: SampleRun | None = None  # the newest, as it began; _last: its last sample
@@ -123,7 +125,7 @@ class SimulatedHub:
 
     def prepare(self, frequency: NDArray[np.uint32]) -> None:
         """Encode now what will be the same in every SAMPLE of this very array of frequencies."""
-        sample = self._sample(0, 0, frequency, TEMPERATURE_UNKNOWN)
+        sample = self._sample(0, 0, frequency)
         self._prepared[id(frequency)] = frequency, PreparedFrame(sample)
 
     def sample(self, frequency: NDArray[np.uint32]) -> bytes:
@@ -134,16 +136,24 @@ class SimulatedHub:
         self.sequence += 1
         self.next_us += self.period_us
         _, prepared = self._prepared.get(id(frequency), (None, None))
-        if prepared is not None and self.celsius == TEMPERATURE_UNKNOWN and self.version == VERSION:
+        is_plain = self.celsius == TEMPERATURE_UNKNOWN and self.pad_fault is None
+        if prepared is not None and is_plain and self.version == VERSION:
             return prepared.encode(sequence, device_us)
-        return encode(self._sample(sequence, device_us, frequency, self.celsius), self.version)
+        sample = self._sample(sequence, device_us, frequency, self.celsius, self.pad_fault)
+        return encode(sample, self.version)
 
     @staticmethod
     def _sample(
-        sequence: int, device_us: int, frequency: NDArray[np.uint32], celsius: int
+        sequence: int,
+        device_us: int,
+        frequency: NDArray[np.uint32],
+        celsius: int = TEMPERATURE_UNKNOWN,
+        pad_fault: NDArray[np.uint32] | None = None,
     ) -> Sample:
         n = len(frequency)
-        pad_fault, temperature = np.zeros(n, "<u4"), np.full(n, celsius, "<i2")
+        if pad_fault is None:
+            pad_fault = np.zeros(n, "<u4")
+        temperature = np.full(n, celsius, "<i2")
         return Sample(sequence, 0, device_us, frequency, pad_fault, temperature)
 
     @property

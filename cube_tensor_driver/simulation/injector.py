@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +23,33 @@ OPEN_FACTOR = 8
 """An open pad has only its parasitic capacitance: its frequency rises above all that the pad law
 with β = 0.3 can give."""
 MAX_MILLIHERTZ = 0xFFFFFFFF
+SPOILING = ("drop", "flip", "insert", "truncate")
+"""What happens to a frame that may not be read any more."""
 
 
 @dataclass
 class SimulatedLink:
-    """A link: the simulated hub at its far end, and the line between."""
+    """A link: the simulated hub at its far end, and the line between.
+
+    spoiled: restarts of the hub before, and number, of each sample that was not sent as it was
+    """
 
     name: str
     hub: SimulatedHub
     line: Line
+    spoiled: list[tuple[int, int]] = field(default_factory=list, kw_only=True)
+
+    def spoil(self) -> None:
+        """The sample that the hub took last is spoiled."""
+        self.spoiled.append((self.hub.boots, self.hub.sequence - 1))
 
 
 @dataclass
 class _BrokenPad:
-    """A pad under a fault; reading: what a stuck pad repeats."""
+    """A pad under a fault; reading: what it read at first, mHz."""
 
     fault: Fault
-    reading: np.uint32 | None = None
+    reading: int | None = None
 
 
 @dataclass
@@ -48,20 +59,21 @@ class _State:
     frames: what happens to the next SAMPLE frames, in order
     held_back: a frame that goes out after the next one
     warming: simulated time at which the temperature began to change, and the fault that says how
+    hold: simulated time whose load stays, and the fault that says so; None: the load goes on
     """
 
     frames: list[str] = field(default_factory=list)
     held_back: bytes = b""
     pads: list[_BrokenPad] = field(default_factory=list)
     warming: tuple[int, Fault] | None = None
+    hold: tuple[int, Fault] | None = None
 
     def warmer(self, now_us: int) -> float:
         """°C above room temperature."""
         if self.warming is None:
             return 0.0
         begin_us, fault = self.warming
-        part = (now_us - begin_us) * 1e-6 / max(fault.seconds, 1e-6)
-        return fault.value * min(1.0, part)
+        return float(warming(fault, begin_us, now_us))
 
 
 class Injector:
@@ -117,33 +129,29 @@ class Injector:
         frequency = frequency.copy()
         if state.warming is not None:
             warmer = state.warmer(now_us)
-            hub.celsius = round(100 * (ROOM_CELSIUS + warmer)) if warmer else TEMPERATURE_UNKNOWN
-            frequency = np.rint(frequency * (1 + PER_CELSIUS * warmer)).astype("<u4")
+            hub.celsius = int(centi_celsius(warmer))
+            frequency = warmed(frequency, warmer)
         for broken in state.pads:
             at = broken.fault.cube, broken.fault.pad
-            frequency[at] = self._reading(broken, frequency[at])
+            if broken.reading is None:
+                broken.reading = int(frequency[at])
+            frequency[at] = broken_reading(broken.fault, int(frequency[at]), broken.reading, now_us)
         if hub.extra_pads:
             frequency = np.pad(frequency, ((0, 0), (0, hub.extra_pads)))
         return frequency
 
-    def _reading(self, broken: _BrokenPad, sound: np.uint32) -> int | np.uint32:
-        """What a broken pad reads, mHz; sound: what it would read otherwise."""
-        fault = broken.fault
-        if fault.kind == "short":
-            return 0
-        if fault.kind == "open":
-            return min(OPEN_FACTOR * int(sound), MAX_MILLIHERTZ)
-        if fault.kind == "noisy":
-            return round(float(sound) * (1 + fault.value * self._random.standard_normal()))
-        if broken.reading is None:
-            broken.reading = sound
-        return broken.reading
+    def load_us(self, link: SimulatedLink, now_us: int) -> int:
+        """Simulated time of the load that the cubes of a hub are under."""
+        hold = self._states[link.name].hold
+        return now_us if hold is None else hold[0]
 
     def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
         """What goes onto the line of one SAMPLE frame; b"" when it is lost or held back."""
         state, random = self._states[link.name], self._random
         kind = state.frames.pop(0) if state.frames else ""
         held_back, state.held_back = state.held_back, b""
+        if kind in SPOILING:
+            link.spoil()
         if kind == "drop":
             data = b""
         elif kind == "flip":
@@ -172,6 +180,7 @@ class Injector:
             state.frames += [kind] * fault.count
         elif kind in PAD_FAULTS:
             state.pads.append(_BrokenPad(fault))
+            _report_pads(hub, state)
         elif kind == "stall":
             line.held_until_us = end_us
         elif kind == "burst":
@@ -190,6 +199,8 @@ class Injector:
             hub.set_clock(now_us, step_us=round(1e6 * fault.value))
         elif kind == "temperature":
             state.warming = now_us, fault
+        elif kind == "hold":
+            state.hold = now_us, fault
         elif kind == "uid":
             hub.false_uid = hub.uid ^ 0xBAD
         elif kind == "pads":
@@ -206,6 +217,9 @@ class Injector:
         hub, line, kind = link.hub, link.line, fault.kind
         if kind in PAD_FAULTS:
             state.pads = [broken for broken in state.pads if broken.fault is not fault]
+            _report_pads(hub, state)
+        elif kind == "hold" and state.hold is not None and state.hold[1] is fault:
+            state.hold = None
         elif kind in ("unplug", "rename") and not line.plugged:
             renamed = None
             if kind == "rename":
@@ -223,3 +237,45 @@ class Injector:
     def _push(self, heap: list[tuple[int, int, Fault]], at_us: int, fault: Fault) -> None:
         self._number += 1
         heapq.heappush(heap, (at_us, self._number, fault))
+
+
+def broken_reading(fault: Fault, sound: int, first: int, time_us: int) -> int:
+    """What a broken pad reads at a simulated time, mHz.
+
+    sound: what it would read otherwise; first: what it would have read when the fault began
+    """
+    if fault.kind == "short":
+        return 0
+    if fault.kind == "open":
+        return min(OPEN_FACTOR * sound, MAX_MILLIHERTZ)
+    if fault.kind == "noisy":
+        # Noise that depends on the time alone can be computed again from the log.
+        return round(sound * (1 + fault.value * np.random.default_rng(time_us).standard_normal()))
+    return first if fault.kind == "stuck" else sound
+
+
+def warming(fault: Fault, begin_us: int, time_us: NDArray[np.int64] | int) -> Any:
+    """°C above room temperature at simulated times, while the temperature follows a fault."""
+    part = (np.asarray(time_us) - begin_us) * 1e-6 / max(fault.seconds, 1e-6)
+    return fault.value * np.minimum(1.0, part)
+
+
+def warmed(millihertz: NDArray[np.uint32], warmer: Any) -> NDArray[np.uint32]:
+    """What pads read that are so many °C warmer, mHz."""
+    changed: NDArray[np.uint32] = np.rint(millihertz * (1 + PER_CELSIUS * warmer)).astype("<u4")
+    return changed
+
+
+def centi_celsius(warmer: Any) -> Any:
+    """What a hub reports, 0.01 °C: it knows its temperature where it is not room temperature."""
+    known = np.rint(100 * (ROOM_CELSIUS + np.asarray(warmer))).astype(int)
+    return np.where(np.asarray(warmer) != 0, known, TEMPERATURE_UNKNOWN)
+
+
+def _report_pads(hub: SimulatedHub, state: _State) -> None:
+    """Have the hub report the pads that it is to report."""
+    bits = np.zeros(len(hub.cube_uids), "<u4")
+    for broken in state.pads:
+        if broken.fault.kind == "report":
+            bits[broken.fault.cube] |= np.uint32(1 << broken.fault.pad)
+    hub.pad_fault = bits if bits.any() else None

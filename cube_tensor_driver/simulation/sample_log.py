@@ -59,12 +59,14 @@ class LinkLog:
     cubes: index in the skin of each of the hub's cubes, ABSENT where the skin has none
     dropped: samples that the hub took and had no room to send, since its last restart
     runs: all samples that it took, in the order of time
+    spoiled: boot and number of each sample that was harmed, or found no room on the line
     """
 
     name: str
     cubes: tuple[int, ...]
     dropped: int
     runs: tuple[SampleRun, ...]
+    spoiled: tuple[tuple[int, int], ...] = ()
 
     @property
     def members(self) -> list[int]:
@@ -119,6 +121,7 @@ class SampleLog:
                 cubes=tuple(link["cubes"]),
                 dropped=link["dropped"],
                 runs=tuple(SampleRun(**run) for run in link["runs"]),
+                spoiled=tuple((boot, number) for boot, number in link["spoiled"]),
             )
             for link in data["links"]
         )

@@ -155,6 +155,7 @@ class Simulator:
                 cubes=tuple(link.carried.members.tolist()),
                 dropped=link.hub.dropped,
                 runs=tuple(link.hub.runs),
+                spoiled=tuple(link.spoiled),
             )
             for link in self._links
         )
@@ -201,14 +202,16 @@ class Simulator:
 
     def _take_sample(self, link: PlayedLink, now_us: int) -> None:
         time_us = link.hub.next_us
+        load_us = self._injector.load_us(link, time_us)
         if link.prepared:
-            frequency = link.prepared[time_us // link.hub.period_us % len(link.prepared)]
+            frequency = link.prepared[load_us // link.hub.period_us % len(link.prepared)]
         else:
-            stress, gradient = self._load.at(time_us)
+            stress, gradient = self._load.at(load_us)
             frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
         frame = link.hub.sample(self._injector.measured(link, frequency, time_us))
         if not link.line.send(self._injector.transmitted(link, frame), now_us):
             link.hub.dropped += 1
+            link.spoil()
 
     def _watch(
         self, selector: selectors.BaseSelector, watched: dict[str, int], link: PlayedLink

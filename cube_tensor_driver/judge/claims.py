@@ -1,0 +1,75 @@
+"""Checks what the driver counts against what was sent and what came."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..simulation.sample_log import LinkLog, SampleLog
+from .frequencies import FrequencyVerdict
+from .record import Record
+from .samples import NONE, Samples
+
+NEAR_ZERO = 1 << 20
+"""A hub that begins to count above this has been made to wrap: its first samples are not counted
+from 0."""
+
+
+def miscounted(
+    record: Record, log: SampleLog, samples: Samples, verdict: FrequencyVerdict
+) -> dict[str, int]:
+    """Rows that the driver counted wrongly.
+
+    The last samples of a hub before it lost its power or restarted are nobody's to know; all others
+    that did not come must be counted, and no more.
+    """
+    counters = record.counters
+    each = len(record.skin.cubes) // len(record.skin.links)
+    lost = each * (counters["lost_on_the_way"] + counters["dropped_in_hub"])
+    counted = (
+        lost + counters["rows of unknown cubes"] + counters["rows with another number of pads"]
+    )
+    # The driver counts on until it is stopped.
+    missing, at_end = int(verdict.missing[verdict.judged].sum()), int(verdict.missing.sum())
+    unknowable = _lost_with_power(record, log, samples, verdict)
+    published = counters["rows published"]
+    # Without a number of rows of what did not come here nobody can say how many there were.
+    came = len(record.frequencies.rows)
+    wrong = 0 if record.frequencies.missed else abs(published - came)
+    if not record.frequencies.missed:
+        wrong += max(0, missing - unknowable - counted) + max(0, counted - at_end)
+    return {
+        "miscounted": wrong + counters["rows unaccounted"] + counters["rows lost by errors"],
+        "counted": counted,
+        "missing": missing,
+        "lost_with_power": unknowable,
+    }
+
+
+def _lost_with_power(
+    record: Record, log: SampleLog, samples: Samples, verdict: FrequencyVerdict
+) -> int:
+    """Rows taken that nobody can know of: those after the last one that came before a restart and,
+    where the count did not begin at 0, those before the first one."""
+    came = np.zeros(len(samples), bool)
+    came[verdict.sample[verdict.sample != NONE]] = True
+    return sum(
+        len(link.members) * _unknowable(link, samples, came, np.flatnonzero(samples.link == number))
+        for number, link in enumerate(log.links)
+    )
+
+
+def _unknowable(
+    link: LinkLog, samples: Samples, came: NDArray[np.bool_], mine: NDArray[np.int64]
+) -> int:
+    """Of the samples `mine` of one link."""
+    boots = np.unique(samples.boot[mine])
+    count = 0
+    for boot in boots.tolist():
+        of_boot = mine[samples.boot[mine] == boot]
+        arrived = of_boot[came[of_boot]]
+        if boot != boots[-1]:
+            count += int(np.count_nonzero(of_boot > arrived.max(initial=-1)))
+        if len(arrived) and samples.number[of_boot[0]] > NEAR_ZERO:
+            count += int(np.count_nonzero(of_boot < arrived.min()))
+    return count

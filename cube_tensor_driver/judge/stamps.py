@@ -1,0 +1,48 @@
+"""Compares the stamps of rows with the simulator's clock.
+
+The smallest delay between a hub and the driver cannot be told from the offset of its clock, so
+stamps are late by it. How late single samples come does not matter: on a busy host, too, some
+come in time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..simulation.sample_log import SampleLog
+from .record import Record
+from .samples import NONE, Samples
+
+SETTLE_S = 6.0
+"""After a restart or a jump of a hub's clock, until its stamps are judged: drift is known then."""
+CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "step", "drift")
+"""What makes the driver fit a hub's clock from the start."""
+
+
+def stamp_errors_ms(
+    record: Record, log: SampleLog, samples: Samples, sample: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(K,) ms from each sample to its stamp, where the hub's clock has been undisturbed for a
+    while. sample: (N,) of each row that came."""
+    rows = record.frequencies.rows
+    leads = np.isin(rows.cube, [link.members[0] for link in log.links])
+    chosen = np.flatnonzero(leads & (sample != NONE))
+    stamp_ns, of = rows.stamp_ns[chosen], sample[chosen]
+    error_ms = 1e-6 * (stamp_ns - samples.time_ns[of])
+    return np.asarray(error_ms[_settled(record, log, samples)[of]], np.float64)
+
+
+def _settled(record: Record, log: SampleLog, samples: Samples) -> NDArray[np.bool_]:
+    """(S,) samples whose stamps are judged."""
+    seconds = 1e-6 * samples.time_us
+    begin = 1e-9 * (record.begin_ns - log.start_time_ns)
+    settled = seconds > begin + SETTLE_S
+    numbers = {link.name: number for number, link in enumerate(log.links)}
+    for fault in log.faults:
+        if fault.fault.kind in CLOCK_FAULTS:
+            near = (seconds >= 1e-6 * fault.start_us - 0.1) & (
+                seconds <= 1e-6 * fault.end_us + SETTLE_S
+            )
+            settled &= ~((samples.link == numbers[fault.fault.link]) & near)
+    return settled

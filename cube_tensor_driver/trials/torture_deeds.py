@@ -1,0 +1,188 @@
+"""What a torture does to the nodes: as their users would, or as a crash would."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from std_srvs.srv import Trigger
+
+from cube_tensor_driver.srv import Tare
+
+from ..config.skin import Skin
+from ..core.errors import CubeError
+from ..core.rows import StressRows
+from ..judge.record import Deed
+from ..processes.children import Children
+from ..processes.skin_processes import Process
+from .running import Observer
+from .tape import Tape
+from .torture_mix import CUBES_PER_HUB, HELD_HUB
+
+START_S, ANSWER_S = 40.0, 10.0
+"""s: until a node has started; until it answers, at most."""
+ANSWER_TRIES = 4
+TARE_S, TARE_EVERY_S = 3.0, 0.3
+"""A tare is refused while data have a gap; the load stays long enough to ask again."""
+LATE_NS = 500_000_000
+"""Where the newest row of stress is older the host is too busy for a tare, and may refuse it."""
+SUBSCRIBER = "markers"
+
+
+class Deeds:
+    """done: what was done so far; refused: why tares were refused that the host is too busy for."""
+
+    def __init__(
+        self,
+        observer: Observer,
+        children: Children,
+        processes: Mapping[str, Process],
+        skin: Skin,
+        stress: Tape[StressRows],
+    ) -> None:
+        self.done: list[Deed] = []
+        self.refused: list[str] = []
+        self._observer, self._children, self._processes = observer, children, processes
+        self._skin, self._stress = skin, stress
+        node = observer.node
+        self._states = {
+            name: node.create_client(ChangeState, f"{name}/change_state")
+            for name in ("driver", "reconstruction")
+        }
+        self._tare = node.create_client(Tare, "reconstruction/tare")
+        self._clear = node.create_client(Trigger, "reconstruction/clear_tare")
+        self._parameters = node.create_client(SetParameters, "driver/set_parameters")
+
+    def start_driver(self, pipe: Path) -> None:
+        """Activate the driver when both ends of every topic know each other, so that the first
+        sample is received too. CubeError: it did not become active."""
+        observer, node = self._observer, self._observer.node
+        observer.spin(START_S, self._states["driver"].service_is_ready)
+        # Whether this one succeeded shows at the next: a request that is sent again is refused.
+        self._change("driver", Transition.TRANSITION_CONFIGURE)
+        observer.spin(
+            START_S,
+            lambda: (
+                node.count_publishers("stress") > 0
+                and node.count_subscribers("stress") > 1
+                and node.count_subscribers("frequencies") > 1
+                and node.count_publishers("frequencies") > 0
+                and pipe.exists()
+            ),
+        )
+        observer.spin(1.0)
+        if not self._change("driver", Transition.TRANSITION_ACTIVATE):
+            log = self._children.log("driver")[-1500:]
+            raise CubeError(f"the driver did not become active:\n{log}")
+
+    def stop_driver(self) -> None:
+        self._change("driver", Transition.TRANSITION_DEACTIVATE)
+
+    def do(self, event: Mapping[str, Any]) -> None:
+        """Do what an event of the mix says."""
+        kind = event["deed"]
+        deeds: dict[str, Callable[[], tuple[bool, str]]] = {
+            "stall reconstruction": lambda: self._pause("reconstruction", event["seconds"]),
+            "stall subscriber": lambda: self._pause(SUBSCRIBER, event["seconds"]),
+            "rate": lambda: self._set_rate(event["value"]),
+            "tare": self._take_tare,
+            "clear": lambda: self._call(self._clear, Trigger.Request()),
+            "restart reconstruction": self._restart,
+            "reconfigure reconstruction": self._reconfigure,
+            "cycle driver": self._cycle_driver,
+        }
+        before, self._begin_ns = self._stress.rows_so_far(), time.time_ns()
+        done, answer = deeds[kind]()
+        cubes = tuple(self._held_cubes) if kind == "tare" else ()
+        self.done.append(
+            Deed(
+                kind,
+                self._begin_ns,
+                time.time_ns(),
+                done,
+                answer,
+                cubes,
+                (before, self._stress.rows_so_far()),
+            )
+        )
+
+    @property
+    def _held_cubes(self) -> range:
+        return range(HELD_HUB * CUBES_PER_HUB, (HELD_HUB + 1) * CUBES_PER_HUB)
+
+    def _pause(self, name: str, seconds: float) -> tuple[bool, str]:
+        self._children.pause(name)
+        self._observer.spin(seconds)
+        self._children.resume(name)
+        return True, ""
+
+    def _set_rate(self, rate: float) -> tuple[bool, str]:
+        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(rate))
+        request = SetParameters.Request(parameters=[Parameter(name="rate", value=value)])
+        answer = self._ask(self._parameters, request)
+        return answer is not None and answer.results[0].successful, str(rate)
+
+    def _take_tare(self) -> tuple[bool, str]:
+        names = [self._skin.names[cube] for cube in self._held_cubes]
+        request = Tare.Request(cubes=names, duration=1.0)
+        until, late = time.monotonic() + TARE_S, False
+        while True:
+            self._begin_ns = time.time_ns()
+            late |= self._begin_ns - self._stress.newest_ns() > LATE_NS
+            done, answer = self._call(self._tare, request)
+            if done or time.monotonic() > until:
+                break
+            self._observer.spin(TARE_EVERY_S)
+        if late and not done:
+            self.refused.append(answer)
+        return done, answer
+
+    def _restart(self) -> tuple[bool, str]:
+        self._children.kill("reconstruction")
+        self._stress.new_writer()
+        self._children.start(self._processes["reconstruction"])
+        return self._wait_for_stress()
+
+    def _reconfigure(self) -> tuple[bool, str]:
+        down = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+        up = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+        done = all(self._change("reconstruction", transition) for transition in down)
+        self._stress.new_writer()
+        done &= all(self._change("reconstruction", transition) for transition in up)
+        comes, answer = self._wait_for_stress()
+        return done and comes, answer
+
+    def _cycle_driver(self) -> tuple[bool, str]:
+        both = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE)
+        return all(self._change("driver", transition) for transition in both), ""
+
+    def _wait_for_stress(self) -> tuple[bool, str]:
+        count = self._stress.count
+        self._observer.spin(START_S, lambda: self._stress.count > count)
+        return self._stress.count > count, ""
+
+    def _change(self, node: str, transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        answer = self._ask(self._states[node], request)
+        return answer is not None and bool(answer.success)
+
+    def _call(self, client: Any, request: Any) -> tuple[bool, str]:
+        answer = self._ask(client, request)
+        return (False, "no answer") if answer is None else (answer.success, answer.message)
+
+    def _ask(self, client: Any, request: Any) -> Any:
+        """The answer; None if there is none. An answer is lost if the node has not met our client
+        yet: then it is asked again."""
+        self._observer.spin(START_S, client.service_is_ready)
+        for _ in range(ANSWER_TRIES):
+            future = client.call_async(request)
+            self._observer.spin(ANSWER_S, future.done)
+            if future.done():
+                return future.result()
+        return None

@@ -1,0 +1,194 @@
+"""The judge of torture finds each thing that is wrong, and nothing where nothing is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.reconstructor import Reconstructor
+from cube_tensor_driver.core.rows import FrequencyRows, concatenate
+from cube_tensor_driver.core.status import STUCK
+from cube_tensor_driver.judge.expected import Expected
+from cube_tensor_driver.judge.record import CubeMessages, Received, Record
+from cube_tensor_driver.judge.samples import Samples
+from cube_tensor_driver.judge.verdict import judge
+from cube_tensor_driver.simulation.faults import Fault
+from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
+
+INSTANTS, COUNT, PERIOD_US, EACH = 400, 2000, 2000, 2
+FAULTS = {
+    "stuck": Fault("stuck", link="hub0", cube=1, pad=4),
+    "noisy": Fault("noisy", link="hub1", cube=0, pad=2, value=1e-3),
+    "short": Fault("short", link="hub1", cube=1, pad=7),
+    "report": Fault("report", link="hub0", cube=0, pad=3),
+}
+RECORDS = tuple(FaultRecord(500_000, 2_500_000, fault) for fault in FAULTS.values())
+WRONG = (
+    "miscounted",
+    "unreadable",
+    "lost",
+    "wrong",
+    "repeated",
+    "missing_tensors",
+    "wrong_tensors",
+    "unflagged",
+    "false_alarms",
+    "wrong_cube_messages",
+    "wrong_periods",
+)
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """A log and a record of 4 s of two hubs with a restart, four broken pads and a dropped sample,
+    as a program without a fault would leave them."""
+    path = tmp_path_factory.mktemp("skin") / "skin.yaml"
+    write_yaml(path, grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0))
+    skin = read_skin(path)
+    run = SampleRun(first=0, last=COUNT - 1, start_us=PERIOD_US, period_us=PERIOD_US)
+    half = COUNT // 2
+    before = replace(run, last=half - 1)
+    after = SampleRun(0, half - 1, PERIOD_US * (half + 1), PERIOD_US, boot=1)
+    links = (
+        LinkLog("hub0", (0, 1), 0, (run,), spoiled=((0, 70),)),
+        LinkLog("hub1", (2, 3), 0, (before, after)),
+    )
+    log = SampleLog(0, links, RECORDS)
+    samples = Samples(log)
+    expected = Expected(skin, log, samples, INSTANTS)
+    order = np.argsort(samples.time_us, kind="stable")
+    order = order[~samples.spoiled[order]]
+    cube = (EACH * samples.link[order, None] + np.arange(EACH)).ravel().astype(np.uint16)
+    of = np.repeat(order, EACH)
+    readings = expected.of(cube, of)
+    frequencies = FrequencyRows(
+        cube=cube,
+        sequence=samples.number[of].astype(np.uint32),
+        stamp_ns=samples.time_ns[of] + 100_000,
+        frequency=readings.frequency,
+        temperature=readings.temperature,
+        pad_fault=readings.pad_fault,
+        status=np.zeros(len(cube), np.uint16),
+    )
+    reconstruct = Reconstructor(skin)
+    scans = np.split(np.arange(len(cube)), np.flatnonzero(np.diff(samples.time_us[of])) + 1)
+    stress = concatenate([reconstruct(frequencies.select(scan)) for scan in scans])
+    record = Record(
+        skin=skin,
+        instants=INSTANTS,
+        frequencies=Received(frequencies),
+        stress=Received(stress),
+        cube_messages=CubeMessages(0, frozenset({skin.frame(skin.cubes[0])}), (), ()),
+        deeds=(),
+        counters={
+            "lost_on_the_way": 1,
+            "dropped_in_hub": 0,
+            "rows published": len(cube),
+            "rows of unknown cubes": 0,
+            "rows with another number of pads": 0,
+            "rows unaccounted": 0,
+            "rows lost by errors": 0,
+        },
+        messages_lost=0,
+        begin_ns=0,
+        end_ns=10**12,
+    )
+    return record, log
+
+
+def found(played, frequencies=None, stress=None, **counters):
+    """Names of the figures that are wrong when rows are exchanged."""
+    record, log = played
+    if frequencies is not None:
+        record = replace(record, frequencies=Received(frequencies))
+    if stress is not None:
+        record = replace(record, stress=Received(stress))
+    record = replace(record, counters={**record.counters, **counters})
+    figures = judge(record, log)
+    return {name for name in WRONG if figures[name]}
+
+
+def changed(rows, chosen=slice(None), **fields):
+    """Rows with other values in some fields; each value may be a function of the old ones."""
+    columns = {name: np.array(getattr(rows, name)) for name in fields}
+    for name, value in fields.items():
+        columns[name][chosen] = value(columns[name][chosen]) if callable(value) else value
+    return replace(rows, **columns)
+
+
+def test_nothing_is_found_where_nothing_is_wrong(played):
+    assert found(played) == set()
+    figures = judge(*played)
+    assert figures["faults_to_flag"] == len(FAULTS)
+    assert figures["samples_sent"] - figures["delivered"] == EACH
+
+
+ROW = 6000
+FREQUENCY_CHANGES = {
+    "one bit": (ROW, {"frequency": lambda f: np.nextafter(f, np.float32(0))}, "wrong"),
+    "temperature": (ROW, {"temperature": 10.0}, "wrong"),
+    "pad fault": (ROW, {"pad_fault": 1}, "wrong"),
+    "sequence": (ROW, {"sequence": 99_999}, "wrong"),
+    "pads": (slice(None), {"frequency": lambda f: f[:, ::-1]}, "wrong"),
+}
+
+
+@pytest.mark.parametrize("name", list(FREQUENCY_CHANGES))
+def test_a_wrong_field_of_frequencies_is_found(played, name):
+    chosen, fields, figure = FREQUENCY_CHANGES[name]
+    assert figure in found(played, changed(played[0].frequencies.rows, chosen, **fields))
+
+
+STRESS_CHANGES = {
+    "component": ({"stress": lambda s: 1.1 * s}, "wrong_tensors"),
+    "gradient": ({"gradient": lambda g: -g}, "wrong_tensors"),
+    "residual": ({"residual": 0.0}, "wrong_tensors"),
+    "observed": ({"observed": lambda bits: bits ^ 1}, "wrong_tensors"),
+    "left out": ({"left_out": 0}, "unflagged"),
+    "other pad": ({"left_out": lambda bits: bits << np.uint32(1)}, "false_alarms"),
+    "stuck bit": ({"status": lambda bits: bits & ~np.uint16(STUCK)}, "unflagged"),
+    "stamp": ({"stamp_ns": lambda at: at + 1}, "missing_tensors"),
+}
+
+
+@pytest.mark.parametrize("name", list(STRESS_CHANGES))
+def test_a_wrong_field_of_stress_is_found(played, name):
+    fields, figure = STRESS_CHANGES[name]
+    assert figure in found(played, stress=changed(played[0].stress.rows, **fields))
+
+
+def test_rows_that_are_missing_or_came_twice_are_found(played):
+    frequencies, stress = played[0].frequencies.rows, played[0].stress.rows
+    all_but_one = np.delete(np.arange(len(frequencies)), ROW)
+    one_twice = np.insert(np.arange(len(frequencies)), ROW, ROW)
+    assert "lost" in found(played, frequencies.select(all_but_one), stress.select(all_but_one))
+    assert "repeated" in found(played, frequencies.select(one_twice))
+    assert found(played, stress=stress.select(all_but_one)) == {"missing_tensors"}
+    assert found(played, stress=stress.select(one_twice)) == {"repeated"}
+
+
+def test_what_the_driver_counts_is_checked(played):
+    for counter in ("lost_on_the_way", "rows published", "rows unaccounted"):
+        assert found(played, **{counter: played[0].counters[counter] + 1}) == {"miscounted"}
+    assert found(played, lost_on_the_way=0) == {"miscounted"}
+
+
+def test_what_did_not_come_here_is_nobodys_fault(played):
+    """DDS's numbers say that messages are missing: nothing is said of their rows."""
+    record, log = played
+    rest = np.r_[0:4000, 4400:8000]
+    frequencies = record.frequencies.rows
+    rest = rest[rest < len(frequencies)]
+    record = replace(
+        record,
+        frequencies=Received(frequencies.select(rest), gaps=((4000, 100),)),
+        counters={**record.counters},
+    )
+    figures = judge(record, log)
+    assert figures["missed_by_judge"] == 100
+    assert {name for name in WRONG if figures[name]} == set()
