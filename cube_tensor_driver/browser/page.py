@@ -103,7 +103,7 @@ class Page:
             contacts = self._surface.contacts(newest.believed(health), CONTACT_PRESSURE)
             self._contact = contacts[0] if contacts else None
         held = self._paused or self._replay.held
-        hertz = float(np.nanmax(rate, initial=0.0))
+        hertz = float(np.fmax.reduce(rate, axis=None, initial=0.0))
         self._headline.content = markup.headline(
             health, hertz, self._contact, held, status.recording
         )

@@ -333,7 +333,9 @@ class Pipeline:
         index = np.where(unknown, 0, cube).astype(int)
         group, rest = self._group[index], self._rest[index]
         highest = highest_frequency(rest, self._beta[group])
-        lowest_v = float(np.nanmax(-rest / highest, initial=-1.0)) * (1 - LOWEST_MARGIN)
+        lowest_v = float(np.fmax.reduce(-rest / highest, axis=None, initial=-1.0)) * (
+            1 - LOWEST_MARGIN
+        )
         # One pad more than there are where a cube is unknown: such a scan never counts as full and
         # is always corrected, where its row becomes NaN.
         n_pads = int(np.count_nonzero(self._exists[group])) + int(unknown.any())
