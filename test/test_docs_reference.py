@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import subprocess
+from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 from bag_maker import make_bag
 from test_docs_python import blocks
 
+import cube_tensor_driver as ctd
 from conftest import ROOT
 from cube_tensor_driver.core.defaults import FOAM_MODULUS, FREQUENCY_NOISE, POISSONS_RATIO
 from cube_tensor_driver.core.estimator import make_estimator
@@ -150,6 +152,14 @@ def test_status_bits_of_the_page_are_those_of_the_message():
     defined = dict(re.findall(r"^uint16 (\w+)=(\d+)", text, re.MULTILINE))
     shown = dict(re.findall(r"^\| `(\w+)` \| (\d+) \|", PAGE.read_text(), re.MULTILINE))
     assert shown == defined
+
+
+@pytest.mark.parametrize("rows", [ctd.FrequencyRows, ctd.StressRows])
+def test_table_of_rows_has_their_fields(rows):
+    page = (ROOT / "docs" / "python.md").read_text()
+    [cells] = re.findall(rf"^\| `{rows.__name__}` .*\n\|---.*\n((?:\|.*\n)+)", page, re.MULTILINE)
+    first = [line.split(" | ")[0] for line in cells.splitlines()]
+    assert re.findall(r"\w+", " ".join(first)) == [field.name for field in fields_of(rows)]
 
 
 def test_recorded_messages_are_read_as_the_page_says(tmp_path, monkeypatch, capsys):
