@@ -1,8 +1,8 @@
 """Compares the stamps of rows with the simulator's clock.
 
-The smallest delay between a hub and the driver cannot be told from the offset of its clock, so
-stamps are late by it. How late single samples come does not matter: on a busy host, too, some
-come in time.
+Hubs answer TIME, so what is left is half the difference of the two directions' smallest delays. How
+late single samples come does not matter: on a busy host, too, some come in time. Stamps that the
+driver says are in doubt are not judged.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.status import STAMP
 from ..simulation.sample_log import SampleLog
 from .record import Record
 from .samples import NONE, Samples
 
 SETTLE_S = 6.0
-"""After a restart or a jump of a hub's clock, until its stamps are judged: drift is known then."""
-CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "step", "drift")
+"""After a restart of a hub, until its stamps are judged: drift is known then."""
+CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "drift")
 """What makes the driver fit a hub's clock from the start."""
 
 
@@ -27,7 +28,8 @@ def stamp_errors_ms(
     while. sample: (N,) of each row that came."""
     rows = record.frequencies.rows
     leads = np.isin(rows.cube, [link.members[0] for link in log.links])
-    chosen = np.flatnonzero(leads & (sample != NONE))
+    is_sure = rows.status & np.uint16(STAMP) == 0
+    chosen = np.flatnonzero(leads & is_sure & (sample != NONE))
     stamp_ns, of = rows.stamp_ns[chosen], sample[chosen]
     error_ms = 1e-6 * (stamp_ns - samples.time_ns[of])
     return np.asarray(error_ms[_settled(record, log, samples)[of]], np.float64)
