@@ -27,7 +27,7 @@ ELSEWHERE = {
     "./cube demo --headless --duration 3 --json figures.json": (
         "test_end_to_end.test_demo_loses_nothing_and_is_right"
     ),
-    "./cube demo --config skin.yaml --headless --duration 3": (
+    "./cube demo --config first.yaml --headless --duration 3": (
         "test_docs_python.test_subscribers_of_the_pages_print_pressures"
     ),
     "./cube bringup /dev/ttyACM0 -o hand.yaml": (
