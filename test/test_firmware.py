@@ -28,8 +28,10 @@ from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.oscillator import stress_slope
 from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.core.status import STAMP
+from cube_tensor_driver.device.decoder import Decoder
+from cube_tensor_driver.device.protocol import Command, Request, Time, encode
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.firmware import Emulator, build, missing
+from cube_tensor_driver.processes.firmware import Emulator, FirmwareError, build, missing, need
 from cube_tensor_driver.processes.skin_processes import skin_processes
 from cube_tensor_driver.simulation.captures import COUNTER_HZ, WINDOW_US, Oscillators, edges
 from cube_tensor_driver.simulation.cubes import hub_cubes, skin_components
@@ -48,9 +50,11 @@ emulated = pytest.mark.skipif(bool(NO_ARM), reason=NO_ARM)
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with cube_hub, and hub.elf where there is a cross compiler."""
+    """A folder with cube_hub under sanitizers, and hub.elf where there is a cross compiler."""
     folder = tmp_path_factory.mktemp("firmware")
-    build(SOURCE, folder, "posix")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CFLAGS", "-fsanitize=address,undefined -fno-sanitize-recover=all")
+        build(SOURCE, folder, "posix")
     if not NO_ARM:
         build(SOURCE, folder, "an386")
     return folder
@@ -126,6 +130,7 @@ def cube_hub(program: Path, *options: str) -> Iterator[str]:
     finally:
         end(process)
         process.stdout.close()
+    assert process.returncode == 0
 
 
 @contextlib.contextmanager
@@ -155,6 +160,35 @@ def emulated_hub(image: Path, skin: Skin) -> Iterator[tuple[str, Oscillators]]:
         server.start()
         yield emulator.port, pads
     server.join()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_does_no_harm(out, tmp_path, seed):
+    """Of all kinds: with few zeros and many, and with frames in it. The sanitizers look on."""
+    random = np.random.default_rng(seed)
+    noise = random.integers(0, 256, 60_000).astype(np.uint8)
+    noise[random.random(len(noise)) < (0.001, 0.05, 0.5)[seed]] = 0
+    with (
+        cube_hub(out / "cube_hub", "--ports", str(tmp_path)) as port,
+        PortWire(port, 921_600) as wire,
+    ):
+        for part in np.split(noise, 60):
+            wire.send(part.tobytes() + b"\0" + encode(Request(Command.START)))
+            wire.listen(1.0)
+        wire.send(b"\0" + encode(Request(Command.TIME, 77)))
+        decoder = Decoder()
+        frames = [frame for _ in range(100) for frame in decoder.feed(wire.listen(0.05))]
+        assert 77 in [frame.number for frame in frames if isinstance(frame, Time)]
+
+
+def test_a_step_names_the_package_that_it_needs(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FirmwareError, match=r"needs arm-none-eabi-gcc: apt-get install .*newlib"):
+        need("the build", "arm-none-eabi-gcc")
+    with pytest.raises(FirmwareError, match=r"apt-get install .* qemu-system-arm"):
+        Emulator(tmp_path / "hub.elf")
+    with pytest.raises(FirmwareError, match=r"needs make, cc: apt-get install .* make gcc"):
+        build(SOURCE, tmp_path, "posix")
 
 
 def checked(port: str) -> Checked:

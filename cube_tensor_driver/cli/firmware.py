@@ -68,6 +68,7 @@ def run_emulated(options: argparse.Namespace) -> int:
         server = threading.Thread(target=pads.serve, args=(emulator.pads,), daemon=True)
         server.start()
         server.join()
+        emulator.check()
     return 0
 
 

@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 from ..core.errors import CubeError
+from .children import END_WITH_PARENT
 
 PACKAGES = {
     "make": "make",
@@ -72,17 +73,35 @@ class Emulator:
         # QEMU gets sockets that listen already: so no port is taken by somebody else in between.
         with _listening(self._address) as host, _listening(ANY_ADDRESS) as pads:
             self.port = "socket://{}:{}".format(*host.getsockname())
-            command = ["qemu-system-arm", "-M", MACHINE, "-kernel", str(self._image)]
+            command = [
+                *END_WITH_PARENT,
+                "qemu-system-arm",
+                "-M",
+                MACHINE,
+                "-kernel",
+                str(self._image),
+            ]
             command += ["-display", "none", "-monitor", "none"]
             for name, listener in (("host", host), ("pads", pads)):
                 line = f"socket,id={name},fd={listener.fileno()},server=on,wait=off,nodelay=on"
                 command += ["-chardev", line, "-serial", f"chardev:{name}"]
             self._process = subprocess.Popen(
-                command, pass_fds=(host.fileno(), pads.fileno()), stdin=subprocess.DEVNULL
+                command,
+                pass_fds=(host.fileno(), pads.fileno()),
+                stdin=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                start_new_session=True,
             )
             self.pads = socket.create_connection(pads.getsockname())
         self.pads.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return self
+
+    def check(self) -> None:
+        """FirmwareError: QEMU has ended by itself."""
+        if self._process.poll() is not None and self._process.stderr is not None:
+            said = self._process.stderr.read().strip()
+            raise FirmwareError(f"QEMU ended with code {self._process.returncode}: {said}")
 
     def __exit__(self, *_: object) -> None:
         # Ends a `recv` of another thread, which closing does not.
@@ -95,6 +114,8 @@ class Emulator:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        if self._process.stderr is not None:
+            self._process.stderr.close()
 
 
 def _listening(address: tuple[str, int]) -> socket.socket:

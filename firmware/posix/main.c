@@ -34,6 +34,7 @@ struct one {
     struct hub hub;
     struct hub_config config;
     struct port port;
+    uint64_t *cube_uids;
     char name[4096];
 };
 
@@ -113,16 +114,16 @@ static struct capture *captures(const struct options *options) {
 }
 
 static bool begin(struct one *one, unsigned index, const struct options *options) {
-    uint64_t *uids = memory(options->cubes, sizeof *uids);
+    one->cube_uids = memory(options->cubes, sizeof(uint64_t));
     for (unsigned cube = 0; cube < options->cubes; cube++)
-        uids[cube] = FIRST_CUBE_UID + (uint64_t)index * options->cubes + cube;
+        one->cube_uids[cube] = FIRST_CUBE_UID + (uint64_t)index * options->cubes + cube;
     size_t row = CUBE_SAMPLE_ROW(options->pads);
     size_t sample = CUBE_WIRE_SIZE(CUBE_SAMPLE_SIZE(0u, 0u) + options->cubes_per_frame * row);
     size_t hello = CUBE_WIRE_SIZE(CUBE_HELLO_SIZE((size_t)options->cubes));
     size_t frame_size = sample > hello ? sample : hello;
     one->config = (struct hub_config){
         .uid = options->uid + index,
-        .cube_uids = uids,
+        .cube_uids = one->cube_uids,
         .n_cubes = (uint16_t)options->cubes,
         .n_pads = (uint8_t)options->pads,
         .cubes_per_frame = (uint16_t)options->cubes_per_frame,
@@ -143,6 +144,14 @@ static bool begin(struct one *one, unsigned index, const struct options *options
         opened = line_open_tcp(&one->port, one->name, (uint16_t)(options->tcp + index));
     }
     return opened && hub_begin(&one->hub, &one->config, &one->port);
+}
+
+static void finish(struct one *one) {
+    line_close(&one->port);
+    free(one->cube_uids);
+    free(one->port.captures);
+    free(one->config.frequency);
+    free(one->config.frame);
 }
 
 static void run(struct one *hubs, unsigned n_hubs) {
@@ -183,7 +192,8 @@ int main(int argc, char **argv) {
     }
     for (unsigned i = 0; i < begun; i++) {
         printf("%s: %u taken, %u dropped\n", hubs[i].name, hubs[i].hub.taken, hubs[i].hub.dropped);
-        line_close(&hubs[i].port);
+        finish(&hubs[i]);
     }
+    free(hubs);
     return begun == options.hubs ? 0 : 1;
 }
