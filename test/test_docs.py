@@ -33,6 +33,12 @@ ELSEWHERE = {
     "./cube bringup /dev/ttyACM0 -o hand.yaml": (
         "test_bringup.test_a_turned_cube_is_found_and_written"
     ),
+    "./cube firmware build": "test_firmware.test_hubs_keep_every_rule_on_real_lines",
+    "./cube firmware run": "test_firmware.test_the_load_on_the_pads_comes_out_as_tensors",
+    "./cube firmware test": "test_firmware.test_captures_are_those_of_the_oscillators",
+    "./cube check socket://127.0.0.1:5331": (
+        "test_firmware.test_hubs_keep_every_rule_on_real_lines"
+    ),
     "./cube record -o run1": "test_bags_ros.test_recorded_is_published_and_reprocessed_is_live",
     "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml": (
         "test_bags_files.test_fit_from_a_bag"

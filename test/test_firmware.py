@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import ROOT, decoded, end
+from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.conformance.check import Checked, check
@@ -191,6 +194,16 @@ def test_a_step_names_the_package_that_it_needs(monkeypatch, tmp_path):
         build(SOURCE, tmp_path, "posix")
 
 
+def checked_by_command(port: str) -> None:
+    """As `./cube check`, which says the same in a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "check.json"
+        code = main(["check", port, "--json", str(path)])
+        result = json.loads(path.read_text())
+    outcomes = [rule["outcome"] for rule in result["rules"]]
+    assert (code, result["failed"]) == (0, 0) and outcomes.count("passed") == result["passed"] > 25
+
+
 def checked(port: str) -> Checked:
     with PortWire(port, 921_600) as wire:
         return check(wire)
@@ -209,15 +222,17 @@ def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
             "terminal": stack.enter_context(
                 cube_hub(out / "cube_hub", "--ports", str(tmp_path), *split)
             ),
-            "TCP": stack.enter_context(cube_hub(out / "cube_hub", "--tcp", str(free_tcp_port()))),
             "simulator": stack.enter_context(simulated_hub(tmp_path / "ports")),
         }
         if not NO_ARM:
             ports["emulator"], _ = stack.enter_context(
                 emulated_hub(out / "hub.elf", read_skin(SKIN))
             )
-        with ThreadPoolExecutor(len(ports)) as pool:
+        by_command = stack.enter_context(cube_hub(out / "cube_hub", "--tcp", str(free_tcp_port())))
+        with ThreadPoolExecutor(len(ports) + 1) as pool:
+            command = pool.submit(checked_by_command, by_command)
             results = dict(zip(ports, pool.map(checked, ports.values()), strict=True))
+            command.result()
     assert {name: result.failed() for name, result in results.items()} == {
         name: [] for name in ports
     }
