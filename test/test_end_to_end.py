@@ -60,6 +60,7 @@ def test_demo_loses_nothing_and_is_right(domain, tmp_path):
     assert result["samples_sent"] == 16 * 100 * 3
     assert result["tensors_received"] == result["samples_received"] == result["samples_sent"]
     assert result["lost"] == 0 and result["crc_errors"] == 0
+    assert output == f"wrote {path}: 4800 samples sent, 0 lost\n"
     # float32 carries 6e-8; pads at a strain of 0.1 have 1e-6 of their stress, times what the
     # inversion adds
     assert result["error_rel_rms"] < 1e-5

@@ -118,6 +118,8 @@ def run_demo(
         print(json.dumps(result, indent=2))
     else:
         write_json(json_path, result)
+        sent, lost = result["samples_sent"], result["lost"]
+        print(f"wrote {json_path}: {sent} samples sent, {lost} lost")
     return 0
 
 
