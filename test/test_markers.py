@@ -165,6 +165,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
             and contacts[-1].position
             and pictures
             and "20 kPa" in pictures[-1].markers[-1].text
+            and any(one.ns == "contact 0" and one.color.a == 1 for one in pictures[-1].markers)
         )
 
     with Children(tmp_path) as children:
@@ -174,7 +175,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
         children.check()
 
     markers = {marker.ns: marker for marker in pictures[-1].markers}
-    assert len(pictures[-1].markers) <= 8
+    assert len(pictures[-1].markers) <= 24
     assert all(
         marker.header.frame_id == "skin_base" and marker.action == Marker.ADD
         for marker in markers.values()
@@ -187,7 +188,11 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     turn = rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
     np.testing.assert_allclose(turn, np.diag([-1, 1, -1]), atol=1e-12)
     points = np.array([[p.x, p.y, p.z] for p in cubes.points]) @ turn.T
-    np.testing.assert_allclose(points, [cube.xyz for cube in skin.cubes], atol=1e-12)
+    upper_faces = np.array([cube.xyz for cube in skin.cubes])
+    upper_faces[:, 2] += skin.cubes[0].calibration.half_side
+    # A plate covers the upper face: the cube of the robot model is seen below it.
+    assert (np.abs(points - upper_faces) <= [1e-12, 1e-12, cubes.scale.z / 2]).all()
+    assert cubes.scale.z < 0.2 * cubes.scale.x
     bar = np.array([[p.x, p.y, p.z] for p in markers["legend bar"].points]) * np.diag(turn)
     assert (
         markers["legend bar"].pose.orientation == q
@@ -206,6 +211,14 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
     assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
     assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
+    numbers = [float(markers[f"legend number {k}"].text) for k in range(3)]
+    assert numbers == [0, 10, 20]
+    # Arrows are to the scale of the legend's.
+    assert markers["traction scale"].text == "traction 20.0 kPa"
+    sample = np.array([[p.x, p.y, p.z] for p in markers["traction arrow"].points])
+    assert np.linalg.norm(shaft) / np.linalg.norm(sample[1] - sample[0]) == pytest.approx(
+        np.hypot(20, 4) / 20
+    )
     # RViz 2 makes blanks over a metre wide where scale.x does not say, and first looks for the text
     # without it
     assert not markers["legend"].text[0].isspace() and not markers["legend"].text[-1].isspace()
@@ -217,11 +230,21 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     figure.draw_without_rendering()
     drawn = sum(len(collection.get_paths()) for collection in figure.axes[0].collections)
     assert drawn >= 6 * n  # as ./cube pictures shows it: the faces of every cube, at least
-    assert "kPa" in figure.axes[0].texts[0].get_text()
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert "traction 20.0 kPa" in texts and sum("N, shear" in text for text in texts) == 1
 
     contact = contacts[-1]
     assert contact.header.frame_id == "skin_base" and len(contact.position) == 1
     assert contact.normal_force[0] > 0 and contact.force[0].z < 0 < contact.force[0].x
+    label, other = markers["contact 0"], markers["contact 1"]
+    assert label.text == f"{contact.normal_force[0]:.2f} N, shear {contact.shear_force[0]:.2f} N"
+    assert label.color.a == 1 and other.color.a < 0.01
+    at = label.pose.position
+    assert (at.x, at.y) == pytest.approx((contact.position[0].x, contact.position[0].y))
+    rings = np.array([[p.x, p.y, p.z] for p in markers["contacts"].points]).reshape(8, -1, 3)
+    radius = np.linalg.norm(rings[0] - rings[0].mean(axis=0), axis=1)
+    np.testing.assert_allclose(np.pi * radius**2, contact.area[0], rtol=1e-6)
+    assert not np.ptp(rings[1:], axis=1).any()
 
 
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "a name of many letters"])

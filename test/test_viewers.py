@@ -15,6 +15,9 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
+from cube_tensor_driver.config.rviz import rviz_view
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.core.scene import QUANTITIES, colours
 
 yaml = pytest.importorskip("yaml")
 
@@ -190,6 +193,29 @@ def test_rviz_reads_every_name_of_ours():
     assert manager["Transformation"]["Current"]["Class"] == "rviz_default_plugins/TF"
     view = manager["Views"]["Current"]
     assert view["Class"] == "rviz_default_plugins/Orbit" and set(view) <= ORBIT
+
+
+def test_rviz_gets_the_frame_a_wrench_and_a_view_of_any_skin():
+    skin = read_skin(ROOT / "config" / "examples" / "sole.yaml")
+    manager = rviz_view(skin)["Visualization Manager"]
+    assert manager["Global Options"]["Fixed Frame"] == skin.parent_frame
+    displays = {display["Name"]: display for display in manager["Displays"]}
+    topic = displays["Wrench"]["Topic"]["Value"]
+    assert topic in {f"cubes/{cube.name}/wrench" for cube in skin.cubes}
+    camera = manager["Views"]["Current"]
+    centre = np.array([camera["Focal Point"][axis] for axis in "XYZ"])
+    furthest = np.linalg.norm(np.array([cube.xyz for cube in skin.cubes]) - centre, axis=1).max()
+    # RViz's camera sees 45 degrees: half of that reaches 0.41 of the distance.
+    assert furthest < 0.41 * camera["Distance"] < 2 * furthest
+
+
+def test_cubes_at_rest_and_arrows_stand_out_from_the_ground_of_rviz():
+    rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
+    ground = rviz["Visualization Manager"]["Global Options"]["Background Color"]
+    grey = np.array([float(part) for part in ground.split(";")]) / 255
+    at_rest = colours(QUANTITIES["pressure"], np.zeros(1), 1.0)[0]
+    for colour in (at_rest, np.ones(3)):
+        assert abs((colour - grey) @ [0.299, 0.587, 0.114]) > 0.2
 
 
 def test_rviz_shows_our_topics_as_they_are_offered():

@@ -15,7 +15,9 @@ from .style import print_style
 
 Array = NDArray[np.float64]
 
-_RVIZ_GREY = (40 / 255, 42 / 255, 46 / 255)
+_RVIZ_GREY = (108 / 255, 112 / 255, 118 / 255)
+VISIBLE = 0.01
+"""Of a colour: less is hidden."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _FACES = np.array(
     [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
@@ -57,13 +59,15 @@ def _draw_cubes(axes: Any, marker: Marker, order: int) -> None:
 
 
 def _draw_text(axes: Any, marker: Marker) -> None:
+    if marker.color.a < VISIBLE:
+        return
     at = marker.pose.position
     axes.text(
         at.x,
         at.y,
         at.z,
         marker.text.strip(" ."),
-        color="white",
+        color=(marker.color.r, marker.color.g, marker.color.b),
         ha="center",
         va="center",
         fontsize=9,

@@ -10,7 +10,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import Action, LaunchContext, Substitution
 from launch.actions import DeclareLaunchArgument, SetLaunchConfiguration
@@ -19,8 +18,9 @@ from launch.substitutions import LaunchConfiguration
 from ..config.load_script import read_script
 from ..config.package_data import package_data
 from ..config.port import port_problem
+from ..config.rviz import rviz_view
 from ..config.skin import Skin, read_skin
-from ..config.yaml import read_yaml, write_yaml
+from ..config.yaml import write_yaml
 from ..core.errors import ConfigError
 from ..processes.temporary import temporary_folder
 
@@ -31,8 +31,6 @@ SINGLE, DEMO, DEMO_LOAD = (
 SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
 NEEDS = {"rviz": ("rviz2", "robot_state_publisher"), "state_publisher": ("robot_state_publisher",)}
 """The ROS packages beyond our own that an argument needs."""
-VIEW_DISTANCE, MIN_DISTANCE = 1.8, 0.05
-"""Of RViz's camera: in diagonals of the skin, and at least, in m."""
 
 
 def text(name: str, description: str, default: str = "") -> DeclareLaunchArgument:
@@ -71,22 +69,9 @@ def parent_frame(skin: Skin) -> str:
 
 
 def rviz_file(skin: Skin) -> str:
-    """The path of rviz/skin.rviz as it fits this skin: its parent frame, a view of all of it, and
-    the wrench of the cube in its middle."""
-    view = read_yaml(package_data() / "rviz" / "skin.rviz")
-    manager = view["Visualization Manager"]
-    position = np.array([cube.xyz for cube in skin.cubes])
-    low, high = position.min(axis=0), position.max(axis=0)
-    centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
-    nearest = int(np.linalg.norm(position - centre, axis=1).argmin())
-    manager["Global Options"]["Fixed Frame"] = skin.parent_frame
-    displays = {display["Name"]: display for display in manager["Displays"]}
-    displays["Wrench"]["Topic"]["Value"] = f"cubes/{skin.cubes[nearest].name}/wrench"
-    camera = manager["Views"]["Current"]
-    camera["Focal Point"] = dict(zip("XYZ", centre.tolist(), strict=True))
-    camera["Distance"] = max(MIN_DISTANCE, VIEW_DISTANCE * size)
+    """The path of a configuration of RViz for this skin."""
     path = temporary_folder("cube_rviz_") / "skin.rviz"
-    write_yaml(path, view)
+    write_yaml(path, rviz_view(skin))
     return str(path)
 
 

@@ -35,11 +35,17 @@ SIZES = {
 
 
 class MarkerArrays(NamedTuple):
-    """Views on the bytes of a marker: points (n, 3) m, colours (n, 4) or (0, 4), text in ASCII."""
+    """Views on the bytes of a marker.
+
+    points: (n, 3) m. colours: (n, 4) of the points, or (0, 4). text: in ASCII. position: (3,) m of
+    the whole. colour: (4,) where points have none.
+    """
 
     points: NDArray[np.float64]
     colours: NDArray[np.float32]
     text: NDArray[np.uint8]
+    position: NDArray[np.float64]
+    colour: NDArray[np.float32]
 
 
 class SerialisedMarkers:
@@ -56,7 +62,9 @@ class SerialisedMarkers:
             points = self._view("<f8", at["points"], (len(marker.points), 3))
             colours = self._view("<f4", at["colors"], (len(marker.colors), 4))
             text = self._view("u1", at["text"], (len(marker.text),))
-            self._arrays[marker.ns] = MarkerArrays(points, colours, text)
+            position = self._view("<f8", _aligned(at["pose"], 8), (3,))
+            colour = self._view("<f4", _aligned(at["color"], 4), (4,))
+            self._arrays[marker.ns] = MarkerArrays(points, colours, text, position, colour)
         # The middleware may fill up the last four bytes.
         expected = ENCAPSULATION_BYTES + walk.end
         if not 0 <= len(self.data) - expected < 4:
@@ -119,5 +127,10 @@ class _CdrWalk:
         return min(self.skip_message(message).values())
 
     def _align(self, size: int) -> int:
-        self.end = -(-self.end // size) * size
+        self.end = _aligned(self.end, size)
         return self.end
+
+
+def _aligned(place: int, size: int) -> int:
+    """The first multiple of a size from a place on."""
+    return -(-place // size) * size

@@ -91,7 +91,7 @@ def _demo_skin() -> Iterator[Children]:
         Children(Path(name)) as children,
     ):
         hubs = SimulatedHubs(Path(name) / "ports")
-        for process in skin_processes(skin, markers=True, simulated=hubs):
+        for process in skin_processes(skin, markers=True, contacts=True, simulated=hubs):
             children.start(process)
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         yield children
