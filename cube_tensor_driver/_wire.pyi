@@ -23,9 +23,12 @@ def read_links(
     and their frames. While it works, other threads run, and its decoders can do nothing else.
     """
 
-def place_rows(samples: list[bytes], stamps_ns: list[int], n_pads: int) -> bytearray:
-    """The rows of decoded SAMPLEs, one after the other, as columns one behind the other.
+def place_rows(
+    samples: list[bytes], stamps_ns: list[int], n_pads: int, memory: bytearray
+) -> None:
+    """Write the rows of decoded SAMPLEs, one after the other, as columns one behind the other.
 
     stamp_ns (N,) int64, sequence (N,) uint32, pad_fault (N,) uint32, temperature (N,) float32 in
     °C, frequency (N, n_pads) float32 in Hz; NaN where it is unknown or the cube has no such pad.
+    memory: of exactly that size, N (20 + 4 n_pads) bytes.
     """

@@ -385,10 +385,11 @@ static bool get_sample(PyObject *raw, cube_frame *frame) {
 
 static PyObject *place_rows(PyObject *module, PyObject *args) {
     (void)module;
-    PyObject *raws, *stamps;
+    PyObject *raws, *stamps, *memory;
     Py_ssize_t pads;
     if (!PyArg_ParseTuple(
-            args, "O!O!n:place_rows", &PyList_Type, &raws, &PyList_Type, &stamps, &pads))
+            args, "O!O!nO!:place_rows", &PyList_Type, &raws, &PyList_Type, &stamps, &pads,
+            &PyByteArray_Type, &memory))
         return NULL;
     Py_ssize_t count = PyList_Size(raws);
     size_t n_rows = 0, n_pads = pads < 0 ? 0 : (size_t)pads;
@@ -411,22 +412,20 @@ static PyObject *place_rows(PyObject *module, PyObject *args) {
         }
         n_rows += frame.as.sample.n_cubes;
     }
-    PyObject *memory =
-        PyByteArray_FromStringAndSize(NULL, (Py_ssize_t)columns_size(n_rows, n_pads));
-    if (memory == NULL)
+    if ((size_t)PyByteArray_Size(memory) != columns_size(n_rows, n_pads)) {
+        PyErr_SetString(PyExc_ValueError, "the memory must have the size of the rows");
         return NULL;
+    }
     Columns columns = columns_of((uint8_t *)PyByteArray_AsString(memory), n_rows, n_pads);
     size_t row = 0;
     for (Py_ssize_t i = 0; i < count; i++) {
         int64_t stamp_ns = PyLong_AsLongLong(PyList_GetItem(stamps, i));
-        if ((stamp_ns == -1 && PyErr_Occurred()) || !get_sample(PyList_GetItem(raws, i), &frame)) {
-            Py_DECREF(memory);
+        if ((stamp_ns == -1 && PyErr_Occurred()) || !get_sample(PyList_GetItem(raws, i), &frame))
             return NULL;
-        }
         place(&frame, stamp_ns, &columns, row);
         row += frame.as.sample.n_cubes;
     }
-    return memory;
+    Py_RETURN_NONE;
 }
 
 /* ------------------------------------------------------------------------------ module -------- */

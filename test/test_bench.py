@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
+from cube_tensor_driver.processes.firmware import missing
 from cube_tensor_driver.trials import bench
 
 KEYS = {
@@ -72,3 +73,24 @@ def test_growth_of_memory_and_its_error():
     found = bench._memory({"driver": list(steps)})
     assert abs(found["rss_mb_per_minute"]) < 4 * found["rss_mb_per_minute_error"]
     assert "rss_mb_per_minute" not in bench._memory({"driver": [80.0] * 20})
+
+
+@pytest.mark.alone
+@pytest.mark.skipif(bool(missing("make", "cc")), reason=missing("make", "cc"))
+def test_links_counts_what_hubs_in_c_sent(tmp_path):
+    figures = tmp_path / "figures.json"
+    command = [sys.executable, "-c", LINKS, figures]
+    subprocess.run(command, capture_output=True, check=True, timeout=60)
+    found = json.loads(figures.read_text())
+    assert found["cubes"] == 80
+    assert found["rows"] + found["lost"] == pytest.approx(found["rows_expected"], rel=0.2)
+    assert 0 < found["cpu_percent"] < 100
+
+
+LINKS = """
+import sys
+from pathlib import Path
+from cube_tensor_driver.trials import bench_links
+bench_links.SETTLE_S = 0.2
+bench_links.bench_links(cubes=3, rate=100.0, duration=1.0, json_path=Path(sys.argv[1]))
+"""

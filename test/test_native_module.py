@@ -111,10 +111,15 @@ def test_rows_have_the_same_bits(pads: tuple[int, ...], monkeypatch: pytest.Monk
 
 @needs_the_module
 def test_rows_are_made_of_samples_only() -> None:
-    place = native.wire.place_rows
     sample = random_sample(np.random.default_rng(1), 2, 3)
-    assert len(place([sample.raw], [1], 3)) == 2 * (8 + 4 + 4 + 4 + 4 * 3)
-    assert place([], [], 3) == b""
+    memory = bytearray(2 * (20 + 4 * 3))
+
+    def place(raws: list[bytes], stamps: list[int], n_pads: int) -> None:
+        native.wire.place_rows(raws, stamps, n_pads, memory)
+
+    place([sample.raw], [1], 3)
+    with pytest.raises(ValueError, match="size of the rows"):
+        place([sample.raw] * 2, [1, 2], 3)
     (stats,) = native.wire.Decoder().feed(encode(Stats(1, 2, 3)))
     for raw in (b"", sample.raw[:-1], sample.raw + b"\0", stats, b"\2\1" + bytes(26)):
         with pytest.raises(ValueError, match="no SAMPLE"):

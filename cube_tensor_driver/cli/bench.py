@@ -16,9 +16,16 @@ def arguments(parser: Parser) -> None:
     pipeline.add_json()
 
     decode = parser.add_subcommand(
-        "decode", "the decoder on all kinds of noise, beside clean frames"
+        "decode", "the decoder on clean frames and all kinds of noise, GB/s"
     )
     decode.add_json()
+
+    links = parser.add_subcommand(
+        "links", "from the bytes of hubs in C to arrays, without DDS and reconstruction"
+    )
+    _add_cubes(links, 1280)
+    _add_time(links)
+    links.add_json()
 
     echo = parser.add_subcommand(
         "echo", "bare rclpy: publish, echo and receive messages of a skin's sizes"
@@ -93,6 +100,15 @@ def run(options: argparse.Namespace) -> int:
         from ..trials.bench_decode import bench_decode
 
         return bench_decode(json_path=options.json)
+    if options.what == "links":
+        from ..trials.bench_links import bench_links
+
+        return bench_links(
+            cubes=options.cubes,
+            rate=options.rate,
+            duration=options.duration,
+            json_path=options.json,
+        )
     from ..trials import bench
 
     if options.what == "pipeline":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import groupby
 from typing import NamedTuple
 
@@ -24,6 +25,9 @@ _CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
 
 MAX_SPAN_NS = 2_000_000_000
 """Rows that are built together lie within it: a message holds 2.1 s after its stamp."""
+
+SHAPES_KEPT = 4
+"""Of rows, whose memory is kept."""
 
 CLEARLY_BEFORE = 0.75
 """Of a period: hubs sample at different phases, and stamps jitter."""
@@ -70,6 +74,8 @@ class ScanBuilder:
         self._pending_ns: list[int] = []  # when the first sample of each pending scan was taken
         self._n_pending = [0] * n_links  # how many pending scans each link has reached
         self._built_ns = [0] * n_links  # when the newest sample that was built was taken
+        # The same few shapes come again and again, and new memory costs more than it.
+        self._columns_of = lru_cache(maxsize=SHAPES_KEPT)(_Columns)
 
     def set_live(self, link: int, live: bool) -> None:
         """Whether a link delivers samples now, so that a scan waits for it."""
@@ -134,7 +140,8 @@ class ScanBuilder:
             end = start + sum(len(part.cubes) for part in same_width)
             # Mostly all cubes have as many pads; then there is nothing to select.
             is_all = len(same_width) == len(parts)
-            _fill(rows if is_all else rows.select(slice(start, end)), same_width)
+            part_of_rows = rows if is_all else rows.select(slice(start, end))
+            _fill(part_of_rows, same_width, self._columns_of)
             start = end
         return rows
 
@@ -204,7 +211,9 @@ def _split(parts: list[_Part]) -> tuple[list[_Part], list[_Part]]:
     return within, [part for part in parts if part.stamp_ns > end_ns]
 
 
-def _fill(rows: FrequencyRows, parts: Sequence[_Part]) -> None:
+def _fill(
+    rows: FrequencyRows, parts: Sequence[_Part], columns_of: Callable[[int, int], _Columns]
+) -> None:
     """Write samples with the same number of pads, one after the other; pads that a cube does not
     have are NaN."""
     counts = [len(part.cubes) for part in parts]
@@ -213,21 +222,31 @@ def _fill(rows: FrequencyRows, parts: Sequence[_Part]) -> None:
     if any(part.status for part in parts):
         rows.status[:] = np.repeat([part.status for part in parts], counts)
     if wire is not None and all(part.sample.raw for part in parts):
-        _fill_values_in_c(rows, parts)
+        columns = columns_of(*rows.frequency.shape)
+        raws, stamps_ns = [part.sample.raw for part in parts], [part.stamp_ns for part in parts]
+        wire.place_rows(raws, stamps_ns, rows.frequency.shape[1], columns.memory)
+        columns.copy_to(rows)
     else:
         _fill_values(rows, parts, counts)
 
 
-def _fill_values_in_c(rows: FrequencyRows, parts: Sequence[_Part]) -> None:
-    """As `_fill_values`, of decoded samples."""
-    n_rows, n_pads = rows.frequency.shape
-    raws, stamps_ns = [part.sample.raw for part in parts], [part.stamp_ns for part in parts]
-    columns = wire.place_rows(raws, stamps_ns, n_pads)
-    rows.stamp_ns[:] = np.ndarray(n_rows, np.int64, columns)
-    rows.sequence[:] = np.ndarray(n_rows, np.uint32, columns, 8 * n_rows)
-    rows.pad_fault[:] = np.ndarray(n_rows, np.uint32, columns, 12 * n_rows)
-    rows.temperature[:] = np.ndarray(n_rows, np.float32, columns, 16 * n_rows)
-    rows.frequency[:] = np.ndarray((n_rows, n_pads), np.float32, columns, 20 * n_rows)
+class _Columns:
+    """Memory for the values of so many rows, as `wire.place_rows` writes them."""
+
+    def __init__(self, n_rows: int, n_pads: int) -> None:
+        self.memory = bytearray(n_rows * (20 + 4 * n_pads))
+        self._stamp_ns = np.ndarray(n_rows, np.int64, self.memory)
+        self._sequence = np.ndarray(n_rows, np.uint32, self.memory, 8 * n_rows)
+        self._pad_fault = np.ndarray(n_rows, np.uint32, self.memory, 12 * n_rows)
+        self._temperature = np.ndarray(n_rows, np.float32, self.memory, 16 * n_rows)
+        self._frequency = np.ndarray((n_rows, n_pads), np.float32, self.memory, 20 * n_rows)
+
+    def copy_to(self, rows: FrequencyRows) -> None:
+        rows.stamp_ns[:] = self._stamp_ns
+        rows.sequence[:] = self._sequence
+        rows.pad_fault[:] = self._pad_fault
+        rows.temperature[:] = self._temperature
+        rows.frequency[:] = self._frequency
 
 
 def _fill_values(rows: FrequencyRows, parts: Sequence[_Part], counts: Sequence[int]) -> None:

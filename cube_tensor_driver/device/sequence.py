@@ -73,9 +73,11 @@ class SequenceTracker:
         """
         # The next number is the common case, and it is quick.
         if sequence == self._next % _WRAP and device_us >= self._newest_us:
+            self._seen.append((self._next, device_us))
             self._next += 1
             self._newest_us = device_us
-            return self._deliver(self._next - 1, device_us, Arrival.NEW)
+            self.counters.delivered += 1
+            return Arrival.NEW
         if not self._seen:
             return self._begin(sequence, device_us, Arrival.NEW)
         ahead = self._ahead(sequence)
