@@ -264,6 +264,8 @@ def test_device_time_of_64_bits() -> None:
     clock = ClockMap()
     stamps = clock.update([top - 20_000, top - 10_000, top], EPOCH_NS)
     assert stamps == [EPOCH_NS - 20_000_000, EPOCH_NS - 10_000_000, EPOCH_NS]
+    # What no clock can have done, in one read.
+    assert ClockMap().update([5, top], EPOCH_NS) == [EPOCH_NS, EPOCH_NS]
 
 
 # (sequence, device time in ms) -> arrival; then delivered, missing, duplicate, out of order,

@@ -103,6 +103,27 @@ def test_a_hub_that_samples_late_has_not_set_its_clock(delay, pause_s) -> None:
     assert delay is not quick or not run.in_doubt.any()
 
 
+def test_loss_disorder_gaps_and_the_wrap_of_numbers_raise_no_doubt() -> None:
+    """Samples lost one by one and for seconds, sent twice, and behind the one that follows."""
+    random = np.random.default_rng(4)
+    kept = random.random(6000) > 0.05
+    kept[2000:3500] = False
+    order = np.flatnonzero(kept)
+    order = np.sort(np.concatenate([order, order[::50]]))
+    swap = np.arange(10, len(order) - 1, 37)
+    order[swap], order[swap + 1] = order[swap + 1], order[swap].copy()
+    true_s = np.arange(6000) / 300
+    device_us = device_times(true_s)
+    arrival_s = np.maximum.accumulate(random_delays(true_s[order], random))
+    clock = ClockMap()
+    for k, arrived_s in zip(order.tolist(), arrival_s.tolist(), strict=True):
+        number = (k - 1000) % (1 << 32)
+        arrival_ns = EPOCH_NS + round(1e9 * arrived_s)
+        (stamp_ns,) = clock.update([int(device_us[k])], arrival_ns, [number])
+        assert not clock.in_doubt and not clock.problems
+        assert true_s[k] < 6 or abs(stamp_ns - EPOCH_NS - 1e9 * (true_s[k] + BASE_S)) < 1_000_000
+
+
 @pytest.mark.parametrize("rate", [50.0, 1000.0])
 def test_rows_of_a_clock_that_stands_still_are_in_doubt_until_it_goes_on(rate) -> None:
     true_s = np.arange(int(20 * rate)) / rate

@@ -68,7 +68,8 @@ LYING = (
     f"the hub's clock jumped {LIES} times within {LIES_NS / 1e9:g} s: "
     "rows are stamped by their arrival"
 )
-_NEVER = -(2**63)
+_NEVER = -(2**80)
+"""Before every time: device times are 64 bits of µs, here in ns."""
 
 
 class HostClockWatch:
