@@ -130,7 +130,7 @@ class SurfaceInverse:
         flat = patches(poses, self.spacing, side)
         self.points = (flat + depth * poses.rotation[:, None, :, 2]).reshape(-1, 3)
         self.cube = np.repeat(np.arange(len(flat)), side**2)
-        self._patch = _square(self.spacing, side)
+        self._patch = square(self.spacing, side)
         observed = np.isfinite(noise[:, np.arange(15), np.arange(15)])
         self.columns = np.flatnonzero(observed.any(axis=0))
         if not len(self.columns):
@@ -342,7 +342,7 @@ def _of_pressure(rows: Array) -> Array:
     return rows.reshape(-1, _ROWS)[:, 2:].ravel()
 
 
-def _square(spacing: float, side: int) -> Array:
+def square(spacing: float, side: int) -> Array:
     """(side^2, 2) m: the points of a patch about its cube, in the order of surface.patches."""
     line = (np.arange(side) - (side - 1) / 2) * spacing
     x, y = np.meshgrid(line, line)

@@ -57,6 +57,14 @@ class Layer:
                 f"Poisson's ratio is {self.poisson}; it must lie in [0, 0.5], for rubber near 0.48"
             )
 
+    def check_depth(self, depth: float) -> None:
+        """Raises ElasticError unless the layer has this depth, m."""
+        if not 0 < depth < self.thickness:
+            raise ElasticError(
+                f"depth is {depth} m in a layer of {self.thickness} m; it must lie between 0 and "
+                "the thickness"
+            )
+
     def transfer(self, kx: Array, ky: Array, depth: float) -> Complex:
         """FIELD at z = -depth under unit traction exp(i k.x).
 
@@ -66,11 +74,7 @@ class Layer:
         space has no limit of sigma_xx and sigma_yy; their mean over directions stands for it.
         Raises ElasticError where there is no such depth.
         """
-        if not 0 < depth < self.thickness:
-            raise ElasticError(
-                f"depth is {depth} m in a layer of {self.thickness} m; it must lie between 0 and "
-                "the thickness"
-            )
+        self.check_depth(depth)
         kx, ky = np.broadcast_arrays(np.asarray(kx, float), np.asarray(ky, float))
         k = np.hypot(kx, ky)
         zero = k == 0

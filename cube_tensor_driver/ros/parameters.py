@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ..config.port import port_problem
-from ..core.defaults import CONTACT_PRESSURE, SURFACE_DEPTH
+from ..core.defaults import CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.scene import QUANTITIES
 
 
@@ -125,6 +125,7 @@ MARKERS = (
     ),
     Parameter("crosses", False, "Draw the principal stresses of each cube as a cross."),
 )
+CONTACT_METHODS = ("interpolation", "inverse")
 CONTACTS = (
     *SKIN_SUBSCRIBER,
     Parameter(
@@ -138,6 +139,25 @@ CONTACTS = (
         CONTACT_PRESSURE,
         "Pressure at the cubes that counts as contact, Pa.",
         span=(0.0, 1e9),
+    ),
+    Parameter(
+        "method",
+        CONTACT_METHODS[0],
+        "How contacts are found: from the pressure interpolated between the cubes, or from the "
+        "surface's traction through the elastomer, which is published on `traction`, too.",
+        choices=", ".join(CONTACT_METHODS),
+    ),
+    Parameter(
+        "thickness",
+        0.0,
+        "Of the elastomer over rigid ground, m, for the method inverse; 0: a half space.",
+        span=(0.0, 1.0),
+    ),
+    Parameter(
+        "poisson",
+        POISSONS_RATIO,
+        "Poisson's ratio of the elastomer, for the method inverse.",
+        span=(0.0, 0.5),
     ),
 )
 RECORDER = (Parameter("skin", "skin", "Name of the skin, for the name of the bag's folder."),)

@@ -129,6 +129,10 @@ class SkinSubscriberNode(CubeNode):
         health: (cubes,) as `Newest.health` gives it.
         """
 
+    def is_wanted(self, publisher: Any) -> bool:
+        """Whether somebody listens to what `message` makes."""
+        return bool(publisher.get_subscription_count())
+
     def configure(self) -> None:
         topic = self.get_name()
         subscriber = SkinSubscriber(self, self.set_up)
@@ -151,7 +155,7 @@ class SkinSubscriberNode(CubeNode):
 
     def _publish(self, subscriber: SkinSubscriber, publisher: Any) -> None:
         skin = subscriber.skin
-        if skin is None or not self._active or not publisher.get_subscription_count():
+        if skin is None or not self._active or not self.is_wanted(publisher):
             return
         message = self.message(skin, skin.newest.health(subscriber.now(), STALE_S))
         if message is not None:

@@ -1,0 +1,130 @@
+"""Contacts from all cubes: force, place and deviations, for loads that other methods computed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.core.modes import STRESS
+from cube_tensor_driver.core.scene import CubePoses
+from cube_tensor_driver.elastic import contact
+from cube_tensor_driver.elastic.inverse import SurfaceInverse
+from cube_tensor_driver.elastic.layer import Layer
+from cube_tensor_driver.elastic.touches import Touches
+
+DEPTH, PITCH, COUNT, LEAST = 4e-3, 12e-3, 7, 300.0
+PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
+
+
+@pytest.fixture(scope="module")
+def inverse():
+    line = (np.arange(COUNT) - COUNT // 2) * PITCH
+    x, y = np.meshgrid(line, line)
+    position = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    poses = CubePoses(position, np.tile(np.eye(3), (COUNT**2, 1, 1)), np.full(COUNT**2, 2e-3))
+    noise = np.tile(np.diag(PADS_NOISE**2), (COUNT**2, 1, 1))
+    return SurfaceInverse.of_cubes(poses, noise, Layer(), DEPTH)
+
+
+def seen(inverse, sources, forces) -> np.ndarray:
+    """(N, 15) under point forces on the surface, by Boussinesq and Cerruti."""
+    below = inverse.poses.position - [0, 0, DEPTH]
+    stress, gradient = contact.field(below, sources, forces, 0.48)
+    return np.concatenate([stress, gradient[:, :3].reshape(len(below), 9)], axis=1)
+
+
+def ball(inverse, width, centre, force) -> np.ndarray:
+    return seen(inverse, *contact.hertz(width / 2, force, centre, order=12))
+
+
+def flat_punch(inverse, width, centre, force) -> np.ndarray:
+    """Pressure 1 / sqrt(a^2 - r^2), infinite at the edge: no Hertz contact at all."""
+    t, weight = np.polynomial.legendre.leggauss(12)
+    r = width / 2 * np.sqrt(1 - ((t + 1) / 2) ** 2)
+    angle = 2 * np.pi * np.arange(48) / 48
+    x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
+    sources = np.stack([centre[0] + x, centre[1] + y, 0 * x], axis=1)
+    return seen(inverse, sources, np.repeat(weight / 2 / 48, 48)[:, None] * np.asarray(force))
+
+
+def noisy(values, random) -> np.ndarray:
+    """With the noise of the pads, and 1 % of each component."""
+    return values + random.standard_normal(values.shape) * np.hypot(PADS_NOISE, 0.01 * values)
+
+
+@pytest.mark.parametrize(
+    ("load", "width", "force_limit", "place_limit"),
+    [(ball, 5e-3, 0.02, 0.1e-3), (flat_punch, 5e-3, 0.03, 0.2e-3), (flat_punch, 2e-2, 0.15, 3e-3)],
+)
+def test_a_contact_between_wide_pitches_has_its_force_and_place(
+    inverse, load, width, force_limit, place_limit
+):
+    """Where the interpolated field misses 69 % of the force, at 5 mm."""
+    random = np.random.default_rng(2)
+    for centre in random.uniform(-PITCH / 2, PITCH / 2, (3, 2)):
+        force = np.array([0.6, -0.3, -3.0])
+        (found,) = Touches(inverse, LEAST).update(
+            noisy(load(inverse, width, centre, force), random)
+        )
+        assert np.linalg.norm(found.force - force) < force_limit * 3
+        assert np.linalg.norm(found.position[:2] - centre) < place_limit
+        assert found.position[2] == pytest.approx(DEPTH)
+        if load is ball:
+            assert found.area == pytest.approx(np.pi * width**2 / 4, rel=0.1)
+
+
+def test_deviations_are_those_of_the_errors(inverse):
+    """Of many noises of one load: within what their number leaves open."""
+    random, errors = np.random.default_rng(5), []
+    force, centre = np.array([0.5, 0.2, -2.0]), np.array([3e-3, -4e-3])
+    clean = ball(inverse, 8e-3, centre, force)
+    touches = Touches(inverse, LEAST)
+    for _ in range(40):
+        (found,) = touches.update(noisy(clean, random))
+        place = (found.position[:2] - centre) / found.position_uncertainty
+        errors.append([(found.normal_force - 2) / found.force_uncertainty, *place])
+    force_ratio, x_ratio, y_ratio = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert 0.7 < force_ratio < 1.4
+    assert 0.6 < np.hypot(x_ratio, y_ratio) / np.sqrt(2) < 1.4
+
+
+def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their_ids(inverse):
+    random, touches = np.random.default_rng(3), Touches(inverse, LEAST)
+    first, second = np.array([-4e-3, 1e-3]), np.array([14e-3, 1e-3])
+    ids = set()
+    for step in range(4):
+        moved = second + 1e-3 * step * np.array([0.0, 1.0])
+        values = ball(inverse, 5e-3, first, (0, 0, -2.0))
+        values += ball(inverse, 5e-3, moved, (0, 0.3, -3.0))
+        strong, weak = touches.update(noisy(values, random))
+        assert strong.normal_force == pytest.approx(3, rel=0.05)
+        assert weak.normal_force == pytest.approx(2, rel=0.05)
+        assert np.linalg.norm(strong.position[:2] - moved) < 0.3e-3
+        assert np.linalg.norm(weak.position[:2] - first) < 0.3e-3
+        ids.add((strong.id, weak.id))
+    assert len(ids) == 1
+    assert touches.update(np.zeros_like(values)) == []
+
+
+def test_the_field_of_a_contact_is_its_pressure(inverse):
+    centre = np.array([6e-3, 6e-3])  # in the middle between four cubes
+    touches = Touches(inverse, LEAST)
+    touches.update(ball(inverse, 8e-3, centre, (0, 0, -3.0)))
+    fine = (np.arange(20) - 9.5) / 20 * inverse.spacing
+    x, y = (inverse.points[:, k, None, None] - centre[k] for k in (0, 1))
+    r = np.hypot(x + fine[:, None], y + fine)
+    peak = 1.5 * 3 / (np.pi * 4e-3**2)
+    pressure = peak * np.sqrt(np.clip(1 - (r / 4e-3) ** 2, 0, None))
+    expected = pressure.mean(axis=(1, 2))  # over the square of each point
+    assert np.abs(touches.field.pressure - expected).max() < 0.03 * peak
+    assert touches.field.pressure.sum() * inverse.area == pytest.approx(3, rel=0.02)
+
+
+def test_cubes_that_fail_beside_a_contact_and_a_skin_without_values(inverse):
+    touches = Touches(inverse, LEAST)
+    values = ball(inverse, 8e-3, np.array([2e-3, 1e-3]), (0, 0, -3.0))
+    values[[COUNT**2 // 2, 3]] = np.nan
+    values[COUNT**2 // 2 + 1, 6:] = np.nan
+    (found,) = touches.update(values)
+    assert found.normal_force == pytest.approx(3, rel=0.05)
+    assert touches.update(np.full_like(values, np.nan)) == []
