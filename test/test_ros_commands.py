@@ -245,6 +245,8 @@ def test_parameters_are_listed_read_and_set(skin, capfd):
     assert "\ntare_duration: " in capfd.readouterr().out
     assert main(["param", "/reconstruction", "use_sim_time"]) == 0
     assert capfd.readouterr().out == "use_sim_time: false\n"
+    assert main(["param", "reconstruction", "tare_duration", "2"]) == 0  # of a real number
+    assert capfd.readouterr().out == "tare_duration: 2.0\n"
     assert main(["param", "reconstruction", "tare_duration", "1.5"]) == 0
     assert capfd.readouterr().out == "tare_duration: 1.5\n"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rcl_interfaces.msg import Parameter
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
@@ -37,15 +37,21 @@ def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
 
 
 def set_parameter(name: str, parameter: str, text: str) -> Any:
-    """Set a parameter to what the text says as YAML; returns its value from now on.
+    """Set a parameter to what the text says as YAML; returns its value from now on. A whole number
+    will do for a real one.
 
     ConfigError: no such node or parameter, or the node refuses the value.
     """
     with node_session("parameters") as (node, executor):
         full = _find(node, executor, name)
         _check(full, parameter, _names(node, executor, full))
-        value = Parameter(name=parameter, value=get_parameter_value(text))
-        request = SetParameters.Request(parameters=[value])
+        value = get_parameter_value(text)
+        whole = value.type == ParameterType.PARAMETER_INTEGER
+        if whole and isinstance(_values(node, executor, full, [parameter])[parameter], float):
+            value = ParameterValue(
+                type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value)
+            )
+        request = SetParameters.Request(parameters=[Parameter(name=parameter, value=value)])
         answer = ask(node, executor, SetParameters, f"{full}/set_parameters", request)
         result = answer.results[0]
         if not result.successful:
