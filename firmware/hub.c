@@ -41,7 +41,9 @@ bool hub_begin(struct hub *hub, const struct hub_config *config, struct port *po
     cube_decoder_init(&hub->decoder, hub->request, sizeof hub->request);
     size_t sample = CUBE_WIRE_SIZE(CUBE_SAMPLE_SIZE(config->cubes_per_frame, config->n_pads));
     size_t hello = CUBE_WIRE_SIZE(CUBE_HELLO_SIZE(config->n_cubes));
-    return config->frame_size >= sample && config->frame_size >= hello;
+    bool fits = config->frame_size >= sample && config->frame_size >= hello;
+    bool ends = config->cubes_per_frame > 0 || config->n_cubes == 0;
+    return fits && ends && config->period_us > 0 && config->min_period_us > 0;
 }
 
 /* ------------------------------------------------------------------------------- requests ---- */

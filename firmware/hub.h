@@ -52,7 +52,7 @@ struct hub {
 };
 
 /* Power-up: stopped, HELLO is due. false: the frame buffer is too small for a frame of
- * cubes_per_frame cubes or for HELLO. */
+ * cubes_per_frame cubes or for HELLO, or cubes_per_frame or a period is 0. */
 bool hub_begin(struct hub *, const struct hub_config *, struct port *);
 
 /* Does all that is to be done now. Returns when something is to be done next, device time in us,

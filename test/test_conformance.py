@@ -13,7 +13,7 @@ from test_device_protocol import wire
 from conftest import ROOT
 from cube_tensor_driver.conformance.check import Checked, check, in_order
 from cube_tensor_driver.conformance.verdict import Outcome
-from cube_tensor_driver.core.errors import CubeError
+from cube_tensor_driver.core.errors import CubeError, LinkError
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.protocol import (
     Ack,
@@ -375,8 +375,9 @@ def test_a_hub_that_breaks_one_rule_fails_exactly_that_one(number, kind, setting
     assert result.failed() == [number], result.to_dict()
 
 
-def test_a_bridge_that_speaks_telnet_fails_l3():
-    result = checked(made(HubInMemory, {}), is_tcp=True, greeting=b"\xff\xfb\x01")
+@pytest.mark.parametrize("greeting", [b"\xff\xfb\x01", b"\x15\x03\x01"], ids=["Telnet", "TLS"])
+def test_a_bridge_that_speaks_something_else_fails_l3(greeting):
+    result = checked(made(HubInMemory, {}), is_tcp=True, greeting=greeting)
     assert result.failed() == ["L3"]
 
 
@@ -421,6 +422,27 @@ def test_rules_are_those_of_the_page_in_its_words():
     for one in in_order():
         assert one.says in of_page[one.number], one.number
         assert f"### {one.section}\n" in page
+
+
+def test_a_line_that_is_lost_is_an_error_with_the_step():
+    class Lost(MemoryWire):
+        def listen(self, seconds):
+            if self.now() > 8:
+                raise LinkError("gone", "lost")
+            return super().listen(seconds)
+
+    with pytest.raises(LinkError, match="lost in the step 'start'"):
+        check(Lost(made(HubInMemory, {})))
+
+
+def test_bytes_that_are_no_frames_end_the_check_soon():
+    class Noise(MemoryWire):
+        def listen(self, seconds):
+            return super().listen(seconds).replace(b"\0", b"\1")
+
+    wire = Noise(made(HubInMemory, {}))
+    result = check(wire)
+    assert result.failed() == ["H1"] and wire.now() < 5
 
 
 def test_a_hub_that_floods_is_an_error():

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..core.errors import CubeError
+from ..core.errors import CubeError, LinkError
 from ..device.protocol import (
     Ack,
     Command,
@@ -94,13 +94,21 @@ class Conversation:
         self._transcript = Transcript(wire.port, wire.is_tcp)
 
     def run(self) -> Transcript:
-        self._ask("opened", seconds=1.2)
-        self._ask("hello", Request(Command.HELLO))
-        if self._transcript.first_bytes:
-            self._requests()
-            self._samples()
-            self._host_that_does_not_read()
-            self._leave_as_found()
+        try:
+            self._ask("opened", seconds=1.2)
+            self._ask("hello", Request(Command.HELLO))
+            if self._n_frames:  # else nobody is there to talk to
+                self._requests()
+                self._samples()
+                self._host_that_does_not_read()
+                self._leave_as_found()
+        except LinkError as error:
+            raise LinkError(
+                f"{self._wire.port}: the connection was lost in the step '{self._step.name}' "
+                f"({error.kind}): check again, and if it is the same step, look at what the hub "
+                "does then",
+                error.kind,
+            ) from error
         counters = self._ear.decoder.counters.as_dict()
         for name in ("bytes", "frames"):
             counters.pop(name)

@@ -6,9 +6,12 @@ import select
 import time
 
 from ..config.port import TCP
+from ..core.errors import LinkError
 from ..device.link import Link, LinkConfig
 
 TRY_AGAIN_S = 0.01
+BACK_S = 5.0
+"""A board on USB that restarts when its port is opened is away for some seconds."""
 
 
 class PortWire:
@@ -52,7 +55,14 @@ class PortWire:
     def reopen(self, seconds: float) -> None:
         self._link.close()
         time.sleep(seconds)
-        self._open()
+        until = self.now() + BACK_S
+        while not self._link.is_open:
+            try:
+                self._open()
+            except LinkError:
+                if self.now() > until:
+                    raise
+                time.sleep(TRY_AGAIN_S)
 
     def _open(self) -> None:
         while not self._link.open():

@@ -87,7 +87,7 @@ class Oscillators:
 
     def serve(self, line: socket.socket) -> None:
         """Answer until the line ends."""
-        with contextlib.suppress(ConnectionError):
+        with contextlib.suppress(OSError):
             while data := line.recv(4096):
                 line.sendall(self.answer(data))
 

@@ -51,7 +51,8 @@ int main(void) {
         .frame = frame,
         .frame_size = sizeof frame,
     };
-    hub_begin(&the_hub, &config, &board);
+    if (!hub_begin(&the_hub, &config, &board))
+        return 1;
     for (;;) {
         hub_step(&the_hub);
         wait_for_interrupt(); /* at most until the next tick, 1 ms */

@@ -7,6 +7,12 @@ extern uint32_t stack_end, data_load, data_begin, data_end, bss_begin, bss_end;
 int main(void);
 void reset(void);
 
+/* A fault: the host sees that the hub is silent, a debugger sees where. */
+static void halt(void) {
+    for (;;) {
+    }
+}
+
 void reset(void) {
     const uint32_t *from = &data_load;
     for (uint32_t *to = &data_begin; to < &data_end; to++)
@@ -14,12 +20,7 @@ void reset(void) {
     for (uint32_t *to = &bss_begin; to < &bss_end; to++)
         *to = 0;
     main();
-}
-
-/* A fault: the host sees that the hub is silent, a debugger sees where. */
-static void halt(void) {
-    for (;;) {
-    }
+    halt();
 }
 
 /* Its interrupt does nothing but wake the processor. */

@@ -11,6 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <termios.h>
 #include <time.h>
 #include <unistd.h>
@@ -41,7 +42,10 @@ bool line_open_terminal(struct port *line, const char *path) {
     cfmakeraw(&settings);
     if (tcsetattr(line->other, TCSANOW, &settings) != 0)
         return complain(line);
-    unlink(path);
+    /* The link that a process left behind is replaced, but no file of somebody else. */
+    struct stat there;
+    if (lstat(path, &there) == 0 && S_ISLNK(there.st_mode))
+        unlink(path);
     return symlink(terminal, path) == 0 || complain(line);
 }
 

@@ -27,7 +27,7 @@ static const char usage[] =
 struct options {
     const char *ports;
     unsigned tcp, hubs, cubes, pads, cubes_per_frame, period_us, frequency;
-    unsigned long long uid;
+    unsigned uid;
 };
 
 struct one {
@@ -77,11 +77,12 @@ static struct options parse(int argc, char **argv) {
         case 'f': options.cubes_per_frame = number(optarg, 1, 1000); break;
         case 'T': options.period_us = number(optarg, 100, 10000000); break;
         case 'F': options.frequency = number(optarg, 20000, 4000000); break;
-        case 'u': options.uid = strtoull(optarg, NULL, 0); break;
+        case 'u': options.uid = number(optarg, 0, UINT32_MAX - MOST_HUBS); break;
         default: fputs(usage, stderr); exit(2);
         }
     }
-    if (optind != argc || (options.ports == NULL) == (options.tcp == 0)) {
+    bool fits = options.tcp + options.hubs <= 65536;
+    if (optind != argc || (options.ports == NULL) == (options.tcp == 0) || !fits) {
         fputs(usage, stderr);
         exit(2);
     }
@@ -122,7 +123,7 @@ static bool begin(struct one *one, unsigned index, const struct options *options
     size_t hello = CUBE_WIRE_SIZE(CUBE_HELLO_SIZE((size_t)options->cubes));
     size_t frame_size = sample > hello ? sample : hello;
     one->config = (struct hub_config){
-        .uid = options->uid + index,
+        .uid = (uint64_t)options->uid + index,
         .cube_uids = one->cube_uids,
         .n_cubes = (uint16_t)options->cubes,
         .n_pads = (uint8_t)options->pads,

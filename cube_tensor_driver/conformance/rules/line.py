@@ -11,6 +11,7 @@ from ..verdict import ANY_FRAME, Verdict, failed, not_tried, passed, rule
 from .sample import periods_us
 
 TELNET_COMMANDS = range(0xFB, 0xFF)  # WILL, WON'T, DO, DON'T
+TLS_RECORD = b"\x15\x03"  # an alert: this is no TLS that we speak
 
 
 @rule("L1", "no flow control, neither RTS/CTS nor XON/XOFF", needs=(ANY_FRAME,))
@@ -37,7 +38,11 @@ def nothing_but_the_bytes(talk: Transcript) -> Verdict:
     first = talk.first_bytes
     if len(first) > 1 and first[0] == 0xFF and first[1] in TELNET_COMMANDS:
         return failed(f"the bridge begins with a command of Telnet: {first[:3].hex(' ')}")
-    return passed("no byte but those of frames at the beginning")
+    if first[:2] == TLS_RECORD:
+        return failed(f"the bridge begins with a record of TLS: {first[:3].hex(' ')}")
+    if not first:
+        return not_tried("nothing came")
+    return passed("neither Telnet nor TLS at the beginning")
 
 
 @rule("L4", "A connection that ends or fails is lost.")
