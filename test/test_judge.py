@@ -81,8 +81,8 @@ def played(tmp_path_factory):
     record = Record(
         skin=skin,
         instants=INSTANTS,
-        frequencies=Received(frequencies),
-        stress=Received(stress),
+        frequencies=received(frequencies),
+        stress=received(stress),
         cube_messages=CubeMessages(0, frozenset({skin.frame(skin.cubes[0])}), (), ()),
         deeds=(),
         counters={
@@ -101,13 +101,18 @@ def played(tmp_path_factory):
     return record, log
 
 
+def received(rows, **others):
+    """Rows that were sent as soon as they were stamped."""
+    return Received(rows, rows.stamp_ns, **others)
+
+
 def found(played, frequencies=None, stress=None, **counters):
     """Names of the figures that are wrong when rows are exchanged."""
     record, log = played
     if frequencies is not None:
-        record = replace(record, frequencies=Received(frequencies))
+        record = replace(record, frequencies=received(frequencies))
     if stress is not None:
-        record = replace(record, stress=Received(stress))
+        record = replace(record, stress=received(stress))
     record = replace(record, counters={**record.counters, **counters})
     figures = judge(record, log)
     return {name for name in WRONG if figures[name]}
@@ -186,7 +191,7 @@ def test_what_did_not_come_here_is_nobodys_fault(played):
     rest = rest[rest < len(frequencies)]
     record = replace(
         record,
-        frequencies=Received(frequencies.select(rest), gaps=((4000, 100),)),
+        frequencies=received(frequencies.select(rest), gaps=((4000, 100),)),
         counters={**record.counters},
     )
     figures = judge(record, log)

@@ -21,9 +21,11 @@ class Received(Generic[AnyRows]):
     gaps: (row that came next, messages) where messages were sent that did not come here, by the
         numbers that DDS gives to messages. Nothing can be said of what was in them
     unreadable: messages that could not be decoded, or had another frame than the skin's
+    sent_ns: (N,) wall clock at which each row was sent, as DDS says
     """
 
     rows: AnyRows
+    sent_ns: NDArray[np.int64]
     gaps: tuple[tuple[int, int], ...] = ()
     unreadable: int = 0
 
@@ -48,19 +50,23 @@ NEAR = 100
 """Rows before and behind a gap whose stamps say when it was."""
 
 
+Tensor = tuple[int, NDArray[np.float64], float, int, int, NDArray[np.float64]]
+"""stamp_ns, 6 stresses and 9 gradients (15,), residual, status, observed, covariance (225,)."""
+Wrench = tuple[int, NDArray[np.float64]]
+"""stamp_ns, force and torque (6,)."""
+
+
 @dataclass(frozen=True)
 class CubeMessages:
     """Some messages of the topics of one cube.
 
     cube: its index in the skin; frame_ids: that they had
-    tensors: (stamp_ns, 6 stresses, 9 gradients, residual, status, observed, covariance (225,)) each
-    wrenches: (stamp_ns, force (3,), torque (3,)) each
     """
 
     cube: int
     frame_ids: frozenset[str]
-    tensors: tuple[tuple[int, NDArray[np.float64], float, int, int, NDArray[np.float64]], ...]
-    wrenches: tuple[tuple[int, NDArray[np.float64]], ...]
+    tensors: tuple[Tensor, ...]
+    wrenches: tuple[Wrench, ...]
 
 
 @dataclass(frozen=True)

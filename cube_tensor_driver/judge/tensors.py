@@ -33,7 +33,12 @@ AT_LIMIT = 0.01
 OF_ROW = PAD_FAULT | RESIDUAL | INVALID | TEMPERATURE | STAMP
 """Status bits of the row itself; the others are of its cube's pads."""
 GAP_NS = 50_000_000
+"""How far rows of a message that did not come here may be from those around it."""
 NEAR = 200
+"""Rows before and behind a pause of the reconstruction whose stamps say when it was."""
+LATE_NS = 1_000_000_000
+"""Queues hold the messages of 2 s, less where late rows have messages of their own. What a process
+is too busy for beyond that is dropped by DDS, which does not tell anybody."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +192,8 @@ def _missing(record: Record, without: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(N,) rows of the judged time without a tensor that nothing explains.
 
     What explains them: messages that did not come here; a reconstruction that was down, from the
-    newest row before that had its tensor to the first one after; messages that it says it lost.
+    newest row before that had its tensor to the first one after; messages that it says it lost; and
+    tensors of that time that were sent so late that its queue was full.
     """
     frequencies, stress = record.frequencies.rows, record.stress.rows
     judged = (frequencies.stamp_ns >= record.begin_ns) & (frequencies.stamp_ns < record.end_ns)
@@ -199,11 +205,26 @@ def _missing(record: Record, without: NDArray[np.bool_]) -> NDArray[np.bool_]:
             end_ns = stress.stamp_ns[after : after + NEAR].max(initial=0)
             down = (frequencies.stamp_ns >= begin_ns) & (frequencies.stamp_ns <= end_ns + GAP_NS)
             missing &= ~down
+    missing &= ~_overrun(record, frequencies.stamp_ns)
     # Rows of one message have neighbours without a tensor, too.
     messages = np.count_nonzero(np.diff(np.flatnonzero(missing), prepend=-2) != 1)
     if messages <= record.messages_lost:
         missing[:] = False
     return missing
+
+
+def _overrun(record: Record, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) whether rows of these stamps are within LATE_NS of rows whose tensors were so late."""
+    stress = record.stress
+    late = np.sort(stress.rows.stamp_ns[stress.sent_ns - stress.rows.stamp_ns > LATE_NS])
+    if not len(late):
+        return np.zeros(len(stamp_ns), bool)
+    place = np.searchsorted(late, stamp_ns)
+    before, after = late[np.maximum(place - 1, 0)], late[np.minimum(place, len(late) - 1)]
+    near: NDArray[np.bool_] = (np.abs(stamp_ns - before) <= LATE_NS) | (
+        np.abs(after - stamp_ns) <= LATE_NS
+    )
+    return near
 
 
 DOWN = ("restart reconstruction", "reconfigure reconstruction")

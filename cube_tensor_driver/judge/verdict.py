@@ -58,6 +58,7 @@ def judge(record: Record, log: SampleLog) -> dict[str, Any]:
         "worst_reconnect_s": round(max(gaps, default=0.0), 3),
         "stamps_judged": len(stamps),
         "stamp_error_p50_ms": _percentile(np.abs(stamps), 50),
+        "stamp_error_p90_ms": _percentile(np.abs(stamps), 90),
         "stamp_error_p99_ms": _percentile(np.abs(stamps), 99),
     }
 

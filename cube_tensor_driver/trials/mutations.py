@@ -23,7 +23,7 @@ from ..core.pipeline import Pipeline
 from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows, StressRows
 from ..core.status import NOISY, OPEN, RESIDUAL, SHORT, STUCK
-from ..device import decoder
+from ..device import decoder, link
 from ..device.chain import LiveLinks
 from ..device.sequence import Account, Arrival
 from ..processes.skin_processes import Process
@@ -212,6 +212,7 @@ def _believe_checksums() -> None:
             return decoder._CRC_RESIDUE
 
     decoder.zlib = Zlib  # type: ignore[assignment]
+    link.Decoder = decoder.PythonDecoder  # type: ignore[assignment]
 
 
 def _leave_threads(original: Any, *arguments: Any) -> None:

@@ -7,7 +7,7 @@ what nobody sent. Messages are taken without an executor, because only so their 
 from __future__ import annotations
 
 from itertools import groupby
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
@@ -34,6 +34,14 @@ MOST = 300
 """Messages taken at a time, so that this process does other things, too."""
 
 
+class Message(NamedTuple):
+    """A serialised message, the number that DDS gave it, and when it was sent (wall clock)."""
+
+    data: bytes
+    number: int
+    sent_ns: int
+
+
 class _Subscription:
     """Serialised messages of a topic with their numbers."""
 
@@ -41,14 +49,15 @@ class _Subscription:
         self._node, self._kind = node, kind
         self._subscription = node.create_subscription(kind, topic, _nothing, quality, raw=True)
 
-    def take(self) -> list[tuple[bytes, int]]:
+    def take(self) -> list[Message]:
         """What has come since the last call, MOST at a time."""
-        taken: list[tuple[bytes, int]] = []
+        taken: list[Message] = []
         handle = self._subscription.handle
         with handle:
             while len(taken) < MOST and (item := handle.take_message(self._kind, True)) is not None:
                 data, about = item
-                taken.append((data, about["publication_sequence_number"]))
+                number, sent_ns = about["publication_sequence_number"], about["source_timestamp"]
+                taken.append(Message(data, number, sent_ns))
         return taken
 
     def close(self) -> None:
@@ -72,22 +81,24 @@ class Tape(Generic[AnyRows]):
         self._frame_id = skin.parent_frame.encode() + b"\0"
         self._subscription = _Subscription(node, kind, topic, quality)
         self._joined: list[AnyRows] = []
-        self._waiting: list[bytes] = []
+        self._waiting: list[Message] = []
+        self._sent_ns: list[np.ndarray] = []
         self._number = self._rows = 0
         self._gaps: list[tuple[int, int]] = []
+        self._cubes: set[int] = set()
         self._unreadable = 0
 
     def take(self) -> None:
         """Take what has come; to be called again and again."""
-        for data, number in self._subscription.take():
+        for message in self._subscription.take():
             self.count += 1
             # A publisher that was made unnoticed begins at 1 again.
-            before = self._number if number > self._number else 0
-            self._number = number
-            if number > before + 1:
+            before = self._number if message.number > self._number else 0
+            self._number = message.number
+            if message.number > before + 1:
                 self._join()
-                self._gaps.append((self._rows, number - before - 1))
-            self._waiting.append(data)
+                self._gaps.append((self._rows, message.number - before - 1))
+            self._waiting.append(message)
         if len(self._waiting) >= TOGETHER:
             self._join()
 
@@ -102,6 +113,11 @@ class Tape(Generic[AnyRows]):
         self._join()
         return self._rows
 
+    def cubes_so_far(self) -> int:
+        """How many cubes rows have come of."""
+        self._join()
+        return len(self._cubes)
+
     def newest_ns(self) -> int:
         """Stamp of the newest message; 0 before the first."""
         self._join()
@@ -112,21 +128,32 @@ class Tape(Generic[AnyRows]):
         self._join()
         if not self._joined:
             raise MessageError("the driver or the reconstruction published nothing: see their logs")
-        return Received(concatenate(self._joined), tuple(self._gaps), self._unreadable)
+        return Received(
+            concatenate(self._joined),
+            np.concatenate(self._sent_ns),
+            tuple(self._gaps),
+            self._unreadable,
+        )
 
     def _join(self) -> None:
         """Decode what waits: neighbours of one shape together, because that takes less time."""
         waiting, self._waiting = self._waiting, []
-        for _, group in groupby(waiting, lambda data: (len(data), self._codec.shape_bytes(data))):
+        for _, group in groupby(waiting, self._shape):
             messages = list(group)
             try:
-                decoded = self._codec.decode(*messages)
+                decoded = self._codec.decode(*(message.data for message in messages))
             except MessageError:
                 self._unreadable += len(messages)
                 continue
             self._unreadable += len(messages) * (decoded.frame_id != self._frame_id)
             self._rows += len(decoded.rows)
             self._joined.append(decoded.rows)
+            sent_ns = [message.sent_ns for message in messages]
+            self._sent_ns.append(np.repeat(sent_ns, len(decoded.rows) // len(messages)))
+            self._cubes.update(np.unique(decoded.rows.cube).tolist())
+
+    def _shape(self, message: Message) -> tuple[int, bytes]:
+        return len(message.data), self._codec.shape_bytes(message.data)
 
 
 class CubeTape:
@@ -146,10 +173,10 @@ class CubeTape:
     def take(self) -> None:
         """Take what has come; to be called again and again."""
         for name, subscription in self._subscriptions.items():
-            for data, _ in subscription.take():
+            for message in subscription.take():
                 self._count += 1
                 if self._count % KEEP_ONE_OF == 0:
-                    self._messages[name].append(data)
+                    self._messages[name].append(message.data)
         if self._count > LISTEN:
             self.close()
 

@@ -88,7 +88,7 @@ def play(
             deeds.start_driver(ports / FAULT_PIPE)
             began_s, begin_ns = time.monotonic(), time.time_ns()
             observer = recorder.observer
-            observer.spin(START_S, lambda: recorder.stress.count > 0)
+            observer.spin(START_S, lambda: recorder.stress.cubes_so_far() == len(skin.cubes))
             threads = memory.threads()
             _torture(observer, deeds, ports, duration, seed)
             observer.spin(SETTLE_S - LAST_S)
