@@ -53,6 +53,9 @@ ELSEWHERE = {
         "test_reliability_torture"
         ".test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong"
     ),
+    "./cube torture --mutate all --seed 1 --json mutations.json": (
+        "test_reliability_torture.test_mutations_are_caught"
+    ),
     "./cube demo --config config/examples/sole.yaml --load config/examples/gait.yaml "
     "--duration 3.3 --figure gait.png": (
         "test_examples.test_sole_finds_the_ground_reaction_force_and_its_centre"

@@ -157,15 +157,13 @@ class SampleLog:
 
     def taken_ns(
         self, cube: NDArray[Any], sequence: NDArray[Any], stamp_ns: NDArray[Any]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """When samples (N,) were taken, wall clock, and how often their hub had restarted before.
+    ) -> NDArray[np.int64]:
+        """When samples (N,) were taken, wall clock; NEVER for what no hub took.
 
         cube: index in the skin; sequence: as on the wire. A number may have been given again after
-        a restart: then the sample is meant that was taken nearest to stamp_ns. Both are NEVER for
-        what no hub took.
+        a restart: then the sample is meant that was taken nearest to stamp_ns.
         """
         time_ns = np.full(len(cube), NEVER, np.int64)
-        boot = np.full(len(cube), NEVER, np.int64)
         for link in self.links:
             rows = np.flatnonzero(np.isin(cube, link.members))
             for run in link.runs:
@@ -177,5 +175,4 @@ class SampleLog:
                 best = np.abs(time_ns[taken] - stamp_ns[taken])
                 nearer = (time_ns[taken] == NEVER) | (distance < best)
                 time_ns[taken[nearer]] = moment[nearer]
-                boot[taken[nearer]] = run.boot
-        return time_ns, boot
+        return time_ns

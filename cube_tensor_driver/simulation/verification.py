@@ -1,7 +1,7 @@
-"""What simulated hubs sent, compared with what arrived and what the driver counted as lost.
+"""What simulated hubs sent, compared with what arrived.
 
-Demo, torture and bench collect what arrives in `Arrivals` and `compare` it with the sample log at
-the end. Counts are in rows: one cube, one sample.
+Demo and bench collect what arrives in `Arrivals` and `compare` it with the sample log at the end.
+Counts are in rows: one cube, one sample. The judge of torture does more: `judge/`.
 """
 
 from __future__ import annotations
@@ -63,14 +63,11 @@ class Arrivals:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was sent, counted and received of the samples taken in a span of time.
+    """What was sent and received of the samples taken in a span of time.
 
     sent: rows of samples that the hubs took
     received: rows of them that arrived, each counted once
-    repeated: rows that arrived once more
-    never_taken: rows of samples that no hub took, at any time
-    counted: rows that the driver counted as not delivered
-    taken_ns, boot: (N,) of each row kept in `Arrivals`, as `SampleLog.taken_ns`
+    taken_ns: (N,) of each row kept in `Arrivals`, as `SampleLog.taken_ns`
     first: (K,) which of those arrived first of each row of the span
     latency_ms, stamp_error_ms: (K,) of these rows, from the sample to its arrival, and between the
         sample and its stamp
@@ -78,46 +75,30 @@ class Comparison:
 
     sent: int
     received: int
-    repeated: int
-    never_taken: int
-    counted: int
     taken_ns: NDArray[np.int64]
-    boot: NDArray[np.int64]
     first: NDArray[np.int64]
     latency_ms: NDArray[np.float64]
     stamp_error_ms: NDArray[np.float64]
 
     @property
     def missing(self) -> int:
-        """Rows sent that did not arrive and were not counted; below 0 when too many were
-        counted."""
-        return self.sent - self.received - self.counted
+        """Rows sent that did not arrive."""
+        return self.sent - self.received
 
 
-def compare(
-    log: SampleLog, arrivals: Arrivals, start_ns: int, end_ns: int, *, counted: int = 0
-) -> Comparison:
-    """Compare what arrived with what was taken from start_ns to before end_ns of the wall clock.
-
-    counted: rows of that span that the driver counted as not delivered.
-    """
+def compare(log: SampleLog, arrivals: Arrivals, start_ns: int, end_ns: int) -> Comparison:
+    """Compare what arrived with what was taken from start_ns to before end_ns of the wall clock."""
     cube, sequence, stamp_ns, received_ns = arrivals.columns()
-    taken_ns, boot = log.taken_ns(cube, sequence, stamp_ns)
+    taken_ns = log.taken_ns(cube, sequence, stamp_ns)
     rows = np.flatnonzero((taken_ns != NEVER) & (taken_ns >= start_ns) & (taken_ns < end_ns))
     # Cube and time in one number: sequence numbers are given again after a restart.
     since_us = (taken_ns[rows] - log.start_time_ns) // 1000
     key = since_us * len(arrivals.row_count) + cube[rows]
     first = rows[np.sort(np.unique(key, return_index=True)[1])]
-    count = arrivals.row_count[cube]
-    received = int(count[first].sum())
     return Comparison(
         sent=log.rows_taken(start_ns, end_ns),
-        received=received,
-        repeated=int(count[rows].sum()) - received,
-        never_taken=int(count[taken_ns == NEVER].sum()),
-        counted=counted,
+        received=int(arrivals.row_count[cube[first]].sum()),
         taken_ns=taken_ns,
-        boot=boot,
         first=first,
         latency_ms=1e-6 * (received_ns[first] - taken_ns[first]),
         stamp_error_ms=1e-6 * np.abs(stamp_ns[first] - taken_ns[first]),
