@@ -193,61 +193,41 @@ def test_what_no_surface_is(depth, side):
 
 def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_is():
     pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.browser.surface_layer import Raster, is_flat
+    from cube_tensor_driver.browser.top_view import Raster
 
-    turn, place = rotation_from_rpy(0.3, -0.8, 2.0), np.array([0.2, -0.1, 0.4])
+    place = np.array([0.2, -0.1, 0.4])
     skin = flat(5, 3, 0.01)
     keep = np.delete(np.arange(15), 7)  # a hole in the middle
-    skin = CubePoses(
-        (skin.position @ turn.T + place)[keep], skin.rotation[keep] @ turn, skin.half_side[keep]
-    )
+    skin = CubePoses((skin.position + place)[keep], skin.rotation[keep], skin.half_side[keep])
     surface = Surface(skin, DEPTH, 2)
     colours = np.random.default_rng(2).random((len(surface.points), 3))
-    assert is_flat(surface.points, skin.rotation[surface.cube], surface.spacing)
-    raster = Raster(surface.points, turn, surface.spacing, surface.spacing, None)
+    raster = Raster(surface.points, surface.spacing / 4, 0.75 * surface.spacing)
     image = raster.image(colours)
-    assert image.shape == (6, 10, 4)
-    np.testing.assert_allclose(raster.centre, place, atol=1e-12)
-    hole = np.zeros((6, 10), bool)
-    hole[2:4, 4:6] = True
-    np.testing.assert_array_equal(image[..., 3] == 0, hole)
+    np.testing.assert_allclose((raster.low + raster.high) / 2, place[:2], atol=1e-12)
+    assert (image[image.shape[0] // 2, image.shape[1] // 2] == 0).all()
+    size = (raster.high - raster.low) / image.shape[1::-1]
     for point, colour in zip(surface.points, colours, strict=True):
-        x, y, _ = (point - place) @ turn / surface.spacing
-        np.testing.assert_array_equal(
-            image[round(2.5 - y), round(4.5 + x), :3], (255 * colour).astype(np.uint8)
-        )
+        column = (point[0] - raster.low[0]) / size[0]
+        row = (raster.high[1] - point[1]) / size[1]
+        shown = image[int(row), int(column)]
+        np.testing.assert_array_equal(shown[:3], np.round(255 * colour))
+        assert shown[3] == 255
 
-    # with the cubes in it, each as a square of its own turn
-    turned = skin._replace(rotation=skin.rotation @ rotation_from_rpy(0, 0, np.pi / 4))
-    raster = Raster(surface.points, turn, surface.spacing, surface.spacing / 8, turned)
-    image = raster.image(np.concatenate([colours, 1 - colours[: len(keep)]]))
-    rows, columns = image.shape[:2]
-    painted = np.zeros((rows, columns), bool)
-    for cube, place_of_cube in enumerate(skin.position):
-        x, y, _ = (place_of_cube - place) @ turn / (surface.spacing / 8)
-        across = np.arange(columns) - (columns - 1) / 2 - x
-        up = (rows - 1) / 2 - np.arange(rows) - y
-        # |x| + |y| < half the diagonal of a square that is turned by 45 degrees
-        inside = np.abs(across) + np.abs(up)[:, None] < np.sqrt(2) * skin.half_side[cube] / (
-            surface.spacing / 8
-        )
-        assert inside.sum() > 10
-        painted |= inside
-        expected = (255 * (1 - colours[cube])).astype(np.uint8)
-        assert (image[inside][:, :3] == expected).all() and (image[inside][:, 3] == 255).all()
-    nothing = raster.owner == len(colours) + len(keep)
-    assert nothing[24, 40] and not nothing[~np.kron(hole, np.ones((8, 8), bool))].any()
-    assert (raster.owner[~painted & (image[..., 3] > 0)] < len(colours)).all()
-    hidden = raster.image(np.concatenate([np.full_like(colours, np.nan), colours[: len(keep)]]))
-    np.testing.assert_array_equal(hidden[..., 3] > 0, painted)
 
-    bent = skin.rotation.copy()
-    bent[3] = rotation_from_rpy(0.1, 0, 0) @ bent[3]
-    assert not is_flat(surface.points, bent[surface.cube], surface.spacing)
-    far = surface.points + np.where(surface.cube == 3, 1.0, 0.0)[:, None] * turn[:, 0]
-    assert not is_flat(far, skin.rotation[surface.cube], surface.spacing)
-    raised = surface.points + np.where(surface.cube == 3, 0.003, 0.0)[:, None] * turn[:, 2]
-    assert not is_flat(raised, skin.rotation[surface.cube], surface.spacing)
+def test_the_view_s_squares_have_the_colour_of_their_value():
+    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
+    from cube_tensor_driver.browser.surface_layer import STEPS, step_colours, steps_of
+    from cube_tensor_driver.core import scene
+
+    for name in ("pressure", "zz"):
+        quantity = scene.QUANTITIES[name]
+        shown = np.append(np.linspace(-12e3, 12e3, 301), np.nan)
+        colours = step_colours(quantity)[steps_of(quantity, shown, 10e3)]
+        expected = 255 * scene.colours(quantity, shown, 10e3)
+        # half a step, where the scale is steepest
+        scale = 255 * scene.colours(quantity, np.linspace(-10e3, 10e3, 2000), 10e3)
+        steepest = np.abs(np.diff(scale, axis=0)).max() * 2000 / STEPS
+        assert np.abs(colours - expected).max() <= steepest / 2 + 1
 
 
 def test_two_pads_take_a_gradient_for_shear_and_eight_do_not():

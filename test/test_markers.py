@@ -60,10 +60,10 @@ def test_principal_cross_of_pure_shear_lies_at_45_degrees():
 def test_colours_are_the_table_s_ends_grey_where_unknown_and_monotonous_in_lightness():
     quantity = QUANTITIES["pressure"]
     shown = scene.colours(quantity, np.array([-5.0, 0, 10, 99, np.nan]), 10.0)
-    dark, bright = np.array([0x44, 0x01, 0x54]) / 255, np.array([0xFD, 0xE7, 0x25]) / 255
-    np.testing.assert_allclose(shown, [dark, dark, bright, bright, scene.GREY])
+    zero, top = np.array([0xFF, 0xFF, 0xCC]) / 255, np.array([0x80, 0x00, 0x26]) / 255
+    np.testing.assert_allclose(shown, [zero, zero, top, top, scene.GREY])
     lightness = scene.colours(quantity, np.linspace(0, 10, 50), 10.0) @ [0.299, 0.587, 0.114]
-    assert (np.diff(lightness) > 0).all()
+    assert (np.diff(lightness) < 0).all()
     signed = scene.colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ [0.299, 0.587, 0.114]
     assert signed[1] > 2 * max(signed[0], signed[2])
 
@@ -200,7 +200,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
         and not bar[:, 2].any()
     )
     colours = np.array([[c.r, c.g, c.b, c.a] for c in cubes.colors])
-    np.testing.assert_allclose(colours[pressed], [0xFD / 255, 0xE7 / 255, 0x25 / 255, 1], atol=1e-6)
+    np.testing.assert_allclose(colours[pressed], [0x80 / 255, 0x00 / 255, 0x26 / 255, 1], atol=1e-6)
     np.testing.assert_allclose(colours[silent, :3], scene.GREY, atol=1e-6)
     traction = np.array([[p.x, p.y, p.z] for p in markers["traction"].points]).reshape(n, 3, 2, 3)
     shaft = traction[pressed, 0, 1] - traction[pressed, 0, 0]

@@ -6,7 +6,9 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+from ..core.errors import ConfigError
 from ..processes.children import END_WITH_PARENT
 
 END_S = 10.0
@@ -14,18 +16,29 @@ END_S = 10.0
 
 
 class BagRecorder:
-    """At most one recording, in the folder that this process runs in."""
+    """At most one recording at a time, below a folder that is made if need be.
 
-    def __init__(self) -> None:
+    path: of the last bag.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.path = folder
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
     def recording(self) -> bool:
         return self._process is not None
 
-    def start(self) -> str:
-        """Start to record; returns the name of the bag."""
-        name = time.strftime("skin_%Y%m%d_%H%M%S")
+    def start(self) -> None:
+        """Start to record. ConfigError: there is no such folder."""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"{self._folder}: {error.strerror}; name another folder with --recordings"
+            ) from None
+        self.path = self._folder / time.strftime("skin_%Y%m%d_%H%M%S")
         command = [
             *END_WITH_PARENT,
             sys.executable,
@@ -33,12 +46,11 @@ class BagRecorder:
             "cube_tensor_driver.cli",
             "record",
             "-o",
-            name,
+            str(self.path),
         ]
         self._process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
         )
-        return name
 
     def end(self) -> None:
         """Finish the bag; safe to call without a recording."""

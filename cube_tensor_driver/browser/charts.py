@@ -1,7 +1,10 @@
-"""The plots of one cube over the last seconds."""
+"""Plots over the last seconds: of any cubes and any component, as files too."""
 
 from __future__ import annotations
 
+import csv
+import io
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,81 +12,185 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
+from ..core.modes import COMPONENTS, STRESS
+from ..plot.live import draw_lines
+from ..plot.style import png
 from . import markup
 from .history import History
+
+Array = NDArray[np.float64]
 
 HISTORY_S = 10.0
 TIME_SCALE = uplot.Scale(time=False, auto=False, range=(-HISTORY_S, 0.0))
 RENEW = 20
 """After so many pictures the charts are laid out again, see `Chart.draw`."""
-STROKES = ("#4dabf7", "#ffa94d", "#69db7c")
-DASHES = ((), (6, 3), (2, 3))
-AXIS_SIZES = (34, 46)
-"""Room for the numbers at the time axis and at the axis of values, pixels."""
+MOST_LINES = 12
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9", "#888888")
+DASHES = ((), (7, 4))
+AXIS_SIZES = (44, 56)
+"""Room for the numbers and the label of the axis of time and of the axis of values, pixels."""
+HEIGHT = 250
+GROUPS = {
+    "normal stress": ("xx", "yy", "zz"),
+    "shear": ("yz", "zx", "xy"),
+    "gradient of σzz": ("zz_x", "zz_y", "zz_z"),
+    "all stresses": tuple(STRESS),
+    "all gradients": tuple(COMPONENTS[len(STRESS) :]),
+    "residual": ("residual",),
+    **{markup.label(name): (name,) for name in COMPONENTS},
+}
+"""What a chart can show, by its name. All columns of a group have one unit."""
+AT_FIRST = ("normal stress", "gradient of σzz")
 
 
-class ChartContent(NamedTuple):
-    """Which columns of the history a chart shows; factor: from SI to the unit in the title."""
+class Line(NamedTuple):
+    """One line of a chart: a column of the history of one cube."""
 
-    title: str
-    factor: float
-    columns: tuple[str, ...]
-
-
-CONTENTS = (
-    ChartContent("normal stress / kPa", 1e-3, ("xx", "yy", "zz")),
-    ChartContent("shear / kPa", 1e-3, ("zx", "yz", "xy")),
-    ChartContent("gradient / kPa/mm", 1e-6, ("zz_x", "zz_y", "zz_z")),
-    ChartContent("residual / σ", 1.0, ("residual",)),
-)
+    cube: int
+    column: int
+    label: str
 
 
 class Charts:
-    """All charts of the page."""
+    """The tab with the plots of some cubes.
 
-    def __init__(self, gui: viser.GuiApi) -> None:
-        self._charts = [Chart(gui, content) for content in CONTENTS]
+    The chosen cube is always among them; others are named in a text field.
+    """
+
+    def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, names: Sequence[str]) -> None:
+        self._names = list(names)
         self._drawn = 0
+        self._latest: History | None = None
+        self._cubes = [0]
+        with tab:
+            self._text = gui.add_text(
+                "more cubes",
+                "",
+                hint="names, for example: c05 c06. The chosen cube comes first.",
+                order=0,
+            )
+            self._charts = [
+                Chart(gui, tab, group, 1 + 2 * number) for number, group in enumerate(AT_FIRST)
+            ]
+            files = gui.add_button_group("save as", ("CSV", "PNG"), order=10)
+            zoom = "To zoom, pause the page and drag. A double click shows all again."
+            gui.add_html(markup.box(zoom), order=11)
 
-    def draw(self, times: NDArray[np.float64], values: NDArray[np.float64]) -> None:
-        """times (M,) s, values (M, 16) as `History.of` gives them."""
+        @files.on_click
+        def _(event: viser.GuiEvent) -> None:
+            self._save(event.client, str(files.value))
+
+    def draw(self, history: History, chosen: int) -> None:
         self._drawn += 1
+        self._latest = history
+        known = {name: number for number, name in enumerate(self._names)}
+        words = str(self._text.value).replace(",", " ").split()
+        self._cubes = list(dict.fromkeys([chosen, *(known[w] for w in words if w in known)]))
         for chart in self._charts:
-            chart.draw(times, values, nudge=bool(self._drawn // RENEW % 2))
+            chart.choose(self._lines(chart, history))
+            chart.draw(history, nudge=bool(self._drawn // RENEW % 2))
+
+    def offer_observed(self, history: History) -> None:
+        """Offer only what some cube observes."""
+        seen = dict(zip(History.COLUMNS, history.observed, strict=True))
+        if not any(seen[name] for name in COMPONENTS):
+            return
+        groups = [name for name, columns in GROUPS.items() if any(seen[c] for c in columns)]
+        for chart in self._charts:
+            chart.offer(groups)
+
+    def _lines(self, chart: Chart, history: History) -> list[Line]:
+        seen = dict(zip(History.COLUMNS, history.observed, strict=True))
+        wanted = [name for name in GROUPS[chart.group] if seen[name]]
+        lines = [
+            Line(cube, History.COLUMNS.index(name), f"{self._names[cube]} {markup.label(name)}")
+            for cube in self._cubes
+            for name in wanted
+        ]
+        return lines[:MOST_LINES]
+
+    def _save(self, client: viser.ClientHandle | None, kind: str) -> None:
+        if client is None or self._latest is None:
+            return
+        if kind == "CSV":
+            content = csv_of(self._latest, self._cubes, self._names)
+            client.send_file_download("skin.csv", content, save_immediately=True)
+        elif kind == "PNG":
+            panels = [chart.panel(self._latest) for chart in self._charts]
+            client.send_file_download("skin.png", png(draw_lines(panels)), save_immediately=True)
 
 
 class Chart:
-    """One chart with up to three lines."""
+    """One chart; group: which of GROUPS it shows."""
 
-    def __init__(self, gui: viser.GuiApi, content: ChartContent) -> None:
-        self._factor = content.factor
-        self._columns = [History.COLUMNS.index(name) for name in content.columns]
+    def __init__(
+        self, gui: viser.GuiApi, tab: viser.GuiTabHandle, group: str, order: float
+    ) -> None:
+        """order: of its choice in the tab; the plot is the next."""
+        self._gui, self._tab, self._order = gui, tab, order
         self._range = (0.0, 1.0)
-        lines = [
-            uplot.Series(label=markup.label(name), stroke=stroke, width=1.5, dash=dash)
-            for name, stroke, dash in zip(content.columns, STROKES, DASHES, strict=False)
-        ]
-        grid: uplot.Axis_Grid = {"stroke": "#495057", "width": 0.5}
-        self._plot = gui.add_uplot(
-            (np.array([0.0]),) * (1 + len(lines)),
-            (uplot.Series(label="s"), *lines),
-            title=content.title,
-            height=160,
-            axes=tuple(uplot.Axis(stroke="#ced4da", grid=grid, size=size) for size in AXIS_SIZES),
-            scales=self._scales(),
-            padding=(4, 8, 0, 0),
-        )
+        self._lines: list[Line] = []
+        self._choice = gui.add_dropdown("plot", tuple(GROUPS), initial_value=group, order=order)
+        self._plot: viser.GuiUplotHandle | None = None
 
-    def draw(self, times: NDArray[np.float64], values: NDArray[np.float64], nudge: bool) -> None:
+    @property
+    def group(self) -> str:
+        # A browser may send any text.
+        return self._choice.value if self._choice.value in GROUPS else "normal stress"
+
+    def offer(self, groups: list[str]) -> None:
+        if tuple(groups) != tuple(self._choice.options):
+            self._choice.options = groups
+
+    def choose(self, lines: list[Line]) -> None:
+        """Show these lines from now on; another chart if they are others."""
+        if lines == self._lines or not lines:
+            return
+        self._lines = lines
+        if self._plot is not None:
+            self._plot.remove()
+        self._range = (0.0, 1.0)
+        grid: uplot.Axis_Grid = {"stroke": "#dee2e6", "width": 1}
+        labels = ("time before now / s", self._label)
+        axes = tuple(
+            uplot.Axis(stroke="#343a40", grid=grid, size=size, label=label, labelSize=18)
+            for size, label in zip(AXIS_SIZES, labels, strict=True)
+        )
+        with self._tab:
+            self._plot = self._gui.add_uplot(
+                (np.array([0.0]),) * (1 + len(lines)),
+                (
+                    uplot.Series(label="s"),
+                    *(
+                        uplot.Series(
+                            label=line.label,
+                            stroke=COLOURS[number % len(COLOURS)],
+                            width=1.8,
+                            dash=DASHES[number // len(COLOURS) % len(DASHES)],
+                        )
+                        for number, line in enumerate(lines)
+                    ),
+                ),
+                height=HEIGHT,
+                axes=axes,
+                scales=self._scales(),
+                padding=(10, 12, 0, 0),
+                order=self._order + 1,
+            )
+
+    def draw(self, history: History, nudge: bool) -> None:
         """nudge: change the scale by an invisible amount.
 
         A chart that the browser made before it knew its width has no time axis until its scales
         change.
         """
-        shown = values[:, self._columns].T * self._factor
-        self._plot.data = (times, *shown)
+        if self._plot is None:
+            return
+        shown = self._values(history)
+        self._plot.data = (history.times, *shown)
         # uPlot cannot find the range of values with NaN.
-        finite = shown[np.isfinite(shown)]
+        finite = np.concatenate(shown)
+        finite = finite[np.isfinite(finite)]
         low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
         if nudge:
             high += 1e-9 * (high - low)
@@ -91,8 +198,39 @@ class Chart:
             self._range = (low, high)
             self._plot.scales = self._scales()
 
+    def panel(self, history: History) -> tuple[str, Array, dict[str, Array]]:
+        """Label of the values, times and values by the name of the line, as they are shown."""
+        lines = zip(self._lines, self._values(history), strict=True)
+        return self._label, history.times, {line.label: values for line, values in lines}
+
+    @property
+    def _label(self) -> str:
+        return f"{self.group} / {markup.unit(GROUPS[self.group][0])[1]}"
+
+    def _values(self, history: History) -> list[Array]:
+        size = markup.unit(GROUPS[self.group][0])[0]
+        return [history.of(line.cube, line.column) / size for line in self._lines]
+
     def _scales(self) -> dict[str, uplot.Scale]:
         return {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=self._range)}
+
+
+def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> bytes:
+    """All observed columns of some cubes as a table in SI units; a row per instant."""
+    seen = np.flatnonzero(history.observed).tolist()
+    header = ["time / s"]
+    columns = [history.times]
+    for cube in cubes:
+        for column in seen:
+            name = History.COLUMNS[column]
+            si = "1" if name == "residual" else "Pa/m" if "_" in name else "Pa"
+            header.append(f"{names[cube]} {name} / {si}")
+            columns.append(history.of(cube, column))
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(header)
+    table.writerows([f"{value:.6g}" for value in row] for row in zip(*columns, strict=True))
+    return text.getvalue().encode()
 
 
 def round_range(low: float, high: float) -> tuple[float, float]:

@@ -1,18 +1,29 @@
-"""Controls of the page that belong together: what colours mean, where a replay is."""
+"""Controls of the page: what is drawn, what colours mean, where a replay is."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Protocol
 
 import viser
 
+from ..core.modes import COMPONENTS
 from ..core.scene import QUANTITIES, Quantity
 from . import markup
+from .history import History
+from .scene_3d import Shown
 
 STEP_S = 0.1
 """Of the slider of a replay."""
+SHOWN_LABELS = {
+    "field": "field between the cubes",
+    "traction": "traction arrows",
+    "gradient": "gradient arrows",
+    "principal": "principal stresses",
+    "names": "names of cubes",
+}
 
 
 class ReplayState(Protocol):
@@ -31,7 +42,7 @@ class ColourControls:
         labels = [quantity.label for quantity in QUANTITIES.values()]
         self._quantity = gui.add_dropdown("colour", labels)
         self._quantity.on_update(lambda _: changed())
-        self._range = gui.add_number("range (0: auto)", 0.0, min=0.0, step=0.1)
+        self._range = gui.add_number("top (0: auto)", 0.0, min=0.0, step=0.1)
         self._legend = gui.add_html("")
 
     @property
@@ -46,25 +57,51 @@ class ColourControls:
         value = float(self._range.value)
         return value * self.quantity.size if math.isfinite(value) and value > 0 else 0.0
 
+    def offer_observed(self, history: History) -> None:
+        """Offer only what some cube observes."""
+        observed = dict(zip(History.COLUMNS, history.observed, strict=True))
+        if not any(observed[name] for name in COMPONENTS):
+            return
+        seen = [
+            quantity.label
+            for name, quantity in QUANTITIES.items()
+            if name not in COMPONENTS or observed[name]
+        ]
+        if tuple(seen) != tuple(self._quantity.options):
+            self._quantity.options = seen
+
     def write_legend(self, top: float) -> None:
         """top: of the range in use, SI."""
         self._legend.content = markup.legend(self.quantity, top)
 
 
-class ReplayControls:
-    """A slider that shows and sets where a replay is, and a button to hold it; hidden without one.
+class ShownControls:
+    """Check boxes for the parts of the 3-D view."""
 
-    held: whether the replay is paused.
+    def __init__(self, gui: viser.GuiApi, shown: Shown) -> None:
+        for field in fields(Shown):
+            self._add(gui, shown, field.name)
+
+    def _add(self, gui: viser.GuiApi, shown: Shown, name: str) -> None:
+        box = gui.add_checkbox(SHOWN_LABELS[name], getattr(shown, name))
+        box.on_update(lambda _: setattr(shown, name, bool(box.value)))
+
+
+class ReplayControls:
+    """A slider that shows and sets where a replay is, and a button to stop it; hidden without one.
+
+    held: whether the replay is stopped.
     """
 
     def __init__(
         self, gui: viser.GuiApi, hold: Callable[[], None], jump: Callable[[float], None]
     ) -> None:
-        """hold: called to hold or go on; jump: called with a position in s."""
+        """hold: called to stop or go on; jump: called with a position in s."""
         self.held = False
         with gui.add_folder("replay", visible=False) as self._folder:
-            self._slider = gui.add_slider("s", 0.0, 1.0, STEP_S, 0.0)
-            self._button = gui.add_button("hold")
+            self._position = gui.add_html("")
+            self._slider = gui.add_slider("time / s", 0.0, 1.0, STEP_S, 0.0)
+            self._button = gui.add_button("stop the replay")
         self._button.on_click(lambda _: hold())
 
         @self._slider.on_update
@@ -77,7 +114,11 @@ class ReplayControls:
         """Show where a replay is; None: there is none."""
         self.held = replay is not None and replay.paused
         self._folder.visible = replay is not None
-        if replay is not None:
-            self._slider.max = max(replay.length, STEP_S)
-            self._slider.value = min(replay.position, self._slider.max)  # type: ignore[misc]
-            self._button.label = "play" if replay.paused else "hold"
+        if replay is None:
+            return
+        self._slider.max = max(round(math.ceil(replay.length / STEP_S) * STEP_S, 1), STEP_S)
+        self._slider.value = round(min(replay.position, self._slider.max), 1)  # type: ignore[misc]
+        self._position.content = markup.box(
+            f"<b>{markup.clock(replay.position)}</b> of {markup.clock(replay.length)}"
+        )
+        self._button.label = "go on with the replay" if replay.paused else "stop the replay"

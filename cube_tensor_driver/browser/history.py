@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.modes import COMPONENTS
-from ..core.scene import Newest
 
 
 class History:
@@ -19,11 +18,11 @@ class History:
         self._times = np.full(length, np.nan)
         self._count = 0
 
-    def add(self, now: float, newest: Newest) -> None:
-        """Keep the newest rows as they are at `now`, s."""
+    def add(self, now: float, values: NDArray[np.float64], residual: NDArray[np.float64]) -> None:
+        """Keep values (cubes, 15) and residual (cubes,) as they are at `now`, s."""
         slot = self._count % len(self._times)
-        self._values[slot, :, :-1] = newest.values
-        self._values[slot, :, -1] = newest.residual
+        self._values[slot, :, :-1] = values
+        self._values[slot, :, -1] = residual
         self._times[slot] = now
         self._count += 1
 
@@ -31,17 +30,24 @@ class History:
         """Forget everything, because what comes next is of another time."""
         self._count = 0
 
-    def of(self, cube: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times (M,) in s, the last one 0 and the others negative, and values (M, 16) of a cube.
+    def of(self, cube: int, column: int) -> NDArray[np.float64]:
+        """(M,) values of one of `COLUMNS` of a cube, SI; the oldest is first."""
+        return self._values[self._slots(), cube, column].astype(float)
 
-        The oldest is first. The columns of the values are `COLUMNS`.
-        """
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(M,) s; the last one is 0, the others are negative."""
+        times = self._times[self._slots()]
+        return times - times[-1] if len(times) else times
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """(16,) which of `COLUMNS` some cube has shown."""
+        return np.asarray(np.isfinite(self._values[self._slots()]).any(axis=(0, 1)))
+
+    def _slots(self) -> NDArray[np.int64]:
         length = len(self._times)
-        slots = np.arange(max(0, self._count - length), self._count) % length
-        times = self._times[slots]
-        if len(times):
-            times = times - times[-1]
-        return times, self._values[slots, cube].astype(float)
+        return np.arange(max(0, self._count - length), self._count) % length
 
 
 class RowRate:

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from html import escape
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core import scene
 from ..core.modes import COMPONENTS
-from ..core.scene import Newest
 from ..core.status import STATUS
 from ..elastic.surface import Contact
+from .moment import Moment
 
-GREEN, AMBER, RED, YELLOW = "#51cf66", "#ffa94d", "#ff6b6b", "#ffd43b"
+GREEN, AMBER, RED, BLUE = "#2b8a3e", "#e67700", "#c92a2a", "#1864ab"
+NoteColour = Literal["blue", "green", "red"]
 MOST_ROWS = 20
 """Of cubes that are not fine; beside them the page tells how many there are."""
 LEGEND_STEPS = 9
@@ -24,19 +26,30 @@ BOX_STYLE = "padding:0 0.8em 0.4em;font-size:0.85em"
 BAR_STYLE = "height:0.9em;border-radius:3px;background:linear-gradient(to right,{})"
 TICKS_STYLE = "display:flex;justify-content:space-between"
 VALUE_STYLE = "text-align:right;font-family:monospace"
+PHONE_STYLE = (
+    "<style>@media (max-width: 36em) {"
+    "[style*='width: 20em'] {width: 100vw !important}"
+    "[style*='max-height: 60%'] {max-height: 45% !important}}</style>"
+)
+"""viser's sheet for narrow screens is 20em wide and covers the skin: all of the width, but low."""
 
 
 @dataclass
 class PageStatus:
     """What the page says about other things than the rows.
 
-    links: a line for each link. action: what became of the last thing that was asked for.
-    recording: whether a bag is being written.
+    links: a line for each link. action: what became of the last thing that was asked for, with a
+    title and colour for a note. recording: whether a bag is being written.
     """
 
     links: list[str] = field(default_factory=list)
     action: str = ""
+    title: str = ""
+    colour: NoteColour = "blue"
     recording: bool = False
+
+    def say(self, title: str, action: str, colour: NoteColour = "blue") -> None:
+        self.title, self.action, self.colour = title, action, colour
 
 
 def waiting(domain: str) -> str:
@@ -53,8 +66,30 @@ def box(content: str) -> str:
 
 
 def label(name: str) -> str:
-    """A component as people write it: ∂zz/∂x for zz_x."""
-    return f"∂{name[:2]}/∂{name[3]}" if "_" in name else name
+    """A component as people write it: ∂σzz/∂x for zz_x."""
+    if name == "residual":
+        return name
+    return f"∂σ{name[:2]}/∂{name[3]}" if "_" in name else f"σ{name}"
+
+
+def unit(name: str) -> tuple[float, str]:
+    """Size in SI, and name, of the unit in which a component or the residual is shown."""
+    if name == "residual":
+        return 1.0, "× noise"
+    return (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
+
+
+def value(quantity: scene.Quantity, shown: float) -> str:
+    """A quantity of one cube, SI, with its unit."""
+    if np.isnan(shown):
+        return "not observed"
+    return f"{quantity.label} {shown / quantity.size:.2f} {quantity.unit}"
+
+
+def clock(seconds: float) -> str:
+    """12.3 s; or 3 min 12.3 s."""
+    minutes, rest = divmod(round(seconds, 1), 60)
+    return f"{minutes:.0f} min {rest:.1f} s" if minutes else f"{rest:.1f} s"
 
 
 def newtons(contact: Contact) -> str:
@@ -73,7 +108,7 @@ def headline(
     """The first line: does it run, how many cubes, how fast, how hard it is pressed."""
     live = int(np.count_nonzero(health < scene.FAULTY))
     if paused:
-        dot, word = YELLOW, "paused"
+        dot, word = BLUE, "paused"
     elif live == len(health):
         dot, word = GREEN, "live"
     elif live:
@@ -108,16 +143,32 @@ def legend(quantity: scene.Quantity, top: float) -> str:
     return box(bar + _div(TICKS_STYLE, ticks) + _div("text-align:center", meaning))
 
 
-def numbers(newest: Newest, cube: int, health: int, hertz: float) -> str:
+def explanation(bar: float, stress: float, gradient: float) -> str:
+    """What is drawn, and how long arrows are. bar: length of the scale bar, m. stress, Pa, and
+    gradient, Pa/m: of arrows as long as the bar."""
+    long = f"as long as the bar ({1e3 * bar:g} mm):"
+    lines = [
+        ("#282c34", f"traction on the upper face, {long} <b>{stress / 1e3:.3g} kPa</b>"),
+        ("#1969d2", f"pressure grows this way, {long} <b>{gradient / 1e6:.3g} kPa/mm</b>"),
+    ]
+    rows = "".join(f"<div><b style='color:{colour}'>➜</b> {text}</div>" for colour, text in lines)
+    rows += "<div><b>◯</b> the chosen cube; click another one to choose it</div>"
+    rows += "<div>principal stresses: <b style='color:#d22828'>red</b> pulls, "
+    rows += "<b style='color:#2850dc'>blue</b> pushes</div>"
+    rows += "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>"
+    return box(rows)
+
+
+def numbers(moment: Moment, cube: int, hertz: float) -> str:
     """The observed components of a cube, its residual, rate and state."""
     rows = []
-    for name, value in zip(COMPONENTS, newest.values[cube], strict=True):
-        size, unit = (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
-        if np.isfinite(value):
-            rows.append((label(name), f"{value / size:+.3f}", unit))
-    rows.append(("residual", f"{newest.residual[cube]:.2f}", "σ"))
+    for name, shown in zip(COMPONENTS, moment.values[cube], strict=True):
+        size, unit_name = unit(name)
+        if np.isfinite(shown):
+            rows.append((label(name), f"{shown / size:+.3f}", unit_name))
+    rows.append(("residual", f"{moment.residual[cube]:.2f}", "× noise"))
     rows.append(("rate", f"{hertz:.0f}", "Hz"))
-    rows.append(("state", _state(newest.status[cube], health), ""))
+    rows.append(("state", _state(moment.status[cube], moment.health[cube]), ""))
     return box(_table(rows))
 
 

@@ -29,6 +29,15 @@ CUBE: Mesh = (
     ),
 )
 """A cube of half side 1 about the origin."""
+CUBE_EDGES = np.array(
+    [
+        [one, other]
+        for number, one in enumerate(CUBE[0])
+        for other in CUBE[0][number + 1 :]
+        if np.count_nonzero(one != other) == 1
+    ]
+)
+"""(12, 2, 3) its edges."""
 
 LEAST_ARROW, NECK = 0.15, 0.2
 """Parts of an arrow's unit length: arrows below the first are left out, heads are the second."""

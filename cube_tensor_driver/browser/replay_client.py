@@ -37,12 +37,12 @@ class ReplayClient:
         """A jump is wanted or under way: `state` is not where the user wants to be."""
         return self._wanted is not None or self._jump is not None
 
-    def toggle_hold(self) -> str:
-        """Hold, or go on; returns what to tell the user."""
+    def toggle_hold(self) -> None:
+        """Stop, or go on."""
         if self.state is None:
-            return ""
+            return
         request = SteerReplay.Request(position=np.nan, paused=not self.state.paused)
-        return self._services.ask("replay", self._client, request)
+        self._services.ask("replay", self._client, request)
 
     def jump_to(self, position: float) -> None:
         """Jump to `position`, s, with the next `update`; of several wishes the last one counts."""

@@ -2,12 +2,12 @@
 
 A computer without a graphics card draws each instance of a batched mesh by itself. A thousand cubes
 twenty times a second are too many for it. So what grows with the skin is a single object: all
-arrows of one sort are one mesh, and the cubes of a large skin are part of the surface layer.
+arrows of one sort are one mesh, and the cubes of a large skin are squares in their colours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,11 +16,12 @@ import viser
 from numpy.typing import NDArray
 
 from ..core import scene
-from ..core.scene import QUANTITIES, CubePoses, Newest, Quantity
+from ..core.scene import QUANTITIES, CubePoses, Quantity
 from ..elastic.surface import Contact, Surface
 from . import markup
-from .meshes import CUBE, NOTHING, Mesh, arrows, hit, ring, rods
-from .surface_layer import SurfaceLayer
+from .meshes import CUBE, CUBE_EDGES, NOTHING, Mesh, arrows, hit, ring, rods
+from .moment import Moment
+from .surface_layer import SquareLayer
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -29,34 +30,53 @@ SPAN = 2.0
 """The longest side of a skin in the scene. Cameras and clipping planes of viewers are made for
 metres, skins are centimetres long."""
 MOST_SOLID = 256
-"""Skins with more cubes show them as squares in the surface layer."""
-LAYERS = ("field", "traction", "gradient", "principal")
-SHOWN_AT_FIRST = {"field", "traction", "gradient"}
+"""Skins with more cubes show them as squares where their upper faces would be."""
+MOST_NAMES = 256
+"""Larger skins have no names in 3-D: they would cover it."""
 LEAST_ARROW = SPAN / 16
 """Arrows are drawn as if the pitch were at least this, so that the direction of a touch is still
 seen among a thousand cubes."""
 THIN = SPAN / 1000
 """Thinner lines are not seen on all screens."""
-FIELD_BRIGHTNESS = 0.5
-"""The field is darker than the cubes, so that these stand out."""
-AMBIENT, DIRECT = 2.0, 1.4
+AMBIENT, DIRECT = 2.4, 1.7
 """Intensities of the lights with which colours look as in the legend."""
-WHITE, GOLD = (235, 235, 235), (255, 153, 38)
-PULL, PUSH = (255, 90, 70), (90, 150, 255)
+DARK, BLUE, EDGE = (40, 44, 52), (25, 105, 210), (110, 114, 122)
+PULL, PUSH = (210, 40, 40), (40, 80, 220)
+FAULT_COLOURS = {scene.DOUBTFUL: (230, 130, 0), scene.FAULTY: (215, 25, 25), scene.STALE: DARK}
+CROSS_HEIGHT = 0.75
+"""Of the middle of principal crosses above the cubes' centres, in pitches: outside the cubes."""
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 
 class Colouring(NamedTuple):
-    """What colours mean in one picture of a skin with N cubes.
+    """What colours mean in one picture of a skin with N cubes and M points of its surface.
 
-    values: (N, 15) as in core/scene.py, NaN where a cube has no tensor. quantity: what is shown;
-    shown: (N,) its values; top: of its range, SI.
+    quantity: what is shown. cubes: (N,) and field: (M,) its values, SI. top: of its range, SI.
     """
 
-    values: Array
     quantity: Quantity
-    shown: Array
+    cubes: Array
+    field: Array
     top: float
+
+    @classmethod
+    def of(
+        cls, moment: Moment, surface: Surface, quantity: Quantity, wanted: float, before: float
+    ) -> Colouring:
+        """wanted: top of the range, SI; 0: it follows what there is, and `before`."""
+        cubes = quantity.of(moment.values, moment.residual)
+        top = wanted or scene.automatic(quantity, cubes, before)
+        return cls(quantity, cubes, _field(moment, surface, quantity, cubes), top)
+
+
+def _field(moment: Moment, surface: Surface, quantity: Quantity, cubes: Array) -> Array:
+    """(M,) on the points of the surface: interpolated if the quantity is pressure or shear,
+    otherwise the value of the nearest cube."""
+    if quantity is QUANTITIES["pressure"]:
+        return moment.field.pressure
+    if quantity is QUANTITIES["shear"]:
+        return np.linalg.norm(np.nan_to_num(moment.field.shear), axis=1)
+    return cubes[surface.cube]
 
 
 @dataclass(frozen=True)
@@ -88,32 +108,45 @@ class Placement:
         return (position - self.centre) * self.unit
 
 
+@dataclass
+class Shown:
+    """Which parts of the 3-D view are drawn."""
+
+    field: bool = True
+    traction: bool = True
+    gradient: bool = True
+    principal: bool = False
+    names: bool = False
+
+
 class Scene3D:
     """The 3-D part of the page.
 
-    shown: which of LAYERS are drawn; selected: the cube with a ring around it; top: of the range
-    that colours were drawn with last, SI. All three may be set. pick: called with a cube that was
-    clicked.
+    shown: which parts are drawn; selected: the cube with a ring around it. Both may be set.
+    pick: called with a cube that was clicked.
     """
 
     def __init__(
         self,
         api: viser.SceneApi,
+        names: Sequence[str],
         poses: CubePoses,
         surface: Surface,
         pick: Callable[[int], None],
     ) -> None:
         placement = Placement.of(poses)
-        self.shown = set(SHOWN_AT_FIRST)
+        self.shown = Shown()
         self.selected = int((placement.poses.position**2).sum(axis=1).argmin())
-        self.top = 0.0
+        self._unit = placement.unit
         _set_up_lights(api)
+        self.bar = ScaleBar(api, placement, surface).length
         self._cubes = Cubes(api, placement, surface)
+        self._names = Names(api, placement, names)
         self._traction = Arrows(api, placement, TRACTION)
         self._gradient = Arrows(api, placement, GRADIENT)
         self._crosses = PrincipalCrosses(api, placement)
         self._faults = FaultCrosses(api, placement)
-        self._ring = SelectionRing(api, placement)
+        self._chosen = ChosenCube(api, placement, names)
         self._label = ContactLabel(api, placement)
 
         @api.on_click()
@@ -123,78 +156,143 @@ class Scene3D:
             if cube is not None:
                 pick(cube)
 
-    def draw(
-        self, quantity: Quantity, top: float, newest: Newest, health: NDArray[np.integer]
-    ) -> None:
-        """Draw the newest rows. top: of the range of colours, SI; 0 follows what is there."""
-        values = newest.believed(health)
-        shown = quantity.of(values, newest.residual)
-        self.top = top or scene.automatic(quantity, shown, self.top)
-        colouring = Colouring(values, quantity, shown, self.top)
-        self._cubes.draw(colouring, with_field="field" in self.shown)
-        self._traction.draw(values, newest.residual, visible="traction" in self.shown)
-        self._gradient.draw(values, newest.residual, visible="gradient" in self.shown)
-        self._crosses.draw(values, self._traction.longest, visible="principal" in self.shown)
-        self._faults.draw(health)
-        self._ring.surround(self.selected)
+    def draw(self, moment: Moment, colouring: Colouring) -> None:
+        shown, values = self.shown, moment.values
+        self._cubes.draw(colouring, with_field=shown.field)
+        self._names.visible = shown.names
+        self._traction.draw(values, moment.residual, visible=shown.traction)
+        self._gradient.draw(values, moment.residual, visible=shown.gradient)
+        self._crosses.draw(values, self._traction.longest, visible=shown.principal)
+        self._faults.draw(moment.health)
+        value = colouring.cubes[self.selected]
+        self._chosen.show(self.selected, markup.value(colouring.quantity, value))
+        self._label.show(moment.contact)
 
-    def show_contact(self, contact: Contact | None) -> None:
-        """Write the forces of a contact above it; None: there is none."""
-        self._label.show(contact)
+    def bar_stress(self) -> float:
+        """The traction, Pa, whose arrow is as long as the scale bar."""
+        return self.bar * self._unit * self._traction.value_per_length
+
+    def bar_gradient(self) -> float:
+        """The gradient, Pa/m, whose arrow is as long as the scale bar."""
+        return self.bar * self._unit * self._gradient.value_per_length
+
+
+class ScaleBar:
+    """A bar in front of the skin, and the axes of its parent frame beside it.
+
+    length: of the bar, m: 1, 2 or 5 times a power of ten, about a quarter of the skin.
+    """
+
+    def __init__(self, api: viser.SceneApi, placement: Placement, surface: Surface) -> None:
+        span = SPAN / placement.unit
+        self.length = round_down(span / 4)
+        points = placement.point(surface.points)
+        low, high = points.min(axis=0), points.max(axis=0)
+        y, z = low[1] - 0.16 * SPAN, low[2] - float(placement.poses.half_side.max())
+        start = np.array([low[0], y, z])
+        end = start + np.array([self.length * placement.unit, 0, 0])
+        _set_mesh(_add_mesh(api, "bar", DARK), rods(np.array([[start, end]]), 0.006 * SPAN))
+        middle = tuple((start + end) / 2 - np.array([0, 0.03 * SPAN, 0]))
+        api.add_label(
+            "/bar/label", f"{1e3 * self.length:g} mm", position=middle, anchor="top-center"
+        )
+        corner, axis = np.array([high[0] - 0.05 * SPAN, y, z]), 0.1 * SPAN
+        api.add_frame(
+            "/axes",
+            axes_length=axis,
+            axes_radius=0.006 * SPAN,
+            origin_radius=0.01 * SPAN,
+            position=tuple(corner),
+        )
+        for name, direction in zip("xyz", np.eye(3), strict=True):
+            api.add_label(
+                f"/axes/{name}",
+                name,
+                position=tuple(1.3 * axis * direction),
+                anchor="center-center",
+            )
+
+
+def round_down(length: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above a length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(power * max(k for k in (1, 2, 5) if k * power <= length * (1 + 1e-9)))
 
 
 class Cubes:
     """The cubes and the field below them, in colour."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement, surface: Surface) -> None:
-        poses = placement.poses
-        self._surface = surface
-        self._solid: viser.BatchedMeshHandle | None = None
-        if len(poses.position) <= MOST_SOLID:
-            vertices, faces = CUBE
-            self._solid = api.add_batched_meshes_simple(
-                "/cubes",
-                vertices,
-                faces,
-                scene.quaternions(poses.rotation),
-                poses.position,
-                batched_scales=poses.half_side,
-                batched_colors=np.full((len(poses.position), 3), 90, np.uint8),
-                flat_shading=True,
-                lod="off",
-                **NO_SHADOWS,
-            )
-        of_cube = surface.cube
+        poses, of_cube = placement.poses, surface.cube
         down = poses.rotation[of_cube, :, 2] * poses.half_side[of_cube, None]
-        self._layer = SurfaceLayer(
+        self._field = SquareLayer(
             api,
+            "field",
             placement.point(surface.points) - down,
             poses.rotation[of_cube],
             surface.spacing * placement.unit,
-            None if self._solid else poses,
+        )
+        self._solid: viser.BatchedMeshHandle | None = None
+        self._squares: SquareLayer | None = None
+        up = poses.rotation[:, :, 2] * poses.half_side[:, None]
+        if len(poses.position) > MOST_SOLID:
+            side = 2 * float(np.median(poses.half_side))
+            self._squares = SquareLayer(api, "cubes", poses.position + up, poses.rotation, side)
+            return
+        self._solid = api.add_batched_meshes_simple(
+            "/cubes",
+            *CUBE,
+            scene.quaternions(poses.rotation),
+            poses.position,
+            batched_scales=poses.half_side,
+            batched_colors=np.full((len(poses.position), 3), 200, np.uint8),
+            flat_shading=True,
+            lod="off",
+            **NO_SHADOWS,
+        )
+        edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
+        lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
+        api.add_line_segments(
+            "/edges", lines.reshape(-1, 2, 3), EDGE, thickness=1.5, thickness_units="screen"
         )
 
     def draw(self, colouring: Colouring, with_field: bool) -> None:
-        field = np.full((len(self._surface.points), 3), np.nan)
+        quantity, top = colouring.quantity, colouring.top
         if with_field:
-            brightness = scene.colours(colouring.quantity, self._field(colouring), colouring.top)
-            field = FIELD_BRIGHTNESS * brightness
-        cubes = scene.colours(colouring.quantity, colouring.shown, colouring.top)
-        if self._solid is not None:
-            self._solid.batched_colors = linear_light(cubes)
-            self._layer.paint(field)
+            self._field.paint(quantity, colouring.field, top)
         else:
-            self._layer.paint(np.concatenate([field, cubes]))
+            self._field.hide()
+        if self._squares is not None:
+            self._squares.paint(quantity, colouring.cubes, top)
+        elif self._solid is not None:
+            colours = scene.colours(quantity, colouring.cubes, top)
+            self._solid.batched_colors = linear_light(colours)
 
-    def _field(self, colouring: Colouring) -> Array:
-        """(M,) on the points of the surface: interpolated if the quantity is pressure or shear,
-        otherwise the value of the nearest cube."""
-        if colouring.quantity is QUANTITIES["pressure"]:
-            return self._surface.field(colouring.values).pressure
-        if colouring.quantity is QUANTITIES["shear"]:
-            shear = np.nan_to_num(self._surface.field(colouring.values).shear)
-            return np.linalg.norm(shear, axis=1)
-        return colouring.shown[self._surface.cube]
+
+class Names:
+    """The names of all cubes of a skin that is not large, above them."""
+
+    def __init__(self, api: viser.SceneApi, placement: Placement, names: Sequence[str]) -> None:
+        self._frame = api.add_frame("/names", show_axes=False, visible=False)
+        if len(names) > MOST_NAMES:
+            return
+        for number, (name, point) in enumerate(zip(names, _above(placement, 1.3), strict=True)):
+            api.add_label(
+                f"/names/{number}",
+                name,
+                position=tuple(point),
+                anchor="bottom-center",
+                font_screen_scale=0.8,
+            )
+
+    @property
+    def visible(self) -> bool:
+        return bool(self._frame.visible)
+
+    @visible.setter
+    def visible(self, visible: bool) -> None:
+        if visible != self._frame.visible:
+            self._frame.visible = visible
 
 
 @dataclass(frozen=True)
@@ -216,7 +314,7 @@ class ArrowStyle:
 
 TRACTION = ArrowStyle(
     name="traction",
-    colour=WHITE,
+    colour=DARK,
     full_length=1.8,
     quantity=QUANTITIES["shear"],
     measured=lambda values, residual: values[:, 2:5],
@@ -224,7 +322,7 @@ TRACTION = ArrowStyle(
 )
 GRADIENT = ArrowStyle(
     name="gradient",
-    colour=GOLD,
+    colour=BLUE,
     full_length=1.2,
     quantity=QUANTITIES["gradient"],
     measured=QUANTITIES["gradient"].of,
@@ -244,6 +342,11 @@ class Arrows:
         self._style = style
         self._mesh = _add_mesh(api, style.name, style.colour)
 
+    @property
+    def value_per_length(self) -> float:
+        """SI units per unit of length in the scene."""
+        return self.longest / (self._style.full_length * self._placement.arrow)
+
     def draw(self, values: Array, residual: Array, visible: bool) -> None:
         style, unit = self._style, self._placement.arrow
         measured = style.measured(values, residual)
@@ -255,11 +358,12 @@ class Arrows:
 
 
 class PrincipalCrosses:
-    """The principal stresses of each cube as a cross."""
+    """The principal stresses of each cube as a cross above it."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
         self._placement = placement
         self._frame = api.add_frame("/principal", show_axes=False, visible=False)
+        self._lift = _above(placement, CROSS_HEIGHT, placement.pitch) - _above(placement, 1.0)
         self._pulls = _add_mesh(api, "principal/pulls", PULL)
         self._pushes = _add_mesh(api, "principal/pushes", PUSH)
 
@@ -270,6 +374,7 @@ class PrincipalCrosses:
             return
         pitch = self._placement.pitch
         lines, pulls = scene.principal_crosses(self._placement.poses, values, pitch / longest)
+        lines = lines + self._lift[:, None, None]
         _set_mesh(self._pulls, rods(lines[pulls], 0.02 * pitch))
         _set_mesh(self._pushes, rods(lines[~pulls], 0.02 * pitch))
 
@@ -281,9 +386,8 @@ class FaultCrosses:
         self._placement = placement
         self._drawn: NDArray[np.integer] | None = None
         self._meshes = {}
-        for state in (scene.DOUBTFUL, scene.FAULTY, scene.STALE):
-            red, green, blue = (255 * scene.MARK[state]).astype(int).tolist()
-            self._meshes[state] = _add_mesh(api, f"faults/{state}", (red, green, blue))
+        for state, colour in FAULT_COLOURS.items():
+            self._meshes[state] = _add_mesh(api, f"faults/{state}", colour)
 
     def draw(self, health: NDArray[np.integer]) -> None:
         if self._drawn is not None and np.array_equal(health, self._drawn):
@@ -296,22 +400,25 @@ class FaultCrosses:
             _set_mesh(mesh, rods(lines, 0.03 * self._placement.pitch))
 
 
-class SelectionRing:
-    """A ring around the cube whose numbers the page shows."""
+class ChosenCube:
+    """A ring around the cube whose numbers the page shows, with its name and value."""
 
-    def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
-        poses = placement.poses
-        self._upper_faces = (
-            poses.position + 1.1 * poses.rotation[:, :, 2] * poses.half_side[:, None]
-        )
-        self._orientations = scene.quaternions(poses.rotation)
+    def __init__(self, api: viser.SceneApi, placement: Placement, names: Sequence[str]) -> None:
+        self._names = names
+        self._upper_faces = _above(placement, 1.1)
+        self._orientations = scene.quaternions(placement.poses.rotation)
         radius = 0.6 * placement.pitch + 0.01 * placement.arrow
-        self._mesh = _add_mesh(api, "selected", WHITE)
-        _set_mesh(self._mesh, ring(radius, THIN + 0.005 * placement.arrow))
+        self._ring = _add_mesh(api, "chosen", DARK)
+        _set_mesh(self._ring, ring(radius, THIN + 0.005 * placement.arrow))
+        # Away from the viewer's side of a contact's label, which stands above its cube.
+        self._label = api.add_label(
+            "/chosen/label", "", position=(0.0, -radius, 0.0), anchor="top-center"
+        )
 
-    def surround(self, cube: int) -> None:
-        self._mesh.position = self._upper_faces[cube]
-        self._mesh.wxyz = self._orientations[cube]
+    def show(self, cube: int, value: str) -> None:
+        self._ring.position = self._upper_faces[cube]
+        self._ring.wxyz = self._orientations[cube]
+        self._label.text = f"{self._names[cube]}: {value}"
 
 
 class ContactLabel:
@@ -329,6 +436,13 @@ class ContactLabel:
             self._label.text = markup.newtons(contact)
             self._label.position = self._placement.point(contact.position) + above
         self._label.visible = contact is not None
+
+
+def _above(placement: Placement, factor: float, unit: float | None = None) -> Array:
+    """(N, 3) points above the cubes' centres: `factor` times half a side, or times a unit."""
+    poses = placement.poses
+    height = poses.half_side[:, None] if unit is None else unit
+    return poses.position + factor * height * poses.rotation[:, :, 2]
 
 
 def _set_up_lights(api: viser.SceneApi) -> None:

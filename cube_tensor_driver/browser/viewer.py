@@ -13,8 +13,9 @@ import os
 import queue
 import signal
 import time
+import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
 
 import rclpy
 import viser
@@ -23,7 +24,6 @@ from std_srvs.srv import Trigger
 
 from cube_tensor_driver.srv import Tare
 
-from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ConfigError
 from ..ros.compat import make_executor
 from ..ros.guard import CallbackGuard
@@ -35,26 +35,17 @@ from .charts import HISTORY_S
 from .gate import guarded_server
 from .history import History, RowRate
 from .markup import PageStatus
-from .page import Buttons, Page, WaitingPage
+from .moment import Moment
+from .page import Buttons, Page, ShownSkin, WaitingPage
 from .replay_client import ReplayClient
 from .service_calls import ServiceCalls
 
 HOST = "127.0.0.1"
-PORT = 8080
 PICTURES_HZ, NUMBERS_HZ = 20.0, 4.0
 SAY_WAITING_S = 2.0
 """Without a skin, until the terminal says that the page waits for one."""
 NEVER_STALE_S = 1e9
 """For cubes while a replay is held."""
-
-
-class ShownSkin(NamedTuple):
-    """What belongs to the skin on the page, and goes when another one comes."""
-
-    skin: FollowedSkin
-    page: Page
-    history: History
-    rows: RowRate
 
 
 class Viewer:
@@ -64,8 +55,9 @@ class Viewer:
     threads: what they ask for waits in a queue.
     """
 
-    def __init__(self, port: int, depth: float) -> None:
-        """port: of the page, TCP. depth: from the cubes' centres to the surface, m."""
+    def __init__(self, port: int, depth: float, recordings: Path) -> None:
+        """port: of the page, TCP. depth: from the cubes' centres to the surface, m. recordings:
+        the folder for bags."""
         self._server = _serve(port)
         self._depth = depth
         self._node = rclpy.create_node("view")
@@ -76,14 +68,21 @@ class Viewer:
         )
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
         self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
-        self._services = ServiceCalls()
-        self._replay = ReplayClient(self._node, self._services)
-        self._recorder = BagRecorder()
         self._status = PageStatus()
+        self._services = ServiceCalls(self._status.say)
+        self._replay = ReplayClient(self._node, self._services)
+        self._recorder = BagRecorder(recordings)
         self._links: dict[str, str] = {}
         self._pressed: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._followed: FollowedSkin | None = None
         self._shown: ShownSkin | None = None
-        self._waiting = WaitingPage(self._server, markup.waiting(_domain()))
+        self._rows = RowRate(0, time.monotonic())
+        self._pages: dict[int, Page | WaitingPage] = {}
+        put = self._pressed.put
+        self._server.on_client_connect(lambda client: put(lambda: self._open_page(client)))
+        self._server.on_client_disconnect(
+            lambda client: put(lambda: self._forget_page(client.client_id))
+        )
         self._executor = make_executor()
         self._executor.add_node(self._node)
 
@@ -108,8 +107,8 @@ class Viewer:
             with_numbers = now >= next_numbers
             if with_numbers:
                 next_numbers = now + 1 / NUMBERS_HZ
-            if self._shown is not None:
-                self._guard.wrap(self._update)(self._shown, with_numbers)
+            if self._followed is not None and self._shown is not None:
+                self._guard.wrap(self._update)(self._followed, self._shown, with_numbers)
             elif now >= say_waiting_at:
                 say_waiting_at = math.inf
                 print(markup.waiting(_domain()), flush=True)
@@ -121,77 +120,92 @@ class Viewer:
         self._server.stop()
 
     def _show_skin(self, skin: FollowedSkin) -> None:
-        """There is a skin, or another one: make its page."""
-        if self._shown is not None:
-            self._shown.page.close()
-        self._waiting.close()
+        """There is a skin, or another one: make its pages."""
         names = [cube.name for cube in skin.info.cubes]
-        page = Page(self._server, skin.info.name, names, skin.poses, self._depth, self._buttons())
-        page.show_replay(self._replay.state)
         history = History(len(names), round(HISTORY_S * PICTURES_HZ))
-        self._shown = ShownSkin(skin, page, history, RowRate(len(names), time.monotonic()))
+        self._shown = ShownSkin(skin.info.name, names, skin.poses, self._depth, history)
+        self._followed = skin
+        self._rows = RowRate(len(names), time.monotonic())
+        for page in self._pages.values():
+            page.close()
+        self._pages.clear()
+        for client in self._server.get_clients().values():
+            self._open_page(client)
+
+    def _open_page(self, client: viser.ClientHandle) -> None:
+        """The page of a browser that has come; safe to call again."""
+        if client.client_id in self._pages or client.client_id not in self._server.get_clients():
+            return
+        if self._shown is None:
+            self._pages[client.client_id] = WaitingPage(client, markup.waiting(_domain()))
+            return
+        page = Page(client, self._shown, self._buttons())
+        page.show_replay(self._replay.state)
+        self._pages[client.client_id] = page
+
+    def _forget_page(self, client_id: int) -> None:
+        self._pages.pop(client_id, None)
 
     def _buttons(self) -> Buttons:
         def tare() -> None:
-            self._ask("tare", self._tare, Tare.Request())
+            self._services.ask("tare", self._tare, Tare.Request())
 
         def clear_tare() -> None:
-            self._ask("clear tare", self._clear_tare, Trigger.Request())
-
-        def hold() -> None:
-            self._status.action = self._replay.toggle_hold() or self._status.action
+            self._services.ask("undo tare", self._clear_tare, Trigger.Request())
 
         put = self._pressed.put
         return Buttons(
             tare=lambda: put(tare),
             clear_tare=lambda: put(clear_tare),
             record=lambda: put(self._toggle_recording),
-            hold=lambda: put(hold),
+            hold=lambda: put(self._replay.toggle_hold),
             jump=lambda position: put(lambda: self._replay.jump_to(position)),
         )
 
-    def _update(self, shown: ShownSkin, with_numbers: bool) -> None:
+    def _update(self, followed: FollowedSkin, shown: ShownSkin, with_numbers: bool) -> None:
         """One picture; with_numbers: and what stands beside it."""
-        skin, page = shown.skin, shown.page
         if self._replay.update():
             shown.history.clear()
         held = self._replay.held
         now = self._subscriber.now()
-        health = skin.newest.health(now, NEVER_STALE_S if held else STALE_S)
-        if not page.paused and not held:
-            shown.history.add(now, skin.newest)
-        # Without a browser there is nobody to draw for.
-        if not self._server.get_clients():
-            return
-        if not page.paused:
-            page.draw(skin.newest, health)
+        health = followed.newest.health(now, NEVER_STALE_S if held else STALE_S)
+        if not held:
+            shown.history.add(now, followed.newest.believed(health), followed.newest.residual)
         if with_numbers:
-            shown.rows.update(time.monotonic(), skin.newest.count)
-            self._update_status(page)
-            page.write(skin.newest, health, shown.rows.rate, shown.history, self._status)
+            self._update_status()
+            self._rows.update(time.monotonic(), followed.newest.count)
+        # Without a browser there is nobody to draw for.
+        if not self._pages:
+            return
+        moment = Moment.of(followed.newest, health, shown.surface)
+        here = self._server.get_clients()
+        for client_id, page in self._pages.items():
+            if isinstance(page, Page) and client_id in here:
+                if with_numbers and not self._replay.jumping:
+                    page.show_replay(self._replay.state)
+                page.show(moment, self._rows.rate, self._status, with_numbers)
 
-    def _update_status(self, page: Page) -> None:
+    def _update_status(self) -> None:
         status = self._status
-        for line in self._services.news():
-            status.action = line
+        self._services.update()
         code = self._recorder.ended_by_itself()
         if code is not None:
-            status.action = f"recording ended by itself with code {code}"
+            status.say("The recording ended", f"recording ended by itself with code {code}", "red")
         status.recording = self._recorder.recording
         status.links = list(self._links.values())
         self._replay.forget_if_silent()
-        if not self._replay.jumping:
-            page.show_replay(self._replay.state)
-
-    def _ask(self, what: str, client: Any, request: Any) -> None:
-        self._status.action = self._services.ask(what, client, request)
 
     def _toggle_recording(self) -> None:
         if self._recorder.recording:
             self._recorder.end()
-            self._status.action = "recording ended"
-        else:
-            self._status.action = f"recording to {self._recorder.start()}"
+            self._status.say("Recorded", f"recorded to {self._recorder.path}", "green")
+            return
+        try:
+            self._recorder.start()
+        except ConfigError as error:
+            self._status.say("The recording did not start", str(error), "red")
+            return
+        self._status.say("Recording", f"recording to {self._recorder.path}")
 
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -207,6 +221,8 @@ def _domain() -> str:
 def _serve(port: int) -> viser.ViserServer:
     """ConfigError: the port is in use."""
     logging.getLogger("websockets").setLevel(logging.ERROR)
+    # A browser may leave while its picture is made.
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     try:
         # viser prints a banner
         with contextlib.redirect_stdout(io.StringIO()), guarded_server():
@@ -215,11 +231,11 @@ def _serve(port: int) -> viser.ViserServer:
         raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
 
 
-def run_view(port: int = PORT, depth: float = SURFACE_DEPTH) -> int:
+def run_view(port: int, depth: float, recordings: Path) -> int:
     """Serve the page until Ctrl-C; returns the exit code.
 
-    port: TCP. depth: from the cubes' centres to the surface, m. Raises ConfigError if the port is
-    in use.
+    port: TCP. depth: from the cubes' centres to the surface, m. recordings: the folder for bags.
+    Raises ConfigError if the port is in use.
     """
     stopping = False
 
@@ -231,7 +247,7 @@ def run_view(port: int = PORT, depth: float = SURFACE_DEPTH) -> int:
         signal.signal(number, stop)
     start_ros()
     try:
-        with contextlib.closing(Viewer(port, depth)) as viewer:
+        with contextlib.closing(Viewer(port, depth, recordings)) as viewer:
             print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
             viewer.spin(lambda: stopping)
     finally:

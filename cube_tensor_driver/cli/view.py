@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from ..core.defaults import SURFACE_DEPTH
 from .parser import Parser, positive, tcp_port
+
+RECORDINGS = Path("~/cube_recordings")
 
 
 def arguments(parser: Parser) -> None:
@@ -23,9 +26,16 @@ def arguments(parser: Parser) -> None:
         metavar="M",
         help="depth of the cubes below the surface, m (default: %(default)s)",
     )
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        default=RECORDINGS,
+        metavar="DIR",
+        help="folder for the bags that are recorded from the page (default: %(default)s)",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     from ..browser.viewer import run_view
 
-    return run_view(options.port, options.depth)
+    return run_view(options.port, options.depth, options.recordings.expanduser())

@@ -20,9 +20,9 @@ from .statistics import WINDOW_S
 from .status import INVALID, RESIDUAL
 from .tensor import principal_stresses, quaternion_from_rotation
 
-# viridis, and ColorBrewer's RdBu reversed. Lightness changes monotonically away from zero, so that
-# both can be read in grey.
-SEQUENTIAL = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
+# ColorBrewer's YlOrRd, and RdBu reversed. Both are light at zero, and their lightness changes
+# monotonically away from it: they can be read in grey, and a skin at rest is seen.
+SEQUENTIAL = "ffffcc ffeda0 fed976 feb24c fd8d3c fc4e2a e31a1c bd0026 800026"
 DIVERGING = "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f"
 GREY, RED, ORANGE, WHITE = (
     (0.55, 0.55, 0.55),

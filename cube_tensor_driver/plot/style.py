@@ -6,14 +6,18 @@ matplotlib's global settings stay as they are. A drawing function has the decora
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import imsave
+from numpy.typing import NDArray
 
 from ..config.atomic_write import atomic_write
 from ..core.errors import ConfigError
@@ -76,6 +80,21 @@ def save(figure: Figure, path: Path) -> None:
     check_picture(path)
     with atomic_write(path) as partial:
         figure.savefig(partial, format=path.suffix[1:] or "png")
+
+
+@print_style()
+def png(figure: Figure) -> bytes:
+    """A figure as the content of a PNG file."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()
+
+
+def png_of_pixels(pixels: NDArray[np.uint8]) -> bytes:
+    """Pixels (rows, columns, 4) as the content of a PNG file."""
+    content = io.BytesIO()
+    imsave(content, pixels, format="png")
+    return content.getvalue()
 
 
 def check_picture(path: Path) -> None:
