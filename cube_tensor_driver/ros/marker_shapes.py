@@ -17,7 +17,7 @@ TRACTION_LENGTH, GRADIENT_LENGTH = 1.2, 0.8
 """Of the longest arrows, in pitches."""
 
 Colour = tuple[float, float, float]
-WHITE, TRACTION, GRADIENT = (0.95, 0.95, 0.95), (1.0, 1.0, 1.0), (1.0, 0.6, 0.1)
+WHITE, TRACTION, GRADIENT = (0.95, 0.95, 0.95), (1.0, 1.0, 1.0), (0.2, 0.6, 1.0)
 CONTACT = (1.0, 0.45, 0.75)
 
 
