@@ -103,7 +103,7 @@ def draw_fit(fit: Fit, measured: NDArray[np.float64]) -> Figure:
     ends = np.array([np.nanmin(fit.fitted), np.nanmax(fit.fitted)]) * 1e-3
     left.plot(ends, ends, color="0.5", lw=0.8, zorder=0)
     left.set(xlabel="fitted pad stress / kPa", ylabel="measured pad stress / kPa")
-    left.legend(fontsize=7, ncols=2 if len(pads) <= 12 else 3)
+    left.legend(fontsize=7, ncol=2 if len(pads) <= 12 else 3)
     right.axhline(0, color="0.5", lw=0.8)
     right.set(xlabel="fitted pad stress / kPa", ylabel="measured − fitted / Pa")
     right.set_title(

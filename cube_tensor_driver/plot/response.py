@@ -38,7 +38,7 @@ def draw_convergence(result: Response) -> Figure:
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:.2g}")
-        axis.legend(fontsize="small", ncols=2, handlelength=4)
+        axis.legend(fontsize="small", ncol=2, handlelength=4)
     return figure
 
 

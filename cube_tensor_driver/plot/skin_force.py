@@ -43,7 +43,7 @@ def draw_forces(
         handles,
         labels,
         title="lines: script, marks: measured",
-        ncols=3,
+        ncol=3,
         loc="lower left",
         bbox_to_anchor=(0, 1),
     )

@@ -155,4 +155,4 @@ def _draw_columns(axes: Any, seconds: np.ndarray, columns: np.ndarray, names: li
             label=name,
         )
     columns_of_legend = 1 if len(names) <= 12 else 2
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, ncols=columns_of_legend)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, ncol=columns_of_legend)

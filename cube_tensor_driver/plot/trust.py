@@ -30,8 +30,7 @@ def draw_trust(result: LayoutStudy) -> Figure:
         for axis, name in zip(axes[row], names, strict=True):
             _draw_errors(axis, 1e3 * result.widths, result.error[name][row])
             axis.set_title(f"{name}, side {1e3 * side:g} mm")
-    handles, labels = axes[0][-1].get_legend_handles_labels()
-    figure.legend(handles, labels, ncols=1, loc="outside right center", handlelength=4)
+    axes[0][-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=4)
     figure.supxlabel(f"width of the indenter, mm (cube's centre {1e3 * result.depth:g} mm deep)")
     figure.supylabel("largest error over all positions / range of the component")
     return figure

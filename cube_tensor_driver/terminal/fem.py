@@ -44,8 +44,8 @@ def _matrix(result: Response, start: int) -> Table:
     for number, (pad, row) in enumerate(zip(result.layout.pads, result.matrix, strict=True), 1):
         label = f"V{number} {pad}" if result.layout.planar else pad
         # Adding 0 makes 0 of -0.
-        table.add_row(label, *(f"{value + 0.0:.4f}" for value in row[modes]))
-    table.add_section()
+        values = (f"{value + 0.0:.4f}" for value in row[modes])
+        table.add_row(label, *values, end_section=number == len(result.layout.pads))
     table.add_row("left, %", *(f"{100 * result.mode_residual[name]:.2f}" for name in names))
     return table
 
@@ -57,13 +57,14 @@ def _convergence(result: Response) -> Table:
     for mesh in meshes:
         table.add_column(str(mesh["unknowns"]), justify="right")
     table.add_column("last step", justify="right")
-    for name in list(result.coefficients)[:COEFFICIENTS_SHOWN]:
+    names = list(result.coefficients)[:COEFFICIENTS_SHOWN]
+    for name in names:
         values = [mesh["coefficients"][name] for mesh in meshes]
         step = ""
         if len(values) > 1 and values[-2]:
             step = f"{100 * abs(values[-1] / values[-2] - 1):.2g} %"
-        table.add_row(name, *(f"{value:.5f}" for value in values), step)
-    table.add_section()
+        numbers = (f"{value:.5f}" for value in values)
+        table.add_row(name, *numbers, step, end_section=name == names[-1])
     changes = [mesh["change"] for mesh in meshes]
     shown = ["" if change is None else f"{100 * change:.2g} %" for change in changes]
     table.add_row("change to the next", *shown)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
 
@@ -20,7 +20,7 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
     bar = Progress(
         what_column,
         BarColumn(bar_width=20),
-        TaskProgressColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
         TimeElapsedColumn(),
         console=console,
         transient=True,
@@ -28,7 +28,7 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
         disable=not console.is_terminal,
     )
     with bar:
-        task = bar.add_task("meshing", total=None)
+        task = bar.add_task("meshing", total=1.0)
 
         def report(done: float, total: float, what: str) -> None:
             bar.update(task, completed=done, total=total, description=what)
