@@ -113,6 +113,16 @@ def test_a_pad_that_stands_still_or_is_too_fast_is_not_measured(hub_frequency):
     assert hub_frequency(0, 1, 5, 10**6) == 0
 
 
+def test_a_ring_needs_no_lock(tmp_path):
+    """Between two threads, under the thread sanitizer."""
+    program = tmp_path / "ring"
+    source = ROOT / "test" / "ring_process.c"
+    options = ["-std=c11", "-O2", "-fsanitize=thread", "-pthread", f"-I{SOURCE}"]
+    subprocess.run(["cc", *options, source, "-o", program], check=True, timeout=60)
+    done = subprocess.run([program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_captures_are_those_of_the_oscillators():
     """To the tick; a pad without two edges in the window has none."""
     millihertz = np.array([100_000_000, 0, 399_000, 3_000_000_000], np.uint32)
