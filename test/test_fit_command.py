@@ -234,3 +234,12 @@ def test_a_layout_of_ones_own(tmp_path):
     # along its own axis
     result = json.loads((tmp_path / "m.json").read_text())
     assert "zx" in result["unobservable"] and "zz" not in result["unobservable"]
+
+
+@pytest.mark.parametrize("name", ["x.png", "x", "gone/x.yaml"])
+def test_an_output_that_cannot_be_is_named_by_its_own_option(tmp_path, name):
+    """The picture beside it, which nobody asked for by name, is not spoken of."""
+    loads = ROOT / "docs" / "example_loads.csv"
+    done = cube("fit", loads, "--layout", "planar", "-o", tmp_path / name)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"cube: -o {tmp_path / name}: ") and "--figure" not in done.stderr

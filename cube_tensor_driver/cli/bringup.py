@@ -27,7 +27,7 @@ PITCH = 0.012
 
 def arguments(parser: Parser) -> None:
     parser.add_argument("port", metavar="PORT", help="device path, or socket://host:port")
-    parser.add_output("-o", "--output", required=True, help="skin file to write")
+    parser.add_output("-o", "--output", kind="yaml", required=True, help="skin file to write")
     parser.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
     parser.add_argument(
         "--calibration",

@@ -53,7 +53,7 @@ def arguments(parser: Parser) -> None:
         metavar="FILE",
         help="calibration file or name (default: that of the package for the layout)",
     )
-    grid.add_output("-o", "--output", required=True, help="skin file to write")
+    grid.add_output("-o", "--output", kind="yaml", required=True, help="skin file to write")
     check = parser.add_subcommand("check", "list what is wrong with a skin file, or what it holds")
     check.add_argument("file", type=Path, metavar="FILE", help="skin file")
 

@@ -115,7 +115,7 @@ def arguments(parser: Parser) -> None:
     parser.add_output(
         "--figures", kind="folder", help="write pictures of convergence, response and each load"
     )
-    parser.add_output("-o", "--output", help="calibration file to write")
+    parser.add_output("-o", "--output", kind="yaml", help="calibration file to write")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -38,7 +38,9 @@ def arguments(parser: Parser) -> None:
         metavar="G",
         help="full, slab, mirrors or none (default: %(default)s)",
     )
-    parser.add_output("-o", "--output", required=True, help="calibration file to write")
+    parser.add_output(
+        "-o", "--output", kind="yaml", required=True, help="calibration file to write"
+    )
     parser.add_argument(
         "--base",
         metavar="FILE",

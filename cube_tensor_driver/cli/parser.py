@@ -19,7 +19,7 @@ WIDEST = 100
 class Output:
     """A file or folder that a command writes, to be checked before any work.
 
-    kind: file, picture (its suffix must be a format) or folder.
+    kind: file, yaml (its suffix says so), picture (its suffix must be a format) or folder.
     """
 
     flag: str
@@ -142,7 +142,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 def check_outputs(options: argparse.Namespace) -> None:
     """ConfigError, before any work: an output that cannot be written. Fills in their defaults."""
-    from ..config.output_files import check_folder, check_outputs
+    from ..config.output_files import check_folder, check_outputs, check_yaml
 
     files: dict[str, Path | None] = {}
     pictures: list[Path] = []
@@ -151,6 +151,8 @@ def check_outputs(options: argparse.Namespace) -> None:
         if callable(value):
             value = value(options)
             setattr(options, output.name, value)
+        if output.kind == "yaml":
+            check_yaml(output.flag, value)
         if output.kind == "folder":
             check_folder(output.flag, value)
         else:

@@ -9,6 +9,8 @@ from typing import Any
 from ..core.errors import ConfigError
 from .atomic_write import atomic_write, check_writable
 
+YAML = (".yaml", ".yml")
+
 
 def check_outputs(paths: dict[str, Path | None]) -> None:
     """Check the output files of a command, by the option that names each, before any work is done.
@@ -40,6 +42,12 @@ def check_folder(option: str, path: Path | None) -> None:
         except ConfigError:
             pass
     raise ConfigError(f"{option} {path}: {problem}; name a folder that can be made and written")
+
+
+def check_yaml(option: str, path: Path | None) -> None:
+    """Raise ConfigError if a file that is to hold YAML has another suffix."""
+    if path is not None and path.suffix not in YAML:
+        raise ConfigError(f"{option} {path}: a YAML file ends in {' or '.join(YAML)}; name one")
 
 
 def write_json(path: Path, value: Any) -> None:

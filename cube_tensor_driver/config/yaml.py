@@ -40,6 +40,10 @@ _NOT_YAML = (
 """What PyYAML lets through where a value does not fit its tag."""
 
 
+_Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+"""In C where it is installed: half of the time for a large skin, and the same text."""
+
+
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """The safe loader, in C where it is installed, which refuses a key that appears twice.
 
@@ -160,8 +164,13 @@ def read_yaml(path: Path) -> Any:
 
 def to_yaml(value: Any) -> str:
     """Plain values as YAML text."""
-    text: str = yaml.safe_dump(
-        value, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
+    text: str = yaml.dump(
+        value,
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=None,
+        width=110,
+        allow_unicode=True,
     )
     return text
 
