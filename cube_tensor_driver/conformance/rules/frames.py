@@ -24,7 +24,7 @@ def zeros_around(talk: Transcript) -> Verdict:
 
 @rule(
     "F2",
-    "A receiver counts each run that is no frame, as above, and goes on with the next. It never "
+    "A receiver counts each run that is no frame, as above, and continues with the next. It never "
     "answers it",
     needs=(ANY_FRAME,),
 )

@@ -52,7 +52,7 @@ def lost_connections(talk: Transcript) -> Verdict:
 
 @rule(
     "L5",
-    "The hub goes on sampling, drops what it cannot send, counts it, and answers the next host as "
+    "The hub keeps sampling, drops what it cannot send, counts it, and answers the next host as "
     "it would have answered the last one.",
     needs=(Hello, Sample, Stats),
 )

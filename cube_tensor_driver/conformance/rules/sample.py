@@ -47,7 +47,7 @@ def periods_us(samples: list[Sample]) -> NDArray[np.float64]:
 @rule(
     "S1",
     "Samples are numbered from 0 at power-up, one for each that is taken, also while nobody "
-    "listens. START, STOP and a new period do not begin anew.",
+    "listens. START, STOP and a new period do not change the numbers.",
     needs=(Sample,),
 )
 def numbers_go_on(talk: Transcript) -> Verdict:
