@@ -30,7 +30,14 @@ def draw_trust(result: LayoutStudy) -> Figure:
         for axis, name in zip(axes[row], names, strict=True):
             _draw_errors(axis, 1e3 * result.widths, result.error[name][row])
             axis.set_title(f"{name}, side {1e3 * side:g} mm")
-    axes[0][-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=4)
+    # No higher than a panel: the layout would put the rows apart.
+    axes[0][-1].legend(
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.03),
+        handlelength=4,
+        fontsize="small",
+        labelspacing=0.15,
+    )
     figure.supxlabel(f"width of the indenter, mm (cube's centre {1e3 * result.depth:g} mm deep)")
     figure.supylabel("largest error over all positions / range of the component")
     return figure
