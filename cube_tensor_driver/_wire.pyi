@@ -23,9 +23,7 @@ def read_links(
     and their frames. While it works, other threads run, and its decoders can do nothing else.
     """
 
-def place_rows(
-    samples: list[bytes], stamps_ns: list[int], n_pads: int, memory: bytearray
-) -> None:
+def place_rows(samples: list[bytes], stamps_ns: list[int], n_pads: int, memory: bytearray) -> None:
     """Write the rows of decoded SAMPLEs, one after the other, as columns one behind the other.
 
     stamp_ns (N,) int64, sequence (N,) uint32, pad_fault (N,) uint32, temperature (N,) float32 in

@@ -329,3 +329,18 @@ def test_no_python_is_said_with_the_way_out(tmp_path):
     )
     assert done.returncode == 1
     assert "no Python 3.10 to 3.13 found" in done.stderr and "sudo apt install" in done.stderr
+
+
+def test_a_command_whose_library_is_missing_names_it():
+    """rosbags has no rosdep key: whoever needs bags on a ROS machine installs it by hand."""
+    script = """
+import sys
+sys.modules["rosbags"] = None
+from cube_tensor_driver.cli.main import main
+sys.exit(main(["bag", "info", "."]))
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, **CAPTURED)
+    assert done.returncode == 1
+    assert "needs the Python module rosbags, which is not there: pip install rosbags\n" in (
+        done.stderr
+    )

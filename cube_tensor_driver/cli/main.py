@@ -35,9 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except ModuleNotFoundError as error:
         # Not every command needs every library; those without a rosdep key are installed by hand.
+        module = (error.name or "").split(".")[0]
         print(
-            f"cube: this command needs the Python module {error.name}, which is not there: "
-            f"pip install {error.name}",
+            f"cube: this command needs the Python module {module}, which is not there: "
+            f"pip install {module}",
             file=sys.stderr,
         )
         return 1
