@@ -24,7 +24,7 @@ from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 
 
-def test_one_list_serves_launch_and_demo():
+def test_the_demo_starts_what_it_needs_in_order():
     names = [
         process.executable
         for process in skin_processes(
@@ -142,6 +142,31 @@ def test_pages_use_arguments_that_launch_files_have():
     assert launches
     for file, arguments in launches:
         assert set(re.findall(r"(\w+):=", arguments)) <= set(declared(file)), file
+
+
+def test_the_launch_file_starts_what_the_demo_starts():
+    """And the recorder, RViz and the publisher of frames."""
+    pytest.importorskip("launch_ros", reason="needs launch and launch_ros, which the wheels lack")
+    from launch.actions import ExecuteProcess
+    from launch.launch_description_sources import get_launch_description_from_python_launch_file
+    from launch_ros.actions import Node
+
+    path = str(ROOT / "launch" / "skin.launch.py")
+    actions = get_launch_description_from_python_launch_file(path).entities
+    started = {
+        action.node_executable if isinstance(action, Node) else action.name[0].text
+        for action in actions
+        if isinstance(action, ExecuteProcess)
+    }
+    every = [
+        *skin_processes(SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True),
+        *skin_processes(SKIN, composed=True),
+    ]
+    assert started == {process.executable for process in every} | {
+        "recorder",
+        "rviz2",
+        "robot_state_publisher",
+    }
 
 
 def arguments_refused(**given: str) -> str:

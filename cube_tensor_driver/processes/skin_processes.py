@@ -1,4 +1,5 @@
-"""What to start for a skin: one list that the launch files and `./cube demo` share."""
+"""What to start for a skin: the list of `./cube demo`. launch/skin.launch.py has the same processes
+as actions."""
 
 from __future__ import annotations
 
@@ -65,7 +66,6 @@ def skin_processes(
     rate: float = 0.0,
     publish_period: float = 0.0,
     composed: bool = False,
-    autostart: bool = True,
     markers: bool = False,
     contacts: bool = False,
     simulated: SimulatedHubs | None = None,
@@ -77,10 +77,8 @@ def skin_processes(
 
     port: replaces the port in the file, for a skin with one link. rate: samples per second, 0: as
     the file says. publish_period: time that one message covers, s, 0: one message per scan.
-    autostart: False leaves it to others to configure and activate the nodes.
     """
-    start: dict[str, Value] = {} if autostart else {"autostart": False}
-    common: dict[str, Value] = {"config": str(config), "publish_period": publish_period, **start}
+    common: dict[str, Value] = {"config": str(config), "publish_period": publish_period}
     port_directory = str(simulated.ports) if simulated else ""
     driver = {**common, "port": port, "rate": rate, "port_directory": port_directory}
 
@@ -90,9 +88,9 @@ def skin_processes(
     else:
         processes += [_node("reconstruction", common), _node("driver", driver)]
     if markers:
-        processes.append(_node("markers", start))
+        processes.append(_node("markers", {}))
     if contacts:
-        processes.append(_node("contacts", start))
+        processes.append(_node("contacts", {}))
     return processes
 
 
