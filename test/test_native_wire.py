@@ -6,6 +6,7 @@ from __future__ import annotations
 import shutil
 import struct
 import subprocess
+import sysconfig
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,6 +118,17 @@ def test_it_compiles_without_a_warning_and_without_a_library(options: list[str],
     undefined = subprocess.run(["nm", "-u", compiled], check=True, capture_output=True, text=True)
     names = {line.split()[-1] for line in undefined.stdout.splitlines()}
     assert names <= {"memcpy", "memset", "memchr", "_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
+
+
+PYTHON_H = Path(sysconfig.get_paths()["include"])
+
+
+@pytest.mark.skipif(not (PYTHON_H / "Python.h").is_file(), reason="no headers: python3-dev")
+def test_the_python_module_compiles_without_a_warning() -> None:
+    # Without -Wpedantic: Python's slots hold functions as pointers to data.
+    strict = [option for option in STRICT if option != "-Wpedantic"]
+    command = ["cc", *strict, "-fsyntax-only", "-isystem", PYTHON_H, NATIVE / "python_wire.c"]
+    subprocess.run(command, check=True, timeout=60)
 
 
 @pytest.mark.parametrize("name", list(FRAMES))
