@@ -1,4 +1,5 @@
-"""Takes a picture of the browser view in headless Chromium, while a load presses.
+"""Takes a picture of the running browser view in headless Chromium, while a load presses the chosen
+cube.
 
 Use: photograph.py URL FILE.png
 """
@@ -7,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -21,24 +23,18 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--use-gl=angle",
     "--use-angle=swiftshader",
-    "--window-size=1400,950",
+    "--window-size=1440,990",
 )
 READY = """const text = document.body.innerText
 return /of \\d+ cubes/.test(text) && text.includes('live')"""
-HELD = """return new Promise(drawn => {
-  if (!document.body.innerText.includes('paused')) return drawn(false)
-  let left = 3
-  const next = () => left-- ? requestAnimationFrame(next) : drawn(true)
-  next() })"""
-"""Whether the page is paused, after it has been drawn again."""
-CLICK = """for (const button of document.querySelectorAll('button'))
-  if (button.innerText.trim() == 'pause') button.click()"""
 CLEAR = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
-LOADED = "return Number((/([0-9.]+) N, shear/.exec(document.body.innerText) || [0, 0])[1])"
-LEAST_N, WAIT_S = 2.2, 60.0
-TOUCHES = 3
-"""The load comes and goes. The picture shows it when it presses the third time: then the plots are
-full."""
+PRESSURE = """const found = /σzz\\s+([-+][0-9.]+)\\s+kPa/.exec(document.body.innerText)
+return found ? -Number(found[1]) : 0"""
+"""Of the chosen cube, kPa."""
+LEAST_KPA, STEADY_KPA, STEADY_S, WAIT_S = 6.0, 0.3, 0.6, 60.0
+TOUCHES = 2
+"""The load comes and goes. The picture shows it when it presses the second time: then the plots are
+full. It is taken while the load rests, so that all numbers are those of the picture."""
 
 
 @contextmanager
@@ -65,25 +61,19 @@ def photograph(url: str, path: str) -> None:
         wait.until(lambda _: browser.execute_script(READY))
         browser.execute_script(CLEAR)
         for _ in range(TOUCHES - 1):
-            wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
-            wait.until(lambda _: browser.execute_script(LOADED) < LEAST_N / 2)
-        wait.until(lambda _: paused_under_load(browser, wait))
+            wait.until(lambda _: browser.execute_script(PRESSURE) > LEAST_KPA)
+            wait.until(lambda _: browser.execute_script(PRESSURE) < LEAST_KPA / 2)
+        wait.until(lambda _: is_steady(browser))
+        browser.execute_script(CLEAR)
         browser.save_screenshot(path)
 
 
-def paused_under_load(browser: webdriver.Chrome, wait: WebDriverWait[webdriver.Chrome]) -> bool:
-    """Wait for the load, then pause the page.
-
-    False: by then the load was gone. The page runs on in this case.
-    """
-    wait.until(lambda _: browser.execute_script(LOADED) > LEAST_N)
-    browser.execute_script(CLICK)
-    wait.until(lambda _: browser.execute_script(HELD))
-    if browser.execute_script(LOADED) > LEAST_N:
-        return True
-    browser.execute_script(CLICK)
-    wait.until(lambda _: browser.execute_script(READY))
-    return False
+def is_steady(browser: webdriver.Chrome) -> bool:
+    """Whether a load presses the chosen cube and does not change."""
+    before = browser.execute_script(PRESSURE)
+    time.sleep(STEADY_S)
+    change = abs(browser.execute_script(PRESSURE) - before)
+    return bool(before > LEAST_KPA and change < STEADY_KPA)
 
 
 if __name__ == "__main__":

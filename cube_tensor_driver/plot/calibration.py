@@ -30,10 +30,10 @@ def draw_layout(layout: Layout) -> Figure:
     azimuth = np.degrees(np.arctan2(_VIEW[1], _VIEW[0]))
     axes.view_init(elev=elevation, azim=azimuth)
     axes.set(
-        xlabel="x / d0",
-        ylabel="y / d0",
-        zlabel="z / d0 (out of the skin)",
-        title=f"layout {layout.name}",
+        xlabel="$x$ / $d_0$",
+        ylabel="$y$ / $d_0$",
+        zlabel="$z$ / $d_0$ (out of the skin)",
+        title=f"layout {layout.name} ($d_0$: half side; dashed: pads behind)",
     )
     axes.set_box_aspect((1, 1, 1))
     for set_ticks in (axes.set_xticks, axes.set_yticks, axes.set_zticks):

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from ..core.layout import Layout
 from ..research.virtual_bench import Deformation
-from .style import SIGNED_COLOURS, print_style
+from .style import SIGNED_COLOURS, print_style, symbol
 
 Array = NDArray[np.float64]
 
 _FIGURE_4_TITLES = {
-    "zx": "(a) shear only, 10 kPa",
-    "zz_x": "(b) normal stress growing along x, 10 kPa per d0",
+    "zx": r"(a) shear alone: $\sigma_{zx}$ = 10 kPa",
+    "zz_x": r"(b) $\sigma_{zz}$ grows along $x$: $d_0\,\partial\sigma_{zz}/\partial x$ = 10 kPa",
 }
 
 
@@ -33,12 +33,12 @@ def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
     axes = figure.subplots(4, 2)
     for axis, (name, deformation) in zip(axes.flat, deformations.items(), strict=False):
         scale = _draw_deformation(axis, deformation, 4)
-        axis.set_title(f"{name}, 10 kPa (displacements times {scale:.2g})")
+        axis.set_title(f"{symbol(name)}, 10 kPa (displacements times {scale:.2g})")
         _draw_pads(axis, layout, 1e3 * deformation.half_side)
     pad = Patch(facecolor="white", edgecolor="black", hatch="||||", label="pad")
     axes.flat[-1].axis("off")
     axes.flat[-1].legend(handles=[pad], loc="center", handlelength=4)
-    figure.supxlabel("x, mm")
+    figure.supxlabel(r"$x$ / mm")
     return figure
 
 
@@ -54,7 +54,12 @@ def draw_figure_4(deformations: dict[str, Deformation]) -> Figure:
     for axis, (name, deformation) in zip(axes, deformations.items(), strict=True):
         scale = _draw_deformation(axis, deformation, 6)
         axis.set(title=_FIGURE_4_TITLES[name])
-    axes[-1].set_xlabel(f"x, mm (displacements drawn times {scale:.2g})")
+    axes[-1].set_xlabel(r"$x$ / mm")
+    figure.supxlabel(
+        f"White: the cube. Outlines are displaced by {scale:.2g} times\n"
+        r"the displacements, arrows show their direction. $d_0$: half side of the cube, 2 mm.",
+        fontsize=8,
+    )
     return figure
 
 
@@ -91,7 +96,7 @@ def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> flo
     axis.fill(*outline, facecolor="white", edgecolor="black", linewidth=1.2)
     edge = 1e3 * d0 * window
     top = min(edge, 600 * deformation.height)
-    axis.set(xlim=(-edge, edge), ylim=(-top, top), aspect="equal", ylabel="z, mm")
+    axis.set(xlim=(-edge, edge), ylim=(-top, top), aspect="equal", ylabel=r"$z$ / mm")
     axis.grid(False)
     return float(scale)
 
@@ -119,11 +124,12 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
     # matplotlib dashes the lines below zero.
     lines = axis.tricontour(mesh, kilopascal, levels, colors="black", linewidths=0.7)
     for label in axis.clabel(lines, fontsize=7, fmt="%g", inline=False):
+        label.set_rotation(0)
         label.set_path_effects([withStroke(linewidth=2, foreground="white")])
         beside_cube = np.abs(label.get_position()).max() < 1.5e3 * deformation.half_side
         if beside_cube:  # too narrow for a label
             label.remove()
-    colorbar = axis.figure.colorbar(image, ax=axis, label="sigma_zz, kPa (dashed: negative)")
+    colorbar = axis.figure.colorbar(image, ax=axis, label=r"$\sigma_{zz}$ / kPa (dashed: negative)")
     colorbar.add_lines(lines)
 
 
@@ -143,12 +149,22 @@ def _draw_arrows(axis: Any, deformation: Deformation, drawn: Array, window: floa
         np.argmin(np.hypot(*(deformation.points - point[:, None])))
         for point in grid.reshape(2, -1).T
     ]
+    tails, moved = drawn[:, nodes], deformation.displacement[:, nodes]
+    # As long as d0, the longest one; only those that are in view as a whole.
+    arrows = 1e3 * deformation.half_side * moved / np.hypot(*moved).max()
+    tips = tails + arrows
+    edge = 1e3 * deformation.half_side * window
+    top = min(edge, 600 * deformation.height)
+    limits = np.array([[edge], [top]])
+    whole = (np.abs(tips) < limits).all(axis=0) & (np.abs(tails) < limits).all(axis=0)
     axis.quiver(
-        *drawn[:, nodes],
-        *deformation.displacement[:, nodes],
+        *tails[:, whole],
+        *arrows[:, whole],
         color="black",
         edgecolor="white",
         linewidth=0.3,
         width=0.004,
         angles="xy",
+        scale_units="xy",
+        scale=1,
     )

@@ -10,32 +10,41 @@ from matplotlib.figure import Figure
 
 from ..core.modes import PLANE
 from ..research.paper import Experiment
-from .style import curve_style, print_style
+from .style import curve_style, print_style, symbol
 
-PADS = ("C1", "C2", "C3", "C4")
-SIGNALS = ("P_normal", "P_shear", "P_grad")
-_ROD_CURVES = {"signal": "P_shear", "shear": "of it: true local shear", "crosstalk": "cross-talk"}
+PADS = tuple(f"$f_{number}$ of pad C{number}" for number in range(1, 5))
+SIGNALS = tuple(rf"$P_\mathrm{{{name}}}$" for name in ("normal", "shear", "grad"))
+_ROD_CURVES = {
+    "signal": "signal for shear",
+    "shear": "part that is the true local shear",
+    "crosstalk": "rest: cross-talk",
+}
+_SMALL = 1e-3
+"""Of the greatest stress: panels whose curves are all below it show no axis of values."""
 
 
 @print_style()
-def draw_experiment(result: Experiment) -> Figure:
+def draw_experiment(result: Experiment, law: str) -> Figure:
     """Frequencies and P_normal, P_shear, P_grad as in Figs. 7 and 8, beside stress and gradient.
 
     Stress and gradient are reconstructed from eight pads (full lines) or true (dashed).
+    law: linear or finite, of the elastomer's model
     """
     figure = Figure(figsize=(13, 3.3))
     axes = figure.subplots(1, 4)
     x = 1e3 * result.displacement
     _draw_columns(axes[0], x, result.frequency, PADS)
-    axes[0].set(title="frequencies", ylabel="kHz")
+    axes[0].set(title="frequencies", ylabel="frequency / kHz")
     _draw_columns(axes[1], x, result.prototype, SIGNALS)
-    axes[1].set(title="prototype, eqs. 8 to 10", ylabel="kHz")
-    _draw_modes(axes[2], result, range(3), "stress")
-    _draw_modes(axes[3], result, range(3, 7), "gradient times d0")
+    axes[1].set(title="prototype, eqs. 8 to 10", ylabel="signal / kHz")
+    _draw_modes(axes[2], result, range(3), "stress", r"$\sigma$ / kPa")
+    _draw_modes(axes[3], result, range(3, 7), "gradient", r"$d_0\,\partial\sigma$ / kPa")
     for axis in axes:
         axis.legend(fontsize="small", handlelength=3)
-        axis.set_xlabel("displacement, mm")
-    figure.suptitle(result.name)
+        axis.set_xlabel("displacement / mm")
+    figure.suptitle(
+        f"Experiment {result.name}: {law} model ($d_0$: half side; full lines: from eight pads)"
+    )
     return figure
 
 
@@ -44,17 +53,25 @@ def _draw_columns(axis: Any, x: np.ndarray, columns: np.ndarray, names: Sequence
         axis.plot(x, columns[:, number] / 1e3, label=name, **curve_style(number))
 
 
-def _draw_modes(axis: Any, result: Experiment, modes: range, title: str) -> None:
+def _draw_modes(axis: Any, result: Experiment, modes: range, title: str, label: str) -> None:
     x = 1e3 * result.displacement
     for number, mode in enumerate(modes):
         recovered, true = result.recovered[:, mode] / 1e3, result.truth[:, mode] / 1e3
         style = curve_style(number)
-        axis.plot(x, recovered, label=PLANE.names[mode], **style | {"linestyle": "-"})
+        axis.plot(x, recovered, label=symbol(PLANE.names[mode]), **style | {"linestyle": "-"})
         axis.plot(x, true, **style | {"linestyle": "--"})
-    axis.set(title=f"{title} (dashed: true)", ylabel="kPa")
-    floor = np.abs(result.recovered).max() / 1e5
-    if max(map(abs, axis.get_ylim())) < floor:  # what is smaller is rounding, not a result
-        axis.set_ylim(-floor, floor)
+    axis.set(title=f"{title} (dashed: true)", ylabel=label)
+    shown = np.abs(np.stack([result.recovered, result.truth])[:, :, list(modes)])
+    floor = _SMALL * float(np.abs(result.recovered).max())
+    if shown.max() < floor:
+        axis.set(ylim=(-1, 1), yticks=[0])
+        axis.text(
+            0.5,
+            0.25,
+            f"zero by symmetry:\nall below {floor / 1e3:.1g} kPa",
+            ha="center",
+            transform=axis.transAxes,
+        )
 
 
 @print_style()
@@ -65,7 +82,11 @@ def draw_rod_sweep(table: dict[str, list[float]]) -> Figure:
     place = 1e3 * np.array(table["place"])
     for number, (key, label) in enumerate(_ROD_CURVES.items()):
         axis.plot(place, np.array(table[key]) / 1e3, label=label, **curve_style(number))
-    axis.set(xlabel="rod's middle from the cube's middle, mm", ylabel="-v1 + v2 + v3 - v4, kPa")
+    axis.set(
+        title="Rod pressed 1 mm: signal for shear over its position, bonded bottom",
+        xlabel="distance of the rod's middle from the cube's / mm",
+        ylabel="$-v_1 + v_2 + v_3 - v_4$ / kPa",
+    )
     axis.legend(handlelength=4)
     return figure
 
@@ -75,14 +96,17 @@ def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
     """P_normal, P_shear, P_grad over displacement, as the paper's Fig. 8 shows them."""
     figure = Figure(figsize=(9, 3.1))
     axes = figure.subplots(1, len(experiments))
+    values = 1e-3 * np.concatenate([experiment.prototype for experiment in experiments])
+    margin = 0.05 * np.ptp(values)
+    limits = (values.min() - margin, values.max() + margin)
     for axis, experiment in zip(axes, experiments, strict=True):
         x = 1e3 * experiment.displacement
         for values, name, style in zip(
             experiment.prototype.T, SIGNALS, ("o-", "s--", "^:"), strict=True
         ):
             axis.plot(x, 1e-3 * values, style, color="black", mfc="white", ms=4, label=name)
-        axis.set(title=experiment.name, xlabel="displacement / mm")
+        axis.set(title=experiment.name, xlabel="displacement / mm", ylim=limits)
         axis.title.set_fontsize(8)
-    axes[0].set_ylabel("Σ ± Δf / kHz")
+    axes[0].set_ylabel(r"signal $\sum \pm\Delta f_i$ / kHz")
     axes[0].legend(fontsize=8)
     return figure

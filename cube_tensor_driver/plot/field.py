@@ -33,13 +33,16 @@ def draw_field(example: FieldExample) -> Figure:
         image = _draw_pressure(axis, example, pressure, top)
         title = name
         if name != "truth":
-            title = f"{name}: {100 * _relative_rms(pressure, example.pressure['truth']):.0f} %"
+            error = _relative_rms(pressure, example.pressure["truth"])
+            title = f"{name}\nrms error {100 * error:.0f} %"
         limits = (-_VIEW_MM, _VIEW_MM)
-        axis.set(title=title, xlabel="x / mm", aspect="equal", xlim=limits, ylim=limits)
+        axis.set(title=title, xlabel="$x$ / mm", aspect="equal", xlim=limits, ylim=limits)
         axis.grid(False)
-    axes[0].set_ylabel("y / mm")
+    axes[0].set_ylabel("$y$ / mm")
     axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
-    figure.colorbar(image, ax=axes, label="pressure in the cubes' plane / kPa")
+    figure.colorbar(
+        image, ax=axes, label="pressure in the cubes' plane / kPa\n(white contours: 4 kPa apart)"
+    )
     return figure
 
 
@@ -86,7 +89,9 @@ def draw_field_study(study: FieldStudy) -> Figure:
         axis.set_xticks(pitches, [f"{pitch:.0f}" for pitch in pitches], minor=False)
         axis.minorticks_off()
     axes[0].set_ylabel("rms error / rms pressure")
-    axes[0].legend(title="contact width\n(dashed: values alone)", fontsize=7, title_fontsize=7)
+    axes[0].legend(
+        title="width of the contact\n(dashed: without gradients)", fontsize=7, title_fontsize=7
+    )
     return figure
 
 

@@ -26,7 +26,7 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
         results = experiments(finite=law == "finite", progress=_part(report, law))
         for number, result in enumerate(results, 1):
             written.append(folder / f"experiment_{number}_{law}.png")
-            save(draw_experiment(result), written[-1])
+            save(draw_experiment(result, law), written[-1])
             numbers[f"{result.name}, {law}"] = _numbers(result)
     table = rod_sweep(progress=_part(report, "rod"))
     written.append(folder / "rod_positions.png")

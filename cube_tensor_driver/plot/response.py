@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from ..elastic.fem import Response
-from .style import SIGNED_COLOURS, curve_style, print_style
+from .style import SIGNED_COLOURS, curve_style, print_style, symbol
 
 _MOST_COEFFICIENTS = 12
 """The largest ones are drawn."""
@@ -31,8 +31,8 @@ def draw_convergence(result: Response) -> Figure:
             100 * abs(row["coefficients"][name] - last[name]) / largest for row in rows[:-1]
         ]
         axis.loglog(unknowns, distance, label=name, **curve_style(number))
-    finest = f"distance from {rows[-1]['unknowns']} unknowns, % of the largest"
-    axis.set(xlabel="unknowns", ylabel=finest)
+    finest = f"distance from the result with {rows[-1]['unknowns']} unknowns / % of the largest"
+    axis.set(xlabel="unknowns of the mesh", ylabel=finest)
     if unknowns:
         axis.set_xticks(unknowns, [str(n) for n in unknowns], minor=False)
         axis.xaxis.set_minor_formatter(NullFormatter())
@@ -51,11 +51,13 @@ def draw_response(result: Response) -> Figure:
     limit = np.abs(result.matrix).max()
     image = axis.imshow(result.matrix, cmap=SIGNED_COLOURS, vmin=-limit, vmax=limit, aspect="auto")
     axis.grid(False)
-    axis.set_xticks(range(n_modes), result.modes, rotation=60 if n_modes > 7 else 0)
+    axis.set_xticks(
+        range(n_modes), [symbol(mode) for mode in result.modes], rotation=60 if n_modes > 7 else 0
+    )
     axis.set_yticks(range(n_pads), [f"V{k + 1}  {pad}" for k, pad in enumerate(result.layout.pads)])
     for (pad, mode), value in np.ndenumerate(result.matrix):
         if abs(value) > 5e-3 * limit:
             color = "black" if value > -0.1 * limit else "white"
             axis.text(mode, pad, f"{value:.2f}", ha="center", va="center", fontsize=7, color=color)
-    figure.colorbar(image, ax=axis, label="pad stress per mode, Pa per Pa")
+    figure.colorbar(image, ax=axis, label="pad stress over amplitude of the mode / (Pa/Pa)")
     return figure

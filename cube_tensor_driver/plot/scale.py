@@ -13,7 +13,15 @@ _CPU_KEYS = {
     "reconstruction": ("cpu_reconstruction_percent", "s-", "black"),
     "echo": ("echo_cpu_percent", "^:", "0.55"),
 }
-_LATENCY_KEYS = {"p50": ("latency_p50_ms", "o-"), "p99": ("latency_p99_ms", "s--")}
+_NAMES = {
+    "driver": "driver",
+    "reconstruction": "reconstruction",
+    "echo": "echo: the same messages, no work",
+}
+_LATENCY_KEYS = {
+    "median": ("latency_p50_ms", "o-"),
+    "99th percentile": ("latency_p99_ms", "s--"),
+}
 
 
 @print_style()
@@ -27,16 +35,23 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
     cubes = [row["cubes"] for row in rows]
     for name, (key, style, color) in _CPU_KEYS.items():
         used = [1e4 * row[key] / row["rate_hz"] for row in rows]
-        left.plot(cubes, used, style, color=color, mfc="white", ms=5, label=name)
-    left.set(xscale="log", xlabel="cubes", ylabel="CPU per frame / µs", ylim=(0, None))
+        left.plot(cubes, used, style, color=color, mfc="white", ms=5, label=_NAMES[name])
+    left.set(
+        xscale="log",
+        xlabel="number of cubes",
+        ylabel="CPU per scan / µs",
+        title="cost of one scan of all cubes",
+        ylim=(0, None),
+    )
     left.legend()
     for name, (key, style) in _LATENCY_KEYS.items():
         latency = [row[key] for row in rows]
         right.plot(cubes, latency, style, color="black", mfc="white", ms=5, label=name)
     right.set(
         xscale="log",
-        xlabel="cubes",
-        ylabel="latency, pads read to tensor received / ms",
+        xlabel="number of cubes",
+        ylabel="latency / ms",
+        title="from reading the pads to receiving the tensor",
         ylim=(0, None),
     )
     for axis in (left, right):

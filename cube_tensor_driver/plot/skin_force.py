@@ -56,12 +56,14 @@ def draw_forces(
     path.plot(1e3 * centre[:, 1], 1e3 * centre[:, 0], color="black", lw=1)
     measured = 1e3 * measured_centre
     path.plot(measured[:, 1], measured[:, 0], "o", color="C3", mfc="none", ms=3)
-    path.set(xlabel="y / mm", ylabel="x / mm", aspect="equal")
-    path.set_title("centre of pressure, cubes", fontsize=9)
+    path.set(xlabel="$y$ / mm", ylabel="$x$ / mm", aspect="equal")
+    path.set_title("path of the centre of pressure\n(grey: cubes; circles: measured)", fontsize=9)
     return figure
 
 
 def _draw_components(panel: Any, times: Array, script: Array, measured: Array) -> None:
     for axis, (letter, marker, color, dash) in enumerate(_AXES):
         panel.plot(times, script[:, axis], color=color, lw=1, ls=dash)
-        panel.plot(times, measured[:, axis], marker, color=color, mfc="none", ms=3, label=letter)
+        panel.plot(
+            times, measured[:, axis], marker, color=color, mfc="none", ms=3, label=f"${letter}$"
+        )

@@ -57,6 +57,16 @@ def print_style() -> Iterator[None]:
         yield
 
 
+def symbol(component: str) -> str:
+    """A component or mode in mathematical type: zz, zz_x for its derivative along x, xy_y-zx_z."""
+    if "-" in component:
+        return " − ".join(symbol(part) for part in component.split("-"))
+    stress, _, direction = component.partition("_")
+    if not direction:
+        return rf"$\sigma_{{{stress}}}$"
+    return rf"$\partial\sigma_{{{stress}}}/\partial {direction}$"
+
+
 def curve_style(number: int) -> dict[str, Any]:
     """Colour, marker and dashes of a panel's curve of this number."""
     count = len(_CURVE_COLOURS)

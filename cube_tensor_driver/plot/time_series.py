@@ -13,7 +13,7 @@ from ..bags.source import BagSource
 from ..core.errors import BagError
 from ..core.modes import COMPONENTS, STRESS
 from ..core.status import INVALID, RESIDUAL
-from .style import MARKERS, print_style
+from .style import MARKERS, print_style, symbol
 
 DASHES = ("-", "--", "-.", ":")
 GAP = 3.0
@@ -101,18 +101,20 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
     change = 100 * (series.frequency / series.rest - 1)
     _draw_columns(axes[0], seconds, change, series.pads)
     axes[0].set(ylabel="frequency above rest / %", title=f"{title}: cube {series.name}")
-    _draw_columns(axes[1], seconds, series.values[:, :stresses] * 1e-3, list(STRESS))
-    axes[1].set(ylabel="stress / kPa (tension +)")
-    gradients = [f"∂{name[:2]}/∂{name[3]}" for name in COMPONENTS[stresses:]]
+    _draw_columns(
+        axes[1], seconds, series.values[:, :stresses] * 1e-3, [symbol(name) for name in STRESS]
+    )
+    axes[1].set(ylabel="stress / kPa (tension: +)")
+    gradients = [symbol(name) for name in COMPONENTS[stresses:]]
     _draw_columns(axes[2], seconds, series.values[:, stresses:] * 1e-6, gradients)
-    axes[2].set(ylabel="gradient / kPa per mm")
+    axes[2].set(ylabel="gradient / (kPa/mm)")
     axes[3].plot(seconds, series.residual, color="0.3", lw=0.8, label="residual")
     for bit, label, marker in ((RESIDUAL, "residual too large", "x"), (INVALID, "invalid", "v")):
         bad = series.status & bit > 0
         if bad.any():
             residual = np.nan_to_num(series.residual[bad])
             axes[3].plot(seconds[bad], residual, marker, color="C3", ms=4, label=label)
-    axes[3].set(ylabel="residual / noise", xlabel="time after the start of the bag / s")
+    axes[3].set(ylabel="residual / expected noise", xlabel="time after the start of the bag / s")
     axes[3].legend(loc="upper right", fontsize=7)
     return figure
 

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from ..core.modes import COMPONENTS, STRESS
 from ..research.layout_study import TRUSTED_ERROR, LayoutStudy
-from .style import curve_style, print_style
+from .style import curve_style, print_style, symbol
 
 _DIRECTION_DASHES = ("--", "-.", ":")
 _DIRECTION_COLOURS = ("0.0", "0.35", "tab:cyan")
@@ -29,16 +30,25 @@ def draw_trust(result: LayoutStudy) -> Figure:
     for row, side in enumerate(result.sides):
         for axis, name in zip(axes[row], names, strict=True):
             _draw_errors(axis, 1e3 * result.widths, result.error[name][row])
-            axis.set_title(f"{name}, side {1e3 * side:g} mm")
+            axis.set_title(f"layout {name}, side {1e3 * side:g} mm")
+    handles, labels = axes[0][-1].get_legend_handles_labels()
+    handles.append(Patch(facecolor="0.92", edgecolor="0.7"))
+    labels.append(f"error above {100 * TRUSTED_ERROR:g} %:\nnot to be trusted")
+    smallest = min(float(np.nanmin(error)) for error in result.error.values())
+    axes[0][0].set_ylim(0.7 * smallest, 20)
     # No higher than a panel: the layout would put the rows apart.
     axes[0][-1].legend(
+        handles,
+        labels,
         loc="upper left",
         bbox_to_anchor=(1.0, 1.03),
         handlelength=4,
         fontsize="small",
-        labelspacing=0.15,
+        labelspacing=0.1,
     )
-    figure.supxlabel(f"width of the indenter, mm (cube's centre {1e3 * result.depth:g} mm deep)")
+    figure.supxlabel(
+        f"width of the indenter / mm (the cube's centre is {1e3 * result.depth:g} mm deep)"
+    )
     figure.supylabel("largest error over all positions / range of the component")
     return figure
 
@@ -50,8 +60,7 @@ def _draw_errors(axis: Any, widths: np.ndarray, errors: np.ndarray) -> None:
         observed = not np.isnan(errors[0, number])
         if observed:
             style = _component_style(number)
-            axis.loglog(widths, errors[:, number], label=component, **style)
-    axis.set_ylim(5e-3, 20)
+            axis.loglog(widths, errors[:, number], label=symbol(component), **style)
 
 
 def _component_style(number: int) -> dict[str, Any]:
