@@ -32,6 +32,22 @@ from .bench import bench_scale
 
 START_S = 30.0
 """How long the processes may take to start."""
+LOAD = """\
+period: 8.0
+indenters:
+- name: finger
+  shape: disc
+  radius: 0.006
+  friction: 0.5
+  does:
+  - press:
+      from: 0.0
+      to: 8.0
+      at: [-0.004, -0.003, 0]
+      force: [0, 2.6, 2.6, 2.6, 0]
+      shear: [1.0, 0.4, 0]
+"""
+"""Presses beside the cube c05, whose numbers the browser view shows at first, and rests there."""
 PHOTOGRAPH_S = 120.0
 """How long the browser may take to make its picture."""
 PERIOD = 160
@@ -90,7 +106,9 @@ def _demo_skin() -> Iterator[Children]:
         tempfile.TemporaryDirectory(prefix="cube_pictures_") as name,
         Children(Path(name)) as children,
     ):
-        hubs = SimulatedHubs(Path(name) / "ports")
+        load = Path(name) / "load.yaml"
+        load.write_text(LOAD)
+        hubs = SimulatedHubs(Path(name) / "ports", load=load)
         for process in skin_processes(skin, markers=True, contacts=True, simulated=hubs):
             children.start(process)
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
