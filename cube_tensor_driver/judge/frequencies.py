@@ -8,31 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.status import STAMP
+from ..simulation.faults import CUT_FAULTS
 from ..simulation.sample_log import SampleLog
 from .expected import Expected
-from .record import Record
+from .record import STOPPING, Record
 from .samples import CHUNK, NONE, Samples
 
-CUT_FAULTS = (
-    "stall",
-    "burst",
-    "unplug",
-    "rename",
-    "reset",
-    "wrap",
-    "step",
-    "drift",
-    "uid",
-    "pads",
-    "version",
-)
-"""Faults that cut a link or its clock; samples may be lost at them."""
 RECOVERY_S = 6.0
 """After a cut a link delivers again: a port is tried again every 5 s at the latest."""
 BEFORE_S = 0.1
 """Bytes that are on their way when a link is cut are lost, too."""
-STOPPING = ("restart driver", "cycle driver")
-"""Deeds that stop the hubs."""
 RESTART_S = 3.0
 """Until the hubs deliver again after one."""
 GAP_NS = 50_000_000

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from ..simulation.faults import CUT_FAULTS
 from ..simulation.sample_log import SampleLog
-from .frequencies import CUT_FAULTS, RECOVERY_S, STOPPING
-from .record import Record
+from .frequencies import RECOVERY_S
+from .record import STOPPING, Record
 
 WITHIN_NS = 1_000_000_000
 """After a rate was asked for, until each hub that is not cut samples at it."""

@@ -69,6 +69,12 @@ class CubeMessages:
     wrenches: tuple[Wrench, ...]
 
 
+STOPPING = ("cycle driver",)
+"""Deeds that stop the hubs for a while."""
+DOWN = ("restart reconstruction", "reconfigure reconstruction")
+"""Deeds during which there is no reconstruction."""
+
+
 @dataclass(frozen=True)
 class Deed:
     """Something that was done to the nodes.

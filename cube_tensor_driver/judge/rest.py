@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.rows import StressRows
 from .expected import Expected
-from .record import Record
+from .record import DOWN, Record
 
 BACKLOG_NS, AHEAD_NS = 5_000_000_000, 500_000_000
 """Rows that were sampled so long before a change may still have waited for the reconstruction, and
@@ -21,7 +21,6 @@ so long after it the change may still be on its way."""
 RESTORE_NS = 2_000_000_000
 """After a restart, until the driver has said who the cubes are and their tare is restored."""
 CHANGES = ("tare", "clear")
-RESTARTS = ("restart reconstruction", "reconfigure reconstruction")
 
 
 class RestEpochs:
@@ -34,7 +33,7 @@ class RestEpochs:
         self._epochs: list[tuple[int, NDArray[np.float64]]] = [(0, self._calibrated)]
         self._unclear: list[tuple[int, int]] = []  # when either of two may be in force
         for deed in record.deeds:
-            if deed.kind in RESTARTS:
+            if deed.kind in DOWN:
                 self._unclear.append((deed.begin_ns - BACKLOG_NS, deed.end_ns + RESTORE_NS))
             if deed.kind in CHANGES and deed.done:
                 self._unclear.append((deed.begin_ns - BACKLOG_NS, deed.end_ns + AHEAD_NS))

@@ -17,7 +17,7 @@ from ..core.pipeline import Pipeline
 from ..core.rows import FrequencyRows, StressRows
 from ..core.status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .expected import Expected
-from .record import Record
+from .record import DOWN, Record
 from .rest import RestEpochs
 from .samples import CHUNK, NONE
 
@@ -225,9 +225,6 @@ def _overrun(record: Record, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         np.abs(after - stamp_ns) <= LATE_NS
     )
     return near
-
-
-DOWN = ("restart reconstruction", "reconfigure reconstruction")
 
 
 def _say(what: str, rows: FrequencyRows | StressRows, row: int, start_time_ns: int) -> str:

@@ -16,13 +16,11 @@ from ..core.oscillator import stress_slope
 from ..core.rows import StressRows
 from ..core.statistics import WINDOW_S
 from ..core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
-from ..simulation.faults import PAD_FAULTS
+from ..simulation.faults import CUT_FAULTS, PAD_FAULTS
 from ..simulation.sample_log import FaultRecord
 from .expected import EDGE_US, Expected
-from .frequencies import CUT_FAULTS
-from .record import Record
+from .record import DOWN, Record
 from .samples import NONE, Samples
-from .tensors import DOWN
 
 BIT = {"open": OPEN, "short": SHORT, "stuck": STUCK, "noisy": NOISY, "report": REPORTED}
 """What each fault of a pad is called in the status."""

@@ -44,6 +44,20 @@ KINDS = {
 FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
 """What happens to the frames of single samples."""
 PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
+CUT_FAULTS = (
+    "stall",
+    "burst",
+    "unplug",
+    "rename",
+    "reset",
+    "wrap",
+    "drift",
+    "step",
+    "uid",
+    "pads",
+    "version",
+)
+"""What cuts a link or its clock."""
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """What is over as soon as it has begun; all others last `seconds`."""
 

@@ -8,23 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..simulation.faults import FRAME_FAULTS, PAD_FAULTS
+from ..simulation.faults import CUT_FAULTS, FRAME_FAULTS, PAD_FAULTS
 
 HUBS, CUBES_PER_HUB, PADS, RATE = 4, 8, 8, 500.0
-CUTS = (
-    "stall",
-    "burst",
-    "unplug",
-    "rename",
-    "reset",
-    "wrap",
-    "drift",
-    "step",
-    "uid",
-    "pads",
-    "version",
-)
-"""Faults that a link has one after the other."""
 DEEDS = {
     "stall reconstruction": "stop the process for `seconds`, less than its queue holds",
     "stall subscriber": "stop another subscriber of stress for longer than its queue holds",
@@ -99,7 +85,8 @@ def schedule(duration: float, seed: int) -> Iterator[tuple[float, dict[str, Any]
     add(1.5, kind="temperature", link="hub1", value=5.0, seconds=1.0)
     add(4.5, kind="temperature", link="hub1", value=0.0)
     # Each kind in turn, so that a short torture has them all.
-    kinds = [kind for _ in range(1 + int(duration)) for kind in random.permutation(CUTS).tolist()]
+    rounds = range(1 + int(duration))
+    kinds = [kind for _ in rounds for kind in random.permutation(CUT_FAULTS).tolist()]
     for hub in range(HUBS):
         at = random.uniform(FIRST_CUT_S, FIRST_CUT_S + 3.0)
         while at < end:
