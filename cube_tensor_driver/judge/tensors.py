@@ -21,8 +21,9 @@ from .record import DOWN, Record
 from .rest import RestEpochs
 from .samples import CHUNK, NONE
 
-TOLERANCE = 1e-3
-"""Of a component's range: float32 leaves 1e-6, a wrong sample 1e-1."""
+TOLERANCE, OF_LOAD = 1e-4, 1e-3
+"""Of a component's range, from the reference and from the load: float32 leaves 1e-6, rounding to
+mHz 1e-5 and more where few pads are left; a tare that is wrong by 20 ppm, 4e-4."""
 NOISE_SHARE = 0.1
 """Of the standard deviation that the noise of its pads gives a component: where few pads are left,
 rounding is amplified as noise is."""
@@ -77,10 +78,13 @@ def judge_tensors(
     for at in range(0, len(known), CHUNK):
         chosen = known[at : at + CHUNK]
         made, measured = stress.select(chosen), frequencies.select(source[chosen])
+        sent_ns = record.stress.sent_ns[chosen]
         right = np.zeros(len(chosen), bool)
-        for rest, applies in epochs.choices(made):
+        for rest, applies in epochs.choices(sent_ns):
             right |= applies & reference.agrees(made, measured, rest)
-        right &= reference.agrees_with_load(made, sample[source[chosen]], epochs.untared(made))
+        right &= reference.agrees_with_load(
+            made, sample[source[chosen]], epochs.untared(made.cube, sent_ns)
+        )
         bad[chosen] = ~right
     examples = [_say("wrong tensor", stress, row, start_time_ns) for row in np.flatnonzero(bad)[:4]]
     examples += [
@@ -148,7 +152,7 @@ class Reference:
         certain = readings.certain[readings.sound].all(axis=1)
         part = made.select(chosen)
         near = np.abs(_components(part) - self._truth[instant, part.cube]) <= (
-            TOLERANCE * self._range
+            OF_LOAD * self._range
         )
         hidden = part.observed[:, None] >> np.arange(near.shape[1]) & 1 == 0
         agrees[chosen] = (near | hidden).all(axis=1) | ~certain

@@ -30,6 +30,9 @@ START_S, ANSWER_S = 40.0, 10.0
 ANSWER_TRIES = 4
 TARE_S, TARE_EVERY_S = 3.0, 0.3
 """A tare is refused while data have a gap; the load stays long enough to ask again."""
+TARED_S = 1.0
+"""How long a tare is in force at least, also where this process is late: else nobody could see
+it."""
 LATE_NS = 500_000_000
 """Where the newest row of stress is older the host is too busy for a tare, and may refuse it."""
 SUBSCRIBER = "markers"
@@ -111,6 +114,8 @@ class Deeds:
                 (before, self._stress.rows_so_far()),
             )
         )
+        if kind == "tare":
+            self._observer.spin(TARED_S)
 
     @property
     def _held_cubes(self) -> range:
