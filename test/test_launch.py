@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -233,6 +234,8 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
+    too_late = threading.Timer(60.0, process.send_signal, [signal.SIGINT])
+    too_late.start()
     lines: list[str] = []
 
     def wait_for(text: str) -> str:
@@ -254,6 +257,7 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
         process.send_signal(signal.SIGINT)
         output, _ = process.communicate(timeout=20)
     finally:
+        too_late.cancel()
         process.kill()
     output = "".join(lines) + output
     assert process.returncode == 0, output
