@@ -266,6 +266,6 @@ def set_up(client: viser.ClientHandle, name: str) -> None:
     client.gui.set_panel_label(name)
     client.gui.main_panel.dock_right()
     narrow = client.camera.image_width < client.camera.image_height
-    far, target = (1.9, LOWER_TARGET) if narrow else (0.95, CAMERA_TARGET)
+    far, target = (1.6, LOWER_TARGET) if narrow else (0.95, CAMERA_TARGET)
     client.camera.position = target + far * (CAMERA_POSITION - CAMERA_TARGET)
     client.camera.look_at = target
