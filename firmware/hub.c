@@ -150,14 +150,6 @@ static void take_sample(struct hub *hub, const struct capture *captures, uint64_
 }
 
 static void measure(struct hub *hub, uint64_t now_us) {
-    if (hub->measuring) {
-        uint64_t middle_us;
-        const struct capture *captures = port_window(hub->port, &middle_us);
-        if (captures == NULL)
-            return;
-        hub->measuring = false;
-        take_sample(hub, captures, middle_us);
-    }
     if (hub->started && !hub->measuring && now_us >= hub->next_us) {
         port_begin_window(hub->port);
         hub->measuring = true;
@@ -165,6 +157,14 @@ static void measure(struct hub *hub, uint64_t now_us) {
         if (hub->next_us <= now_us) /* too late for some: these are never taken */
             schedule(hub, now_us);
     }
+    if (!hub->measuring)
+        return;
+    uint64_t middle_us;
+    const struct capture *captures = port_window(hub->port, &middle_us);
+    if (captures == NULL)
+        return;
+    hub->measuring = false;
+    take_sample(hub, captures, middle_us);
 }
 
 /* ------------------------------------------------------------------------------- the step ---- */

