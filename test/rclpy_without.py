@@ -54,7 +54,7 @@ FEATURES = {
 
 if __name__ == "__main__":
     _, names, module, *arguments = sys.argv
-    importlib.import_module("rclpy.node")
+    importlib.import_module("rclpy.lifecycle")  # rclpy itself keeps what it has imported
     for name in names.split(","):
         FEATURES[name]()
     sys.argv = [module, *arguments]
