@@ -37,13 +37,14 @@ LIMITS = {
     "deeds_failed": 0.0,
     "crashes": 0.0,
     "threads_leaked": 0.0,
-    "rss_slope_mb_per_min": 2.0,
+    "rss_slope_mb_per_min": 5.0,
     "worst_reconnect_s": 3.0,
     "stamp_error_p50_ms": 0.7,
     "stamp_error_p90_ms": 1.5,
     "stamp_error_p99_ms": 10.0,
 }
-"""The most that each figure may be."""
+"""The most that each figure may be. On a busy host queues of DDS fill, and memory grows with them;
+a leak of 200 bytes a message is 6 MB a minute."""
 
 
 def run_torture(*, duration: float, seed: int = 0, json_path: Path | None = None) -> int:
