@@ -80,11 +80,15 @@ class Kernels:
     def response(self, place: Array, angle: Array, size: float) -> Array:
         """(N, 15, 3) of cubes at `place` from the middle of a disc with force 1 N; size: m."""
         r, direction = _polar(place)
-        position = np.log(size / self.depth / SIZES[0]) / np.log(SIZES[1] / SIZES[0])
-        first, weight = _cubic(np.clip(position, 1.0, len(SIZES) - 2.001))
-        near = slice(int(first) - 1, int(first) + 3)
-        table = np.einsum("s,srfi->rfi", weight, self._response[near])
+        table = self._disc_table(size)
         return self._turned(_at(table, r / self.step, self._last), direction, angle)
+
+    def field(self, place: Array, size: float) -> Array:
+        """(N, 24, 3) FIELD in Pa and Pa/m at `place` from the middle of such a disc."""
+        r, direction = _polar(place)
+        table = _at(self._disc_table(size), r / self.step, self._last)
+        turn = _vector_rotation(direction).swapaxes(1, 2)
+        return field_rotation(direction) @ (table @ turn)
 
     def cross(self, place: Array, angle: Array) -> Array:
         """(N, 15, 3) covariance of cubes at `place` from a point with the point's traction."""
@@ -108,6 +112,14 @@ class Kernels:
         """(N,) pressure at the cubes' depth at `place` from the middle of a disc; force (3,) N."""
         zero = np.zeros(len(place))
         return -self.response(place, zero, size)[:, _ZZ] @ force
+
+    def _disc_table(self, size: float) -> Array:
+        """(places, 24, 3) of a disc of this radius, m."""
+        position = np.log(size / self.depth / SIZES[0]) / np.log(SIZES[1] / SIZES[0])
+        first, weight = _cubic(np.clip(position, 1.0, len(SIZES) - 2.001))
+        near = slice(int(first) - 1, int(first) + 3)
+        table: Array = np.einsum("s,srfi->rfi", weight, self._response[near])
+        return table
 
     def _prior(self, wave: Array) -> Array:
         lengths = np.array(LENGTHS) * self.depth

@@ -51,7 +51,7 @@ ADDED, DROPPED = 0.2, 0.1
 where its own falls below that part: two limits, so that nothing flickers."""
 APART, MERGED = 1.0, 0.7
 """Pitches between contacts from which on a second one begins, and below which two are one."""
-VALLEY, NO_VALLEY = 0.7, 0.85
+VALLEY, NO_VALLEY = 0.8, 0.92
 """Between two contacts the pressure at the cubes' depth falls below this part of the fainter one's;
 two between which it does not fall below the second number become one."""
 USUAL_SIZE, SIZE_SPREAD = 0.8, 1.0
@@ -61,6 +61,9 @@ MUCH_LEFT = 0.02
 """Alpha over AMPLITUDE from which on a contact counts as no Hertz contact."""
 GREATEST_FORCE = 1e3
 """Prior standard deviation of a force, N: none that matters, so that no force is possible, too."""
+OF_OTHERS = 1.3
+"""Part of the mean size of a cube's components that has the model's error in each of them, too: an
+error of a pad's gain turns the great ones into the small ones."""
 FINER = 8
 """Places along the side of a point's square over which a disc's traction is averaged."""
 _REACH = 12.0
@@ -409,7 +412,7 @@ class _Scan:
         self._known = known.ravel()
         filled = np.where(known, y, 0.0)
         rms = np.sqrt((filled**2).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
-        error = MODEL_ERROR**2 * (filled**2 + 0.04 * rms[:, None] ** 2)
+        error = MODEL_ERROR**2 * (filled**2 + (OF_OTHERS * rms[:, None]) ** 2)
         n, width = y.shape
         one = np.arange(n)
         blocks = np.zeros((n, width, n, width))

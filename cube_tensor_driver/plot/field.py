@@ -14,7 +14,7 @@ from .style import print_style
 
 Array = NDArray[np.float64]
 
-_VIEW_MM = 22.0
+VIEW_MM = 22.0
 """The example is drawn from minus to plus this."""
 _ERROR_LEVELS = (0.1, 0.2, 0.3, 0.5)
 """Of the table that tells how many cubes the gradients save."""
@@ -30,12 +30,12 @@ def draw_field(example: FieldExample) -> Figure:
     axes = figure.subplots(1, 3, sharey=True)
     top = 1e-3 * max(pressure.max() for pressure in example.pressure.values())
     for axis, (name, pressure) in zip(axes, example.pressure.items(), strict=True):
-        image = _draw_pressure(axis, example, pressure, top)
+        image = draw_pressure(axis, example, pressure, top)
         title = name
         if name != "truth":
-            error = _relative_rms(pressure, example.pressure["truth"])
+            error = relative_rms(pressure, example.pressure["truth"])
             title = f"{name}\nrms error {100 * error:.0f} %"
-        limits = (-_VIEW_MM, _VIEW_MM)
+        limits = (-VIEW_MM, VIEW_MM)
         axis.set(title=title, xlabel="$x$ / mm", aspect="equal", xlim=limits, ylim=limits)
         axis.grid(False)
     axes[0].set_ylabel("$y$ / mm")
@@ -46,7 +46,7 @@ def draw_field(example: FieldExample) -> Figure:
     return figure
 
 
-def _draw_pressure(axis: Any, example: FieldExample, pressure: Array, top: float) -> Any:
+def draw_pressure(axis: Any, example: FieldExample, pressure: Array, top: float) -> Any:
     """One map (M,) Pa with cubes and load, from 0 to `top` kPa."""
     points = example.points
     order = np.lexsort((points[:, 0].round(9), points[:, 1].round(9)))
@@ -61,7 +61,7 @@ def _draw_pressure(axis: Any, example: FieldExample, pressure: Array, top: float
     return image
 
 
-def _relative_rms(pressure: Array, truth: Array) -> float:
+def relative_rms(pressure: Array, truth: Array) -> float:
     return float(np.sqrt(((pressure - truth) ** 2).mean() / (truth**2).mean()))
 
 

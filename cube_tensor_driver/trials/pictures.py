@@ -22,11 +22,14 @@ from ..plot.field import draw_field, draw_field_study, field_tables
 from ..plot.markers import draw_markers
 from ..plot.pads_example import draw_pads, draw_sweep
 from ..plot.style import save
+from ..plot.traction import draw_traction, traction_table
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
-from ..research.field_study import field_example, field_study
+from ..research.field_study import WIDTHS, field_example, field_study
 from ..research.pads_example import planar_calibration, sweep
 from ..research.paper import experiments
+from ..research.traction_study import MAIN, WRONG, traction_example
+from ..research.traction_study import study as traction_study
 from ..ros.session import node_session
 from .bench import bench_scale
 
@@ -59,7 +62,8 @@ COUNTS, RATE, MEASURE_S = [1, 4, 16, 64, 256, 1024, 4096], 100.0, 6.0
 def make_pictures(folder: Path) -> None:
     """Write all pictures and figures of the documentation; view.png only where Chromium is.
 
-    Prints the tables of the field study. CubeError: something did not start, or cannot be written.
+    Prints the tables of the field study and of the traction study. CubeError: something did not
+    start, or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -91,6 +95,12 @@ def make_pictures(folder: Path) -> None:
     save(draw_field(field_example()), folder / "field.png")
     study = field_study()
     save(draw_field_study(study), folder / "field_error.png")
+    save(draw_traction(traction_example()), folder / "traction.png")
+    widths = WIDTHS.tolist()
+    by_cubes = {one.cubes: errors for one, errors in traction_study(MAIN, widths).items()}
+    print(traction_table(by_cubes))
+    settings = traction_study(list(WRONG.values()), [5e-3, 15e-3], cases=8)
+    print(traction_table({name: settings[one] for name, one in WRONG.items()}))
     names = ("pitches", "widths", "error", "position", "force")
     table = {name: getattr(study, name).tolist() for name in names}
     (folder / "field.json").write_text(json.dumps(table) + "\n")

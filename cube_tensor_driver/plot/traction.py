@@ -1,0 +1,62 @@
+"""Pictures and tables of the surface's traction from all cubes, and of its study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..research.field_study import FieldExample
+from ..research.traction_study import METHODS, Errors
+from .field import VIEW_MM, draw_pressure, relative_rms
+from .style import print_style
+
+
+@print_style()
+def draw_traction(example: FieldExample) -> Figure:
+    """One contact: true pressure at the cubes' depth, that of each method, and what the inverse
+    says about its error. The titles tell the rms of the error over the rms of the pressure."""
+    figure = Figure(figsize=(9, 6.2))
+    axes = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
+    names = ("truth", *METHODS, "standard deviation")
+    truth = example.pressure["truth"]
+    top = 1e-3 * truth.max()
+    for axis, name in zip(axes, names, strict=False):
+        pressure = example.pressure[name]
+        image = draw_pressure(axis, example, np.maximum(pressure, 0), top)
+        title = name
+        if name in METHODS:
+            title = f"{name}: {100 * relative_rms(pressure, truth):.0f} %"
+        if name == "standard deviation":
+            stated = np.sqrt((pressure**2).mean() / (truth**2).mean())
+            title = f"stated by the inverse: {100 * stated:.0f} %"
+        limits = (-VIEW_MM, VIEW_MM)
+        axis.set(title=title, aspect="equal", xlim=limits, ylim=limits)
+        axis.grid(False)
+    axes[-1].set_visible(False)
+    for axis in axes[2:5]:
+        axis.set_xlabel("$x$ / mm")
+    for axis in axes[::3]:
+        axis.set_ylabel("$y$ / mm")
+    axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
+    figure.colorbar(image, ax=axes, label="pressure at the cubes' depth / kPa (white contours: 4 kPa apart)")
+    return figure
+
+
+def traction_table(rows: Mapping[str, Sequence[Errors]]) -> str:
+    """Markdown: per row and width the errors of interpolation, inverse, inverse with contacts."""
+    lines = [
+        "| cubes | width | field | force | place, mm | force seen/stated | place seen/stated |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, all_widths in rows.items():
+        for one in all_widths:
+            cells = [
+                " / ".join(f"{value:.3f}" for value in one.field),
+                " / ".join(f"{value:.3f}" for value in one.force),
+                " / ".join(f"{1e3 * value:.2f}" for value in one.place),
+                *(" / ".join(f"{value:.1f}" for value in column) for column in one.seen.T),
+            ]
+            lines.append(f"| {name} | {1e3 * one.width:g} mm | {' | '.join(cells)} |")
+    return "\n".join(lines)

@@ -1,0 +1,259 @@
+"""What the surface's traction from all cubes is worth: errors and stated deviations against truth.
+
+Contacts press anywhere in the cell between four cubes of a flat skin. Their stress comes from the
+point forces of contact.py, not from what the inverse uses. It goes through the whole chain: pads
+whose gains are known to GAIN_ERROR, the pad law, a counter's noise, the pipeline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config.calibration import find_calibration, read_calibration
+from ..config.package_data import package_data
+from ..core.calibration import Calibration
+from ..core.defaults import CONTACT_PRESSURE, FREQUENCY_NOISE, POISSONS_RATIO
+from ..core.modes import to_matrix
+from ..core.oscillator import pad_frequency
+from ..core.pipeline import Pipeline
+from ..core.rows import FrequencyRows
+from ..core.tensor import rotation_from_rpy
+from ..elastic import contact
+from ..elastic.inverse import SurfaceInverse
+from ..elastic.kernels import Kernels
+from ..elastic.layer import Layer
+from ..elastic.surface import Surface
+from ..elastic.touches import Touches
+from .field_study import FORCE, FRICTION, WINDOW, FieldExample, flat_skin
+
+Array = NDArray[np.float64]
+
+CUBES = ("24-pad", "planar", "planar, crosswise")
+METHODS = ("interpolation", "inverse", "inverse with contacts")
+SHAPES = ("ball", "flat punch")
+GAIN_ERROR = 0.01
+"""Standard deviation of a pad's gain against what its calibration says."""
+CASES = 16
+_SIDE = 0.072
+_ORDER = 14
+"""Of the quadrature of a ball: stress at 4 mm below one of 20 mm is within 1e-3 of its peak."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One skin and its loads: lengths in m. What follows `known_thickness` is true and
+    not known to the inverse.
+
+    depth: of the cubes; gain_error: of pads; thickness: of the elastomer, inf: a half space
+    """
+
+    cubes: str = CUBES[0]
+    pitch: float = 8e-3
+    depth: float = 5e-3
+    shape: str = SHAPES[0]
+    known_thickness: float = np.inf
+    depth_error: float = 0.0
+    poisson: float = POISSONS_RATIO
+    thickness: float = np.inf
+    gain_error: float = GAIN_ERROR
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Of contacts of one width (m) on one skin.
+
+    field: rms error of the pressure at the cubes' depth over its rms, of each of METHODS
+    force: rms error of the normal force over the force; place: 95th percentile, m; both of the
+        interpolation and of the contacts
+    seen: rms of force error and of place error, over what was stated; of interpolation and contacts
+    found: part of the loads with exactly one contact
+    """
+
+    width: float
+    field: Array
+    force: Array
+    place: Array
+    seen: Array
+    found: float
+
+
+class Bench:
+    """A skin of one setting, its inverse, and loads on it."""
+
+    def __init__(self, setting: Setting, side: int = 4) -> None:
+        """side: points along the side of a cube's patch"""
+        self.setting = setting
+        skin = flat_skin(setting.pitch, max(_SIDE, 5 * setting.pitch))
+        n = len(skin.position)
+        self.poses = skin
+        if setting.cubes == CUBES[2]:
+            across = np.round(skin.position[:, :2] / setting.pitch).sum(axis=1).astype(int) % 2 == 1
+            turned = np.where(across[:, None, None], rotation_from_rpy(0, 0, np.pi / 2), np.eye(3))
+            self.poses = skin._replace(rotation=turned)
+        name = "cube.yaml" if setting.cubes == CUBES[0] else "planar.yaml"
+        folder = package_data() / "config" / "calibration"
+        self.calibration: Calibration = read_calibration(find_calibration(name, folder))
+        self._pipeline = Pipeline([self.calibration] * n)
+        noise = np.tile(self._pipeline.covariance(0), (n, 1, 1))
+        self.inverse = SurfaceInverse.of_cubes(
+            self.poses, noise, Layer(setting.known_thickness), setting.depth, side
+        )
+        self.surface = Surface(self.poses, setting.depth, side)
+        self.window = np.abs(self.inverse.points[:, :2]).max(axis=1) < WINDOW / 2
+        self._layer: Kernels | None = None
+        if np.isfinite(setting.thickness):
+            layer = Layer(setting.thickness, setting.poisson)
+            self._layer = Kernels(layer, setting.depth, 1.0)
+
+    def truth(self, points: Array, width: float, force: Array, centre: Array) -> Array:
+        """(N, 24) stress and its gradient, Pa and Pa/m, below points (N, 2)."""
+        depth = self.setting.depth + self.setting.depth_error
+        sources, forces = self._load(width, force, centre)
+        if self._layer is not None:
+            return self._layer.field(points - centre, width / 2) @ force
+        below = np.column_stack([points, np.full(len(points), -depth)])
+        stress, gradient = contact.field(below, sources, forces, self.setting.poisson)
+        return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
+
+    def _load(self, width: float, force: Array, centre: Array) -> tuple[Array, Array]:
+        if self.setting.shape == SHAPES[0]:
+            return contact.hertz(width / 2, force, centre, _ORDER)
+        return flat_punch(width / 2, force, centre, _ORDER)
+
+    def measured(self, field: Array, random: np.random.Generator) -> Array:
+        """(cubes, 15) what the pipeline makes of a field (cubes, 24) in the skin's frame."""
+        calibration, turn = self.calibration, self.poses.rotation
+        stress = np.einsum("nai,nbj,nab->nij", turn, turn, to_matrix(field[:, :6]))
+        gradient = to_matrix(field[:, 6:].reshape(-1, 6, 3).swapaxes(1, 2))  # (n, axis, 3, 3)
+        gradient = np.einsum("nai,nbj,nck,ncab->nijk", turn, turn, turn, gradient)
+        state = calibration.modes.state(stress, calibration.half_side * gradient)
+        pads = state @ calibration.response.T
+        pads *= 1 + self.setting.gain_error * random.standard_normal(pads.shape)
+        rest = calibration.rest_frequency
+        hertz = pad_frequency(pads, rest, calibration.beta, calibration.modulus)
+        hertz *= 1 + FREQUENCY_NOISE * random.standard_normal(hertz.shape)
+        rows = self._pipeline.process(FrequencyRows.of(np.arange(len(hertz)), hertz))
+        return np.concatenate([rows.stress, rows.gradient], axis=1)
+
+    def load(self, random: np.random.Generator) -> tuple[Array, Array]:
+        """A force (3,) and where it acts (2,), in the cell in the middle."""
+        angle = 2 * np.pi * random.random()
+        force = FORCE * np.array([FRICTION * np.cos(angle), FRICTION * np.sin(angle), -1.0])
+        return force, self.setting.pitch * (random.random(2) - 0.5)
+
+    def errors(self, width: float, cases: int = CASES) -> Errors:
+        """Of random loads of this width, with the same numbers every time."""
+        random = np.random.default_rng(8)
+        field, force = np.zeros((cases, 3)), np.full((cases, 2), -1.0)
+        place, seen = np.full((cases, 2), WINDOW), np.full((cases, 2, 2), np.nan)
+        one = 0
+        for case in range(cases):
+            load, centre = self.load(random)
+            points = self.inverse.points[self.window, :2]
+            true = -self.truth(points, width, load, centre)[:, 2]
+            values = self.measured(
+                self.truth(self.poses.position[:, :2], width, load, centre), random
+            )
+            touches = Touches(self.inverse, CONTACT_PRESSURE)
+            found: list[Any] = [
+                self.surface.contacts(values, CONTACT_PRESSURE),
+                touches.update(values),
+            ]
+            one += len(found[1]) == 1
+            fields = [
+                self.surface.field(values).pressure,
+                self.inverse.field(values).below,
+                touches.field.below if touches.field is not None else np.zeros(len(self.window)),
+            ]
+            for k, computed in enumerate(fields):
+                field[case, k] = ((computed[self.window] - true) ** 2).mean() / (true**2).mean()
+            for k, contacts in enumerate(found):
+                if contacts:
+                    first = contacts[0]
+                    away = first.position[:2] - centre
+                    force[case, k] = first.normal_force / FORCE - 1
+                    place[case, k] = np.linalg.norm(away)
+                    sigma = first.position_uncertainty * np.sqrt(2)
+                    error = first.normal_force - FORCE
+                    seen[case, k] = error / first.force_uncertainty, place[case, k] / sigma
+        return Errors(
+            width=width,
+            field=np.sqrt(field.mean(axis=0)),
+            force=np.sqrt((force**2).mean(axis=0)),
+            place=np.percentile(place, 95, axis=0),
+            seen=np.sqrt(np.nanmean(seen**2, axis=0)),
+            found=one / cases,
+        )
+
+
+def traction_example() -> FieldExample:
+    """A narrow contact between planar cubes, crosswise: pressure at the cubes' depth as it is, as
+    two methods compute it, and the standard deviation that the inverse states, Pa."""
+    bench = Bench(Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3), side=10)
+    centre, width = bench.setting.pitch * np.array([0.35, 0.25]), 6e-3
+    load = FORCE * np.array([FRICTION, 0.0, -1.0])
+    places = bench.poses.position[:, :2]
+    values = bench.measured(bench.truth(places, width, load, centre), np.random.default_rng(1))
+    points = bench.inverse.points
+    touches = Touches(bench.inverse, CONTACT_PRESSURE)
+    touches.update(values)
+    pressure = {
+        "truth": -bench.truth(points[:, :2], width, load, centre)[:, 2],
+        METHODS[0]: bench.surface.field(values).pressure,
+        METHODS[1]: bench.inverse.field(values).below,
+        "standard deviation": bench.inverse.deviation(values).below,
+    }
+    if touches.field is not None:
+        pressure[METHODS[2]] = touches.field.below
+    return FieldExample(points, pressure, bench.poses.position, centre)
+
+
+def flat_punch(radius: float, force: Array, centre: Array, order: int) -> tuple[Array, Array]:
+    """Traction F / (2 pi a sqrt(a^2 - r^2)) as point forces: a rigid flat punch (Johnson 3.8)."""
+    nodes, weight = np.polynomial.legendre.leggauss(order)
+    r, count = radius * np.sqrt(1 - ((nodes + 1) / 2) ** 2), 4 * order
+    angle = 2 * np.pi * np.arange(count) / count
+    x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
+    sources = np.stack([centre[0] + x, centre[1] + y, 0 * x], axis=1)
+    return sources, np.repeat(weight / 2 / count, count)[:, None] * np.asarray(force)
+
+
+def study(
+    settings: Sequence[Setting],
+    widths: Sequence[float],
+    cases: int = CASES,
+    progress: Callable[[Setting, Errors], None] | None = None,
+) -> dict[Setting, list[Errors]]:
+    """Errors of each setting at each width (m)."""
+    results: dict[Setting, list[Errors]] = {}
+    for setting in settings:
+        bench = Bench(setting)
+        results[setting] = []
+        for width in widths:
+            results[setting].append(bench.errors(width, cases))
+            if progress is not None:
+                progress(setting, results[setting][-1])
+    return results
+
+
+MAIN = tuple(Setting(cubes=cubes) for cubes in CUBES)
+"""Pitch 8 mm, depth 5 mm, a half space that is one."""
+PITCHES = tuple(
+    Setting(cubes=cubes, pitch=pitch, depth=4e-3) for pitch in (12e-3, 24e-3) for cubes in CUBES[:2]
+)
+_PLAIN = Setting()
+WRONG = {
+    "everything as known": _PLAIN,
+    "5 % gain spread": replace(_PLAIN, gain_error=0.05),
+    "cubes 0.5 mm deeper": replace(_PLAIN, depth_error=0.5e-3),
+    "Poisson's ratio 0.46": replace(_PLAIN, poisson=0.46),
+    "layer of 11 mm taken for a half space": replace(_PLAIN, thickness=11e-3),
+    "layer of 11 mm, known": replace(_PLAIN, thickness=11e-3, known_thickness=11e-3),
+    "flat punch instead of a ball": replace(_PLAIN, shape=SHAPES[1]),
+}
+"""What the inverse does not know, and what it costs."""
