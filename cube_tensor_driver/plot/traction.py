@@ -40,7 +40,8 @@ def draw_traction(example: FieldExample) -> Figure:
     for axis in axes[::3]:
         axis.set_ylabel("$y$ / mm")
     axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
-    figure.colorbar(image, ax=axes, label="pressure at the cubes' depth / kPa (white contours: 4 kPa apart)")
+    label = "pressure at the cubes' depth / kPa (white contours: 4 kPa apart)"
+    figure.colorbar(image, ax=axes, label=label)
     return figure
 
 
