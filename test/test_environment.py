@@ -219,6 +219,12 @@ def bare(*arguments: str, columns: int = 80) -> subprocess.CompletedProcess[str]
     )
 
 
+def test_distro_without_the_checkout_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--distro", "kilted", "demo"])
+    assert ended.value.code == 2 and "an option of ./cube" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]], ids=" ".join)
 def test_help_lists_every_command_without_the_environment(arguments):
     done = bare(*arguments)

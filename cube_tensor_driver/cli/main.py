@@ -65,6 +65,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def command_parser(name: str) -> Parser:
     """SystemExit: there is no such command."""
+    if name.startswith("--distro"):
+        Parser(prog=PROGRAM).error("--distro is an option of ./cube in a checkout")
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
         close = nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
