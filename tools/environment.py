@@ -62,7 +62,6 @@ PIP_OPTIONS = (
     "--no-input",
     "--disable-pip-version-check",
     "--progress-bar=off",
-    "--no-binary=cobs",
 )
 
 
