@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import pytest
@@ -226,9 +227,12 @@ def test_ros_commands_name_what_the_package_has():
 def test_programs_of_a_page_run(name):
     import numpy as np
 
+    from cube_tensor_driver.core.calibration import illustrative
     from cube_tensor_driver.core.scene import CubePoses
 
+    cube = types.SimpleNamespace(xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0))
     there = {
+        "skin": types.SimpleNamespace(cubes=[cube], calibrations=[illustrative("planar")]),
         "poses": CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002)),
         "values": np.zeros((1, 15)),
     }

@@ -151,7 +151,8 @@ class SurfaceInverse:
     def flattened(self, middle: int, cubes: Index) -> tuple[Array, Array]:
         """Places (n, 2) m of cubes laid flat about the middle one, in its frame, and the angle (n,)
         rad by which each is turned."""
-        return _flattened(self.poses, np.array([middle]), cubes[None])
+        place, angle = _flattened(self.poses, np.array([middle]), cubes[None])
+        return place[0], angle[0]
 
     def field(self, values: Array) -> TractionField:
         """The traction that the values (cubes, 15) tell, NaN where a component is not known.
@@ -365,8 +366,7 @@ def _nearest(poses: CubePoses) -> Index:
 
 
 def _flattened(poses: CubePoses, middles: Index, near: Index) -> tuple[Array, Array]:
-    """Places (n, W, 2) and angles (n, W) of near cubes (n, W) about middles (n,); (W, 2) and (W,)
-    for one middle."""
+    """Places (n, W, 2) and angles (n, W) of near cubes (n, W) about middles (n,)."""
     rotation = poses.rotation[middles]
     apart = poses.position[near] - poses.position[middles][:, None]
     local = np.einsum("nji,nkj->nki", rotation, apart)
@@ -375,7 +375,7 @@ def _flattened(poses: CubePoses, middles: Index, near: Index) -> tuple[Array, Ar
     relative = np.einsum("nji,nkjl->nkil", rotation, poses.rotation[near])
     sine = relative[..., 1, 0] - relative[..., 0, 1]
     angle = np.arctan2(sine, relative[..., 0, 0] + relative[..., 1, 1])
-    return (place[0], angle[0]) if len(middles) == 1 and len(near) == 1 else (place, angle)
+    return place, angle
 
 
 def _distinct(rows: Array) -> Index:
