@@ -28,7 +28,7 @@ from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..research.field_study import WIDTHS, field_example, field_study
 from ..research.pads_example import planar_calibration, sweep
 from ..research.paper import experiments
-from ..research.traction_study import MAIN, WRONG, traction_example
+from ..research.traction_study import MAIN, PITCHES, WRONG, traction_example
 from ..research.traction_study import study as traction_study
 from ..ros.session import node_session
 from .bench import bench_scale
@@ -97,10 +97,12 @@ def make_pictures(folder: Path) -> None:
     save(draw_field_study(study), folder / "field_error.png")
     save(draw_traction(traction_example()), folder / "traction.png")
     widths = WIDTHS.tolist()
-    by_cubes = {one.cubes: errors for one, errors in traction_study(MAIN, widths).items()}
+    by_cubes = {one.cubes: errors for one, errors in traction_study(MAIN, widths, cases=12).items()}
     print(traction_table(by_cubes))
-    settings = traction_study(list(WRONG.values()), [5e-3, 15e-3], cases=8)
+    settings = traction_study(list(WRONG.values()), [5e-3, 15e-3], cases=6)
     print(traction_table({name: settings[one] for name, one in WRONG.items()}))
+    by_pitch = traction_study(PITCHES, [2e-3, 5e-3, 10e-3, 20e-3], cases=4)
+    print(traction_table({f"{s.cubes}, {1e3 * s.pitch:g} mm": e for s, e in by_pitch.items()}))
     names = ("pitches", "widths", "error", "position", "force")
     table = {name: getattr(study, name).tolist() for name in names}
     (folder / "field.json").write_text(json.dumps(table) + "\n")
