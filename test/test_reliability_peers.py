@@ -129,14 +129,17 @@ def test_an_info_of_any_content_ends_no_node(skin):
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     infos = skin.listen(SkinInfo, "info", latched)
     skin.wait(lambda: infos)
-    publisher = skin.node.create_publisher(SkinInfo, "info", latched)
-    skin.wait(lambda: publisher.get_subscription_count() >= 4)  # all nodes but the driver, and us
-    for change in INFOS.values():
-        info = copy.deepcopy(infos[0])
-        change(info)
-        count = len(infos)
-        publisher.publish(info)
-        skin.wait(lambda count=count: len(infos) > count)
+    # Markers, contacts and we listen to the one, the reconstruction and we to the other.
+    for topic, listeners in (("info", 3), ("driver/info", 2)):
+        received = infos if topic == "info" else skin.listen(SkinInfo, topic, latched)
+        publisher = skin.node.create_publisher(SkinInfo, topic, latched)
+        skin.wait(lambda p=publisher, n=listeners: p.get_subscription_count() >= n)
+        for change in INFOS.values():
+            info = copy.deepcopy(infos[0])
+            change(info)
+            count = len(received)
+            publisher.publish(info)
+            skin.wait(lambda received=received, count=count: len(received) > count)
 
 
 def test_a_tared_skin_with_uids_starts_again(ros, tmp_path):
