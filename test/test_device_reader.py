@@ -251,16 +251,19 @@ def test_who_comes_first_waits_for_those_that_deliver(
     watch.frame(Hello, link=1)
     for k in range(10):
         hub.sample(k)
-        time.sleep(0.02)
+        time.sleep(
+            0.013
+        )  # with the pause no multiple of TICK_S, at which the reader looks up anyway
         later.sample(k)
         watch.frame(Sample, link=1)
+        time.sleep(0.01)
     together = [
         {link for link, _, frame in batch if isinstance(frame, Sample)} for batch in watch.batches
     ].count({0, 1})
     if period_us == 1_000:
         assert together <= 2  # the scheduler may have held up the reader
     else:
-        assert together >= 5  # without waiting it is 0; the reader may have been awake already
+        assert together >= 8  # the reader may have been awake already
         watch.reader.send(1, Request(Command.STOP))
         later.expect(Command.STOP)
         sent = time.monotonic()
