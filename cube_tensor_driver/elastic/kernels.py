@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 LENGTHS = (0.2, 0.8)
-"""Of the prior over the depth: near the pair that explained contacts of 2 to 20 mm at a depth of 5 mm
-best in a half space."""
+"""Of the prior over the depth: near the pair that explained contacts of 2 to 20 mm best, in a half
+space at a depth of 5 mm."""
 SHEAR = 0.5
 """Prior standard deviation of shear over that of pressure."""
 SIZES = np.geomspace(0.1, 5.0, 44)
