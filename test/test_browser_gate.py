@@ -15,7 +15,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from cube_tensor_driver.browser.controls import ColourControls
-from cube_tensor_driver.browser.gate import guarded_server, refusal
+from cube_tensor_driver.browser.gate import check_host, guarded_server, refusal
+from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.scene import QUANTITIES
 
 HERE = "127.0.0.1"
@@ -43,38 +44,71 @@ def test_only_this_page_is_answered(host: str, origin: str | None, word: str) ->
     assert word in found and bool(word) == bool(found)
 
 
-@pytest.fixture(scope="module")
-def port() -> Iterator[int]:
-    with guarded_server():
+TOKEN = "a-token"
+
+
+@pytest.fixture(params=["", TOKEN])
+def port(request: pytest.FixtureRequest) -> Iterator[int]:
+    """Of a server with the token, or without one."""
+    with guarded_server(request.param):
         server = viser.ViserServer(HERE, 0, verbose=False)
     yield server.get_port()
     server.stop()
 
 
+def asked(port: int, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection(HERE, port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    answer.text = answer.read()
+    connection.close()
+    return answer
+
+
+def connected(port: int, origin: str | None, **headers: str) -> bool:
+    protocols = [f"viser-v{viser.__version__}"]
+    try:
+        with connect(
+            f"ws://{HERE}:{port}",
+            origin=origin,
+            subprotocols=protocols,
+            additional_headers=headers,
+        ) as socket:
+            return bool(socket.recv(timeout=10))
+    except InvalidStatus as refused:
+        assert refused.response.status_code == 403
+        return False
+
+
+@pytest.mark.parametrize("port", [""], indirect=True)
 def test_the_server_refuses_other_hosts_and_origins(port: int) -> None:
-    def status(**headers: str) -> int:
-        connection = http.client.HTTPConnection(HERE, port, timeout=10)
-        connection.request("GET", "/", headers=headers)
-        answer = connection.getresponse()
-        answer.read()
-        connection.close()
-        return answer.status
+    assert asked(port).status == 200
+    assert asked(port, Host="evil.example").status == 403
+    assert asked(port, Origin="http://evil.example").status == 403
+    assert connected(port, None) and connected(port, f"http://{HERE}:{port}")
+    assert not connected(port, "http://evil.example")
 
-    assert status() == 200
-    assert status(Host="evil.example") == 403
-    assert status(Origin="http://evil.example") == 403
 
-    def connected(origin: str | None) -> bool:
-        protocols = [f"viser-v{viser.__version__}"]
-        try:
-            with connect(f"ws://{HERE}:{port}", origin=origin, subprotocols=protocols) as socket:
-                return bool(socket.recv(timeout=10))
-        except InvalidStatus as refused:
-            assert refused.response.status_code == 403
-            return False
+@pytest.mark.parametrize("port", [TOKEN], indirect=True)
+def test_on_other_addresses_a_browser_needs_the_token(port: int) -> None:
+    """In the address of the page; its websocket brings the cookie that came with the page."""
+    for path in ("/", "/?token=", "/?token=b-token", "/?token=%ff", "/?", "//["):
+        refused = asked(port, path, Cookie="cube_view_1=\xff")
+        assert refused.status == 403 and b"with ?token=" in refused.text
+    page = asked(port, f"/?token={TOKEN}", Host=f"skin.example:{port}")
+    assert page.status == 200 and b"<html" in page.text
+    cookie, *rules = page.headers["Set-Cookie"].split("; ")
+    assert set(rules) == {"HttpOnly", "SameSite=Lax"}
+    assert asked(port, Cookie=f"another=1; {cookie}").status == 200
+    assert not connected(port, None)
+    assert connected(port, f"http://{HERE}:{port}", Cookie=cookie)
+    assert not connected(port, "http://evil.example", Cookie=cookie)
 
-    assert connected(None) and connected(f"http://{HERE}:{port}")
-    assert not connected("http://evil.example")
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "", "a" * 64 + ".b"])
+def test_an_address_that_cannot_be_had_is_refused(host: str) -> None:
+    with pytest.raises(ConfigError, match="--host"):
+        check_host(host)
 
 
 def test_values_that_no_control_offers_do_no_harm() -> None:

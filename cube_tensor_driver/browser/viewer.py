@@ -1,4 +1,4 @@
-"""`./cube view`: serves a page on this machine that shows the running skin.
+"""`./cube view`: serves a page that shows the running skin.
 
 It is a process of its own, so that it slows nothing else down.
 """
@@ -11,7 +11,9 @@ import logging
 import math
 import os
 import queue
+import secrets
 import signal
+import socket
 import time
 import warnings
 from collections.abc import Callable
@@ -32,7 +34,7 @@ from ..ros.skin_subscriber import STALE_S, FollowedSkin, SkinSubscriber
 from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S
-from .gate import guarded_server
+from .gate import HOSTS, check_host, guarded_server
 from .history import History, RowRate
 from .markup import PageStatus
 from .moment import Moment
@@ -40,7 +42,8 @@ from .page import Buttons, Page, ShownSkin, WaitingPage
 from .replay_client import ReplayClient
 from .service_calls import ServiceCalls
 
-HOST = "127.0.0.1"
+WILDCARDS = ("0.0.0.0", "::")
+"""All addresses of this machine."""
 PICTURES_HZ, NUMBERS_HZ = 20.0, 4.0
 SAY_WAITING_S = 2.0
 """Without a skin, until the terminal says that the page waits for one."""
@@ -55,10 +58,12 @@ class Viewer:
     threads: what they ask for waits in a queue.
     """
 
-    def __init__(self, port: int, depth: float, recordings: Path) -> None:
-        """port: of the page, TCP. depth: from the cubes' centres to the surface, m. recordings:
-        the folder for bags."""
-        self._server = _serve(port)
+    def __init__(self, host: str, port: int, depth: float, recordings: Path) -> None:
+        """host, port: where the page is served, TCP. depth: from the cubes' centres to the surface,
+        m. recordings: the folder for bags."""
+        self._host = host
+        self._token = "" if host in HOSTS else secrets.token_urlsafe(16)
+        self._server = _serve(host, port, self._token)
         self._depth = depth
         self._node = rclpy.create_node("view")
         self._guard = CallbackGuard(self._node)
@@ -88,7 +93,11 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        return f"http://{HOST}:{self._server.get_port()}"
+        """What to open in a browser; with the token, where one is needed."""
+        host = socket.gethostname() if self._host in WILDCARDS else self._host
+        name = f"[{host}]" if ":" in host else host
+        query = f"/?token={self._token}" if self._token else ""
+        return f"http://{name}:{self._server.get_port()}{query}"
 
     def spin(self, stopping: Callable[[], bool]) -> None:
         """Serve until `stopping` is true."""
@@ -117,7 +126,8 @@ class Viewer:
         self._recorder.end()
         self._executor.remove_node(self._node)
         self._node.destroy_node()
-        self._server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it has stopped
+            self._server.stop()
 
     def _show_skin(self, skin: FollowedSkin) -> None:
         """There is a skin, or another one: make its pages."""
@@ -218,24 +228,25 @@ def _domain() -> str:
     return os.environ.get("ROS_DOMAIN_ID") or "0"
 
 
-def _serve(port: int) -> viser.ViserServer:
-    """ConfigError: the port is in use."""
+def _serve(host: str, port: int, token: str) -> viser.ViserServer:
+    """ConfigError: the host is no address of this machine, or the port is in use."""
+    check_host(host)
     logging.getLogger("websockets").setLevel(logging.ERROR)
     # A browser may leave while its picture is made.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     try:
         # viser prints a banner
-        with contextlib.redirect_stdout(io.StringIO()), guarded_server():
-            return viser.ViserServer(HOST, port, label="cube_tensor_driver", verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()), guarded_server(token):
+            return viser.ViserServer(host, port, label="cube_tensor_driver", verbose=False)
     except OSError as error:
         raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
 
 
-def run_view(port: int, depth: float, recordings: Path) -> int:
+def run_view(host: str, port: int, depth: float, recordings: Path) -> int:
     """Serve the page until Ctrl-C; returns the exit code.
 
-    port: TCP. depth: from the cubes' centres to the surface, m. recordings: the folder for bags.
-    Raises ConfigError if the port is in use.
+    host, port: where the page is served, TCP. depth: from the cubes' centres to the surface, m.
+    recordings: the folder for bags. Raises ConfigError if host or port cannot be had.
     """
     stopping = False
 
@@ -247,7 +258,7 @@ def run_view(port: int, depth: float, recordings: Path) -> int:
         signal.signal(number, stop)
     start_ros()
     try:
-        with contextlib.closing(Viewer(port, depth, recordings)) as viewer:
+        with contextlib.closing(Viewer(host, port, depth, recordings)) as viewer:
             print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
             viewer.spin(lambda: stopping)
     finally:

@@ -1,4 +1,4 @@
-"""./cube view: a page on this machine that shows a running skin."""
+"""./cube view: a page that shows a running skin."""
 
 from __future__ import annotations
 
@@ -12,6 +12,13 @@ RECORDINGS = Path("~/cube_recordings")
 
 
 def arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="where the page is served; on any other than this machine's own (0.0.0.0: on all) "
+        "browsers need the token in the printed address (default: %(default)s)",
+    )
     parser.add_argument(
         "--port",
         type=tcp_port,
@@ -38,4 +45,4 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from ..browser.viewer import run_view
 
-    return run_view(options.port, options.depth, options.recordings.expanduser())
+    return run_view(options.host, options.port, options.depth, options.recordings.expanduser())
