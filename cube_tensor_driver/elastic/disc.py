@@ -1,0 +1,113 @@
+"""Discs on a skin: Hertz contacts, what cubes see of them and what they do to the surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .inverse import SurfaceInverse, TractionField, square
+from .kernels import hertz_pressure
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+FINER = 8
+"""Places along the side of a point's square over which a disc's traction is averaged."""
+_REACH = 12.0
+"""Depths beyond which a contact is not seen."""
+
+
+@dataclass
+class Disc:
+    """A Hertz contact in the frame of its home, the nearest cube.
+
+    id: the same as long as it is followed
+    place: (2,) m; size: radius, m; force: (3,) N; alpha: Pa, of what is left around it
+    """
+
+    id: int
+    home: int
+    place: Array
+    size: float
+    force: Array
+    alpha: float
+
+
+class DiscModel:
+    """What discs make on the skin of an inverse. Places are in the skin's parent frame, m."""
+
+    def __init__(self, inverse: SurfaceInverse) -> None:
+        self.inverse = inverse
+        self._cubes = cKDTree(inverse.poses.position)
+        self._points = cKDTree(inverse.points)
+
+    def middle(self, disc: Disc) -> Array:
+        """(3,) m on the surface."""
+        poses = self.inverse.poses
+        local = np.array([*disc.place, self.inverse.depth])
+        return poses.position[disc.home] + poses.rotation[disc.home] @ local
+
+    def seen(self, discs: list[Disc]) -> Array:
+        """(cubes, C) what all cubes see of these contacts."""
+        inverse = self.inverse
+        seen = np.zeros((len(inverse.poses.position), len(inverse.columns)))
+        for disc in discs:
+            cubes, place, angle = self.cubes_around(disc.home)
+            response = inverse.kernels.response(place - disc.place, angle, disc.size)
+            seen[cubes] += response[:, inverse.columns] @ disc.force
+        return seen
+
+    def below(self, discs: list[Disc]) -> Array:
+        """(M,) pressure of these contacts at the cubes' depth."""
+        below = np.zeros(len(self.inverse.points))
+        for disc in discs:
+            points, place, _ = self.points_around(disc)
+            below[points] += self.inverse.kernels.disc_pressure(place, disc.size, disc.force)
+        return below
+
+    def with_discs(self, rest: TractionField, below: Array, discs: list[Disc]) -> TractionField:
+        """What is left and the discs, these as the mean over the square of each point: so the sum
+        over the points is the force, however narrow a contact is."""
+        traction = rest.traction.copy()
+        within = square(self.inverse.spacing / FINER, FINER)
+        for disc in discs:
+            points, place, turn = self.points_around(disc)
+            distance = np.linalg.norm(place[:, None] + within, axis=2)
+            share = hertz_pressure(distance, disc.size).mean(axis=1)
+            traction[points] += share[:, None] * (turn @ disc.force)
+        return rest._replace(traction=traction, below=below)
+
+    def points_around(self, disc: Disc) -> tuple[Index, Array, Array]:
+        """Points near a contact: which, their places (n, 2) from its middle in its home's frame,
+        and rotations (n, 3, 3) from that frame to the point's."""
+        inverse = self.inverse
+        reach = _REACH / 2 * inverse.depth
+        points = np.sort(self._points.query_ball_point(self.middle(disc), reach))
+        points = np.asarray(points, dtype=np.intp)
+        rotation = inverse.poses.rotation
+        local = (inverse.points[points] - self.middle(disc)) @ rotation[disc.home]
+        turn = rotation[inverse.cube[points]].swapaxes(1, 2) @ rotation[disc.home]
+        return points, local[:, :2], turn
+
+    def cubes_around(self, home: int) -> tuple[Index, Array, Array]:
+        """Cubes that see contacts of this home: which, places and angles laid flat."""
+        inverse = self.inverse
+        reach = _REACH * inverse.depth
+        cubes = np.sort(self._cubes.query_ball_point(inverse.poses.position[home], reach))
+        cubes = np.asarray(cubes, dtype=np.intp)
+        facing = inverse.poses.rotation[cubes, :, 2] @ inverse.poses.rotation[home, :, 2] > 0.5
+        cubes = cubes[facing]
+        return cubes, *inverse.flattened(home, cubes)
+
+    def nearest_cubes(self, disc: Disc, count: int) -> Index:
+        """Which cubes are the nearest to a disc, at most `count`."""
+        count = min(count, len(self.inverse.poses.position))
+        found = self._cubes.query(self.middle(disc), count)[1]
+        return np.asarray(found, dtype=np.intp).reshape(-1)
+
+    def nearest_points(self, places: Array) -> Index:
+        """(n,) the point nearest to each place (n, 3)."""
+        return np.asarray(self._points.query(places)[1], dtype=np.intp)
