@@ -10,13 +10,14 @@ from launch.actions import ExecuteProcess, OpaqueFunction
 from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import LaunchConfiguration, OrSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
 from cube_tensor_driver.config.urdf import skin_urdf
 from cube_tensor_driver.ros.launching import (
     DEMO_LOAD,
     FromSkin,
+    GivenParameters,
     check_arguments,
     rviz_file,
     skin_name,
@@ -35,12 +36,12 @@ def generate_launch_description() -> LaunchDescription:
         text("config", "Skin file (YAML); empty with simulate:=true: the demo skin."),
         text("namespace", "Namespace of the nodes and their topics, below any that is pushed."),
         text("port", "Port of the hub instead of the file's, for a skin with one link."),
-        text("rate", "Samples per second; 0.0: as in the skin file.", "0.0"),
-        text("publish_period", "Time that one message covers, s; 0.0: one for each scan.", "0.0"),
+        text("rate", "Samples per second; empty: as the parameter says."),
+        text("publish_period", "Time that one message covers, s; empty: as the parameter says."),
         switch("simulate", "Simulate the skin's hubs instead of opening its ports."),
         text("load", "Load script (YAML) for a simulated skin.", str(DEMO_LOAD)),
         switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
-        switch("autostart", "Nodes configure and activate themselves (lifecycle).", "true"),
+        switch("autostart", "Nodes configure and activate themselves (lifecycle).", ""),
         switch("respawn", "Start a node again that has ended by itself.", "true"),
         switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),
@@ -48,18 +49,11 @@ def generate_launch_description() -> LaunchDescription:
         switch("record", "Record the skin into a new bag below the current folder (mcap)."),
         switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
     ]
-    autostart = {"autostart": ParameterValue(given("autostart"), value_type=bool)}
-    reconstruction = {
-        **autostart,
-        "config": given("config"),
-        "publish_period": ParameterValue(given("publish_period"), value_type=float),
-    }
-    driver = {
-        **reconstruction,
-        "port": ParameterValue(given("port"), value_type=str),
-        "rate": ParameterValue(given("rate"), value_type=float),
-        "port_directory": given("port_directory"),
-    }
+    autostart = ParameterFile(GivenParameters("autostart"))
+    reconstruction = ParameterFile(GivenParameters("autostart", "config", "publish_period"))
+    driver = ParameterFile(
+        GivenParameters("autostart", "config", "publish_period", "port", "rate", "port_directory")
+    )
     separate, composed = UnlessCondition(given("composed")), IfCondition(given("composed"))
     urdf = {"robot_description": ParameterValue(FromSkin(skin_urdf), value_type=str)}
     return LaunchDescription(
@@ -97,7 +91,7 @@ def wanted(argument: str, other: str | None = None) -> IfCondition:
     return IfCondition(OrSubstitution(given(argument), given(other or argument)))
 
 
-def node(executable: str, parameters: dict[str, Any], condition: Any, **options: Any) -> Node:
+def node(executable: str, parameters: Any, condition: Any, **options: Any) -> Node:
     """A node of this package. `composed` holds several, which keep their own names."""
     return Node(
         package=PACKAGE,

@@ -201,11 +201,14 @@ ROBOT = """
   <group>
     <push_ros_namespace namespace="robot1"/>
     <set_parameter name="drift_time" value="33.0"/>
+    <set_parameter name="publish_period" value="0.05"/>
+    <set_parameter name="rate" value="50.0"/>
     <set_remap from="stress" to="touch"/>
     <include file="$(find-pkg-share cube_tensor_driver)/launch/skin.launch.py">
       <arg name="simulate" value="true"/>
       <arg name="namespace" value="hand"/>
       <arg name="record" value="true"/>
+      <arg name="rate" value="80.0"/>
     </include>
   </group>
 </launch>
@@ -213,11 +216,14 @@ ROBOT = """
 
 
 def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
-    """Its namespace, remaps and parameters reach the nodes and the recorder; a driver that dies
-    starts again; one Ctrl-C ends all and leaves a whole bag."""
+    """Its namespace, remaps and parameters reach the nodes and the recorder; an argument of the
+    launch file beats a parameter that was set around it. A driver that dies starts again; one
+    Ctrl-C ends all and leaves a whole bag."""
     pytest.importorskip("launch_ros", reason="needs launch_ros, which the wheels lack")
     if shutil.which("ros2") is None:
         pytest.skip("needs the command ros2 (ros2cli and ros2launch), which the wheels lack")
+    from rcl_interfaces.srv import GetParameters
+
     from cube_tensor_driver.bags.read import Bag
     from cube_tensor_driver.msg import SkinStress
 
@@ -252,6 +258,12 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
         ros.wait(lambda: len(heard) > 20)
         os.kill(driver, signal.SIGKILL)
         wait_for("link hub1: hub 0x2 with 8 cubes of 8 pads")
+        asked = GetParameters.Request(names=["rate", "publish_period", "config"])
+        rate, period, config = ros.call(
+            GetParameters, "/robot1/hand/driver/get_parameters", asked
+        ).values
+        assert (rate.double_value, period.double_value) == (80.0, 0.05)
+        assert config.string_value == str(SKIN)
         begun = len(heard)
         ros.wait(lambda: len(heard) > begun + 20)
         process.send_signal(signal.SIGINT)

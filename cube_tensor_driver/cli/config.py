@@ -68,6 +68,7 @@ def write_grid(options: argparse.Namespace) -> int:
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
+    from ..terminal.output import working
 
     if options.output.exists():
         raise ConfigError(f"-o {options.output}: the file is there; remove it, or name another one")
@@ -87,7 +88,8 @@ def write_grid(options: argparse.Namespace) -> int:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
     text = f"{size}, on {options.links} {'link' if options.links == 1 else 'links'}"
-    write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
+    with working(f"writing {len(skin['cubes'])} cubes"):
+        write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
     print(f"wrote {options.output}: {text}")
     return 0
 
@@ -109,10 +111,12 @@ def check_file(path: Path) -> int:
     from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin
     from ..device.line_load import line_doubts
+    from ..terminal.output import working
 
-    skin, mistakes = check_skin(path)
-    if skin is not None:
-        mistakes = [*pose_doubts(skin), *line_doubts(skin)]
+    with working(f"checking {path}"):
+        skin, mistakes = check_skin(path)
+        if skin is not None:
+            mistakes = [*pose_doubts(skin), *line_doubts(skin)]
     for mistake in mistakes:
         print(f"cube: {path}: {mistake}", file=sys.stderr)
     if skin is None or mistakes:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import Action, LaunchContext, Substitution
@@ -23,6 +24,7 @@ from ..config.skin import Skin, read_skin
 from ..config.yaml import write_yaml
 from ..core.errors import ConfigError
 from ..processes.temporary import temporary_folder
+from .parameters import DRIVER
 
 _CONFIG = package_data() / "config"
 SINGLE, DEMO, DEMO_LOAD = (
@@ -39,9 +41,10 @@ def text(name: str, description: str, default: str = "") -> DeclareLaunchArgumen
 
 
 def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
-    """A launch argument that is true or false."""
+    """A launch argument that is true or false, or empty if that is the default."""
+    choices = ["true", "false"] if default else ["", "true", "false"]
     return DeclareLaunchArgument(
-        name, default_value=default, choices=["true", "false"], description=description
+        name, default_value=default, choices=choices, description=description
     )
 
 
@@ -58,6 +61,31 @@ class FromSkin(Substitution):
     def perform(self, context: LaunchContext) -> str:
         """ConfigError: the skin file is wrong."""
         return self._make(read_skin(Path(_given(context, "config"))))
+
+
+class GivenParameters(Substitution):
+    """The path of a parameter file with the launch arguments of these names that are not empty.
+
+    The others are left to the including launch file: what a node is passed beats its SetParameter.
+    ConfigError: one is not of the parameter's type.
+    """
+
+    def __init__(self, *names: str) -> None:
+        super().__init__()
+        self._parameters = [parameter for parameter in DRIVER if parameter.name in names]
+
+    def describe(self) -> str:
+        return f"parameters {', '.join(parameter.name for parameter in self._parameters)}"
+
+    def perform(self, context: LaunchContext) -> str:
+        given = {
+            parameter.name: _typed(parameter.name, text, type(parameter.default))
+            for parameter in self._parameters
+            if (text := _given(context, parameter.name))
+        }
+        path = temporary_folder("cube_parameters_") / "given.yaml"
+        write_yaml(path, {"/**": {"ros__parameters": given}})
+        return str(path)
 
 
 def skin_name(skin: Skin) -> str:
@@ -96,7 +124,7 @@ def check_arguments(context: LaunchContext) -> list[Action]:
     if problem:
         raise ConfigError(f"port: {problem}")
     for name in ("rate", "publish_period"):
-        _check_number(name, _given(context, name))
+        _typed(name, _given(context, name) or "0", float)
     for name, packages in NEEDS.items():
         if _given(context, name) == "true":
             _check_installed(name, packages)
@@ -111,11 +139,13 @@ def _given(context: LaunchContext, name: str) -> str:
     return str(LaunchConfiguration(name).perform(context))
 
 
-def _check_number(name: str, value: str) -> None:
+def _typed(name: str, text: str, kind: type) -> Any:
+    if kind is bool:
+        return text == "true"
     try:
-        float(value)
+        return kind(text)
     except ValueError:
-        raise ConfigError(f"{name}:={value}: must be a number") from None
+        raise ConfigError(f"{name}:={text}: must be a number") from None
 
 
 def _check_installed(name: str, packages: tuple[str, ...]) -> None:

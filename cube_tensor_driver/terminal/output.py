@@ -1,13 +1,14 @@
-"""A progress bar for long computations, and warnings."""
+"""Progress of long work, and warnings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column
+from rich.text import Text
 
 
 @contextmanager
@@ -35,6 +36,12 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
 
         yield report
         bar.update(task, completed=bar.tasks[0].total)
+
+
+def working(text: str) -> AbstractContextManager[object]:
+    """A moving line on stderr, where that is a terminal, while something takes long whose progress
+    is not known."""
+    return Console(stderr=True).status(Text(text))
 
 
 def warn(text: str) -> None:
