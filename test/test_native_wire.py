@@ -124,10 +124,11 @@ PYTHON_H = Path(sysconfig.get_paths()["include"])
 
 
 @pytest.mark.skipif(not (PYTHON_H / "Python.h").is_file(), reason="no headers: python3-dev")
-def test_the_python_module_compiles_without_a_warning() -> None:
+@pytest.mark.parametrize("name", ["python_wire.c", "cube_follow.c"])
+def test_the_python_module_compiles_without_a_warning(name: str) -> None:
     # Without -Wpedantic: Python's slots hold functions as pointers to data.
     strict = [option for option in STRICT if option != "-Wpedantic"]
-    command = ["cc", *strict, "-fsyntax-only", "-isystem", PYTHON_H, NATIVE / "python_wire.c"]
+    command = ["cc", *strict, "-fsyntax-only", "-isystem", PYTHON_H, NATIVE / name]
     subprocess.run(command, check=True, timeout=60)
 
 

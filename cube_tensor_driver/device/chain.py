@@ -7,6 +7,7 @@ queue behind it.
 from __future__ import annotations
 
 import logging
+import threading
 import time
 import traceback
 from collections import deque
@@ -18,6 +19,7 @@ from ..core.rows import FrequencyRows
 from ..core.status import STAMP
 from .clock import ClockMap, HostClockWatch
 from .cube_table import CubeAddress
+from .follower import Follower
 from .link import Link, LinkConfig, LinkState
 from .link_log import LinkLog, Log
 from .native import SLOWER, wire
@@ -74,6 +76,9 @@ class _LinkRecord:
     hub_changes: int = 0
     was_open: bool = False
 
+    def __post_init__(self) -> None:
+        self.follower = Follower(self.account, self.clock)
+
 
 class LiveLinks:
     """Reads the links of a skin and calls back with rows of frequencies.
@@ -121,6 +126,8 @@ class LiveLinks:
             self._log.warning(SLOWER)
         self._link_logs = [LinkLog(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
+        # Reports look at accounts and clocks while the reader's thread does not change them.
+        self._taking = threading.Lock()
         self._errors = 0
         self._reader: Reader | None = None
 
@@ -176,36 +183,38 @@ class LiveLinks:
         """How each link is doing, and what happened since the last report; empty before `start`."""
         if self._reader is None:
             return []
-        return [
-            self._report(link, record, log)
-            for link, record, log in zip(
-                self._reader.links, self._records, self._link_logs, strict=True
-            )
-        ]
+        with self._taking:
+            for record in self._records:
+                record.follower.take_back()
+            return [
+                self._report(link, record, log)
+                for link, record, log in zip(
+                    self._reader.links, self._records, self._link_logs, strict=True
+                )
+            ]
 
     def receive(self, received: Sequence[LinkFrames]) -> None:
         """Take in frames of the links, and call back with what they complete.
 
         The reader's thread calls this once per wake-up.
         """
-        now_ns, step_ns = self._see_clock()
-        account = self._rows
-        for link, arrival_ns, frames, asked_ns in received:
-            # Bytes that were read just before the clock was set have the old time.
-            if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
-                arrival_ns += step_ns
-            # A round trip during which the clock was set says nothing.
-            if step_ns:
-                asked_ns = 0
-            for frame in frames:
-                if isinstance(frame, Sample):
-                    account.received += frame.shape[0]
-            try:
-                self._take(link, arrival_ns, frames, asked_ns)
-            except Exception as error:  # noqa: BLE001  (the rows of other links go on)
-                self._lose(error)
+        with self._taking:
+            now_ns, step_ns = self._see_clock()
+            for link, arrival_ns, frames, asked_ns in received:
+                # Bytes that were read just before the clock was set have the old time.
+                if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
+                    arrival_ns += step_ns
+                samples = [frame for frame in frames if isinstance(frame, Sample)]
+                self._rows.received += sum(sample.shape[0] for sample in samples)
+                try:
+                    if len(samples) == len(frames) and self._follow(link, arrival_ns, samples):
+                        continue
+                    # A round trip during which the clock was set says nothing.
+                    self._take(link, arrival_ns, frames, 0 if step_ns else asked_ns)
+                except Exception as error:  # noqa: BLE001  (the rows of other links go on)
+                    self._lose(error)
         self._deliver()
-        account.check()
+        self._rows.check()
 
     def _see_clock(self) -> tuple[int, int]:
         """The time, and by how much the host's clock was set since the last call, ns."""
@@ -215,15 +224,25 @@ class LiveLinks:
         text = f"the host's clock was set by {1e-9 * step_ns:+.6g} s: stamps follow it at once"
         self._log.warning(text)
         for record in self._records:
+            record.follower.take_back()
             record.clock.shift(step_ns)
             record.clock.problems.add(text)
         if self._reader is not None:
             self._reader.forget_questions()
         return now_ns, step_ns
 
+    def _follow(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> bool:
+        """Give samples to the scans if all of them are usual; whether they are."""
+        stamps_ns = self._records[link].follower.follow(samples, arrival_ns)
+        if stamps_ns is None:
+            return False
+        self._scans.add(link, samples, stamps_ns)
+        return True
+
     def _take(self, link: int, arrival_ns: int, frames: Sequence[Frame], asked_ns: int) -> None:
         """Count the frames of a link and give their samples to the scans."""
         record = self._records[link]
+        record.follower.take_back()
         samples: list[Sample] = []
         for frame in frames:
             if isinstance(frame, Sample):
@@ -245,6 +264,7 @@ class LiveLinks:
                 record.account.stats(frame)
                 record.contradictions = record.account.contradictions()
         self._give(link, arrival_ns, samples)
+        record.follower.lend()
 
     def _give(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
         """Samples of one run of a hub, which arrived together, to the scans."""

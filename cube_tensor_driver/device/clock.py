@@ -23,8 +23,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
-from .clock_step import StepWatch, Suspicion, Verdict
+from .clock_step import LentSteps, StepWatch, Suspicion, Verdict
 from .round_trips import RoundTrip, RoundTrips
 
 BUCKET_NS = 1_000_000_000
@@ -68,6 +69,8 @@ LYING = (
     f"the hub's clock jumped {LIES} times within {LIES_NS / 1e9:g} s: "
     "rows are stamped by their arrival"
 )
+LENT_US, LENT_NS = 1 << 50, 1 << 60
+"""Times beyond these are not lent: they come from clocks that are wrong by decades."""
 _NEVER = -(2**80)
 """Before every time: device times are 64 bits of µs, here in ns."""
 
@@ -101,6 +104,25 @@ class HostClockWatch:
             return now, 0
         self._offset = offset
         return now, step
+
+
+class LentLine(NamedTuple):
+    """What a `ClockMap` knows at the last sample, under its names; stamp_offset: of the line that
+    gives stamps."""
+
+    first_us: int
+    first_ns: int
+    offset: float
+    drift: float
+    stamp_offset: float
+    newest: int
+    arrival: int
+    stamp: int
+    bucket_end: int
+    jitter_ns: float
+    least: float
+    earliest: float
+    delay: float
 
 
 class ClockMap:
@@ -196,6 +218,45 @@ class ClockMap:
     def round_trip_ns(self) -> float:
         """The shortest round trip of the last minute; 0 without."""
         return self._trips.least_ns
+
+    def lend(self) -> tuple[LentSteps, LentLine] | None:
+        """For `follower.py`; None: the clock is in doubt, or too little is known of it."""
+        steps = self._steps.lend()
+        is_doubtful = self.in_doubt or self._is_doubtful or self._suspicion is not None
+        if steps is None or self._is_fresh or is_doubtful:
+            return None
+        # Until the bucket has a point, none is known to be the earliest.
+        earliest = self._earliest if math.isfinite(self._least) else (0.0, 0.0)
+        line = LentLine(
+            self._first_us,
+            self._first_ns,
+            self._offset,
+            self._drift,
+            min(self._offset, self._true_offset),
+            self._newest,
+            self._last_arrival,
+            self._last_stamp,
+            self._bucket_end,
+            self.jitter_ns,
+            self._least,
+            *earliest,
+        )
+        is_small = max(steps.device_us, abs(line.first_us)) < LENT_US
+        times_ns = line.first_ns, line.newest, line.arrival, line.stamp, line.bucket_end
+        is_small = is_small and max(map(abs, times_ns)) < LENT_NS
+        # Stamps that were in doubt may hold back those after them.
+        return (steps, line) if is_small and line.stamp >= self._doubtful_stamp else None
+
+    def take_back(self, steps: LentSteps, line: LentLine) -> None:
+        """As if `update` had seen all samples until the one of `steps`."""
+        self._steps.take_back(steps)
+        self._last_us = steps.device_us
+        self._newest = line.newest
+        self._last_arrival = self._moved_ns = line.arrival
+        self._last_sound = line.arrival - self._first_ns
+        self._last_stamp = line.stamp
+        self.jitter_ns = line.jitter_ns
+        self._least, self._earliest = line.least, (line.earliest, line.delay)
 
     def answer(self, sent_ns: int, device_us: int, arrival_ns: int) -> None:
         """The hub read device_us after a question was sent at sent_ns, and its answer arrived at

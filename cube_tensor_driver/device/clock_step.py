@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from enum import Enum
+from typing import NamedTuple
 
 from .sequence import MAX_GAP, MEMORY
 
@@ -34,6 +35,18 @@ UNUSUAL = 8.0
 _WRAP = 1 << 32
 
 
+class LentSteps(NamedTuple):
+    """What a `StepWatch` knows of the last sample: its number and device time; the period; when the
+    next is due, if that is known; by how much samples lag behind the period."""
+
+    sequence: int
+    device_us: int
+    period_us: float
+    due_us: float
+    lag_us: float
+    is_due: bool
+
+
 class StepWatch:
     """Compares the device times of samples with their numbers."""
 
@@ -52,6 +65,20 @@ class StepWatch:
         self._period_us = 0.0
         self._lag_us = 0.0
         self._next = -1
+
+    def lend(self) -> LentSteps | None:
+        """For `follower.py`; None: the next sample tells nothing."""
+        if self._number < 0 or self._period_us <= 0.0:
+            return None
+        is_due = self._next == self._number + 1
+        return LentSteps(
+            self._number, self._device_us, self._period_us, self._due_us, self._lag_us, is_due
+        )
+
+    def take_back(self, lent: LentSteps) -> None:
+        """As if `look` had seen all samples until the one of `lent`."""
+        self._number, self._device_us, self._period_us, self._due_us, self._lag_us, is_due = lent
+        self._next = self._number + 1 if is_due else -1
 
     def look(self, number: int, device_us: int) -> int:
         """By how much the clock seems to have been set before this sample, µs; mostly 0."""
