@@ -1,8 +1,10 @@
-"""Who may talk to the server of the browser view, and what a browser may send."""
+"""Who may talk to the server of the browser view, what a browser may send, and what it may save."""
 
 from __future__ import annotations
 
+import csv
 import http.client
+import io
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -10,14 +12,21 @@ import pytest
 
 pytest.importorskip("viser", reason="needs viser")
 
+import numpy as np
 import viser
+from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from cube_tensor_driver.browser.charts import csv_of
 from cube_tensor_driver.browser.controls import ColourControls
 from cube_tensor_driver.browser.gate import check_host, guarded_server, refusal
+from cube_tensor_driver.browser.history import History
 from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.scene import QUANTITIES
+from cube_tensor_driver.plot.live import draw_lines
+from cube_tensor_driver.plot.style import png
 
 HERE = "127.0.0.1"
 
@@ -125,3 +134,26 @@ def test_values_that_no_control_offers_do_no_harm() -> None:
     controls = ColourControls(gui, lambda: None)
     assert controls.quantity in QUANTITIES.values()
     assert controls.top == 0.0
+
+
+def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:
+    """c1 sees σzz and its gradient, no cube sees the others."""
+    zz, zz_x = History.COLUMNS.index("zz"), History.COLUMNS.index("zz_x")
+    history = History(2, 3)
+    for number in range(5):  # two more than are kept
+        values = np.full((2, len(COMPONENTS)), np.nan)
+        values[1, [zz, zz_x]] = -1000.0 * number, 2e6
+        history.add(10 + 0.5 * number, values, np.array([np.nan, 1.25]))
+    table = list(csv.reader(io.StringIO(csv_of(history, [1], ["c0", "c1"]).decode())))
+    assert table == [
+        ["time / s", "c1 zz / Pa", "c1 zz_x / Pa/m", "c1 residual / 1"],
+        ["-1", "-2000", "2e+06", "1.25"],
+        ["-0.5", "-3000", "2e+06", "1.25"],
+        ["0", "-4000", "2e+06", "1.25"],
+    ]
+    panels = [("normal stress / kPa", history.times, {"c1": history.of(1, zz) / 1e3})]
+    (axis,) = (figure := draw_lines(panels)).axes
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("time before now / s", "normal stress / kPa")
+    np.testing.assert_allclose(axis.lines[0].get_xydata(), [[-1, -2], [-0.5, -3], [0, -4]])
+    with Image.open(io.BytesIO(png(figure))) as picture:
+        assert picture.format == "PNG" and min(picture.size) > 400

@@ -14,7 +14,7 @@ from viser import uplot
 
 from ..core.modes import COMPONENTS, STRESS
 from ..plot.live import draw_lines
-from ..plot.style import png
+from ..plot.style import png, symbol
 from . import markup
 from .history import History
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 HISTORY_S = 10.0
 TIME_SCALE = uplot.Scale(time=False, auto=False, range=(-HISTORY_S, 0.0))
-RENEW = 20
+RENEW = 3
 """After so many pictures the charts are laid out again, see `Chart.draw`."""
 MOST_LINES = 12
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9", "#888888")
@@ -44,11 +44,15 @@ AT_FIRST = ("normal stress", "gradient of σzz")
 
 
 class Line(NamedTuple):
-    """One line of a chart: a column of the history of one cube."""
+    """One line of a chart: a column of the history of one cube.
+
+    label, printed: its name on the page, and in a picture with mathematical type.
+    """
 
     cube: int
     column: int
     label: str
+    printed: str
 
 
 class Charts:
@@ -103,7 +107,12 @@ class Charts:
         seen = dict(zip(History.COLUMNS, history.observed, strict=True))
         wanted = [name for name in GROUPS[chart.group] if seen[name]]
         lines = [
-            Line(cube, History.COLUMNS.index(name), f"{self._names[cube]} {markup.label(name)}")
+            Line(
+                cube,
+                History.COLUMNS.index(name),
+                f"{self._names[cube]} {markup.label(name)}",
+                f"{self._names[cube]} {name if name == 'residual' else symbol(name)}",
+            )
             for cube in self._cubes
             for name in wanted
         ]
@@ -201,7 +210,8 @@ class Chart:
     def panel(self, history: History) -> tuple[str, Array, dict[str, Array]]:
         """Label of the values, times and values by the name of the line, as they are shown."""
         lines = zip(self._lines, self._values(history), strict=True)
-        return self._label, history.times, {line.label: values for line, values in lines}
+        label = self._label.replace("σzz", symbol("zz"))
+        return label, history.times, {line.printed: values for line, values in lines}
 
     @property
     def _label(self) -> str:

@@ -83,7 +83,8 @@ def value(quantity: scene.Quantity, shown: float) -> str:
     """A quantity of one cube, SI, with its unit."""
     if np.isnan(shown):
         return "not observed"
-    return f"{quantity.label} {shown / quantity.size:.2f} {quantity.unit}"
+    rounded = round(shown / quantity.size, 2) + 0.0  # of -0.0, 0.0
+    return f"{quantity.label} {rounded:.2f} {quantity.unit}"
 
 
 def clock(seconds: float) -> str:
@@ -119,7 +120,7 @@ def headline(
         f"<span style='color:{dot}'>⬤</span> <b>{word}</b>",
         f"{live} of {len(health)} cubes",
         f"{hertz:.0f} Hz",
-        "no load" if contact is None else newtons(contact),
+        "no load" if contact is None else newtons(contact).replace(" ", "&nbsp;"),
     ]
     if recording:
         parts.append(f"<b style='color:{RED}'>● recording</b>")

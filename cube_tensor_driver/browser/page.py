@@ -30,11 +30,15 @@ MOST_POINTS_PER_SIDE = 12
 BRAND_COLOUR = (24, 100, 171)
 BACKGROUND = (246, 247, 249)
 LEFT_WIDTH = 440.0
-"""Of the panel with the plots, pixels."""
+RIGHT_WIDTH = 320.0
+"""Of the panel with the plots, and of viser's main panel, pixels."""
 CAMERA_POSITION = np.array([0.1, -1.0, 1.05]) * SPAN
 CAMERA_TARGET = np.array([0.0, -0.04, 0.0]) * SPAN
 LOWER_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
 """For phones: their panels cover the lower part of the picture, the skin is above them."""
+NEAREST, NEAREST_WIDTH = 0.95, 0.78
+"""How far the camera is, relative to CAMERA_POSITION, where the picture is wide enough; and where
+it is not, times its width over its height."""
 PAUSE, GO_ON = "pause the page", "go on"
 RECORD, STOP = "record", "stop recording"
 TARE, CLEAR_TARE = "tare", "undo tare"
@@ -243,7 +247,7 @@ class WaitingPage:
 
     def __init__(self, client: viser.ClientHandle, text: str) -> None:
         set_up(client, "no skin yet")
-        self._text = client.gui.add_markdown(text)
+        self._text = client.gui.add_html(markup.PHONE_STYLE + markup.box(text))
         self._label = client.scene.add_label(
             "/waiting", "Waiting for a skin …", anchor="center-center", font_screen_scale=1.6
         )
@@ -265,7 +269,11 @@ def set_up(client: viser.ClientHandle, name: str) -> None:
     client.scene.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8), "png")
     client.gui.set_panel_label(name)
     client.gui.main_panel.dock_right()
-    narrow = client.camera.image_width < client.camera.image_height
-    far, target = (1.6, LOWER_TARGET) if narrow else (0.95, CAMERA_TARGET)
+    width, height = client.camera.image_width, client.camera.image_height
+    narrow = width < height
+    target = LOWER_TARGET if narrow else CAMERA_TARGET
+    # The skin and what stands beside it fill the width that the panels leave.
+    free = width if narrow else max(width - LEFT_WIDTH - RIGHT_WIDTH, 0.3 * width)
+    far = max(NEAREST, NEAREST_WIDTH * height / free)
     client.camera.position = target + far * (CAMERA_POSITION - CAMERA_TARGET)
     client.camera.look_at = target
