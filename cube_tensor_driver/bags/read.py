@@ -36,6 +36,8 @@ PACKAGE = "cube_tensor_driver"
 FREQUENCIES, STRESS, INFO = (
     f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo")
 )
+CONTACTS = f"{PACKAGE}/msg/SkinContacts"
+TRACTION = "sensor_msgs/msg/PointCloud2"
 VERSIONS = (1, 2, 3)
 """Versions of SkinInfo that this package reads."""
 TOGETHER, TOGETHER_BYTES = 64, 1 << 19

@@ -27,6 +27,7 @@ from .mcap import HEAD
 from .message_codec import stress_codec
 from .read import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, typestore
 from .recording import Settings, stamp_ns
+from .reprocess_contacts import ContactsOverTime, ContactWriter
 from .source import BagSource, Segment
 from .tables import TableWriter
 from .write import BagWriter, quality
@@ -61,12 +62,16 @@ AS_RECORDED = Overrides()
 
 @dataclass(frozen=True)
 class ReprocessJob:
-    """One bag to reprocess. form of the output: bag, parquet or csv."""
+    """One bag to reprocess.
+
+    form of the output: bag, parquet or csv; contacts: a bag has them, too
+    """
 
     bag: Path
     output: Path
     form: str
     overrides: Overrides = AS_RECORDED
+    contacts: ContactsOverTime | None = None
 
 
 class ReprocessResult(NamedTuple):
@@ -114,7 +119,7 @@ def _reprocess(bag: Bag, job: ReprocessJob, output: Path) -> ReprocessResult:
         )
     sources = [BagSource(bag, topic) for topic in topics]
     if job.form == "bag":
-        _write_bag(sources, job.overrides, output)
+        _write_bag(sources, job.overrides, job.contacts, output)
     else:
         _write_table(sources[0], job.overrides, output)
     return ReprocessResult(
@@ -124,23 +129,33 @@ def _reprocess(bag: Bag, job: ReprocessJob, output: Path) -> ReprocessResult:
     )
 
 
-def _write_bag(sources: list[BagSource], overrides: Overrides, output: Path) -> None:
+def _write_bag(
+    sources: list[BagSource],
+    overrides: Overrides,
+    contacts: ContactsOverTime | None,
+    output: Path,
+) -> None:
     with BagWriter(output) as writer:
         for source in sources:
             bag, skin = source.bag, source.topic.removesuffix("frequencies")
             settings = settings_with(source, overrides)
             writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
             writer.add_topic(f"{skin}stress", STRESS, [quality()])
-            data = _info_messages(source.recording.infos, settings)
-            for info, one in zip(source.recording.infos, data, strict=True):
+            infos = list(_infos(source.recording.infos, settings))
+            for info in infos:
                 inside_ns = max(bag.start_ns, min(bag.end_ns, stamp_ns(info)))
-                writer.write(f"{skin}info", inside_ns, one)
+                data = bytes(typestore().serialize_cdr(info, INFO))
+                writer.write(f"{skin}info", inside_ns, data)
+            touched = None if contacts is None else ContactWriter(writer, skin, contacts)
             for segment, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):
                 messages = segment.messages
                 records = stress_codec.encode_many(
                     stress, messages.stamp_ns, messages.frame_id, before=HEAD
                 )
                 writer.write_many(f"{skin}stress", segment.recorded_ns, records)
+                if touched is not None:
+                    touched.set_up(infos[segment.number])
+                    touched.write(stress, messages, segment.recorded_ns)
 
 
 def _write_table(source: BagSource, overrides: Overrides, output: Path) -> None:
@@ -262,8 +277,8 @@ def _tared(
     return np.where(exists, total / np.maximum(count, 1), np.nan)
 
 
-def _info_messages(infos: list[Any], settings: list[Settings]) -> Iterator[bytes]:
-    """The recorded infos with other settings, serialised."""
+def _infos(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
+    """The recorded infos with other settings."""
     covariances: dict[str, NDArray[np.float64]] = {}
     for info, one in zip(infos, settings, strict=True):
         first = {
@@ -284,7 +299,7 @@ def _info_messages(infos: list[Any], settings: list[Settings]) -> Iterator[bytes
                 info.cubes, one.calibrations, one.rest_frequency, strict=True
             )
         ]
-        changed = replace(
+        yield replace(
             info,
             version=max(VERSIONS),
             sender="reconstruction",
@@ -293,4 +308,3 @@ def _info_messages(infos: list[Any], settings: list[Settings]) -> Iterator[bytes
             calibrations=[calibration_text(one.calibrations[n]) for n in first.values()],
             covariance=np.array([covariances[key] for key in first]).ravel(),
         )
-        yield bytes(typestore().serialize_cdr(changed, INFO))

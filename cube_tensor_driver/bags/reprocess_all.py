@@ -8,12 +8,14 @@ import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import BagError, ConfigError, CubeError
 from .reprocess import PARTIAL, Overrides, ReprocessJob, ReprocessResult, reprocess
+from .reprocess_contacts import ContactsOverTime
 
 SUFFIX = {"bag": "", "parquet": ".parquet", "csv": ".csv"}
 RECIPE = "reprocess.yaml"
@@ -21,7 +23,11 @@ RECIPE = "reprocess.yaml"
 
 
 def make_jobs(
-    bags: Sequence[Path], folder: Path, form: str, overrides: Overrides
+    bags: Sequence[Path],
+    folder: Path,
+    form: str,
+    overrides: Overrides,
+    contacts: ContactsOverTime | None = None,
 ) -> list[ReprocessJob]:
     """One job per bag, whose name its result has. BagError: two bags have one name."""
     names: dict[str, Path] = {}
@@ -34,12 +40,14 @@ def make_jobs(
             )
         names[name] = bag
     return [
-        ReprocessJob(bag, folder / f"{name}{SUFFIX[form]}", form, overrides)
+        ReprocessJob(bag, folder / f"{name}{SUFFIX[form]}", form, overrides, contacts)
         for name, bag in names.items()
     ]
 
 
-def write_recipe(folder: Path, form: str, overrides: Overrides) -> None:
+def write_recipe(
+    folder: Path, form: str, overrides: Overrides, contacts: ContactsOverTime | None = None
+) -> None:
     """Make the folder and note how its results are made, so that a restart continues the same way.
 
     BagError: results in it were made another way, or it cannot be written.
@@ -51,6 +59,8 @@ def write_recipe(folder: Path, form: str, overrides: Overrides) -> None:
         "skin": {cube.name: cube.calibration.id for cube in cubes} or None,
         "tare_from_s": list(overrides.tare) if overrides.tare else None,
     }
+    if contacts is not None:
+        recipe["contacts"] = {**asdict(contacts.settings), "rate": contacts.rate}
     path = folder / RECIPE
     if path.exists() and has_results(folder):
         if read_yaml(path) != recipe:

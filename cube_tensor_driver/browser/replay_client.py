@@ -11,7 +11,7 @@ from rclpy.task import Future
 from cube_tensor_driver.msg import ReplayState
 from cube_tensor_driver.srv import SteerReplay
 
-from ..ros.skin_subscriber import STALE_S
+from ..core.scene import STALE_S
 from .service_calls import WAIT_S, ServiceCalls
 
 

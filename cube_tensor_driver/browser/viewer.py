@@ -27,10 +27,11 @@ from std_srvs.srv import Trigger
 from cube_tensor_driver.srv import Tare
 
 from ..core.errors import ConfigError
+from ..core.scene import STALE_S
 from ..ros.compat import make_executor
 from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros
-from ..ros.skin_subscriber import STALE_S, FollowedSkin, SkinSubscriber
+from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S

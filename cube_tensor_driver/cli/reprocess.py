@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.defaults import CONTACT_METHODS
 from .parser import Parser, count, number
 
 if TYPE_CHECKING:
     from ..bags.reprocess import Overrides
+    from ..bags.reprocess_contacts import ContactsOverTime
 
 
 def arguments(parser: Parser) -> None:
@@ -47,6 +50,13 @@ def arguments(parser: Parser) -> None:
         help="format of the results (default: %(default)s)",
     )
     parser.add_argument(
+        "--contacts",
+        nargs="+",
+        metavar=("METHOD", "NAME:=VALUE"),
+        help="add contacts and traction, as the node contacts makes them with method:=METHOD and "
+        "its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
+    )
+    parser.add_argument(
         "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"
     )
     parser.add_argument(
@@ -68,9 +78,9 @@ def run(options: argparse.Namespace) -> int:
     )
     from ..terminal.reprocessing import ReprocessingReport
 
-    overrides = overrides_of(options)
-    jobs = make_jobs(options.bags, options.output, options.format, overrides)
-    write_recipe(options.output, options.format, overrides)
+    overrides, contacts = overrides_of(options), contacts_of(options)
+    jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
+    write_recipe(options.output, options.format, overrides, contacts)
     waiting = [job for job in jobs if not job.output.exists()]
     report = ReprocessingReport(options.output, jobs=len(jobs), waiting=len(waiting))
     processes = useful_workers(options.jobs, len(waiting))
@@ -103,3 +113,36 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
     if options.skin is not None:
         skin = read_skin(options.skin)
     return Overrides(calibration, skin, tare)
+
+
+def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
+    """ConfigError: a method or value that the node `contacts` would not take; or a table."""
+    from ..bags.reprocess_contacts import ContactsOverTime
+    from ..core.errors import ConfigError
+    from ..elastic.contact_finder import ContactSettings
+    from ..ros.parameters import CONTACTS
+
+    if options.contacts is None:
+        return None
+    if options.format != "bag":
+        raise ConfigError(f"--contacts with --format {options.format}: only a bag holds contacts")
+    method, *others = options.contacts
+    known = {one.name: one for one in CONTACTS if one.span is not None}
+    if method not in CONTACT_METHODS:
+        raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
+    values = {name: one.default for name, one in known.items()}
+    for text in others:
+        name, _, value = text.partition(":=")
+        if name not in known:
+            raise ConfigError(f"--contacts {text}: use NAME:=VALUE with one of {', '.join(known)}")
+        low, high = known[name].span or (0.0, 0.0)
+        try:
+            values[name] = float(value)
+        except ValueError:
+            values[name] = math.nan
+        if not low <= values[name] <= high:
+            raise ConfigError(f"--contacts {text}: needed is a number from {low:g} to {high:g}")
+    rate = values.pop("rate")
+    settings = ContactSettings(method, **values)
+    settings.check()
+    return ContactsOverTime(settings, rate)

@@ -7,6 +7,10 @@ SURFACE_DEPTH = 4e-3
 CONTACT_PRESSURE = 300.0
 """A contact is where the pressure in the cubes' plane exceeds this, Pa."""
 
+CONTACT_METHODS = ("interpolation", "inverse")
+"""How contacts are found: from the pressure interpolated between the cubes, or from the surface's
+traction through the elastomer."""
+
 YOUNGS_MODULUS = 0.3e6
 """Of the elastomer, Pa: soft silicone."""
 POISSONS_RATIO = 0.48

@@ -37,6 +37,8 @@ HEALTH = ("ok", "doubtful", "no tensor", "stale")
 INVALID; stale: no row came lately."""
 MARK = np.array([GREY, ORANGE, RED, WHITE])
 """Colour of the cross over a cube by its health; a fine cube has none."""
+STALE_S = 1.0
+"""A cube is stale when no row of it has come for so long."""
 FALL = 0.98
 """What an automatic range keeps of its top from one picture to the next."""
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ..config.port import port_problem
-from ..core.defaults import CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
+from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.scene import QUANTITIES
 
 
@@ -125,7 +125,6 @@ MARKERS = (
     ),
     Parameter("crosses", False, "Draw the principal stresses of each cube as a cross."),
 )
-CONTACT_METHODS = ("interpolation", "inverse")
 CONTACTS = (
     *SKIN_SUBSCRIBER,
     Parameter(

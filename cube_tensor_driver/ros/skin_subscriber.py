@@ -17,9 +17,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from cube_tensor_driver.msg import SkinInfo, SkinStress
 
 from ..bags.message_codec import stress_codec
+from ..bags.skin_info import cube_poses, geometry
 from ..core.errors import CubeError, MessageError
-from ..core.scene import CubePoses, Newest
-from ..core.tensor import rotation_from_quaternion
+from ..core.scene import STALE_S, CubePoses, Newest
 from .guard import CallbackGuard
 from .node import CubeNode
 from .parameters import Parameter
@@ -27,8 +27,6 @@ from .parameters import Parameter
 DEPTH = 10
 """A viewer wants the newest messages, not all of them. So its queue is short and it asks for best
 effort: a slow viewer holds up nobody."""
-STALE_S = 1.0
-"""A cube is stale when no row of it has come for so long."""
 ERROR_PERIOD_S = 5.0
 """The log has at most one line about damaged messages in this time."""
 
@@ -77,7 +75,7 @@ class SkinSubscriber:
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def _receive_info(self, info: SkinInfo) -> None:
-        if self.skin is not None and _geometry(self.skin.info) == _geometry(info):
+        if self.skin is not None and geometry(self.skin.info) == geometry(info):
             self.skin.info = info
             return
         try:
@@ -160,34 +158,3 @@ class SkinSubscriberNode(CubeNode):
         message = self.message(skin, skin.newest.health(subscriber.now(), STALE_S))
         if message is not None:
             publisher.publish(message)
-
-
-def cube_poses(info: SkinInfo) -> CubePoses:
-    """Where the cubes of an `info` are, in m.
-
-    CubeError: no cubes, or a pose or size that no cube can have.
-    """
-    if not info.cubes:
-        raise MessageError(f"info of the skin {info.name}: it has no cubes")
-    positions = [cube.pose.position for cube in info.cubes]
-    orientations = [cube.pose.orientation for cube in info.cubes]
-    rotations = [rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w])) for q in orientations]
-    poses = CubePoses(
-        position=np.array([(p.x, p.y, p.z) for p in positions]),
-        rotation=np.array(rotations),
-        half_side=np.array([cube.half_side for cube in info.cubes]),
-    )
-    possible = np.isfinite(poses.position).all(axis=1) & (poses.half_side > 0)
-    possible &= np.isfinite(poses.half_side)
-    for number in np.flatnonzero(~possible).tolist():
-        raise MessageError(
-            f"info of the skin {info.name}: cube {info.cubes[number].name} is at "
-            f"{poses.position[number].tolist()} m with a half side of {poses.half_side[number]} m; "
-            "it needs finite numbers and a size above 0"
-        )
-    return poses
-
-
-def _geometry(info: SkinInfo) -> list[object]:
-    """What makes it another skin for a viewer if it changes."""
-    return [info.header.frame_id, *((cube.name, cube.pose, cube.half_side) for cube in info.cubes)]

@@ -1,0 +1,94 @@
+"""Contacts and the surface's traction out of the stress of a bag: a sink beside its writer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import BagError
+from ..core.rows import StressRows
+from ..core.scene import STALE_S, Newest
+from ..elastic.contact_finder import ContactFinder, ContactSettings, contact_finder
+from .contact_messages import encode_contacts, encode_traction
+from .message_codec import Decoded
+from .read import CONTACTS, TRACTION
+from .skin_info import cube_poses, cubes_noise, geometry
+from .write import BagWriter, quality
+
+
+@dataclass(frozen=True)
+class ContactsOverTime:
+    """settings: how contacts are found; rate: messages per second at most."""
+
+    settings: ContactSettings
+    rate: float
+
+
+class ContactWriter:
+    """Writes `contacts` and `traction` of one skin into a bag, as the node publishes them.
+
+    Parameters: topics: what the skin's topics begin with.
+    """
+
+    def __init__(self, writer: BagWriter, topics: str, wanted: ContactsOverTime) -> None:
+        self._writer, self._wanted = writer, wanted
+        self._period_ns = 1e9 / wanted.rate
+        self._contacts, self._traction = f"{topics}contacts", f"{topics}traction"
+        writer.add_topic(self._contacts, CONTACTS, [quality()])
+        writer.add_topic(self._traction, TRACTION, [quality(depth=2)])
+        self._geometry: list[object] | None = None
+        self._finder: ContactFinder | None = None
+        self._frame_id = ""
+        self._last_ns: int | None = None
+
+    def set_up(self, info: Any) -> None:
+        """For the rows that follow. As in the node, contacts go on where cubes stay in place.
+
+        CubeError: no contacts can be computed on such a skin.
+        """
+        if self._geometry == geometry(info):
+            return
+        poses = cube_poses(info)
+        self._finder = contact_finder(self._wanted.settings, poses, cubes_noise(info))
+        self._newest = Newest(len(info.cubes))
+        self._geometry, self._frame_id = geometry(info), info.header.frame_id
+
+    def write(
+        self, stress: StressRows, messages: Decoded[Any], recorded_ns: NDArray[np.int64]
+    ) -> None:
+        """What M messages of stress say, written when each of them was recorded."""
+        rows = len(stress) // len(messages)
+        begin = 0
+        for number, stamp_ns in enumerate(messages.stamp_ns.tolist()):
+            if not self._is_due(stamp_ns):
+                continue
+            end = (number + 1) * rows
+            self._newest.update(stress.select(slice(begin, end)), stamp_ns * 1e-9)
+            begin = end
+            self._write(stamp_ns, int(recorded_ns[number]))
+        if begin < len(stress):
+            last_ns = int(messages.stamp_ns[-1])
+            self._newest.update(stress.select(slice(begin, len(stress))), last_ns * 1e-9)
+
+    def _is_due(self, stamp_ns: int) -> bool:
+        """Whether a period has passed, or time fell back."""
+        last = self._last_ns
+        if last is not None and 0 <= stamp_ns - last < self._period_ns:
+            return False
+        self._last_ns = stamp_ns
+        return True
+
+    def _write(self, stamp_ns: int, recorded_ns: int) -> None:
+        if self._finder is None:
+            raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
+        values = self._newest.believed(self._newest.health(stamp_ns * 1e-9, STALE_S))
+        contacts = self._finder.update(values)
+        data = encode_contacts(stamp_ns, self._frame_id, contacts)
+        self._writer.write(self._contacts, recorded_ns, data)
+        cloud = self._finder.cloud(values)
+        if cloud is not None:
+            data = encode_traction(stamp_ns, self._frame_id, cloud)
+            self._writer.write(self._traction, recorded_ns, data)

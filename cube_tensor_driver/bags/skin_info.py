@@ -1,0 +1,51 @@
+"""What an `info` says about a skin's cubes; of rclpy's message or of a bag's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import MessageError
+from ..core.modes import COMPONENTS
+from ..core.scene import CubePoses
+from ..core.tensor import rotation_from_quaternion
+
+
+def cube_poses(info: Any) -> CubePoses:
+    """Where the cubes of an `info` are, in m.
+
+    MessageError: no cubes, or a pose or size that no cube can have.
+    """
+    if not info.cubes:
+        raise MessageError(f"info of the skin {info.name}: it has no cubes")
+    positions = [cube.pose.position for cube in info.cubes]
+    orientations = [cube.pose.orientation for cube in info.cubes]
+    rotations = [rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w])) for q in orientations]
+    poses = CubePoses(
+        position=np.array([(p.x, p.y, p.z) for p in positions]),
+        rotation=np.array(rotations),
+        half_side=np.array([cube.half_side for cube in info.cubes]),
+    )
+    possible = np.isfinite(poses.position).all(axis=1) & (poses.half_side > 0)
+    possible &= np.isfinite(poses.half_side)
+    for number in np.flatnonzero(~possible).tolist():
+        raise MessageError(
+            f"info of the skin {info.name}: cube {info.cubes[number].name} is at "
+            f"{poses.position[number].tolist()} m with a half side of {poses.half_side[number]} m; "
+            "it needs finite numbers and a size above 0"
+        )
+    return poses
+
+
+def cubes_noise(info: Any) -> NDArray[np.float64]:
+    """(cubes, 15, 15) covariance of the components of each cube of an `info`."""
+    n = len(COMPONENTS)
+    by_id = dict(zip(info.calibration_ids, np.reshape(info.covariance, (-1, n, n)), strict=True))
+    return np.array([by_id[cube.calibration_id] for cube in info.cubes])
+
+
+def geometry(info: Any) -> list[object]:
+    """What of an `info` makes it another skin if it changes."""
+    return [info.header.frame_id, *((cube.name, cube.pose, cube.half_side) for cube in info.cubes)]

@@ -1,0 +1,96 @@
+"""Contacts of a skin by one of two methods, for those who do not care which one it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
+from ..core.scene import CubePoses
+from .inverse import SurfaceInverse
+from .layer import Layer
+from .surface import Contact, Surface
+from .touches import Touches, TrackedContact
+
+Array = NDArray[np.float64]
+
+INTERPOLATION, INVERSE = CONTACT_METHODS
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """How contacts are found.
+
+    method: of CONTACT_METHODS; depth: from the cubes' centres to the surface, m; least: pressure
+    at the cubes that counts as contact, Pa
+    thickness: of the elastomer over rigid ground, m, 0: a half space; poisson: of the elastomer;
+    both for the method inverse
+    """
+
+    method: str = INTERPOLATION
+    depth: float = SURFACE_DEPTH
+    least: float = CONTACT_PRESSURE
+    thickness: float = 0.0
+    poisson: float = POISSONS_RATIO
+
+    @property
+    def layer(self) -> Layer:
+        """ElasticError: no layer is like that."""
+        return Layer(self.thickness or np.inf, self.poisson)
+
+    def check(self) -> None:
+        """ElasticError: there is no such layer, or it does not have this depth."""
+        self.layer.check_depth(self.depth)
+
+
+class ContactFinder(Protocol):
+    """Finds the contacts of one skin."""
+
+    def update(self, values: Array) -> list[Contact] | list[TrackedContact]:
+        """Contacts of the newest values (cubes, 15), NaN where unknown; strongest first."""
+
+    def cloud(self, values: Array) -> Array | None:
+        """(M, 6) the surface after `update` of these values: place in the skin's parent frame, m,
+        pressure, shear and the standard deviation of the pressure, Pa. None: not known."""
+
+
+def contact_finder(settings: ContactSettings, poses: CubePoses, noise: Array) -> ContactFinder:
+    """noise: (cubes, 15, 15) covariance of the components. ElasticError: nothing to compute with.
+
+    The method inverse takes seconds to set up.
+    """
+    if settings.method == INTERPOLATION:
+        return _Interpolated(settings, poses)
+    return _Followed(settings, poses, noise)
+
+
+class _Interpolated:
+    def __init__(self, settings: ContactSettings, poses: CubePoses) -> None:
+        self._surface, self._least = Surface(poses, settings.depth), settings.least
+
+    def update(self, values: Array) -> list[Contact]:
+        return self._surface.contacts(values, self._least)
+
+    def cloud(self, values: Array) -> None:
+        return None
+
+
+class _Followed:
+    def __init__(self, settings: ContactSettings, poses: CubePoses, noise: Array) -> None:
+        layer, depth = settings.layer, settings.depth
+        self._inverse = SurfaceInverse.of_cubes(poses, noise, layer, depth)
+        self._touches = Touches(self._inverse, settings.least)
+
+    def update(self, values: Array) -> list[TrackedContact]:
+        return self._touches.update(values)
+
+    def cloud(self, values: Array) -> Array | None:
+        field = self._touches.field
+        if field is None:
+            return None
+        shear = np.hypot(field.traction[:, 0], field.traction[:, 1])
+        sigma = self._inverse.deviation(values).pressure
+        return np.column_stack([self._inverse.points, field.pressure, shear, sigma])
