@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from cube_tensor_driver.core.status import (
     REPORTED,
     RESIDUAL,
     SHORT,
+    STAMP,
     STUCK,
 )
 from cube_tensor_driver.simulation.cubes import SimulatedCubes
@@ -130,6 +132,28 @@ def test_a_load_that_moves_while_hubs_stall_is_no_noise():
             )
         begin = end + int(random.integers(0, 99))
     assert not health.collect()[0].any()
+
+
+def test_a_load_that_moves_under_stamps_in_doubt_is_no_noise():
+    """As where the host's clock is being set, and rows are stamped by their arrival: one pad is
+    pressed, and rows seem to come at any distance."""
+    health = Health(Pipeline([CALIBRATION], np.float32))
+    random = np.random.default_rng(4)
+    stress = np.zeros(8)
+    stress[3] = 10e3
+    found = []
+    for doubt in (0, STAMP, 0):
+        for row in range(250):
+            at_s = 1e-9 * PERIOD_NS * row
+            v = stress * np.sin(2 * np.pi * 0.5 * at_s)
+            f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+            f = (f * (1 + NOISE * random.standard_normal(8))).astype(np.float32)
+            late_ns = int(random.integers(0, 8 * PERIOD_NS // 10)) if doubt else 0
+            stamp_ns = [health.newest_ns + PERIOD_NS // 10 + late_ns]
+            rows = stamped([0], f[None], [0], stamp_ns)
+            health.update(replace(rows, status=np.array([doubt], np.uint16)))
+        found.append(health.collect()[0].any())
+    assert found == [False, False, False]
 
 
 class Press:
@@ -339,14 +363,16 @@ def test_a_batch_of_several_scans_is_the_scans_one_after_the_other():
         stamp_ns = PERIOD_NS * (singly.row + np.arange(10))[:, None] + np.arange(6)
         frequency[4, 3, 2] = np.nan
         faults = np.zeros((10, 6), np.uint32)
-        of_batch = together.health.update(
-            stamped(
-                np.tile(singly.cube, 10), frequency.reshape(-1, 8), faults.ravel(), stamp_ns.ravel()
-            )
+        status = np.zeros((10, 6), np.uint16)
+        status[3:5, 2], status[9, 4] = STAMP, STAMP
+        stamp_ns[3:5, 2] += 1_000_000
+        whole_batch = stamped(
+            np.tile(singly.cube, 10), frequency.reshape(-1, 8), faults.ravel(), stamp_ns.ravel()
         )
+        of_batch = together.health.update(replace(whole_batch, status=status.ravel()))
         one_by_one = [
-            singly.health.update(stamped(singly.cube, *one))
-            for one in zip(frequency, faults, stamp_ns, strict=True)
+            singly.health.update(replace(stamped(singly.cube, *one), status=of_scan))
+            for *one, of_scan in zip(frequency, faults, stamp_ns, status, strict=True)
         ]
         for whole, parts in zip(of_batch, zip(*one_by_one, strict=True), strict=True):
             np.testing.assert_array_equal(whole, np.concatenate(parts))

@@ -20,7 +20,7 @@ from .pattern import PatternCache, count_repeats
 from .pipeline import Pipeline
 from .rows import FrequencyRows
 from .statistics import WINDOW_S, Window, WindowStatistics
-from .status import OPEN, RANGE, REPORTED, RESIDUAL, SHORT
+from .status import OPEN, RANGE, REPORTED, RESIDUAL, SHORT, STAMP
 
 BACK_NS = round(2e9 * WINDOW_S)
 """A time further back than this before the window's end is another time: a recording that starts
@@ -171,6 +171,8 @@ class Health:
         pad_fault = rows.pad_fault.reshape(scans)
         stamp_ns = rows.stamp_ns.reshape(scans)
         temperature = rows.temperature.reshape(scans)
+        doubtful = rows.status.reshape(scans) & STAMP != 0
+        in_doubt = bool(doubtful.any())
         newest_ns = stamp_ns.max(axis=1).tolist()
         possible = (frequency > pattern.low) & (frequency < pattern.high)
         healthy = [
@@ -188,7 +190,12 @@ class Health:
             if not healthy[start]:
                 self._mark_impossible(pattern.cube, frequency[start], possible[start])
                 self._mark_reported(pattern.cube, pad_fault[start])
-            self._statistics.add(pattern.cubes, frequency[start:end], stamp_ns[start:end])
+            self._statistics.add(
+                pattern.cubes,
+                frequency[start:end],
+                stamp_ns[start:end],
+                doubtful[start:end] if in_doubt else None,
+            )
             self._rows[pattern.cubes] += end - start
             self.temperature[pattern.cubes] = temperature[end - 1]
             self.newest_ns = newest_ns[end - 1]

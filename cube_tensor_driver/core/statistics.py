@@ -9,8 +9,8 @@ Second differences of white noise with variance s² have variance 6 s² (r = 1).
 slowly leaves nothing in them, also where rows are missing. For the noise each term w e² is bounded,
 so that one jump does not look like noise; for the roughness it is not, else great noise would look
 like a load that moves. r is 1 while two intervals are equal within EVEN, because stamps jitter; w
-is 0 across a gap. Roughness is 3 for noise, and (2 pi F T)² for a load that moves with frequency F,
-sampled with period T.
+is 0 across a gap, and where one of the three stamps is in doubt. Roughness is 3 for noise, and
+(2 pi F T)² for a load that moves with frequency F, sampled with period T.
 
 All arrays are (cubes, pads); nothing loops over cubes.
 
@@ -81,6 +81,7 @@ class WindowStatistics:
         self._gap_before, self._gap_within = np.zeros((2, len(rest_frequency)), np.int64)
         # When the newest row of each cube came, and how long after the one before: 0 is unknown.
         self._time_ns, self._interval_ns = np.zeros((2, len(rest_frequency)), np.int64)
+        self._doubtful = np.zeros(len(rest_frequency), bool)  # the stamp of the newest row
         self._waiting = _WaitingScans(slice(0), np.empty((0, 0, 0)), np.empty((0, 0)))
         self.clear()
 
@@ -115,15 +116,22 @@ class WindowStatistics:
         self._lowest[:] = self._highest[:] = np.nan
         self._gap_before[:] = self._gap_within[:] = 0
 
-    def add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
-        """B scans of the same N cubes: frequency (B, N, P) Hz, stamp_ns (B, N).
+    def add(
+        self,
+        cubes: slice | np.ndarray,
+        frequency: np.ndarray,
+        stamp_ns: np.ndarray,
+        doubtful: np.ndarray | None = None,
+    ) -> None:
+        """B scans of the same N cubes: frequency (B, N, P) Hz, stamp_ns (B, N); doubtful (B, N)
+        bool, the stamps that are in doubt, None: none of them.
 
         Sums go scan by scan, so their bits do not depend on how many scans are added at a time.
         """
         frequency = frequency.astype(np.float32, copy=False)
-        if len(frequency) > 1:
+        if len(frequency) > 1 or doubtful is not None or self._doubtful.any():
             self._add_waiting()
-            self._add(cubes, frequency, stamp_ns)
+            self._add(cubes, frequency, stamp_ns, doubtful)
             return
         if cubes is not self._waiting.cubes:
             self._add_waiting()
@@ -138,11 +146,17 @@ class WindowStatistics:
             waiting.count = 0
             self._add(waiting.cubes, waiting.frequency[:count], waiting.stamp_ns[:count])
 
-    def _add(self, cubes: slice | np.ndarray, frequency: np.ndarray, stamp_ns: np.ndarray) -> None:
+    def _add(
+        self,
+        cubes: slice | np.ndarray,
+        frequency: np.ndarray,
+        stamp_ns: np.ndarray,
+        doubtful: np.ndarray | None = None,
+    ) -> None:
         chosen = self._pads[:, cubes]  # a view for a slice, a copy for an index
         last, difference, first_squares, second_squares, bounded_squares = chosen[:5]
         total, lowest, highest, base, bound = chosen[5:]
-        pace = self._pace(cubes, stamp_ns)
+        pace = self._pace(cubes, stamp_ns, self._doubtful_intervals(cubes, doubtful, len(stamp_ns)))
         first = _differences(last, frequency)
         if pace is None:
             second = _differences(difference, first)
@@ -181,19 +195,33 @@ class WindowStatistics:
             gap_within=self._gap_within.copy(),
         )
 
+    def _doubtful_intervals(
+        self, cubes: slice | np.ndarray, doubtful: np.ndarray | None, scans: int
+    ) -> np.ndarray | None:
+        """(B, N) bool, intervals with a doubtful stamp at one of their ends; None: none."""
+        before = self._doubtful[cubes]
+        if doubtful is None:
+            if not before.any():
+                return None
+            doubtful = np.zeros((scans, len(before)), bool)
+        intervals: np.ndarray = doubtful | np.concatenate([before[None], doubtful[:-1]])
+        self._doubtful[cubes] = doubtful[-1]
+        return intervals
+
     def _pace(
-        self, cubes: slice | np.ndarray, stamp_ns: np.ndarray
+        self, cubes: slice | np.ndarray, stamp_ns: np.ndarray, doubtful: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """r and w (B, N, 1) of B scans from the intervals between the rows of a cube; None where
-        all are 1."""
-        interval = _differences(self._time_ns[cubes], stamp_ns)
+        all are 1. doubtful: (B, N) bool, intervals that are not known."""
+        between = _differences(self._time_ns[cubes], stamp_ns)
+        interval = between if doubtful is None else np.where(doubtful, 0, between)
         before = np.concatenate([self._interval_ns[cubes][None], interval[:-1]])
         self._time_ns[cubes], self._interval_ns[cubes] = stamp_ns[-1], interval[-1]
         even = (interval < EVEN * before) & (before < EVEN * interval)
         short = max(interval.max(), before.max()) < GAP_NS
         if short and even.all():  # as it mostly is: saves a third of the time of `add`
             return None
-        self._note_gaps(cubes, interval)
+        self._note_gaps(cubes, between)
         known = (np.minimum(interval, before) > 0) & (np.maximum(interval, before) < GAP_NS)
         ratio = np.where(known & ~even, interval / np.where(known, before, 1), 1.0)
         weight = known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
