@@ -18,12 +18,17 @@ def no_events_executor() -> None:
 def no_matched_event() -> None:
     import rclpy.event_handler as events
 
-    full = events.PublisherEventCallbacks.__init__
+    of_publisher = events.PublisherEventCallbacks.__init__
+    of_subscription = events.SubscriptionEventCallbacks.__init__
 
-    def __init__(self, *, deadline=None, liveliness=None):
-        full(self, deadline=deadline, liveliness=liveliness)
+    def publisher(self, *, deadline=None, liveliness=None):
+        of_publisher(self, deadline=deadline, liveliness=liveliness)
 
-    events.PublisherEventCallbacks.__init__ = __init__
+    def subscription(self, *, deadline=None, liveliness=None, message_lost=None):
+        of_subscription(self, deadline=deadline, liveliness=liveliness, message_lost=message_lost)
+
+    events.PublisherEventCallbacks.__init__ = publisher
+    events.SubscriptionEventCallbacks.__init__ = subscription
 
 
 def no_callback_after_parameters_are_set() -> None:
@@ -42,6 +47,13 @@ def no_event_handler() -> None:
     sys.modules["rclpy.event_handler"] = None
 
 
+def no_message_numbers() -> None:
+    """The last one: it imports what looks for the others. rclpy itself needs the name."""
+    from cube_tensor_driver.ros import compat
+
+    compat.Subscription = type("Subscription", (), {})
+
+
 FEATURES = {
     remove.__name__: remove
     for remove in (
@@ -49,6 +61,7 @@ FEATURES = {
         no_matched_event,
         no_callback_after_parameters_are_set,
         no_event_handler,
+        no_message_numbers,
     )
 }
 

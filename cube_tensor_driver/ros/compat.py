@@ -2,7 +2,8 @@
 
 A feature is looked for, never the name of a distribution: so a backport is used, and a release that
 nobody has seen yet works. Humble lacks all of these: the EventsExecutor, the event that a
-subscriber came or went, the callback after parameters were set, and the module `event_handler`.
+subscriber came or went, the callback after parameters were set, the numbers of messages, and the
+module `event_handler`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 
 try:
     from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -22,7 +24,14 @@ except ImportError:
         SubscriptionEventCallbacks,
     )
 
-__all__ = ["SubscriptionEventCallbacks", "after_parameters_are_set", "make_executor", "on_matched"]
+__all__ = [
+    "SubscriptionEventCallbacks",
+    "after_parameters_are_set",
+    "make_executor",
+    "on_matched",
+    "subscription_events",
+    "with_number",
+]
 
 
 def make_executor() -> Any:
@@ -48,6 +57,30 @@ def on_matched(callback: Callable[[int], None]) -> PublisherEventCallbacks | Non
         callback(event.current_count)
 
     return PublisherEventCallbacks(matched=matched)
+
+
+def subscription_events(**callbacks: Any) -> SubscriptionEventCallbacks:
+    """Events of a subscription that call back by name, without those that this rclpy lacks."""
+    known = inspect.signature(SubscriptionEventCallbacks).parameters
+    return SubscriptionEventCallbacks(
+        **{name: callback for name, callback in callbacks.items() if name in known}
+    )
+
+
+def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
+    """Of a subscription: call back with each message and the number that DDS gave it among those
+    of its publisher. None: this rclpy, or this DDS, does not say it."""
+    if not hasattr(Subscription, "CallbackType"):
+        return lambda message: callback(message, None)
+
+    def with_info(*arguments: Any) -> None:
+        # The EventsExecutor of Jazzy gives both as one tuple.
+        message, info = arguments if len(arguments) == 2 else arguments[0]
+        callback(message, info.get("publication_sequence_number"))
+
+    # By this rclpy sees that the callback takes both.
+    with_info.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
+    return with_info
 
 
 def after_parameters_are_set(node: Node, callback: Callable[[list[Any]], None]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from contextlib import ExitStack
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
@@ -15,8 +14,9 @@ from ..config.skin import read_skin
 from ..core.errors import CubeError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows
-from .compat import SubscriptionEventCallbacks
+from .compat import with_number
 from .diagnostics import Diagnostics
+from .lost_messages import LostMessages
 from .message_limit import check_scans, scan_limit
 from .messages import info_message
 from .node import LATCHED, CubeNode, batch_queue, run
@@ -56,18 +56,18 @@ class Reconstruction(CubeNode):
         folder = None if self._recorded else tare_folder(self.value("tare_folder"))
         self._taring = Taring(self, skin, reconstructor, folder, self._lock, self._publish_info)
         made.callback(self._taring.close)
-        self._diagnostics = ReconstructionDiagnostics(skin, reconstructor, self._taring)
+        self._lost = LostMessages()
+        self._diagnostics = ReconstructionDiagnostics(skin, reconstructor, self._taring, self._lost)
         uids = self.create_subscription(SkinInfo, "driver/info", self._taring.on_info, LATCHED)
         made.callback(self.destroy_subscription, uids)
         if self._subscribes:
-            lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
             frequencies = self.create_subscription(
                 SkinFrequencies,
                 "frequencies",
-                self._on_frequencies,
+                with_number(self._on_frequencies),
                 quality,
                 raw=True,
-                event_callbacks=lost,
+                event_callbacks=self._lost.events(),
             )
             made.callback(self.destroy_subscription, frequencies)
         self._publish_info()
@@ -84,7 +84,8 @@ class Reconstruction(CubeNode):
     def cleanup(self) -> None:
         self._configured.close()
 
-    def _on_frequencies(self, data: bytes) -> None:
+    def _on_frequencies(self, data: bytes, number: int | None) -> None:
+        self._lost.came(number)
         try:
             message = frequency_codec.decode(data)
         except CubeError as error:
@@ -127,10 +128,6 @@ class Reconstruction(CubeNode):
         self._rest_published = self._reconstructor.rest_changes
         info = info_message(self._skin, self._reconstructor.pipeline, since_ns, self._taring.uids)
         self._info.publish(info)
-
-    def _on_lost(self, event: Any) -> None:
-        """Messages are gone for good: the network or this node was away longer than queues hold."""
-        self._diagnostics.lost_messages = event.total_count
 
     def _statuses(self) -> list[DiagnosticStatus]:
         if not self.configured:

@@ -13,6 +13,9 @@ from ..core.rows import StressRows
 from ..core.status import INVALID
 from .cube_health import CubeHealth
 from .diagnostics import make_status
+from .lost_messages import LostMessages
+
+LOST_WHERE = "by the network, or this node was too late for its queue"
 
 
 class TareState(Protocol):
@@ -24,12 +27,13 @@ class TareState(Protocol):
 
 
 class ReconstructionDiagnostics:
-    """Counts what the node does. lost_messages: so far, as DDS says; bad_messages: refused."""
+    """Counts what the node does. bad_messages: refused."""
 
-    def __init__(self, skin: Skin, reconstructor: Reconstructor, tare: TareState) -> None:
-        self.lost_messages = 0
+    def __init__(
+        self, skin: Skin, reconstructor: Reconstructor, tare: TareState, lost: LostMessages
+    ) -> None:
         self.bad_messages = 0
-        self._skin, self._tare = skin, tare
+        self._skin, self._tare, self._lost = skin, tare, lost
         self._cubes = CubeHealth(skin, reconstructor)
         self._rows = self._invalid = 0
         self._rows_before = self._lost_before = 0  # at the last diagnostics
@@ -47,14 +51,14 @@ class ReconstructionDiagnostics:
             "rows": self._rows,
             "rows per second": self._rows - self._rows_before,
             "invalid rows": self._invalid,
-            "messages lost on the way": self.lost_messages,
+            "messages lost on the way": self._lost.count,
             "messages that contradict themselves": self.bad_messages,
             **self._tare.age(),
             **self._cubes.summary(),
         }
-        lost = self.lost_messages - self._lost_before
-        self._rows_before, self._lost_before = self._rows, self.lost_messages
-        text = f"{lost} messages lost on the way: check the network" if lost > 0 else ""
+        lost = self._lost.count - self._lost_before
+        self._rows_before, self._lost_before = self._rows, self._lost.count
+        text = f"{lost} messages lost on the way: {LOST_WHERE}" if lost > 0 else ""
         level = DiagnosticStatus.WARN if self.bad_messages or text else DiagnosticStatus.OK
         return [make_status("rows", self._skin.name, level, text, values), *cubes], lines
 
