@@ -7,21 +7,31 @@ from numpy.typing import NDArray
 
 from ..simulation.sample_log import LinkLog, SampleLog
 from .frequencies import FrequencyVerdict
-from .record import Record
+from .record import NEW_DRIVER, Record
 from .samples import NONE, Samples
+from .tensors import TensorVerdict
 
 NEAR_ZERO = 1 << 20
 """A hub that begins to count above this has been made to wrap: its first samples are not counted
 from 0."""
 
 
-def miscounted(
-    record: Record, log: SampleLog, samples: Samples, verdict: FrequencyVerdict
-) -> dict[str, int]:
-    """Rows that the driver counted wrongly.
+SAID_EVERY_NS = 1_500_000_000
+"""What a driver counted so shortly before it was killed, it may not have said."""
 
-    The last samples of a hub before it lost its power or restarted are nobody's to know; all others
-    that did not come must be counted, and no more.
+
+def miscounted(
+    record: Record,
+    log: SampleLog,
+    samples: Samples,
+    verdict: FrequencyVerdict,
+    tensors: TensorVerdict,
+) -> dict[str, int]:
+    """Rows that the driver counted wrongly, and messages that the reconstruction says it lost
+    although it had them.
+
+    The last samples of a hub before it lost its power or restarted are nobody's to know, nor those
+    around the death of a driver; all others that did not come must be counted, and no more.
     """
     counters = record.counters
     each = len(record.skin.cubes) // len(record.skin.links)
@@ -30,20 +40,33 @@ def miscounted(
         lost + counters["rows of unknown cubes"] + counters["rows with another number of pads"]
     )
     # The driver counts on until it is stopped.
-    missing, at_end = int(verdict.missing[verdict.judged].sum()), int(verdict.missing.sum())
+    known = verdict.judged & ~_near_death(record, samples.time_ns)
+    missing, at_end = int(verdict.missing[known].sum()), int(verdict.missing.sum())
     unknowable = _lost_with_power(record, log, samples, verdict)
-    published = counters["rows published"]
+    published, came = counters["rows published"], len(record.frequencies.rows)
+    unsaid = int(np.count_nonzero(_near_death(record, record.frequencies.sent_ns)))
+    wrong = 0
     # Without a number of rows of what did not come here nobody can say how many there were.
-    came = len(record.frequencies.rows)
-    wrong = 0 if record.frequencies.missed else abs(published - came)
     if not record.frequencies.missed:
+        wrong += max(0, published - came) + max(0, came - unsaid - published)
         wrong += max(0, missing - unknowable - counted) + max(0, counted - at_end)
+        wrong += max(0, record.messages_lost - tensors.without)
     return {
         "miscounted": wrong + counters["rows unaccounted"] + counters["rows lost by errors"],
+        "messages_lost": record.messages_lost,
         "counted": counted,
         "missing": missing,
         "lost_with_power": unknowable,
     }
+
+
+def _near_death(record: Record, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(N,) times in which a driver counted what it could not say any more, or there was none."""
+    near = np.zeros(len(time_ns), bool)
+    for deed in record.deeds:
+        if deed.kind in NEW_DRIVER:
+            near |= (time_ns > deed.begin_ns - SAID_EVERY_NS) & (time_ns < deed.end_ns)
+    return near
 
 
 def _lost_with_power(

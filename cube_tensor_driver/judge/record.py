@@ -69,8 +69,10 @@ class CubeMessages:
     wrenches: tuple[Wrench, ...]
 
 
-STOPPING = ("cycle driver",)
-"""Deeds that stop the hubs for a while."""
+NEW_DRIVER = ("restart driver",)
+"""Deeds that kill the driver and start it again."""
+STOPPING = ("cycle driver", *NEW_DRIVER)
+"""Deeds during which nobody takes what the hubs send."""
 DOWN = ("restart reconstruction", "reconfigure reconstruction")
 """Deeds during which there is no reconstruction."""
 
@@ -100,7 +102,8 @@ class Record:
     """All that came of a tortured skin.
 
     instants: how many instants of the load the hubs repeat
-    counters: of the driver, summed over all links, and of all rows; the newest
+    counters: of the driver, summed over all links, and of all rows; the newest, summed over its
+        lives
     messages_lost: that the reconstruction says it lost on the way, of all its lives
     begin_ns, end_ns: samples that were taken in this time (wall clock) are judged
     """

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ..core.status import STAMP
 from ..simulation.sample_log import SampleLog
-from .record import Record
+from .record import NEW_DRIVER, Record
 from .samples import NONE, Samples
 
 SETTLE_S = 6.0
-"""After a restart of a hub, until its stamps are judged: drift is known then."""
+"""After a restart of a hub or of the driver, until stamps are judged: drift is known then."""
 CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "drift")
 """What makes the driver fit a hub's clock from the start."""
 
@@ -47,4 +47,8 @@ def _settled(record: Record, log: SampleLog, samples: Samples) -> NDArray[np.boo
                 seconds <= 1e-6 * fault.end_us + SETTLE_S
             )
             settled &= ~((samples.link == numbers[fault.fault.link]) & near)
+    for deed in record.deeds:
+        if deed.kind in NEW_DRIVER:
+            end_ns = deed.end_ns + round(1e9 * SETTLE_S)
+            settled &= (samples.time_ns < deed.begin_ns) | (samples.time_ns > end_ns)
     return settled

@@ -17,7 +17,7 @@ from ..core.pipeline import Pipeline
 from ..core.rows import FrequencyRows, StressRows
 from ..core.status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .expected import Expected
-from .record import DOWN, Record
+from .record import DOWN, NEW_DRIVER, Record
 from .rest import RestEpochs
 from .samples import CHUNK, NONE
 
@@ -37,9 +37,6 @@ GAP_NS = 50_000_000
 """How far rows of a message that did not come here may be from those around it."""
 NEAR = 200
 """Rows before and behind a pause of the reconstruction whose stamps say when it was."""
-LATE_NS = 1_000_000_000
-"""Queues hold the messages of 2 s, less where late rows have messages of their own. What a process
-is too busy for beyond that is dropped by DDS, which does not tell anybody."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +48,7 @@ class TensorVerdict:
     wrong: differ from the reference, or from the load
     invented: made from no row that came; repeated: from one that had its tensor already
     missing: rows of frequencies without a tensor that nothing explains
+    without: messages of frequencies of which no row has a tensor
     """
 
     source: NDArray[np.int64]
@@ -59,6 +57,7 @@ class TensorVerdict:
     invented: int
     repeated: int
     missing: int
+    without: int
     examples: tuple[str, ...]
 
 
@@ -72,18 +71,19 @@ def judge_tensors(
     known = np.flatnonzero(source != NONE)
     times = np.bincount(source[known], minlength=len(frequencies))
     missing = _missing(record, times == 0)
+    sent_ns = record.frequencies.sent_ns
     epochs = RestEpochs(record, expected, start_time_ns)
     reference = Reference(record, expected)
     bad = np.zeros(len(stress), bool)
     for at in range(0, len(known), CHUNK):
         chosen = known[at : at + CHUNK]
         made, measured = stress.select(chosen), frequencies.select(source[chosen])
-        sent_ns = record.stress.sent_ns[chosen]
+        made_ns = record.stress.sent_ns[chosen]
         right = np.zeros(len(chosen), bool)
-        for rest, applies in epochs.choices(sent_ns):
+        for rest, applies in epochs.choices(made_ns):
             right |= applies & reference.agrees(made, measured, rest)
         right &= reference.agrees_with_load(
-            made, sample[source[chosen]], epochs.untared(made.cube, sent_ns)
+            made, sample[source[chosen]], epochs.untared(made.cube, made_ns)
         )
         bad[chosen] = ~right
     examples = [_say("wrong tensor", stress, row, start_time_ns) for row in np.flatnonzero(bad)[:4]]
@@ -101,6 +101,7 @@ def judge_tensors(
         invented=int(np.count_nonzero(invented)),
         repeated=int(np.maximum(times - 1, 0).sum()),
         missing=int(np.count_nonzero(missing)),
+        without=len(np.setdiff1d(sent_ns, sent_ns[times > 0])),
         examples=tuple(examples),
     )
 
@@ -195,40 +196,25 @@ def _find(keys: NDArray[np.uint64], wanted: NDArray[np.uint64]) -> NDArray[np.in
 def _missing(record: Record, without: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(N,) rows of the judged time without a tensor that nothing explains.
 
-    What explains them: messages that did not come here; a reconstruction that was down, from the
-    newest row before that had its tensor to the first one after; messages that it says it lost; and
-    tensors of that time that were sent so late that its queue was full.
+    What explains them: messages that did not come here; a node that was down, from the newest row
+    before that had its tensor to the first one after; and as many messages as the reconstruction
+    says that it lost.
     """
     frequencies, stress = record.frequencies.rows, record.stress.rows
     judged = (frequencies.stamp_ns >= record.begin_ns) & (frequencies.stamp_ns < record.end_ns)
     missing = without & judged & ~record.stress.in_gap(frequencies.stamp_ns, GAP_NS)
     for deed in record.deeds:
-        if deed.kind in DOWN:
+        if deed.kind in (*DOWN, *NEW_DRIVER):
             before, after = deed.stress_rows
             begin_ns = stress.stamp_ns[max(0, before - NEAR) : before].min(initial=2**62)
             end_ns = stress.stamp_ns[after : after + NEAR].max(initial=0)
             down = (frequencies.stamp_ns >= begin_ns) & (frequencies.stamp_ns <= end_ns + GAP_NS)
             missing &= ~down
-    missing &= ~_overrun(record, frequencies.stamp_ns)
-    # Rows of one message have neighbours without a tensor, too.
-    messages = np.count_nonzero(np.diff(np.flatnonzero(missing), prepend=-2) != 1)
+    # Rows of one message were sent at one time.
+    messages = len(np.unique(record.frequencies.sent_ns[missing]))
     if messages <= record.messages_lost:
         missing[:] = False
     return missing
-
-
-def _overrun(record: Record, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(N,) whether rows of these stamps are within LATE_NS of rows whose tensors were so late."""
-    stress = record.stress
-    late = np.sort(stress.rows.stamp_ns[stress.sent_ns - stress.rows.stamp_ns > LATE_NS])
-    if not len(late):
-        return np.zeros(len(stamp_ns), bool)
-    place = np.searchsorted(late, stamp_ns)
-    before, after = late[np.maximum(place - 1, 0)], late[np.minimum(place, len(late) - 1)]
-    near: NDArray[np.bool_] = (np.abs(stamp_ns - before) <= LATE_NS) | (
-        np.abs(after - stamp_ns) <= LATE_NS
-    )
-    return near
 
 
 def _say(what: str, rows: FrequencyRows | StressRows, row: int, start_time_ns: int) -> str:

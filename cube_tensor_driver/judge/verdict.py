@@ -33,7 +33,7 @@ def judge(record: Record, log: SampleLog) -> dict[str, Any]:
     )
     health = judge_verdicts(record, samples, expected, of_stress, log.start_time_ns)
     stamps = stamp_errors_ms(record, log, samples, frequencies.sample)
-    claims = miscounted(record, log, samples, frequencies)
+    claims = miscounted(record, log, samples, frequencies, tensors)
     gaps = _reconnects_s(record, log, samples, frequencies.missing)
     examples = [*frequencies.examples, *tensors.examples, *health.examples]
     return {

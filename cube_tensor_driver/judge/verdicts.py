@@ -19,7 +19,7 @@ from ..core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
 from ..simulation.faults import CUT_FAULTS, PAD_FAULTS
 from ..simulation.sample_log import FaultRecord
 from .expected import EDGE_US, Expected
-from .record import DOWN, Record
+from .record import DOWN, NEW_DRIVER, Record
 from .samples import NONE, Samples
 
 BIT = {"open": OPEN, "short": SHORT, "stuck": STUCK, "noisy": NOISY, "report": REPORTED}
@@ -135,7 +135,7 @@ class _Evidence:
 
     def _is_disturbed(self, begin_us: int, end_us: int) -> bool:
         """Whether statistics began anew: rows that come late, after a cut of any link, end a
-        window; a reconstruction that starts has none."""
+        window; a node that starts has none."""
         margin_us = 1_000_000
         cuts = self._expected.records(*CUT_FAULTS)
         if any(
@@ -147,7 +147,7 @@ class _Evidence:
         return any(
             deed.begin_ns - 2e9 < end_ns and deed.end_ns + 2e9 > begin_ns
             for deed in self._record.deeds
-            if deed.kind in DOWN
+            if deed.kind in (*DOWN, *NEW_DRIVER)
         )
 
     def _is_complete(self, cube: int, begin_us: int, end_us: int) -> bool:

@@ -39,7 +39,7 @@ LIMITS = {
     "threads_leaked": 0.0,
     "rss_slope_mb_per_min": 5.0,
     "worst_reconnect_s": 3.0,
-    "stamp_error_p50_ms": 0.7,
+    "stamp_error_p50_ms": 0.3,
     "stamp_error_p90_ms": 1.5,
     "stamp_error_p99_ms": 10.0,
 }

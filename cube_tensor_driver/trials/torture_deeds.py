@@ -36,6 +36,10 @@ it."""
 LATE_NS = 500_000_000
 """Where the newest row of stress is older the host is too busy for a tare, and may refuse it."""
 SUBSCRIBER = "markers"
+TRANSITIONS = "driver/transition_event"
+"""A topic that the driver has as soon as it can be configured."""
+FLUSH_S = 0.3
+"""Until what a process sent just before its death has come."""
 
 
 class Deeds:
@@ -48,11 +52,13 @@ class Deeds:
         processes: Mapping[str, Process],
         skin: Skin,
         stress: Tape[StressRows],
+        new_driver: Callable[[], None],
     ) -> None:
+        """new_driver: called when the driver is dead and what it sent has come."""
         self.done: list[Deed] = []
         self.refused: list[str] = []
         self._observer, self._children, self._processes = observer, children, processes
-        self._skin, self._stress = skin, stress
+        self._skin, self._stress, self._new_driver = skin, stress, new_driver
         node = observer.node
         self._states = {
             name: node.create_client(ChangeState, f"{name}/change_state")
@@ -65,8 +71,14 @@ class Deeds:
     def start_driver(self, pipe: Path) -> None:
         """Activate the driver when both ends of every topic know each other, so that the first
         sample is received too. CubeError: it did not become active."""
+        self._observer.spin(START_S, self._states["driver"].service_is_ready)
+        if not self._activate_driver(set(), pipe.exists):
+            log = self._children.log("driver")[-1500:]
+            raise CubeError(f"the driver did not become active:\n{log}")
+
+    def _activate_driver(self, old: set[bytes], ready: Callable[[], bool]) -> bool:
+        """old: publishers of `frequencies` that are dead, as far as DDS has not noticed it."""
         observer, node = self._observer, self._observer.node
-        observer.spin(START_S, self._states["driver"].service_is_ready)
         # Whether this one succeeded shows at the next: a request that is sent again is refused.
         self._change("driver", Transition.TRANSITION_CONFIGURE)
         observer.spin(
@@ -75,14 +87,17 @@ class Deeds:
                 node.count_publishers("stress") > 0
                 and node.count_subscribers("stress") > 1
                 and node.count_subscribers("frequencies") > 1
-                and node.count_publishers("frequencies") > 0
-                and pipe.exists()
+                and bool(self._publishers("frequencies") - old)
+                and ready()
             ),
         )
         observer.spin(1.0)
-        if not self._change("driver", Transition.TRANSITION_ACTIVATE):
-            log = self._children.log("driver")[-1500:]
-            raise CubeError(f"the driver did not become active:\n{log}")
+        return self._change("driver", Transition.TRANSITION_ACTIVATE)
+
+    def _publishers(self, topic: str) -> set[bytes]:
+        """Of a topic, each by its id in DDS."""
+        found = self._observer.node.get_publishers_info_by_topic(topic)
+        return {bytes(publisher.endpoint_gid) for publisher in found}
 
     def stop_driver(self) -> None:
         self._change("driver", Transition.TRANSITION_DEACTIVATE)
@@ -99,6 +114,7 @@ class Deeds:
             "restart reconstruction": self._restart,
             "reconfigure reconstruction": self._reconfigure,
             "cycle driver": self._cycle_driver,
+            "restart driver": self._restart_driver,
         }
         before, self._begin_ns = self._stress.rows_so_far(), time.time_ns()
         done, answer = deeds[kind]()
@@ -166,6 +182,18 @@ class Deeds:
     def _cycle_driver(self) -> tuple[bool, str]:
         both = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE)
         return all(self._change("driver", transition) for transition in both), ""
+
+    def _restart_driver(self) -> tuple[bool, str]:
+        old = self._publishers("frequencies")
+        changes = self._publishers(TRANSITIONS)
+        self._children.kill("driver")
+        self._observer.spin(FLUSH_S)
+        self._new_driver()
+        self._children.start(self._processes["driver"])
+        self._observer.spin(START_S, lambda: bool(self._publishers(TRANSITIONS) - changes))
+        if not self._activate_driver(old, lambda: True):
+            return False, self._children.log("driver")[-500:]
+        return self._wait_for_stress()
 
     def _wait_for_stress(self) -> tuple[bool, str]:
         count = self._stress.count

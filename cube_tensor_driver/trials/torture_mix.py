@@ -20,6 +20,7 @@ DEEDS = {
     "restart reconstruction": "kill the process and start it again",
     "reconfigure reconstruction": "deactivate, clean up, configure and activate it",
     "cycle driver": "deactivate and activate it",
+    "restart driver": "kill the process and start it again",
 }
 """What is done to the nodes."""
 ROUND_S = 30.0
@@ -37,8 +38,11 @@ ROUND: tuple[tuple[float, dict[str, Any]], ...] = (
     (17.5, {"deed": "reconfigure reconstruction"}),
     (19.5, {"deed": "cycle driver"}),
     (21.5, {"deed": "stall subscriber", "seconds": 3.0}),
+    (25.5, {"deed": "restart driver"}),
 )
 """What comes in each round, in s after its begin."""
+ONCE = ("restart reconstruction", "restart driver")
+"""Only in the first round: memory is judged by how it grows in the life of a process."""
 HELD_HUB = 0
 """The hub whose load stays for the tare, and that nothing else happens to then."""
 QUIET_S = (4.0, 7.0)
@@ -71,9 +75,7 @@ def schedule(duration: float, seed: int) -> Iterator[tuple[float, dict[str, Any]
 
     for start in np.arange(0.0, max(end, 0.1), ROUND_S).tolist():
         for after, event in ROUND:
-            if start + after < end and (
-                start == 0 or event.get("deed") != "restart reconstruction"
-            ):
+            if start + after < end and (start == 0 or event.get("deed") not in ONCE):
                 add(start + after, **event)
     at = 0.0
     while (at := at + random.exponential(0.15)) < duration:

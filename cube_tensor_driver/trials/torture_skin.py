@@ -84,7 +84,14 @@ def play(
             children.start(process)
         memory = Memory(children, NODES)
         with _recording(skin, children, interrupted, memory) as recorder:
-            deeds = Deeds(recorder.observer, children, processes, skin, recorder.stress)
+            deeds = Deeds(
+                recorder.observer,
+                children,
+                processes,
+                skin,
+                recorder.stress,
+                recorder.new_driver,
+            )
             deeds.start_driver(ports / FAULT_PIPE)
             began_s, begin_ns = time.monotonic(), time.time_ns()
             observer = recorder.observer
@@ -181,6 +188,7 @@ class _Recorder:
         self._cube = CubeTape(node, skin, LISTENED_CUBE, quality)
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
+        self._before: Counter[str] = Counter()  # of the driver's earlier lives
         self._messages_lost = [0]  # by the reconstruction, in each of its lives
         self._counters_ns = 0
         self._grew_s, self._size = time.monotonic(), 0
@@ -202,13 +210,24 @@ class _Recorder:
         for a while."""
         return self._counters_ns > stopped_ns and time.monotonic() - self._grew_s > QUIET_S
 
+    def new_driver(self) -> None:
+        """The driver was killed; another one counts from 0."""
+        self.frequencies.new_writer()
+        self._before.update(self._counters())
+        self._links.clear()
+        self._totals.clear()
+
+    def _counters(self) -> dict[str, int]:
+        """Of the driver's present life."""
+        links = self._links.values()
+        of_links = {name: sum(int(link.get(name, 0)) for link in links) for name in COUNTERS}
+        return {**of_links, **{name: int(value) for name, value in self._totals.items()}}
+
     def record(self, begin_ns: int, end_ns: int, deeds: list[Deed]) -> Record:
         """All of it. MessageError: nothing came."""
         self.take()
-        counters = {
-            name: sum(int(link.get(name, 0)) for link in self._links.values()) for name in COUNTERS
-        }
-        totals = {name: int(value) for name, value in self._totals.items()}
+        counters = Counter(self._counters())
+        counters.update(self._before)
         return Record(
             skin=self._skin,
             instants=INSTANTS,
@@ -216,7 +235,7 @@ class _Recorder:
             stress=self.stress.received(),
             cube_messages=self._cube.received(),
             deeds=tuple(deeds),
-            counters={**counters, **totals},
+            counters=counters,
             messages_lost=sum(self._messages_lost),
             begin_ns=begin_ns,
             end_ns=end_ns,
