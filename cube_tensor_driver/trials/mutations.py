@@ -27,9 +27,10 @@ from ..device import decoder, link
 from ..device.chain import LiveLinks
 from ..device.sequence import Account, Arrival
 from ..processes.skin_processes import Process
-from ..ros import cube_topics
+from ..ros import cube_topics, node
 from ..ros.cube_topics import CubeTopics
 from ..ros.frequencies_publisher import FrequenciesPublisher
+from ..ros.lost_messages import LostMessages
 from ..ros.stress_publisher import StressPublisher
 from ..ros.taring import Taring
 
@@ -288,6 +289,11 @@ def _no_tare(original: Any, self: Any, *arguments: Any) -> Any:
     return rest
 
 
+def _short_queue() -> None:
+    node.PAUSE_S = 0.1
+    _around(LostMessages, "came", _nothing)()
+
+
 def _nothing(*_: Any) -> None:
     """Instead of what should be done."""
 
@@ -343,6 +349,7 @@ DRIVER: dict[str, tuple[str, Patch]] = {
 RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
     "lost stress": ("1 of 200 messages of stress is not sent", _repeated(StressPublisher, 0)),
     "stress twice": ("1 of 200 messages of stress is sent twice", _repeated(StressPublisher, 2)),
+    "losses unseen": ("queues hold 0.1 s, and nobody counts what they drop", _short_queue),
     "blind": ("health finds and flags nothing", _around(Health, "update", _see_nothing)),
     "ghosts": ("health flags a sound pad", _around(Health, "update", _see_ghosts)),
     "never stuck": ("stuck pads are not found", _around(PadDiagnosis, "_stuck", _never_found)),
