@@ -34,6 +34,7 @@ from ..core.modes import STRESS
 from ..core.pipeline import Pipeline
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
+from .cache import cached
 from .kernels import Kernels
 from .layer import Layer
 from .surface import patches
@@ -234,13 +235,32 @@ class _Windows:
         looks = [np.round(look / _SAME / 10) for look in looks]
         self.kind = _distinct(np.concatenate([*looks, noise_kind[self.near]], axis=1))
         kinds, first = np.unique(self.kind, return_index=True)
-        parts = [
-            _solve(inverse, place[one], angle[one], inverse.noise[self.near[one]]) for one in first
+
+        def solve() -> dict[str, NDArray[Any]]:
+            """The matrices of the kinds, each written in its place: together they may be large."""
+            solved: dict[str, NDArray[Any]] = {}
+            for number, one in enumerate(first):
+                noise = inverse.noise[self.near[one]]
+                window = _solve(inverse, place[one], angle[one], noise)._asdict()
+                for name, array in window.items():
+                    whole = solved.setdefault(
+                        name, np.empty((len(first), *array.shape), array.dtype)
+                    )
+                    whole[number] = array
+            return solved
+
+        layer, kernels = inverse.kernels.layer, inverse.kernels
+        key: list[Any] = [
+            layer.thickness,
+            layer.poisson,
+            kernels.depth,
+            kernels.scale,
+            inverse.spacing,
         ]
-        self.gain = np.array([part.gain for part in parts])
-        self.precision = np.array([part.precision for part in parts])
-        self.prior = np.array([part.variance for part in parts])
-        self.noise = np.array([part.noise for part in parts])
+        key += [inverse.side, inverse.columns, place[first], angle[first]]
+        solved = cached("windows", [*key, inverse.noise[self.near[first]]], solve)
+        self.gain, self.precision = solved["gain"], solved["precision"]
+        self.prior, self.noise = solved["variance"], solved["noise"]
         counts = np.bincount(self.kind)
         self._many = [
             (kind, np.flatnonzero(self.kind == kind)) for kind in kinds if counts[kind] > 1

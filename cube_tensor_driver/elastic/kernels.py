@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import jv
 
 from ..core.modes import COMPONENTS, STRESS
+from .cache import cached
 from .layer import FIELD, Layer
 
 Array = NDArray[np.float64]
@@ -57,10 +58,22 @@ class Kernels:
     """
 
     def __init__(self, layer: Layer, depth: float, scale: float) -> None:
-        """Raises ElasticError where the layer has no such depth. Takes a few seconds."""
+        """Raises ElasticError where the layer has no such depth. Takes a few seconds the first time
+        (cache.py)."""
+        layer.check_depth(depth)
         self.layer, self.depth, self.scale = layer, depth, scale
         self._row_scale = np.where(np.arange(len(COMPONENTS)) < len(STRESS), 1.0, scale)
         self.step, self._last = depth / _PER_DEPTH, _REACH * _PER_DEPTH
+        key = [layer.thickness, layer.poisson, depth]
+        tables = cached("kernels", key, self._tables)
+        self._cross, self._covariance = tables["cross"], tables["covariance"]
+        self._response = tables["response"]
+        self.variance = np.array([SHEAR**2, SHEAR**2, 1.0])
+        self.pressure_variance = float(self._covariance[1, _ZZ, _ZZ])
+
+    def _tables(self) -> dict[str, Array]:
+        """cross (places, 24, 3), covariance (places, 24, 24), response (sizes, places, 24, 3)."""
+        layer, depth = self.layer, self.depth
         nodes, weights = np.polynomial.legendre.leggauss(_WAVES)
         k = np.asarray((nodes + 1) * _GREATEST / depth / 2)
         weight = np.asarray(weights * _GREATEST / depth / 2)
@@ -70,12 +83,12 @@ class Kernels:
         # (-1, 0, ...) steps: cubic interpolation needs one more on the left.
         places: Array = np.arange(-1.0, self._last + 3) * self.step
         bessel = _Bessel(places, k, weight)
-        self._cross = bessel.line(weighted)
-        self._covariance = bessel.line(weighted @ transfer.conj().swapaxes(2, 3))
         discs = [_disc(k * size * depth)[:, None, None, None] for size in SIZES]
-        self._response = np.stack([bessel.line(transfer * disc) for disc in discs])
-        self.variance = np.array([SHEAR**2, SHEAR**2, 1.0])
-        self.pressure_variance = float(self._covariance[1, _ZZ, _ZZ])
+        return {
+            "cross": bessel.line(weighted),
+            "covariance": bessel.line(weighted @ transfer.conj().swapaxes(2, 3)),
+            "response": np.stack([bessel.line(transfer * disc) for disc in discs]),
+        }
 
     def response(self, place: Array, angle: Array, size: float) -> Array:
         """(N, 15, 3) of cubes at `place` from the middle of a disc with force 1 N; size: m."""
