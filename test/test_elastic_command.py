@@ -24,6 +24,7 @@ from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import memory
 from cube_tensor_driver.research import paper
 from cube_tensor_driver.research.layout_study import LayoutStudy
+from cube_tensor_driver.terminal.output import progress_bar
 
 NARROW = bodies.Body(width=20e-3)
 SMALL = ("--width", "20", "--height", "12", "--meshes", "2")
@@ -385,6 +386,13 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
         "never",
     ] in rows
     assert (tmp_path / "s.png").stat().st_size > 10_000
+
+
+def test_a_file_gets_no_progress_bar(capsys):
+    """Not even an empty line: errors follow on stderr."""
+    with progress_bar() as report:
+        report(1, 2, "half of it")
+    assert capsys.readouterr() == ("", "")
 
 
 def test_paper_makes_its_pictures(monkeypatch, tmp_path):

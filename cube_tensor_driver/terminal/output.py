@@ -15,6 +15,10 @@ from rich.text import Text
 def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
     """A bar of one line on stderr, where that is a terminal; yields report(done, total, what)."""
     console = Console(stderr=True)
+    if not console.is_terminal:
+        # rich 11 ends even a bar that is disabled with an empty line.
+        yield lambda done, total, what: None
+        return
     what_column = TextColumn(
         "{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)
     )
@@ -26,7 +30,6 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
         console=console,
         transient=True,
         expand=True,
-        disable=not console.is_terminal,
     )
     with bar:
         task = bar.add_task("meshing", total=1.0)
