@@ -18,7 +18,7 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from cube_tensor_driver.browser.charts import csv_of
+from cube_tensor_driver.browser.charts import csv_of, round_range
 from cube_tensor_driver.browser.controls import ColourControls
 from cube_tensor_driver.browser.gate import check_host, guarded_server, refusal
 from cube_tensor_driver.browser.history import History
@@ -157,3 +157,16 @@ def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:
     np.testing.assert_allclose(axis.lines[0].get_xydata(), [[-1, -2], [-0.5, -3], [0, -4]])
     with Image.open(io.BytesIO(png(figure))) as picture:
         assert picture.format == "PNG" and min(picture.size) > 400
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ((-14.6, 0.01), (-20, 0)),
+        ((-14.6, 3.0), (-20, 10)),
+        ((-0.01, 4.0), (0, 5)),
+        ((0, 0), (0, 0)),
+    ],
+)
+def test_axes_end_at_round_numbers_and_give_noise_no_room(values, expected) -> None:
+    np.testing.assert_allclose(round_range(*values), expected, atol=1e-8)

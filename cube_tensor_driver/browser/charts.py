@@ -30,6 +30,8 @@ DASHES = ((), (7, 4))
 AXIS_SIZES = (44, 56)
 """Room for the numbers and the label of the axis of time and of the axis of values, pixels."""
 HEIGHT = 250
+NOISE = 0.02
+"""Relative to the largest value: smaller ones on the other side of zero are taken for noise."""
 GROUPS = {
     "normal stress": ("xx", "yy", "zz"),
     "shear": ("yz", "zx", "xy"),
@@ -246,9 +248,11 @@ def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> byte
 def round_range(low: float, high: float) -> tuple[float, float]:
     """A range for an axis that contains low .. high and zero.
 
-    Its ends are multiples of half of 1, 2, 5 or 10 times a power of ten: they change seldom.
+    Its ends are multiples of half of 1, 2, 5 or 10 times a power of ten: they change seldom. Noise
+    beyond zero gets no room.
     """
     size = max(-low, high, 1e-9)
+    low, high = (end if abs(end) > NOISE * size else 0.0 for end in (low, high))
     power = 10.0 ** np.floor(np.log10(size))
     enough = size * (1 - 1e-9)
     step = power * next(k for k in (1, 2, 5, 10) if k * power >= enough) / 2

@@ -30,13 +30,14 @@ def draw_traction(example: FieldExample) -> Figure:
             title = f"{name}: {100 * relative_rms(pressure, truth):.0f} %"
         if name == "standard deviation":
             stated = np.sqrt((pressure**2).mean() / (truth**2).mean())
-            title = f"stated by the inverse: {100 * stated:.0f} %"
+            title = f"stated error (inverse): {100 * stated:.0f} %"
         limits = (-VIEW_MM, VIEW_MM)
         axis.set(title=title, aspect="equal", xlim=limits, ylim=limits)
         axis.grid(False)
     axes[-1].set_visible(False)
     for axis in axes[2:5]:
         axis.set_xlabel("$x$ / mm")
+        axis.tick_params(labelbottom=True)
     for axis in axes[::3]:
         axis.set_ylabel("$y$ / mm")
     axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")

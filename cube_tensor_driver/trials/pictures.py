@@ -120,7 +120,7 @@ def _demo_skin() -> Iterator[Children]:
     ):
         load = Path(name) / "load.yaml"
         load.write_text(LOAD)
-        hubs = SimulatedHubs(Path(name) / "ports", load=load)
+        hubs = SimulatedHubs(Path(name) / "ports", load=load, noise=None)
         for process in skin_processes(skin, markers=True, contacts=True, simulated=hubs):
             children.start(process)
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
