@@ -20,6 +20,7 @@ UBUNTU = (
     "python3-jsonschema",
     "python3-matplotlib",
     "python3-numpy",
+    "python3-pil",
     "python3-psutil",
     "python3-pytest",
     "python3-rich",

@@ -52,6 +52,7 @@ NEEDED = {
     "psutil": "python3-psutil",
     "scipy": "python3-scipy",
     "matplotlib": "python3-matplotlib",
+    "PIL": "python3-pil",
 }
 """Module -> rosdep key, of all that a sourced ROS 2 may lack."""
 

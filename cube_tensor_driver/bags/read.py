@@ -161,10 +161,12 @@ class Bag:
     def skin(self) -> str:
         """The prefix of the skin's topics, which ends in /. BagError: no skin, or several."""
         names = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
+        if not names:
+            raise BagError(f"{self.path}: no topic of {FREQUENCIES}; record frequencies and info")
         if len(names) != 1:
             raise BagError(
                 f"{self.path}: {len(names)} topics of {FREQUENCIES} "
-                f"({', '.join(names) or 'none'}); needed is one"
+                f"({', '.join(names)}); needed is one"
             )
         return names[0]
 
@@ -215,6 +217,10 @@ class Bag:
         """The message. BagError: its bytes do not fit its type."""
         with damage(self.path):
             return self._types.deserialize_cdr(entry.data, entry.msgtype)
+
+    def fields(self, msgtype: str) -> list[tuple[str, Any]]:
+        """Name and kind (as rosbags describes it) of a type's fields; none of an unknown type."""
+        return list(self._types.fielddefs.get(msgtype, ((), ()))[1])
 
     def infos(self, topic: str) -> list[Any]:
         """The SkinInfo messages of a topic. BagError: none, or a version that cannot be read."""

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,9 @@ from .reprocess_contacts import ContactsOverTime, ContactWriter
 from .source import BagSource, Segment
 from .tables import TableWriter
 from .write import BagWriter, quality
+
+if TYPE_CHECKING:
+    from .zarr_table import ZarrWriter
 
 PARTIAL = ".partial"
 """Folder beside the results for what is not complete; a restart begins those again."""
@@ -64,7 +67,7 @@ AS_RECORDED = Overrides()
 class ReprocessJob:
     """One bag to reprocess.
 
-    form of the output: bag, parquet or csv; contacts: a bag has them, too
+    form of the output: bag, parquet, csv or zarr; contacts: a bag has them, too
     """
 
     bag: Path
@@ -161,9 +164,18 @@ def _write_bag(
 def _write_table(source: BagSource, overrides: Overrides, output: Path) -> None:
     settings = settings_with(source, overrides)
     names = [cube.name for cube in source.skin.cubes]
-    with TableWriter(output, [*names, "unknown"]) as table:
+    with make_table(output, [*names, "unknown"]) as table:
         for _, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):
             table.write(stress)
+
+
+def make_table(path: Path, cubes: list[str]) -> TableWriter | ZarrWriter:
+    """A table in the format that the suffix says. ModuleNotFoundError: its library is missing."""
+    if path.suffix == ".zarr":
+        from .zarr_table import ZarrWriter  # not everybody has zarr
+
+        return ZarrWriter(path, cubes)
+    return TableWriter(path, cubes)
 
 
 def reconstruct(

@@ -17,7 +17,7 @@ from ..core.errors import BagError, ConfigError, CubeError
 from .reprocess import PARTIAL, Overrides, ReprocessJob, ReprocessResult, reprocess
 from .reprocess_contacts import ContactsOverTime
 
-SUFFIX = {"bag": "", "parquet": ".parquet", "csv": ".csv"}
+SUFFIX = {"bag": "", "parquet": ".parquet", "csv": ".csv", "zarr": ".zarr"}
 RECIPE = "reprocess.yaml"
 """File in the folder of the results that says how they were made."""
 

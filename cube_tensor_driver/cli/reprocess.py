@@ -27,25 +27,10 @@ def arguments(parser: Parser) -> None:
         metavar="OUT",
         help="folder for the results; those that it has already are not computed again",
     )
-    parser.add_argument(
-        "--calibration", metavar="FILE", help="calibration of all cubes (default: as recorded)"
-    )
-    parser.add_argument(
-        "--skin",
-        type=Path,
-        metavar="FILE",
-        help="skin file with the calibrations to use, for cubes of the same names",
-    )
-    parser.add_argument(
-        "--tare-from",
-        type=number,
-        nargs=2,
-        metavar=("T0", "T1"),
-        help="tare between these times, s after the start of the bag, without load on any cube",
-    )
+    add_overrides(parser)
     parser.add_argument(
         "--format",
-        choices=["bag", "parquet", "csv"],
+        choices=["bag", "parquet", "csv", "zarr"],
         default="bag",
         help="format of the results (default: %(default)s)",
     )
@@ -63,6 +48,26 @@ def arguments(parser: Parser) -> None:
         "--scheduler",
         metavar="ADDRESS",
         help="scheduler of a Dask cluster to run on, as in tcp://host:8786",
+    )
+
+
+def add_overrides(parser: Parser) -> None:
+    """Options that say what differs from the recording; `overrides_of` reads them."""
+    parser.add_argument(
+        "--calibration", metavar="FILE", help="calibration of all cubes (default: as recorded)"
+    )
+    parser.add_argument(
+        "--skin",
+        type=Path,
+        metavar="FILE",
+        help="skin file with the calibrations to use, for cubes of the same names",
+    )
+    parser.add_argument(
+        "--tare-from",
+        type=number,
+        nargs=2,
+        metavar=("T0", "T1"),
+        help="tare between these times, s after the start of the bag, without load on any cube",
     )
 
 

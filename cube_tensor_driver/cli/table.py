@@ -24,6 +24,7 @@ GROUPS = {
         "bag": "show what a bag holds, or repair one",
         "plot": "draw frequencies, stress, gradient and residual of one cube",
         "reprocess": "compute stress from the recorded frequencies of bags again",
+        "export": "make a LeRobot data set of bags, or Parquet, CSV or Zarr tables",
     },
     "Design and calibrate a cube": {
         "layout": "show what a layout's pads measure: ranks, unobservable modes",
