@@ -69,7 +69,7 @@ ELSEWHERE = {
 """What runs for minutes, or needs what a page of its own does not have: the test that runs it."""
 OF_CI = {"./cube test", "./cube lint", "./cube exec CMD", "./cube --distro kilted test"}
 """What .ci/run calls, and what makes an environment of its own."""
-HERE = {"bag", "config", "fem", "fit", "layout", "plot", "urdf", "--help"}
+HERE = {"bag", "config", "export", "fem", "fit", "layout", "plot", "urdf", "--help"}
 """Commands that start no process: they run in this one, which has imported what they need."""
 ENDLESS = {
     "./cube demo --view": "shows it",
@@ -138,7 +138,7 @@ def stage(page: Path, folder: Path) -> None:
     """What a page speaks of as there already."""
     (folder / "config").symlink_to(ROOT / "config")
     (folder / "docs").symlink_to(ROOT / "docs")
-    if page.name == "bags.md":
+    if page.name in ("bags.md", "learning.md"):
         from bag_maker import make_bag
 
         for name in ("run1", "run2"):
