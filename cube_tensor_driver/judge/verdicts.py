@@ -31,7 +31,7 @@ WITHIN_S = 2 * WINDOW_S + 0.1
 """Two windows, and the scan that shows that the second one is over."""
 HOLD_S = 6.0
 """How long a pad that works again may still be left out: 2 s of rows, and its link may be cut for 2
-s meanwhile."""
+s meanwhile. No rows come while there is no driver."""
 COMPLETE = 0.9
 """Of the rows of a cube must have come, or nobody could have found the fault."""
 MOVED = 10.0
@@ -70,7 +70,7 @@ def judge_verdicts(
         cube, kind, bit = expected.cube_of(fault), fault.fault.kind, BIT[fault.fault.kind]
         mine = np.flatnonzero(rows.cube == cube)
         mine_us = time_us[mine]
-        near = (mine_us >= fault.start_us - EDGE_US) & (mine_us <= fault.end_us + 1e6 * HOLD_S)
+        near = (mine_us >= fault.start_us - EDGE_US) & (mine_us <= evidence.held_until_us(fault))
         allowed_pads[mine[near]] |= np.uint32(1 << fault.fault.pad)
         allowed_status[mine[near]] |= np.uint16(bit | ALSO)
         since_us = fault.start_us + (EDGE_US if kind in AT_ONCE else round(1e6 * WITHIN_S))
@@ -104,7 +104,7 @@ def _flags(rows: StressRows, chosen: NDArray[np.int64], pad: int, bit: int) -> N
 
 
 class _Evidence:
-    """Says whether enough came of a cube for its fault to be found."""
+    """Says whether enough came of a cube for its fault to be found, and for its end."""
 
     def __init__(
         self, record: Record, samples: Samples, expected: Expected, start_time_ns: int
@@ -122,6 +122,17 @@ class _Evidence:
             )
             for calibration in calibrations
         ]
+
+    def held_until_us(self, fault: FaultRecord) -> float:
+        """Until when the pad may be left out."""
+        until_us = fault.end_us + 1e6 * HOLD_S
+        for deed in self._record.deeds:
+            begin_us, end_us = (
+                1e-3 * (time_ns - self._start_time_ns) for time_ns in (deed.begin_ns, deed.end_ns)
+            )
+            if deed.kind in NEW_DRIVER and fault.start_us < end_us and begin_us < until_us:
+                until_us += end_us - begin_us
+        return until_us
 
     def suffices(self, fault: FaultRecord, cube: int) -> bool:
         """Faults that show in the row itself need nothing. Others need all rows of two windows,

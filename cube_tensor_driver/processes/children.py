@@ -78,6 +78,10 @@ class Children:
         """Let a process go on that was stopped."""
         _signal(self._processes[executable], signal.SIGCONT)
 
+    def names(self) -> list[str]:
+        """Of those that were started and not ended."""
+        return list(self._processes)
+
     def pid(self, executable: str) -> int:
         """The process id."""
         return self._processes[executable].pid

@@ -30,7 +30,7 @@ class Memory:
         if now < self._next_s:
             return
         self._next_s = now + EVERY_S
-        for name in self._names:
+        for name in set(self._names).intersection(self._children.names()):
             pid = self._children.pid(name)
             times, sizes = self._lives.setdefault(pid, ([], []))
             times.append(now)

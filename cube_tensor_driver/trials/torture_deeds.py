@@ -35,6 +35,8 @@ TARED_S = 1.0
 it."""
 LATE_NS = 500_000_000
 """Where the newest row of stress is older the host is too busy for a tare, and may refuse it."""
+LATE_S = 0.5
+"""A tare that is asked for later than this may come when the load does not stay any more."""
 SUBSCRIBER = "markers"
 TRANSITIONS = "driver/transition_event"
 """A topic that the driver has as soon as it can be configured."""
@@ -102,14 +104,14 @@ class Deeds:
     def stop_driver(self) -> None:
         self._change("driver", Transition.TRANSITION_DEACTIVATE)
 
-    def do(self, event: Mapping[str, Any]) -> None:
-        """Do what an event of the mix says."""
+    def do(self, event: Mapping[str, Any], late_s: float) -> None:
+        """Do what an event of the mix says, so many s after it should have been done."""
         kind = event["deed"]
         deeds: dict[str, Callable[[], tuple[bool, str]]] = {
             "stall reconstruction": lambda: self._pause("reconstruction", event["seconds"]),
             "stall subscriber": lambda: self._pause(SUBSCRIBER, event["seconds"]),
             "rate": lambda: self._set_rate(event["value"]),
-            "tare": self._take_tare,
+            "tare": lambda: self._take_tare(late_s > LATE_S),
             "clear": lambda: self._call(self._clear, Trigger.Request()),
             "restart reconstruction": self._restart,
             "reconfigure reconstruction": self._reconfigure,
@@ -149,10 +151,10 @@ class Deeds:
         answer = self._ask(self._parameters, request)
         return answer is not None and answer.results[0].successful, str(rate)
 
-    def _take_tare(self) -> tuple[bool, str]:
+    def _take_tare(self, late: bool) -> tuple[bool, str]:
         names = [self._skin.names[cube] for cube in self._held_cubes]
         request = Tare.Request(cubes=names, duration=1.0)
-        until, late = time.monotonic() + TARE_S, False
+        until = time.monotonic() + TARE_S
         while True:
             self._begin_ns = time.time_ns()
             late |= self._begin_ns - self._stress.newest_ns() > LATE_NS

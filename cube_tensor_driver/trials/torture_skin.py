@@ -167,7 +167,7 @@ def _torture(observer: Observer, deeds: Deeds, ports: Path, duration: float, see
         for at, event in schedule(duration, seed):
             observer.spin(began + at - time.monotonic())
             if "deed" in event:
-                deeds.do(event)
+                deeds.do(event, time.monotonic() - began - at)
             else:
                 pipe.write(fault_line(event))
                 pipe.flush()
