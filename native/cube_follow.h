@@ -14,7 +14,7 @@
 /* So many samples are followed in a row, then Python looks at one. */
 #define CUBE_FOLLOWED 64u
 
-/* Times of the hub are below 2^50 us and those of the host below 2^60 ns, or nothing is lent.
+/* Times of the hub are below 2^50 us and those of the host below 2^62 ns, or nothing is lent.
  *
  * sequence, device_us: of the last sample; taken_us: of all that were followed, `count` of them
  * period_us, due_us, lag_us, is_due: as in StepWatch

@@ -18,12 +18,13 @@ KEYS = {
     "cubes",
     "rate_hz",
     "duration_s",
+    "samples_expected",
     "samples_sent",
     "tensors_received",
     "lost",
     "skipped",
     "latency_p50_ms",
-    "cpu_simulator_percent",
+    "cpu_simulator_percent" if missing("make", "cc") else "cpu_hubs_percent",
     "cpu_driver_percent",
     "cpu_reconstruction_percent",
     "latency_p99_ms",
@@ -82,7 +83,7 @@ def test_links_counts_what_hubs_in_c_sent(tmp_path):
     command = [sys.executable, "-c", LINKS, figures]
     subprocess.run(command, capture_output=True, check=True, timeout=60)
     found = json.loads(figures.read_text())
-    assert found["cubes"] == 80
+    assert found["cubes"] == 3
     assert found["rows"] + found["lost"] == pytest.approx(found["rows_expected"], rel=0.2)
     assert 0 < found["cpu_percent"] < 100
 

@@ -100,7 +100,7 @@ def test_the_same_with_c_and_without(
 ) -> None:
     random = np.random.default_rng(seed)
     links = Link(with_c=True), Link(with_c=False)
-    number, device_us, host_ns = first, since_us, 10**18
+    number, device_us, host_ns = first, since_us, 1_800_000_000 * 10**9
     for (skipped, step_us, pause_us, is_again, is_looked_at), (size, reads, jitter, delay) in parts:
         number, device_us = max(0, number + skipped), max(0, device_us + step_us)
         host_ns += 1000 * pause_us
@@ -127,7 +127,7 @@ def test_nearly_all_samples_are_followed() -> None:
     """And the drift that is found from them is that of Python alone."""
     links = Link(with_c=True), Link(with_c=False)
     for number in range(7000):
-        arrival_ns = 10**18 + 1_000_030 * number + 1000 * (number * 7919 % 500)
+        arrival_ns = 1_800_000_000 * 10**9 + 1_000_030 * number + 1000 * (number * 7919 % 500)
         samples = [sample(number, PERIOD_US * number)]
         stamps = [link.receive(samples, arrival_ns) for link in links]
         assert stamps[0] == stamps[1]

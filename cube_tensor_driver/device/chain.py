@@ -205,7 +205,8 @@ class LiveLinks:
                 if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
                     arrival_ns += step_ns
                 samples = [frame for frame in frames if isinstance(frame, Sample)]
-                self._rows.received += sum(sample.shape[0] for sample in samples)
+                for sample in samples:
+                    self._rows.received += sample.shape[0]
                 try:
                     if len(samples) == len(frames) and self._follow(link, arrival_ns, samples):
                         continue

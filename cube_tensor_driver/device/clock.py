@@ -69,8 +69,8 @@ LYING = (
     f"the hub's clock jumped {LIES} times within {LIES_NS / 1e9:g} s: "
     "rows are stamped by their arrival"
 )
-LENT_US, LENT_NS = 1 << 50, 1 << 60
-"""Times beyond these are not lent: they come from clocks that are wrong by decades."""
+LENT_US, LENT_NS = 1 << 50, 1 << 62
+"""Times beyond these, 35 and 146 years, are not lent: C could not add them."""
 _NEVER = -(2**80)
 """Before every time: device times are 64 bits of µs, here in ns."""
 

@@ -96,7 +96,9 @@ class ScanBuilder:
         for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
             # What a link has not sent, because it began later or lost it, leaves a gap. Its samples
             # counted one by one would stay behind the others for as long as it delivers.
-            scan = max(self._n_pending[link], self._first_scan_at(stamp_ns))
+            scan = self._n_pending[link]
+            if len(self._pending) > 1:
+                scan = max(scan, self._first_scan_at(stamp_ns))
             if scan == len(self._pending):
                 self._pending.append({})
                 self._pending_ns.append(stamp_ns)
@@ -134,14 +136,15 @@ class ScanBuilder:
         if not parts:
             return None
         rows = make_rows(sum(len(part.cubes) for part in parts), self.cubes.n_pads)
+        # Mostly all cubes have as many pads; then there is nothing to select.
+        if len({part.sample.shape[1] for part in parts}) == 1:
+            _fill(rows, parts, self._columns_of)
+            return rows
         start = 0
         for _, group in groupby(parts, key=lambda part: part.sample.shape[1]):
             same_width = list(group)
             end = start + sum(len(part.cubes) for part in same_width)
-            # Mostly all cubes have as many pads; then there is nothing to select.
-            is_all = len(same_width) == len(parts)
-            part_of_rows = rows if is_all else rows.select(slice(start, end))
-            _fill(part_of_rows, same_width, self._columns_of)
+            _fill(rows.select(slice(start, end)), same_width, self._columns_of)
             start = end
         return rows
 
@@ -192,11 +195,9 @@ class ScanBuilder:
         return reached or len(self._pending)
 
     def _first_scan_at(self, stamp_ns: int) -> int:
-        """The first pending scan that was not taken clearly before this time, as far as it is
-        known."""
+        """The first of several pending scans that was not taken clearly before this time, as far
+        as it is known."""
         times = self._pending_ns
-        if len(times) < 2:
-            return 0
         period = (times[-1] - times[0]) / (len(times) - 1)
         return bisect_left(times, stamp_ns - CLEARLY_BEFORE * period)
 

@@ -52,7 +52,8 @@ class Children:
 
         So Ctrl-C does not reach it directly: it is ended by `end`, after what depends on it.
         """
-        command = [*END_WITH_PARENT, sys.executable, "-m", process.module, *process.arguments]
+        program = [process.program] if process.program else [sys.executable, "-m", process.module]
+        command = [*END_WITH_PARENT, *program, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]
         with self._log_file(process.executable).open("ab") as log:

@@ -18,7 +18,8 @@ class Process:
     """One process of a running skin.
 
     executable: its name in the package. module: what `python -m` runs. node: whether it is a ROS
-    node, which takes parameters; other processes take arguments.
+    node, which takes parameters; other processes take arguments. program: path of what runs in the
+    place of a module.
     """
 
     executable: str
@@ -26,6 +27,7 @@ class Process:
     node: bool = True
     parameters: dict[str, Value] = field(default_factory=dict)
     arguments: tuple[str, ...] = ()
+    program: str = ""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ Counts are in rows: one cube, one sample. The judge of torture does more: `judge
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,20 @@ from numpy.typing import NDArray
 from ..config.skin import Skin
 from ..core.rows import FrequencyRows, StressRows
 from .cubes import hub_cubes
-from .sample_log import NEVER, SampleLog
+from .sample_log import NEVER
+
+
+class Taken(Protocol):
+    """Which samples hubs took and when: a `SampleLog`, or what other hubs wrote."""
+
+    @property
+    def start_time_ns(self) -> int: ...
+
+    def rows_taken(self, start_ns: int, end_ns: int) -> int: ...
+
+    def taken_ns(
+        self, cube: NDArray[Any], sequence: NDArray[Any], stamp_ns: NDArray[Any]
+    ) -> NDArray[np.int64]: ...
 
 
 class Arrivals:
@@ -86,7 +100,7 @@ class Comparison:
         return self.sent - self.received
 
 
-def compare(log: SampleLog, arrivals: Arrivals, start_ns: int, end_ns: int) -> Comparison:
+def compare(log: Taken, arrivals: Arrivals, start_ns: int, end_ns: int) -> Comparison:
     """Compare what arrived with what was taken from start_ns to before end_ns of the wall clock."""
     cube, sequence, stamp_ns, received_ns = arrivals.columns()
     taken_ns = log.taken_ns(cube, sequence, stamp_ns)

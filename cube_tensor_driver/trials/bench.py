@@ -4,7 +4,7 @@ same run."""
 from __future__ import annotations
 
 import gc
-import math
+import re
 import statistics
 import tempfile
 import time
@@ -31,14 +31,18 @@ from ..core.rows import FrequencyRows
 from ..plot.scale import draw_scale
 from ..plot.style import save
 from ..processes.children import Children
+from ..processes.firmware import FirmwareError
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import queue
-from ..simulation.verification import Arrivals, compare, percentile
+from ..simulation.verification import Arrivals, Taken, compare, percentile
+from .hubs_in_c import HubLoad, TakenSamples
 from .running import Usage, end_simulator, observing, report
 
-LAYOUT, PITCH, CUBES_PER_HUB = "planar", 0.012, 80
+LAYOUT, PITCH = "planar", 0.012
 INSTANTS = 16
 """Instants of the load that the simulator repeats: it must cost little here."""
+LOADS = "hubs", "simulator"
+"""What sends the samples: hubs in C, or the simulator where they cannot be built."""
 ROUNDS = 400
 FIRST_S, SETTLE_S, DRAIN_S, ECHO_S = 30.0, 3.0, 1.0, 15.0
 """s: until the first tensor at most; until it is measured; for what is still on its way; of the
@@ -130,6 +134,9 @@ def bench_skin(
 ) -> int:
     """Measure the whole chain, and the floor before and after it.
 
+    The load are hubs in C (firmware/), or the simulator where they cannot be built.
+
+    cubes: or a few more, because all hubs have as many
     rate: samples per second; duration: s of measurement
     publish_period: s that one message covers, 0: one message for each scan
     composed: driver and reconstruction in one process
@@ -162,12 +169,15 @@ def _skin_and_echo(
     cubes: int, rate: float, duration: float, progress: Progress, **chain: Any
 ) -> dict[str, Any]:
     """chain: publish_period and composed, as `bench_skin`."""
+    cubes = HubLoad.of(cubes).cubes
     before = _echo(cubes, rate, min(duration / 2, ECHO_S), progress)
     skin = _skin(cubes, rate, duration, progress, **chain)
     after = _echo(cubes, rate, min(duration / 2, ECHO_S), progress)
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     total = sum(
-        value for name, value in skin.items() if name.startswith("cpu_") and "simulator" not in name
+        value
+        for name, value in skin.items()
+        if name.startswith("cpu_") and name not in (f"cpu_{load}_percent" for load in LOADS)
     )
     return {
         "cubes": cubes,
@@ -190,13 +200,22 @@ def _skin(
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
-        path, log = folder / "skin.yaml", folder / "log.json"
-        links = math.ceil(cubes / CUBES_PER_HUB)
-        write_yaml(path, grid(nx=cubes, ny=1, pitch=PITCH, links=links, rate=rate))
-        hubs = SimulatedHubs(folder / "ports", sample_log=log, instants=INSTANTS)
+        path, log, ports = folder / "skin.yaml", folder / "log", folder / "ports"
+        load = HubLoad.of(cubes)
+        write_yaml(path, grid(nx=load.cubes, ny=1, pitch=PITCH, links=load.hubs, rate=rate))
+        hubs = SimulatedHubs(ports, sample_log=log, instants=INSTANTS)
         processes = skin_processes(
             path, publish_period=publish_period, composed=composed, simulated=hubs
         )
+        try:
+            program = load.build(folder / "firmware")
+        except FirmwareError as error:
+            progress.console.print(f"The Python simulator is the load, which takes more: {error}")
+        else:
+            ports.mkdir()
+            arguments = (*load.arguments(ports, rate), "--log", str(log))
+            in_c = Process("hubs", "", node=False, program=program, arguments=arguments)
+            processes[0] = in_c
         arrivals = Arrivals(read_skin(path), one_per_hub=True)
 
         def receive(data: bytes) -> None:
@@ -204,22 +223,40 @@ def _skin(
 
         with Children(folder) as children:
             measured = _measure(
-                processes, children, receive, rate, duration, progress, f"skin of {cubes} cubes"
+                processes,
+                children,
+                receive,
+                rate,
+                duration,
+                progress,
+                f"skin of {load.cubes} cubes",
             )
-            sample_log = end_simulator(children, log)
-    comparison = compare(sample_log, arrivals, measured.start_ns, measured.end_ns)
+            taken, skipped = _end_load(processes[0].executable, children, log, load)
+    comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
     cpu = measured.cpu_percent
+    seconds = 1e-9 * (measured.end_ns - measured.start_ns)
     return {
+        "samples_expected": round(rate * seconds) * load.cubes,
         "samples_sent": comparison.sent,
         "tensors_received": comparison.received,
         "lost": comparison.missing,
-        "skipped": sample_log.dropped,
+        "skipped": skipped,
         "latency_p50_ms": percentile(comparison.latency_ms, 50),
         "latency_p99_ms": percentile(comparison.latency_ms, 99),
         **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
         **_memory(measured.memory_mb),
         "first_tensor_s": round(measured.first_tensor_s, 2),
     }
+
+
+def _end_load(executable: str, children: Children, log: Path, load: HubLoad) -> tuple[Taken, int]:
+    """End what sends the samples. Returns what it took, and how many samples it had no room for."""
+    if executable == "simulator":
+        sample_log = end_simulator(children, log)
+        return sample_log, sample_log.dropped
+    children.end([executable])
+    dropped = re.findall(r" taken, (\d+) dropped", children.log(executable))
+    return TakenSamples.read(log, load), sum(map(int, dropped))
 
 
 def _echo(cubes: int, rate: float, duration: float, progress: Progress) -> dict[str, float]:
@@ -289,13 +326,13 @@ def _measure(
 
 
 def _memory(memory: dict[str, list[float]]) -> dict[str, float]:
-    """Most MB of any process but the simulator; over a minute or more also how fast the fastest
+    """Most MB of any process but the load; over a minute or more also how fast the fastest
     grows after the first fifth, with the standard error.
 
     It is a line through the means of blocks: allocators grow in steps, so neighbours in time are
     not independent.
     """
-    nodes = [np.array(values) for name, values in memory.items() if name != "simulator"]
+    nodes = [np.array(values) for name, values in memory.items() if name not in LOADS]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
     if len(nodes[0]) * SAMPLE_S >= LONG_S:
         slopes = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import resource
 import subprocess
 import tempfile
@@ -20,11 +19,10 @@ from ..core.rows import FrequencyRows
 from ..device.chain import LiveLinks
 from ..device.live import cube_addresses, link_configs
 from ..device.scan import empty_rows
-from ..processes.firmware import build
+from .hubs_in_c import HubLoad
 from .running import report
 
-PITCH, CUBES_PER_HUB = 0.012, 80
-FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
+PITCH = 0.012
 FIRST_S, SETTLE_S, END_S, STEP_S = 10.0, 2.0, 2.0, 0.05
 """s: until the first rows at most; until it is measured; for the hubs to end; between two looks."""
 
@@ -32,17 +30,17 @@ FIRST_S, SETTLE_S, END_S, STEP_S = 10.0, 2.0, 2.0, 0.05
 def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | None = None) -> int:
     """Measure what reading takes of a core, with hubs in C (firmware/) as the load.
 
-    cubes: rounded up to whole hubs of 80. rate: samples per second. duration: s.
+    cubes: or a few more, because all hubs have as many. rate: samples per second. duration: s.
     `lost`: rows that the hubs took and that did not become rows here. CubeError: the hubs cannot
     be built, or no rows came.
     """
-    hubs = math.ceil(cubes / CUBES_PER_HUB)
-    cubes = hubs * CUBES_PER_HUB
+    load = HubLoad.of(cubes)
+    cubes = load.cubes
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
-        build(FIRMWARE, folder / "firmware", "posix")
+        program = load.build(folder / "firmware")
         path = folder / "skin.yaml"
-        write_yaml(path, grid(nx=cubes, ny=1, pitch=PITCH, links=hubs, rate=rate))
+        write_yaml(path, grid(nx=cubes, ny=1, pitch=PITCH, links=load.hubs, rate=rate))
         skin = read_skin(path)
         delivered = 0
 
@@ -50,7 +48,7 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
             nonlocal delivered
             delivered += len(rows)
 
-        with _hubs(folder, hubs, rate):
+        with _hubs(program, folder, load, rate):
             links = LiveLinks(
                 link_configs(skin, port_directory=folder),
                 cube_addresses(skin),
@@ -75,7 +73,7 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
         "duration_s": duration,
         "rows": rows,
         "rows_expected": round(rate * seconds) * cubes,
-        "lost": lost * CUBES_PER_HUB,
+        "lost": lost * load.cubes_per_hub,
         "cpu_percent": round(100 * cpu_s / seconds, 1),
         "cpu_us_per_scan": round(1e6 * cpu_s * cubes / max(rows, 1), 1),
     }
@@ -84,14 +82,12 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
 
 
 @contextmanager
-def _hubs(folder: Path, hubs: int, rate: float) -> Iterator[None]:
+def _hubs(program: str, folder: Path, load: HubLoad, rate: float) -> Iterator[None]:
     """Hubs on pseudo-terminals in the folder, for the length of a block."""
-    command = [str(folder / "firmware" / "cube_hub"), "--ports", str(folder)]
-    command += ["--hubs", str(hubs), "--cubes", str(CUBES_PER_HUB)]
-    command += ["--period", str(round(1e6 / rate))]
+    command = [program, *load.arguments(folder, rate)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
-        _wait(lambda: len(list(folder.glob("hub*"))) == hubs)
+        _wait(lambda: len(list(folder.glob("hub*"))) == load.hubs)
         yield
     finally:
         process.terminate()

@@ -10,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/prctl.h>
+#include <time.h>
 
 #include "hub.h"
 #include "line.h"
@@ -22,10 +23,12 @@
 static const char usage[] =
     "usage: cube_hub (--ports DIR | --tcp PORT) [--hubs N] [--cubes N] [--pads N]\n"
     "                [--cubes-per-frame N] [--period US] [--uid UID] [--frequency HZ]\n"
-    "Hubs on pseudo-terminals DIR/hub0, DIR/hub1, ... or on TCP ports of 127.0.0.1 from PORT on.\n";
+    "                [--log FILE]\n"
+    "Hubs on pseudo-terminals DIR/hub0, DIR/hub1, ... or on TCP ports of 127.0.0.1 from PORT on.\n"
+    "The log has when each sample was taken.\n";
 
 struct options {
-    const char *ports;
+    const char *ports, *log;
     unsigned tcp, hubs, cubes, pads, cubes_per_frame, period_us, frequency;
     unsigned uid;
 };
@@ -63,7 +66,7 @@ static struct options parse(int argc, char **argv) {
         {"hubs", required_argument, NULL, 'h'},   {"cubes", required_argument, NULL, 'c'},
         {"pads", required_argument, NULL, 'p'},   {"cubes-per-frame", required_argument, NULL, 'f'},
         {"period", required_argument, NULL, 'T'}, {"uid", required_argument, NULL, 'u'},
-        {"frequency", required_argument, NULL, 'F'}, {0},
+        {"frequency", required_argument, NULL, 'F'}, {"log", required_argument, NULL, 'l'}, {0},
     };
     struct options options = {
         .hubs = 1, .cubes = 4, .pads = 8, .period_us = 10000, .frequency = 100000, .uid = 1};
@@ -77,6 +80,7 @@ static struct options parse(int argc, char **argv) {
         case 'f': options.cubes_per_frame = number(optarg, 1, 1000); break;
         case 'T': options.period_us = number(optarg, 100, 10000000); break;
         case 'F': options.frequency = number(optarg, 20000, 4000000); break;
+        case 'l': options.log = optarg; break;
         case 'u': options.uid = number(optarg, 0, UINT32_MAX - MOST_HUBS); break;
         default: fputs(usage, stderr); exit(2);
         }
@@ -155,13 +159,38 @@ static void finish(struct one *one) {
     free(one->config.frame);
 }
 
-static void run(struct one *hubs, unsigned n_hubs) {
+/* The log begins with the wall clock at device time 0, ns; then each sample has 16 bytes: the hub
+ * and the number of the sample as uint32_t, the device time as uint64_t, in the machine's order. */
+static FILE *begin_log(const char *path) {
+    FILE *log = fopen(path, "wb");
+    if (log == NULL) {
+        fprintf(stderr, "cube_hub: %s: %s\n", path, strerror(errno));
+        exit(1);
+    }
+    uint64_t now_us = port_now_us(NULL);
+    struct timespec now;
+    clock_gettime(CLOCK_REALTIME, &now);
+    int64_t start_ns = now.tv_sec * 1000000000 + now.tv_nsec - (int64_t)now_us * 1000;
+    fwrite(&start_ns, sizeof start_ns, 1, log);
+    return log;
+}
+
+static void write_log(FILE *log, uint32_t index, const struct one *one) {
+    uint32_t head[2] = {index, one->hub.taken - 1};
+    fwrite(head, sizeof head, 1, log);
+    fwrite(&one->port.window_us, sizeof one->port.window_us, 1, log);
+}
+
+static void run(struct one *hubs, unsigned n_hubs, FILE *log) {
     struct pollfd events[MOST_HUBS];
     while (!stopped) {
         uint64_t due = UINT64_MAX;
         for (unsigned i = 0; i < n_hubs; i++) {
             line_accept(&hubs[i].port);
+            uint32_t taken = hubs[i].hub.taken;
             uint64_t next = hub_step(&hubs[i].hub);
+            if (log != NULL && hubs[i].hub.taken != taken)
+                write_log(log, i, &hubs[i]);
             line_flush(&hubs[i].port);
             due = next < due ? next : due;
             events[i] = line_events(&hubs[i].port);
@@ -189,7 +218,10 @@ int main(int argc, char **argv) {
         for (unsigned i = 0; i < begun; i++)
             printf("%s\n", hubs[i].name);
         fflush(stdout);
-        run(hubs, begun);
+        FILE *log = options.log != NULL ? begin_log(options.log) : NULL;
+        run(hubs, begun, log);
+        if (log != NULL)
+            fclose(log);
     }
     for (unsigned i = 0; i < begun; i++) {
         printf("%s: %u taken, %u dropped\n", hubs[i].name, hubs[i].hub.taken, hubs[i].hub.dropped);
