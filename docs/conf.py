@@ -27,6 +27,10 @@ MARKUP = re.compile(r"(`[^`]*`|``[^`]*``)|([*|\\]|_\b(?!\w))")
 """What reStructuredText would read as markup: quoted words stay, all else is escaped."""
 
 
+PAGE = re.compile(r"\[([a-z_]+\.md)\]\((?=\1[)#])")
+"""The begin of a link whose text is the page's file name, for those who read the files."""
+
+
 def plain(line: str) -> str:
     return MARKUP.sub(lambda found: found[1] or "\\" + found[2], line)
 
@@ -69,7 +73,8 @@ def restructured(lines: list[str], field: str) -> list[str]:
 
 
 def setup(app) -> None:
-    """The blocks of protocol.md are bytes for a test; docstrings are plain text."""
+    """The blocks of protocol.md are bytes for a test; docstrings are plain text; a link shows the
+    title of its page."""
     for name in ("frame", "wire"):
         app.add_lexer(name, TextLexer)
 
@@ -80,5 +85,9 @@ def setup(app) -> None:
         # Python's own words about the field of a tuple; the class describes its fields.
         return True if str(obj.__doc__).startswith("Alias for field") else None
 
+    def titles(app, docname: str, source: list[str]) -> None:
+        source[0] = PAGE.sub("[](", source[0])
+
+    app.connect("source-read", titles)
     app.connect("autodoc-process-docstring", text)
     app.connect("autodoc-skip-member", skip)

@@ -160,6 +160,9 @@ def test_documentation_builds_without_a_warning(tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "index.txt").is_file()
+    # A link shows the title of its page, not its file name.
+    links = set(re.findall(r"\]\((\w+\.md)", (ROOT / "docs" / "start.md").read_text()))
+    assert links and not [one for one in links if one in (tmp_path / "start.txt").read_text()]
     api = (tmp_path / "api.txt").read_text()
     # What docstrings say in lists are fields: parameters with their types, errors, attributes.
     assert "* **rate** (*float** | **None*) -- samples per second to" in api

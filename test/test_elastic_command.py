@@ -4,6 +4,7 @@ line per mistake."""
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import signal
@@ -42,8 +43,9 @@ def cube(*arguments: object) -> list[str]:
 def test_fem_shows_and_writes_what_is_asked(tmp_path):
     out, saved = tmp_path / "fem.json", tmp_path / "mine.yaml"
     command = cube("fem", *SMALL, "--json", out, "--figures", tmp_path / "pictures", "-o", saved)
+    narrow = os.environ | {"COLUMNS": "60"}
     done = subprocess.run(
-        command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False
+        command, env=narrow, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False
     )
     assert done.returncode == 0, done.stderr
     result = json.loads(out.read_text())
@@ -63,6 +65,7 @@ def test_fem_shows_and_writes_what_is_asked(tmp_path):
         r["unknowns"] for r in result["convergence"]
     )
     assert re.search(rf"V1 \+z-x +{matrix[0, 0]:.4f} +{matrix[0, 1]:.4f} ", done.stdout)
+    assert f"{matrix[0, -1]:.4f}" in done.stdout and "…" not in done.stdout
     for words in ("c_plus_d", "change to the next", "left, %", "rank 7 of 7"):
         assert words in done.stdout
     assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [

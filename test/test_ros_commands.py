@@ -11,6 +11,7 @@ import sys
 import tempfile
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -263,3 +264,19 @@ def test_parameters_that_are_not_there_or_refused_are_said(skin, capfd):
 def test_parameters_of_nobody(nobody, capfd):
     assert main(["param"]) == 1
     assert "no node runs in DDS domain" in capfd.readouterr().err
+
+
+def test_nodes_that_are_found_late_are_listed_too(monkeypatch):
+    """Each of three comes a little later than the one before, as on a busy machine."""
+    from cube_tensor_driver.ros import asking
+
+    monkeypatch.setattr(asking, "SETTLE_S", 0.02)
+    rounds: list[int] = []
+    executor = types.SimpleNamespace(spin_once=lambda timeout_sec: rounds.append(1))
+
+    def found() -> list[str]:
+        return ["/demo", "/driver", "/reconstruction"][: len(seen)]
+
+    seen: list[list[str]] = []
+    assert asking.discover_all(executor, lambda: seen.append(found()) or seen[-1])
+    assert seen[-1] == ["/demo", "/driver", "/reconstruction"] and rounds

@@ -14,7 +14,7 @@ from ..core.errors import CubeError
 FIND_S = 5.0
 """How long nodes may take to be discovered."""
 SETTLE_S = 0.3
-"""From the first node found on, for others to be found too. rmw_fastrtps drops the answer to a
+"""For others to be found too, from the last one found on. rmw_fastrtps drops the answer to a
 client that the server met less than 0.1 s before."""
 ANSWER_S, AGAIN_S = 10.0, 3.0
 """How long an answer may take, and after how long the question is repeated."""
@@ -45,6 +45,19 @@ def discover(executor: Any, found: Callable[[], object]) -> bool:
     return True
 
 
+def discover_all(executor: Any, found: Callable[[], object]) -> bool:
+    """Spin until something is found, and no more of it a moment later. Returns whether it is
+    found."""
+    until = time.monotonic() + FIND_S
+    if not spin(executor, FIND_S, found):
+        return False
+    before = None
+    while before != (now := found()) and time.monotonic() < until:
+        before = now
+        spin(executor, SETTLE_S)
+    return True
+
+
 def find_services(node: Node, executor: Any, kind: str, wanted: str = "") -> list[str]:
     """Full names of the services of a type, as in std_srvs/srv/Trigger, sorted, without
     those of the node itself; may be empty. wanted: one that is waited for, as long as any would be.
@@ -57,7 +70,10 @@ def find_services(node: Node, executor: Any, kind: str, wanted: str = "") -> lis
             name for name, kinds in services if kind in kinds and not name.startswith(own)
         )
 
-    discover(executor, lambda: wanted in found() if wanted else found())
+    if wanted:
+        discover(executor, lambda: wanted in found())
+    else:
+        discover_all(executor, found)
     return found()
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from rclpy.node import Node
 
 from ..core.errors import BagError, CubeError
-from .asking import SETTLE_S, discover, domain_text, spin
+from .asking import SETTLE_S, discover_all, domain_text, spin
 from .listening import profile_of
 from .recorder import message_class
 from .session import node_session
@@ -36,7 +36,7 @@ class Topic:
 def list_topics() -> list[Topic]:
     """Topics that somebody publishes, by name. CubeError: there is none."""
     with node_session("topic_list") as (node, executor):
-        discover(executor, lambda: _published(node))
+        discover_all(executor, lambda: _published(node))
         topics = _published(node)
         if not topics:
             raise CubeError(f"nobody publishes in {domain_text()}; start ./cube demo or a skin")

@@ -8,16 +8,19 @@ from rich.table import Table
 
 from ..elastic.fem import Response
 
-MODES_PER_TABLE = 7
-"""So that a table fits a terminal of 80 columns."""
+MOST_MODES = 7
+"""In one table: what fits 80 columns."""
+LABEL_WIDTH, NUMBER_WIDTH, GAP = 9, 7, 2
 COEFFICIENTS_SHOWN = 40
 
 
 def show_response(result: Response) -> None:
     """Print the matrix, the coefficients on each mesh, and what they leave unexplained."""
     console = Console(highlight=False)
-    for start in range(0, len(result.modes), MODES_PER_TABLE):
-        console.print(_matrix(result, start))
+    column = GAP + max(NUMBER_WIDTH, *(len(name) for name in result.modes))
+    count = max(1, min(MOST_MODES, (console.width - LABEL_WIDTH) // column))
+    for start in range(0, len(result.modes), count):
+        console.print(_matrix(result, start, count))
     console.print(_convergence(result))
     hidden = len(result.coefficients) - COEFFICIENTS_SHOWN
     if hidden > 0:
@@ -32,12 +35,12 @@ def show_response(result: Response) -> None:
     )
 
 
-def _matrix(result: Response, start: int) -> Table:
-    """Pads by modes; the first table has the title of all."""
+def _matrix(result: Response, start: int, count: int) -> Table:
+    """Pads by `count` modes; the first table has the title of all."""
     title = "response, Pa per Pa; below, what the symmetry does not explain"
     table = _table("" if start else title)
     table.add_column("pad")
-    names = result.modes[start : start + MODES_PER_TABLE]
+    names = result.modes[start : start + count]
     for name in names:
         table.add_column(name, justify="right")
     modes = slice(start, start + len(names))
