@@ -14,7 +14,7 @@ from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.judge.expected import Expected
-from cube_tensor_driver.judge.record import CubeMessages, Received, Record
+from cube_tensor_driver.judge.record import CubeMessages, Deed, Received, Record
 from cube_tensor_driver.judge.samples import Samples
 from cube_tensor_driver.judge.verdict import judge
 from cube_tensor_driver.simulation.faults import Fault
@@ -181,6 +181,28 @@ def test_what_the_driver_counts_is_checked(played):
     for counter in ("lost_on_the_way", "rows published", "rows unaccounted"):
         assert found(played, **{counter: played[0].counters[counter] + 1}) == {"miscounted"}
     assert found(played, lost_on_the_way=0) == {"miscounted"}
+
+
+def test_a_tensor_that_the_reconstruction_counts_as_lost_is_not_missing(played):
+    """As many messages as it says, and no more."""
+    record, log = played
+    stress = record.stress.rows
+    rest = received(stress.select(stress.stamp_ns != stress.stamp_ns[ROW]))
+    for said, figures in ((0, {"missing_tensors"}), (1, set()), (2, {"miscounted"})):
+        said_so = replace(record, stress=rest, messages_lost=said)
+        assert {name for name in WRONG if judge(said_so, log)[name]} == figures
+
+
+def test_what_a_driver_counted_just_before_it_was_killed_is_not_known(played):
+    record, log = played
+    stamp_ns = record.frequencies.rows.stamp_ns
+    dead_ns = int(stamp_ns[-1]) + 1
+    dead = Deed("restart driver", dead_ns, dead_ns, True, stress_rows=(len(stamp_ns),) * 2)
+    for unsaid_ns, figures in ((1_400_000_000, set()), (1_600_000_000, {"miscounted"})):
+        unsaid = np.count_nonzero(stamp_ns > dead_ns - unsaid_ns)
+        counters = {**record.counters, "rows published": len(stamp_ns) - int(unsaid)}
+        killed = replace(record, counters=counters, deeds=(dead,))
+        assert {name for name in WRONG if judge(killed, log)[name]} == figures
 
 
 def test_what_did_not_come_here_is_nobodys_fault(played):
