@@ -10,7 +10,7 @@ from .parser import Parser, count, not_negative, positive, sample_rate
 
 def arguments(parser: Parser) -> None:
     pipeline = parser.add_subcommand(
-        "pipeline", "the core beside the same equations and matrix product in bare numpy"
+        "pipeline", "the core against the same equations and matrix product in bare numpy"
     )
     _add_cubes(pipeline, 1260)
     pipeline.add_json()
@@ -34,7 +34,9 @@ def arguments(parser: Parser) -> None:
     _add_time(echo)
     echo.add_json()
 
-    skin = parser.add_subcommand("skin", "from simulated hubs to received tensors, beside the echo")
+    skin = parser.add_subcommand(
+        "skin", "from simulated hubs to received tensors, against the echo"
+    )
     _add_cubes(skin, 64)
     _add_time(skin)
     skin.add_argument(

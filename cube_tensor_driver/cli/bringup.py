@@ -42,7 +42,7 @@ def arguments(parser: Parser) -> None:
         help="samples per second (default: %(default)g)",
     )
     parser.epilog = (
-        "Leave the skin alone for the first 5 s. Then press beside each cube where the command "
+        "Leave the skin alone for the first 5 s. Then press next to each cube where the command "
         "asks for it. End a driver that has the port open first. docs/build.md says more."
     )
 
@@ -180,7 +180,7 @@ def press_cubes(
     def press(of: set[int], where: str) -> Press:
         """The next press beside one of these cubes."""
         while True:
-            screen.say(f"press the skin beside {where}, and hold")
+            screen.say(f"press the skin next to {where}, and hold")
             read = next(each for each in map(watch.update, means) if each is not None)
             screen.say(f"{cubes[read.cube].name} answers: let go")
             while watch.is_held:

@@ -54,7 +54,7 @@ def arguments(parser: Parser) -> None:
     parser.add_output(
         "--figure",
         kind="picture",
-        help="draw force and centre of pressure beside those of the load script",
+        help="draw force and centre of pressure together with those of the load script",
     )
     parser.add_output("--json", help="write the figures to FILE instead of printing them")
 

@@ -56,7 +56,7 @@ def arguments(parser: Parser) -> None:
         "--figure",
         kind="picture",
         default=lambda options: options.output.with_suffix(".png"),
-        help="picture of measured against fitted (default: beside -o, .png)",
+        help="picture of measured against fitted (default: next to -o, .png)",
     )
     parser.add_json()
 

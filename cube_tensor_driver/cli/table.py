@@ -34,7 +34,7 @@ GROUPS = {
     "Test faults and speed": {
         "inject": "inject a fault into running simulated hubs",
         "torture": "run and check 32 cubes at 500 Hz under a random mix of faults",
-        "bench": "measure speed beside the bare minimum",
+        "bench": "measure speed against the bare minimum",
     },
     "Study the sensor": {
         "study": "find how wide a contact must be for each layout to be right",

@@ -21,6 +21,6 @@ def package_data() -> Path:
             if (folder / "package.xml").is_file() and (folder / "config").is_dir():
                 return folder
     raise ConfigError(
-        f"the data files of {_NAME} are not beside {Path(__file__).parent}: "
+        f"the data files of {_NAME} are not next to {Path(__file__).parent}: "
         "install the package again (colcon build, or pip install .)"
     )

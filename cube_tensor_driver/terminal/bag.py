@@ -39,7 +39,8 @@ def show_bag(path: Path) -> None:
 
 
 def _topics(bag: Bag, seconds: float) -> Table:
-    table = Table("topic", "type")
+    table = Table("topic")
+    table.add_column("type", overflow="fold")
     for name in ("messages", "Hz"):
         table.add_column(name, justify="right")
     for connection in sorted(bag.connections, key=lambda connection: connection.topic):
