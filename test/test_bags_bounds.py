@@ -8,6 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+pytest.importorskip("mcap", reason="needs mcap: pip install mcap")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2.storage_mcap import zstd
 

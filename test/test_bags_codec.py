@@ -8,6 +8,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
+
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
 from bag_maker import FREQUENCIES, STRESS, header, message
 
 from cube_tensor_driver.bags.message_codec import frequency_codec, stress_codec

@@ -14,9 +14,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
 import pyarrow.csv
 import pyarrow.parquet
-import pytest
 from bag_maker import START_NS, WRENCH, frequencies_of, header, info_of, loads, make_bag, message
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader

@@ -7,6 +7,9 @@ import re
 from importlib.metadata import version
 
 import pytest
+
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
 from rosbags.rosbag2 import CompressionMode, Reader, Writer
 
 from conftest import ROOT

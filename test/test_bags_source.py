@@ -6,6 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+
+pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
 from bag_maker import START_NS, frequencies_of, info_of, loads, make_bag
 
 from cube_tensor_driver.bags.message_codec import frequency_codec

@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
 from cube_tensor_driver.bags.contact_messages import CLOUD
 from cube_tensor_driver.bags.message_codec import frequency_codec, stress_codec
 from cube_tensor_driver.bags.read import FREQUENCIES, INFO, Bag

@@ -15,6 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
 from bag_maker import make_bag
 
 import cube_tensor_driver as ctd

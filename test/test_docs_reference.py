@@ -14,6 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
+
 from bag_maker import make_bag
 from test_docs_python import blocks
 

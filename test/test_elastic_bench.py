@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
+
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.elastic import body as bodies

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
+
 from conftest import ROOT
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import read_calibration

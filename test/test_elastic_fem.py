@@ -6,6 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
+
 import skfem
 from scipy.sparse.linalg import spsolve
 from skfem.helpers import dot

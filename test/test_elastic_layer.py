@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
+
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS, to_matrix
 from cube_tensor_driver.elastic import contact

@@ -6,6 +6,10 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from conftest import ROOT
 from cube_tensor_driver.plot.time_series import TimeSeries, draw_series

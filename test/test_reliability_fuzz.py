@@ -6,6 +6,9 @@ from __future__ import annotations
 import tracemalloc
 
 import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
