@@ -37,7 +37,7 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "--contacts",
         nargs="+",
-        metavar=("METHOD", "NAME:=VALUE"),
+        metavar=("METHOD", "KEY:=VALUE"),
         help="add contacts and traction, as the node contacts makes them with method:=METHOD and "
         "its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
     )

@@ -132,7 +132,7 @@ class Layer:
             (1 - nu) * terms(2, bottom) + nu * terms(0, bottom),
             (1 - nu) * terms(3, bottom) - (2 - nu) * terms(1, bottom),
         ]
-        constants = np.linalg.solve(np.stack(rows, axis=-2), np.eye(4)[:, :2])
+        constants = np.linalg.inv(np.stack(rows, axis=-2))[..., :2]
         return np.stack(
             [np.einsum("...c,...cl->...l", terms(n, zeta), constants) for n in range(4)]
         )
