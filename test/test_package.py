@@ -53,6 +53,7 @@ HOMES = {
     "transforms3d": {"core"},
     "launch": {"ros"},
     "viser": {"browser"},
+    "mujoco": {"simulation"},
 }
 
 
@@ -139,6 +140,7 @@ KEYS = {
         "scikit-fem",
         "pyarrow",
         "viser",
+        "mujoco",
         "distributed",
         "dask",
         "mcap",
@@ -269,6 +271,7 @@ def test_importing_the_package_imports_nothing_heavy():
         "rich",
         "skfem",
         "psutil",
+        "mujoco",
     }
     loaded = python("import sys, cube_tensor_driver; print(*sys.modules)").split()
     assert not heavy & set(loaded)

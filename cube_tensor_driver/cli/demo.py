@@ -28,6 +28,13 @@ def arguments(parser: Parser) -> None:
         help="load script (default: a contact that wanders over the skin)",
     )
     parser.add_argument(
+        "--mujoco",
+        type=Path,
+        metavar="SCENE",
+        help="MuJoCo scene (.xml) that touches the skin, instead of a load script; it names its "
+        "skin file itself (docs/simulation.md; scenes: config/mujoco)",
+    )
+    parser.add_argument(
         "--rate",
         type=sample_rate,
         metavar="HZ",
@@ -69,6 +76,7 @@ def run(options: argparse.Namespace) -> int:
         config=options.config,
         cubes=options.cubes,
         load=options.load,
+        mujoco=options.mujoco,
         rate=options.rate,
         noise=options.noise,
         duration=duration,

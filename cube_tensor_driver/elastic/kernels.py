@@ -42,9 +42,9 @@ _GREATEST = 25.0
 _WAVES, _ANGLES = 256, 32
 """Gauss points in k, which resolve the Bessel functions out to the tables' reach. Directions of k:
 more than twice the order 8 of the covariance's dependence on them."""
-_PER_DEPTH = 32
+PER_DEPTH = 32
 """Places of the tables per depth: cubic interpolation is then good to 1e-4 of the peak."""
-_REACH = 20
+REACH = 20
 """Of the tables, over the depth; beyond it everything counts as zero."""
 _OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
 _ZZ = STRESS.index("zz")
@@ -63,7 +63,7 @@ class Kernels:
         layer.check_depth(depth)
         self.layer, self.depth, self.scale = layer, depth, scale
         self._row_scale = np.where(np.arange(len(COMPONENTS)) < len(STRESS), 1.0, scale)
-        self.step, self._last = depth / _PER_DEPTH, _REACH * _PER_DEPTH
+        self.step, self._last = depth / PER_DEPTH, REACH * PER_DEPTH
         key = [layer.thickness, layer.poisson, depth]
         tables = cached("kernels", key, self._tables)
         self._cross, self._covariance = tables["cross"], tables["covariance"]
@@ -73,21 +73,13 @@ class Kernels:
 
     def _tables(self) -> dict[str, Array]:
         """cross (places, 24, 3), covariance (places, 24, 24), response (sizes, places, 24, 3)."""
-        layer, depth = self.layer, self.depth
-        nodes, weights = np.polynomial.legendre.leggauss(_WAVES)
-        k = np.asarray((nodes + 1) * _GREATEST / depth / 2)
-        weight = np.asarray(weights * _GREATEST / depth / 2)
-        angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-        transfer = layer.transfer(np.outer(k, np.cos(angle)), np.outer(k, np.sin(angle)), depth)
-        weighted = transfer * (self._prior(k)[:, None, None, None] * [SHEAR**2, SHEAR**2, 1.0])
-        # (-1, 0, ...) steps: cubic interpolation needs one more on the left.
-        places: Array = np.arange(-1.0, self._last + 3) * self.step
-        bessel = _Bessel(places, k, weight)
-        discs = [_disc(k * size * depth)[:, None, None, None] for size in SIZES]
+        waves = Waves(self.layer, self.depth)
+        transfer = waves.transfer
+        weighted = transfer * (self._prior(waves.k)[:, None, None, None] * [SHEAR**2, SHEAR**2, 1])
         return {
-            "cross": bessel.line(weighted),
-            "covariance": bessel.line(weighted @ transfer.conj().swapaxes(2, 3)),
-            "response": np.stack([bessel.line(transfer * disc) for disc in discs]),
+            "cross": waves.line(weighted),
+            "covariance": waves.line(weighted @ transfer.conj().swapaxes(2, 3)),
+            "response": waves.discs(SIZES * self.depth),
         }
 
     def response(self, place: Array, angle: Array, size: float) -> Array:
@@ -150,27 +142,56 @@ class Kernels:
         return turned
 
 
-class _Bessel:
-    """Integrals over the plane of wavenumbers, at places r on the x axis.
+class Waves:
+    """The transfer functions of a layer at one depth, and integrals of them over all wavenumbers.
 
-    A spectrum sum_m F_m(k) exp(i m phi) gives sum_m i^m int F_m J_m(k r) k dk / (2 pi).
+    k: (waves,) 1/m; transfer: (waves, angles, 24, 3) at k in each direction
     """
 
-    def __init__(self, r: Array, k: Array, weight: Array) -> None:
-        orders = np.arange(_ANGLES // 4 + 1)
-        self._kernels = jv(orders[:, None, None], r[:, None] * k) * (weight * k / (2 * np.pi))
+    def __init__(self, layer: Layer, depth: float) -> None:
+        """Raises ElasticError where the layer has no such depth."""
+        nodes, weights = np.polynomial.legendre.leggauss(_WAVES)
+        self.k = np.asarray((nodes + 1) * _GREATEST / depth / 2)
+        self._weight = np.asarray(weights * _GREATEST / depth / 2)
+        angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+        kx, ky = np.outer(self.k, np.cos(angle)), np.outer(self.k, np.sin(angle))
+        self.transfer = layer.transfer(kx, ky, depth)
+        # (-1, 0, ...) steps: cubic interpolation needs one more on the left.
+        self._r: Array = np.arange(-1.0, REACH * PER_DEPTH + 3) * (depth / PER_DEPTH)
+        self._kernels: dict[int, Array] = {}
 
     def line(self, spectrum: Complex) -> Array:
-        """(places, ...) of a spectrum (waves, angles, ...)."""
+        """(places, ...) of a spectrum (waves, angles, ...), at places r on the x axis.
+
+        A spectrum sum_m F_m(k) exp(i m phi) gives sum_m i^m int F_m J_m(k r) k dk / (2 pi).
+        """
+        return self.lines(spectrum, np.ones((1, len(self.k))))[0]
+
+    def lines(self, spectrum: Complex, factors: Array) -> Array:
+        """(factors, places, ...) of the spectrum times each of the factors (factors, waves)."""
         parts = np.fft.fft(spectrum, axis=1) / _ANGLES
         shape = parts.shape[2:]
-        result = np.zeros((self._kernels.shape[1], int(np.prod(shape))))
-        for m, kernel in enumerate(self._kernels):
+        result = np.zeros((len(factors), len(self._r), int(np.prod(shape))))
+        for m in range(_ANGLES // 4 + 1):
             both = parts[:, m] if m == 0 else parts[:, m] + parts[:, -m]
             share = (1j**m * both).real.reshape(len(both), -1)
             if np.abs(share).max() > 0:
-                result += kernel @ share
-        return result.reshape(-1, *shape)
+                kernel = self._kernel(m)
+                for total, factor in zip(result, factors, strict=True):
+                    total += kernel @ (share * factor[:, None])
+        return result.reshape(*result.shape[:2], *shape)
+
+    def _kernel(self, m: int) -> Array:
+        """(places, waves) J_m with what integrates it, made when it is needed: it takes long."""
+        if m not in self._kernels:
+            bessel = jv(m, self._r[:, None] * self.k)
+            self._kernels[m] = bessel * (self._weight * self.k / (2 * np.pi))
+        return self._kernels[m]
+
+    def discs(self, sizes: Array) -> Array:
+        """(sizes, places, 24, 3) FIELD under discs with force 1 N along x, y and z; sizes: their
+        radii, m."""
+        return self.lines(self.transfer, np.stack([_disc(self.k * size) for size in sizes]))
 
 
 def hertz_pressure(distance: Array, size: float) -> Array:

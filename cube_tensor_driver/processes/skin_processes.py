@@ -35,6 +35,7 @@ class SimulatedHubs:
     """The simulator that takes the place of the real hubs.
 
     ports: folder for its pseudo-terminals. load: its load script; None: the one in the package.
+    mujoco: a MuJoCo scene instead of a load script.
     sample_log: file for a record of every sample it sends; None: none. instants: how many instants
     of the load it computes in advance, see `simulation.simulator.Simulator`; None: its default.
     noise: of the pads, relative to their frequencies; None: as the calibrations state.
@@ -42,6 +43,7 @@ class SimulatedHubs:
 
     ports: Path
     load: Path | None = None
+    mujoco: Path | None = None
     sample_log: Path | None = None
     instants: int | None = None
     noise: float | None = 0.0
@@ -51,6 +53,8 @@ class SimulatedHubs:
         arguments = ["--config", str(config), "--ports", str(self.ports)]
         if self.load is not None:
             arguments += ["--load", str(self.load)]
+        if self.mujoco is not None:
+            arguments += ["--mujoco", str(self.mujoco)]
         if self.sample_log is not None:
             arguments += ["--log", str(self.sample_log)]
         if self.instants is not None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cubes import HubCubes
-from .load import Load, LoadMemory
+from .load import AnyLoad, LoadMemory
 
 COUNTER_HZ = 25_000_000
 WINDOW_US = 2_500
@@ -59,7 +59,7 @@ class Oscillators:
     """
 
     hub: HubCubes
-    load: Load
+    load: AnyLoad
     windows: list[int] = field(default_factory=list)
     seed: int = 0
 

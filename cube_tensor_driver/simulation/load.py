@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,34 @@ class Press(NamedTuple):
     radius: float
 
 
+class AnyLoad(Protocol):
+    """What acts on the cubes of a skin: a script, or a robot in simulation.
+
+    poses: of the cubes; depth: from their centres to the surface, m
+    repeats: time after which all comes again, s; None: never
+    period: the same, or the time that counts as the whole of it, s
+    """
+
+    @property
+    def poses(self) -> CubePoses: ...
+
+    @property
+    def depth(self) -> float: ...
+
+    @property
+    def repeats(self) -> float | None: ...
+
+    @property
+    def period(self) -> float: ...
+
+    def at(self, seconds: float) -> tuple[Array, Array]:
+        """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
+        the cubes' frames."""
+
+    def total(self, seconds: float) -> tuple[Array, Array, Array]:
+        """As the function `total`, of what touches the skin at this time."""
+
+
 class Load:
     """A script on a skin: the same at the same time in every process.
 
@@ -65,13 +94,14 @@ class Load:
     Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz), 7.1 (sliding), 8.1 (rolling with
     traction).
 
-    poses: of the cubes; period: of the script, or its length if it plays once, s.
+    poses, depth, repeats, period: as in `AnyLoad`; period: the script's length if it plays once
     """
 
     def __init__(self, skin: Skin, script: Script) -> None:
         """ConfigError: a sphere sinks in deeper than Hertz's contact holds, or a disc is too wide
         for its depth."""
         self.script = script
+        self.depth, self.repeats = script.depth, script.period
         self.period = script.period or script.end
         self._position = np.array([cube.xyz for cube in skin.cubes])
         self._rotation = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
@@ -80,6 +110,7 @@ class Load:
         high = (self._position + half[:, None]).max(axis=0)
         self._centre, self._half_extent = (low + high) / 2, (high - low) / 2
         self.poses = CubePoses(self._position, self._rotation, half)
+        self._pitch = self.poses.pitch
         self._paths = {
             id(action): self._path(action)
             for indenter in script.indenters
@@ -124,19 +155,8 @@ class Load:
         return [press for press in presses if press.force.any()]
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """Sum (3,) of all forces on the skin in N, their centre of pressure (3,) in m and the mean
-        normal (3,) there.
-
-        Without load centre and normal are NaN.
-        """
-        presses = self.presses(seconds)
-        if not presses:
-            return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
-        weight = np.array([-press.force @ press.normal for press in presses])
-        force = np.sum([press.force for press in presses], axis=0)
-        centre = weight @ np.array([press.position for press in presses]) / weight.sum()
-        normal = weight @ np.array([press.normal for press in presses])
-        return force, centre, normal / np.linalg.norm(normal)
+        """As `total`, of what presses at this time."""
+        return total(self.presses(seconds))
 
     def _check(self, indenter: Indenter) -> None:
         """ConfigError: the contact is too wide for what is computed."""
@@ -160,7 +180,7 @@ class Load:
         when = (seconds - action.start) / (action.end - action.start)
         path = self._paths[id(action)]
         position = path.position(when) if path else self._in_metres(action.path[0])
-        normal = self._normal(position)
+        normal = surface_normal(self.poses, self._pitch, position)
         size = float(between(action.force, when))
         if path and action.kind == "slide":
             velocity = path.velocity(when) / (action.end - action.start)
@@ -195,22 +215,41 @@ class Load:
         closed = len(action.path) > 2 and np.array_equal(action.path[0], action.path[-1])
         return CubicSpline(self._in_metres(action.path), closed=closed)
 
-    def _normal(self, position: Array) -> Array:
-        """(3,) out of the skin: the mean of the cubes' z axes, weighted by how near they are."""
-        square = ((self._position - position) ** 2).sum(axis=1)
-        weight = np.exp((square.min() - square) / (2 * self.poses.pitch**2))
-        normal = weight @ self._rotation[:, :, 2]
-        length = np.linalg.norm(normal)
-        return normal / length if length > 0 else self._rotation[np.argmin(square), :, 2]
+
+def surface_normal(poses: CubePoses, pitch: float, position: Array) -> Array:
+    """(3,) out of the skin: the mean of the cubes' z axes, weighted by how near they are.
+
+    pitch: that of the poses, m, which takes long to find
+    """
+    square = ((poses.position - position) ** 2).sum(axis=1)
+    weight = np.exp((square.min() - square) / (2 * pitch**2))
+    normal = weight @ poses.rotation[:, :, 2]
+    length = np.linalg.norm(normal)
+    return normal / length if length > 0 else poses.rotation[np.argmin(square), :, 2]
+
+
+def total(presses: Sequence[Press]) -> tuple[Array, Array, Array]:
+    """Sum (3,) of all forces on the skin in N, their centre of pressure (3,) in m and the mean
+    normal (3,) there.
+
+    Without load centre and normal are NaN.
+    """
+    if not presses:
+        return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
+    weight = np.array([-press.force @ press.normal for press in presses])
+    force = np.sum([press.force for press in presses], axis=0)
+    centre = weight @ np.array([press.position for press in presses]) / weight.sum()
+    normal = weight @ np.array([press.normal for press in presses])
+    return force, centre, normal / np.linalg.norm(normal)
 
 
 class LoadMemory:
     """The fields of a load at whole microseconds. Those of a periodic script are kept for the next
     time that it comes by there: each costs a contact problem for every cube."""
 
-    def __init__(self, load: Load) -> None:
+    def __init__(self, load: AnyLoad) -> None:
         self._load = load
-        period = load.script.period
+        period = load.repeats
         self._period_us = None if period is None else round(1e6 * period)
         self._fields: dict[int, tuple[Array, Array]] = {}
 

@@ -16,7 +16,7 @@ from ..core.modes import COMPONENTS
 from ..core.rows import FrequencyRows, StressRows
 from ..elastic.surface import Contact, Surface
 from .cubes import calibration_groups, skin_components
-from .load import Load
+from .load import AnyLoad
 from .sample_log import SampleLog
 from .verification import Arrivals, Comparison, compare, percentile
 
@@ -63,7 +63,7 @@ class Forces:
 class LoadVerification:
     """Collects rows as they arrive; `compare` then says which of them should have arrived."""
 
-    def __init__(self, skin: Skin, load: Load) -> None:
+    def __init__(self, skin: Skin, load: AnyLoad) -> None:
         self._skin, self._load = skin, load
         self._frequencies, self._stress = Arrivals(skin), Arrivals(skin)
         self._components: list[NDArray[np.floating]] = []
@@ -129,7 +129,7 @@ class LoadVerification:
             raise MessageError(
                 "no tensors of all cubes at one time have arrived: there are no forces to draw"
             )
-        surface = Surface(self._load.poses, self._load.script.depth)
+        surface = Surface(self._load.poses, self._load.depth)
         seconds = (times - self._log.start_time_ns) * 1e-9
         applied = [self._load.total(time) for time in seconds.tolist()]
         found = []

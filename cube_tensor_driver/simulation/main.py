@@ -13,11 +13,11 @@ import sys
 from pathlib import Path
 
 from ..config.load_script import read_script
-from ..config.skin import read_skin
+from ..config.skin import Skin, read_skin
 from ..config.yaml import read_yaml
 from ..core.errors import CubeError
 from .faults import parse_faults
-from .load import Load, default_script
+from .load import AnyLoad, Load, default_script
 from .simulator import Simulator, StopSignal
 
 
@@ -41,10 +41,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--log", type=Path, help="file for the log of what was sampled (JSON), written at the end"
     )
-    parser.add_argument(
+    loads = parser.add_mutually_exclusive_group()
+    loads.add_argument(
         "--load",
         type=Path,
         help="load script; docs/simulation.md (default: an indenter that wanders over the skin)",
+    )
+    loads.add_argument(
+        "--mujoco", type=Path, help="MuJoCo scene that plays by itself; docs/simulation.md"
     )
     parser.add_argument(
         "--instants",
@@ -66,7 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
             parse_faults(read_yaml(options.faults), str(options.faults)) if options.faults else []
         )
         skin = read_skin(options.config)
-        load = Load(skin, read_script(options.load) if options.load else default_script())
+        load = _load(skin, options)
         simulator = Simulator(
             skin,
             load,
@@ -92,6 +96,15 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"simulator: {error}", file=sys.stderr)
             return 1
     return 0
+
+
+def _load(skin: Skin, options: argparse.Namespace) -> AnyLoad:
+    """What acts on the skin. CubeError: it cannot be used."""
+    if options.mujoco:
+        from .mujoco_scene import MujocoLoad  # the elastic tables and MuJoCo take long to load
+
+        return MujocoLoad(options.mujoco, skin)
+    return Load(skin, read_script(options.load) if options.load else default_script())
 
 
 if __name__ == "__main__":

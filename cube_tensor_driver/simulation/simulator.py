@@ -25,7 +25,7 @@ from .faults import Fault, HubSize
 from .hub import SimulatedHub
 from .injector import Injector, SimulatedLink
 from .line import Line, TcpLine
-from .load import Load, LoadMemory
+from .load import AnyLoad, LoadMemory
 from .sample_log import ABSENT, LinkLog, SampleLog
 
 FIRST_UID = 0xC0BE_0000_0000_0001
@@ -63,7 +63,7 @@ class Simulator:
     def __init__(
         self,
         skin: Skin,
-        load: Load,
+        load: AnyLoad,
         ports: Path,
         *,
         noise: float | None = 0.0,

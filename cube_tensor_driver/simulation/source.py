@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..config.load_script import read_script
 from ..config.skin import Skin
@@ -16,13 +17,15 @@ from ..core.rows import FrequencyRows
 from ..device.protocol import NOT_MEASURED
 from .cubes import hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
-from .load import Load, LoadMemory, default_script
+from .load import AnyLoad, Load, LoadMemory, default_script
 from .sample_log import SEQUENCE_RANGE
+
+Array = NDArray[np.float64]
 
 
 def simulate(
     skin: Skin,
-    load: Load | Path | str | None = None,
+    load: AnyLoad | Path | str | None = None,
     *,
     rate: float | None = None,
     duration: float | None = None,
@@ -31,8 +34,8 @@ def simulate(
 ) -> SimulatedSource:
     """The frequencies that hubs of this skin would send under a load, scan by scan.
 
-    load: what presses on the skin, or the file of a load script; None: the shipped script, an
-        indenter that wanders over the skin
+    load: what presses on the skin (a `Load`, a `MujocoLoad`), or the file of a load script; None:
+        the shipped script, an indenter that wanders over the skin
     rate: samples per second; None: the skin's, 100 where it has none
     duration: s of simulated time; None: without end
     noise: standard deviation of a frequency relative to itself (8e-6 is usual)
@@ -41,7 +44,7 @@ def simulate(
     ConfigError: a rate that hubs refuse, a duration that is not greater than 0, an unusable load
     script, or cubes of one hub with different numbers of pads.
     """
-    if not isinstance(load, Load):
+    if load is None or isinstance(load, (Path, str)):
         script = default_script() if load is None else read_script(Path(load))
         load = Load(skin, script)
     if rate is None:
@@ -67,7 +70,7 @@ class SimulatedSource:
     """
 
     skin: Skin
-    load: Load
+    load: AnyLoad
     period_us: int
     duration: float | None = None
     noise: float = 0.0
@@ -87,40 +90,57 @@ class SimulatedSource:
         }
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        hubs = hub_cubes(self.skin, noise=self.noise, drift=self.drift)
-        members = [hub.skin_cubes for hub in hubs]
-        cube = np.concatenate(members).astype(np.uint16)
-        n_pads = max(hub.cubes.n_pads for hub in hubs)
+        pads = SkinPads(self.skin, noise=self.noise, drift=self.drift)
         fields = LoadMemory(self.load)
         self.scans = 0
         for number in itertools.count():
             time_us = number * self.period_us
             if self.duration is not None and time_us >= round(1e6 * self.duration):
                 return
-            stress, gradient = fields.at(time_us)
-            millihertz = np.full((len(cube), n_pads), NOT_MEASURED, np.uint32)
-            start = 0
-            for hub, cubes in zip(hubs, members, strict=True):
-                end = start + len(cubes)
-                millihertz[start:end, : hub.cubes.n_pads] = hub.cubes.frequency(
-                    stress[cubes], gradient[cubes], 1e-6 * time_us
-                )
-                start = end
-            frequency = (millihertz * 1e-3).astype(np.float32)
-            frequency[millihertz == NOT_MEASURED] = np.nan
             self.scans += 1
-            yield FrequencyRows(
-                cube=cube,
-                sequence=np.full(len(cube), number % SEQUENCE_RANGE, np.uint32),
-                stamp_ns=np.full(len(cube), 1000 * time_us),
-                frequency=frequency,
-                temperature=np.full(len(cube), np.nan, np.float32),
-                pad_fault=np.zeros(len(cube), np.uint32),
-                status=np.zeros(len(cube), np.uint16),
-            )
+            yield pads.rows(*fields.at(time_us), number, time_us)
 
     def __enter__(self) -> SimulatedSource:
         return self
 
     def __exit__(self, *error: object) -> None:
         """Nothing is held open."""
+
+
+class SkinPads:
+    """What the pads of a whole skin measure. noise, drift: as in `SimulatedCubes`.
+
+    ConfigError: cubes of one hub have different numbers of pads.
+    """
+
+    def __init__(self, skin: Skin, *, noise: float | None = 0.0, drift: float = 0.0) -> None:
+        self._hubs = hub_cubes(skin, noise=noise, drift=drift)
+        self._cube = np.concatenate([hub.skin_cubes for hub in self._hubs]).astype(np.uint16)
+        self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
+
+    def rows(self, stress: Array, gradient: Array, number: int, time_us: int) -> FrequencyRows:
+        """Scan `number`, a row of every cube, under the fields of the cubes in the skin's order.
+
+        stress: (cubes, 6) Pa; gradient: (cubes, 6, 3) Pa/m; time_us: simulated time
+        """
+        count = len(self._cube)
+        millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
+        start = 0
+        for hub in self._hubs:
+            cubes = hub.skin_cubes
+            end = start + len(cubes)
+            millihertz[start:end, : hub.cubes.n_pads] = hub.cubes.frequency(
+                stress[cubes], gradient[cubes], 1e-6 * time_us
+            )
+            start = end
+        frequency = (millihertz * 1e-3).astype(np.float32)
+        frequency[millihertz == NOT_MEASURED] = np.nan
+        return FrequencyRows(
+            cube=self._cube,
+            sequence=np.full(count, number % SEQUENCE_RANGE, np.uint32),
+            stamp_ns=np.full(count, 1000 * time_us),
+            frequency=frequency,
+            temperature=np.full(count, np.nan, np.float32),
+            pad_fault=np.zeros(count, np.uint32),
+            status=np.zeros(count, np.uint16),
+        )

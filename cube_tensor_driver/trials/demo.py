@@ -28,8 +28,9 @@ from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import queue
-from ..simulation.load import Load, default_script
+from ..simulation.load import AnyLoad, Load, default_script
 from ..simulation.load_verification import LoadVerification
+from ..simulation.mujoco_scene import MujocoLoad, scene_skin
 from ..terminal.live_table import LiveTable
 from .running import Interrupted, Observer, Usage, end_simulator, interruption, observing
 
@@ -46,6 +47,7 @@ def run_demo(
     config: Path | None = None,
     cubes: int | None = None,
     load: Path | None = None,
+    mujoco: Path | None = None,
     rate: float | None = None,
     noise: float | None = None,
     duration: float | None = None,
@@ -58,6 +60,7 @@ def run_demo(
 
     config: skin file; None: the shipped one, or a grid of so many `cubes`
     load: load script; None: the shipped one
+    mujoco: MuJoCo scene that takes the place of a load script; without `config` it names its skin
     rate: samples per second; None: the skin's, 100 where it has none
     noise: of the pads, relative to their frequencies; None: as the calibrations state
     duration: s to measure, after which figures are given; None: until Ctrl-C, without figures
@@ -72,13 +75,14 @@ def run_demo(
     try:
         with tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
             folder = Path(name)
-            path = config.resolve() if config else _skin_file(folder, cubes, rate or RATE)
+            path = _skin_path(folder, config, cubes, mujoco, rate or RATE)
             skin = read_skin(path)
             rate = rate or skin.rate or RATE
-            applied = Load(skin, read_script(load) if load else default_script())
+            applied = _applied(skin, load, mujoco)
             verification = LoadVerification(skin, applied) if duration else None
             log = folder / "log.json"
-            hubs = SimulatedHubs(folder / "ports", load=load, sample_log=log, noise=noise)
+            ports = folder / "ports"
+            hubs = SimulatedHubs(ports, load=load, mujoco=mujoco, sample_log=log, noise=noise)
             processes = skin_processes(path, rate=rate, simulated=hubs)
             if view:
                 processes.append(VIEW)
@@ -121,6 +125,28 @@ def run_demo(
         sent, lost = result["samples_sent"], result["lost"]
         print(f"wrote {json_path}: {sent} samples sent, {lost} lost")
     return 0
+
+
+def _skin_path(
+    folder: Path, config: Path | None, cubes: int | None, mujoco: Path | None, rate: float
+) -> Path:
+    """The skin file of a demo. ConfigError: the options contradict each other."""
+    if config is not None:
+        return config.resolve()
+    if mujoco is None:
+        return _skin_file(folder, cubes, rate)
+    if cubes is not None:
+        raise ConfigError("--cubes makes a skin that no scene knows; name its file with --config")
+    return scene_skin(mujoco)
+
+
+def _applied(skin: Skin, load: Path | None, mujoco: Path | None) -> AnyLoad:
+    """What acts on the skin, computed here too. ConfigError: it cannot be used."""
+    if mujoco is None:
+        return Load(skin, read_script(load) if load else default_script())
+    if load is not None:
+        raise ConfigError("--load and --mujoco are two loads for one skin; give one of them")
+    return MujocoLoad(mujoco, skin)
 
 
 def _skin_file(folder: Path, cubes: int | None, rate: float) -> Path:

@@ -1,0 +1,111 @@
+"""Stress and gradient at cubes under many discs of traction, fast enough for every step of a robot.
+
+The field of a disc depends on the distance r, and turns with the direction phi = atan2(y, x) from
+the disc to the cube. In the circular components of `_NAMES`, of order m = 0 to 3 about z, and with
+the force (F_r, F_t, F_z) along and across that direction, it is::
+
+    c = exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t),     R, T, Z real
+
+The tables R, T and Z are those of kernels.py at each distance and radius.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.modes import STRESS
+from .cache import cached
+from .kernels import PER_DEPTH, REACH, Waves
+from .layer import FIELD, Layer
+
+Array = NDArray[np.float64]
+
+SIZES = np.geomspace(0.1, 5.0, 23)
+"""Radii of the discs in the tables over the depth; others are rounded, by 10 % at most."""
+
+
+def _circular() -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
+    """(14, 24) circular components of FIELD, and the order (14,) of each."""
+
+    def of(name: str) -> NDArray[np.complex128]:
+        return np.eye(len(FIELD))[FIELD.index(name)].astype(complex)
+
+    def plane(suffix: str) -> list[tuple[int, NDArray[np.complex128]]]:
+        """Mean of xx and yy, zz; (zx, yz) as a vector; (xx - yy) / 2 and xy."""
+        s = {name: of(name + suffix) for name in STRESS}
+        return [
+            (0, (s["xx"] + s["yy"]) / 2),
+            (0, s["zz"]),
+            (1, s["zx"] + 1j * s["yz"]),
+            (2, (s["xx"] - s["yy"]) / 2 + 1j * s["xy"]),
+        ]
+
+    rows = plane("") + plane("_z")
+    for (order, along_x), (_, along_y) in zip(plane("_x"), plane("_y"), strict=True):
+        rows.append((order + 1, along_x + 1j * along_y))
+        if order > 0:
+            rows.append((order - 1, along_x - 1j * along_y))
+    return np.stack([row for _, row in rows]), np.array([order for order, _ in rows])
+
+
+_CIRCULAR, _ORDERS = _circular()
+_BACK = np.linalg.pinv(np.concatenate([_CIRCULAR.real, _CIRCULAR.imag])).T
+"""(28, 24) FIELD from real and imaginary parts of the circular components."""
+
+
+class Discs:
+    """Tables for cubes at one depth in a layer.
+
+    Parameters: layer; depth: from the cubes' centres to the surface, m. Raises ElasticError where
+    the layer has no such depth. Takes a second or two the first time (cache.py).
+    """
+
+    def __init__(self, layer: Layer, depth: float) -> None:
+        layer.check_depth(depth)
+        self.layer, self.depth = layer, depth
+        table = cached("discs", [layer.thickness, layer.poisson, depth], self._tables)["table"]
+        # Every place together with the next one: one look-up for an interpolation.
+        self._table = np.concatenate([table[:, :-1], table[:, 1:]], axis=2)
+
+    def _tables(self) -> dict[str, NDArray[np.float32]]:
+        """table (sizes, places, 3, 14): R, Z and T of each component, from r = 0 on."""
+        field = Waves(self.layer, self.depth).discs(SIZES * self.depth)[:, 1:]
+        circular = np.einsum("cf,srfi->sric", _CIRCULAR, field)
+        parts = [circular[:, :, 0].real, circular[:, :, 2].real, circular[:, :, 1].imag]
+        return {"table": np.stack(parts, axis=2).astype(np.float32)}
+
+    def field(self, place: ArrayLike, force: ArrayLike, radius: ArrayLike) -> tuple[Array, Array]:
+        """Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, each the sum over L discs.
+
+        place: (N, L, 2) m, of the cube from the middle of the disc, in the cube's frame
+        force: (N, L, 3) N on the skin, in the cube's frame
+        radius: (L,) m
+
+        Each disc carries Hertz's traction, 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2). Beyond REACH
+        depths everything counts as zero. As `contact.field`, order xx yy zz yz zx xy, tension positive.
+        """
+        x, y = np.moveaxis(np.asarray(place, float), -1, 0)
+        fx, fy, fz = np.moveaxis(np.asarray(force, float), -1, 0)
+        r = np.hypot(x, y)
+        turn = np.where(r > 0, (x + 1j * y) / np.where(r > 0, r, 1.0), 1.0)
+        polar = (fx + 1j * fy) * turn.conj()
+        position = r / self.depth * PER_DEPTH
+        first = np.minimum(position, REACH * PER_DEPTH - 1).astype(np.intp)
+        part = np.where(position < REACH * PER_DEPTH, position - first, 0.0)
+        weight = np.stack([1 - part, part], axis=-1) * (position < REACH * PER_DEPTH)[..., None]
+        load = np.zeros((*r.shape, 2, 2, 3), np.float32)  # real and imaginary, place, R Z T
+        load[..., 0, :, 0] = weight * polar.real[..., None]
+        load[..., 0, :, 1] = weight * fz[..., None]
+        load[..., 1, :, 2] = weight * polar.imag[..., None]
+        parts = load.reshape(*r.shape, 2, 6) @ self._table[self._size(radius), first]
+        circular = parts[..., 0, :] + 1j * parts[..., 1, :]
+        powers = np.stack([np.ones_like(turn), turn, turn**2, turn**3], axis=-1)
+        total = np.einsum("nlc,nlc->nc", circular, powers.astype(np.complex64)[..., _ORDERS])
+        field = np.concatenate([total.real, total.imag], axis=1).astype(float) @ _BACK
+        return field[:, :6], field[:, 6:].reshape(-1, 6, 3)
+
+    def _size(self, radius: ArrayLike) -> NDArray[np.intp]:
+        """Number of the nearest radius in the tables."""
+        ratio = np.clip(np.asarray(radius, float) / self.depth, SIZES[0], SIZES[-1]) / SIZES[0]
+        return np.rint(np.log(ratio) / np.log(SIZES[1] / SIZES[0])).astype(np.intp)

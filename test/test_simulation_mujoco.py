@@ -1,0 +1,230 @@
+"""Skins on the bodies of MuJoCo models: forces in equal forces out, on bodies that stick, slip and
+roll; the discs and patches that this is made of, against exact sums."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.cli.main import main
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import Skin, check_skin_data, read_skin
+from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.elastic import contact
+from cube_tensor_driver.elastic.discs import SIZES, Discs
+from cube_tensor_driver.elastic.inverse import SurfaceInverse
+from cube_tensor_driver.elastic.layer import Layer
+from cube_tensor_driver.simulation.mujoco import MujocoSkin
+from cube_tensor_driver.simulation.mujoco_scene import MujocoLoad, scene_skin
+from cube_tensor_driver.simulation.patches import flat_contact
+from cube_tensor_driver.simulation.source import simulate
+
+DEPTH, PITCH = 4e-3, 6e-3
+SCENES = package_data() / "config" / "mujoco"
+WEIGHT, FRICTION = 0.5 * 9.81, 0.6
+# A skin that is turned, with a flat box on it.
+BOX = """
+<mujoco>
+  <option timestep="0.001" cone="elliptic" impratio="50"/>
+  <worldbody>
+    <body name="pad" pos="0.1 0.2 0.1" euler="0 0 30">
+      <geom type="box" size="0.05 0.05 0.005" pos="0 0 -0.001" friction="0.6"/>
+    </body>
+    <body name="box" pos="0.1 0.2 0.1079" euler="0 0 30">
+      <freejoint/>
+      <geom type="box" size="0.012 0.012 0.004" mass="0.5" friction="0.6"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+WEDGE = '<geom type="box" size="0.004 0.004 0.003" pos="0.018 0 0.003"/></body>'
+"""A second geom over some of the cubes."""
+ALONG = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
+"""The x axis of the skin in the world."""
+
+
+def pad(body: str = "pad") -> Skin:
+    data = grid(nx=7, ny=7, pitch=PITCH, rate=1000.0, layout="cube") | {"parent_frame": body}
+    skin, mistakes = check_skin_data(data, Path())
+    assert not mistakes
+    return skin
+
+
+@pytest.fixture(scope="module")
+def mujoco():
+    return pytest.importorskip("mujoco", reason="needs MuJoCo: pip install mujoco")
+
+
+@pytest.fixture(scope="module")
+def inverse():
+    return SurfaceInverse(pad(), depth=DEPTH)
+
+
+@pytest.fixture
+def box(mujoco):
+    """The box at rest on the skin; model, data and skin."""
+    model = mujoco.MjModel.from_xml_string(BOX)
+    data = mujoco.MjData(model)
+    touch = MujocoSkin(model, data, pad())
+    for _ in range(300):
+        mujoco.mj_step(model, data)
+    return model, data, touch
+
+
+def force_on(touch: MujocoSkin, inverse: SurfaceInverse) -> np.ndarray:
+    """(3,) N on the skin, in its frame, as the reconstructed tensors tell: the traction on the
+    surface, summed. The sum of the cubes' own traction leaves out what spreads beyond them."""
+    rows = touch.read()
+    field = inverse.field(np.concatenate([rows.stress, rows.gradient], axis=1))
+    force: np.ndarray = field.traction.sum(axis=0) * inverse.area
+    return force
+
+
+def test_discs_are_those_of_point_forces():
+    """Stress and gradient under discs of any radius and force anywhere, in a half space."""
+    random = np.random.default_rng(1)
+    cubes = np.column_stack([random.uniform(-0.02, 0.02, (20, 2)), np.full(20, -DEPTH)])
+    middle, forces = random.uniform(-0.02, 0.02, (6, 2)), random.normal(size=(6, 3))
+    cubes[0, :2] = middle[0]  # right below: the direction to the disc is lost there
+    radius = SIZES[[0, 4, 8, 12, 16, 18]] * DEPTH
+    place = cubes[:, None, :2] - middle
+    stress, gradient = Discs(Layer(poisson=0.3), DEPTH).field(
+        place, np.broadcast_to(forces, (20, 6, 3)), radius
+    )
+    exact = [
+        contact.field(cubes, *contact.hertz(a, f, c, order=10), 0.3)
+        for a, f, c in zip(radius, forces, middle, strict=True)
+    ]
+    expected, slope = (sum(parts) for parts in zip(*exact, strict=True))
+    assert np.abs(stress - expected).max() < 1e-3 * np.abs(expected).max()
+    assert np.abs(gradient - slope).max() < 2e-3 * np.abs(slope).max()
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 8])
+def test_a_flat_contact_keeps_force_and_moments_and_nothing_pulls(count):
+    random = np.random.default_rng(count)
+    normal = random.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    points = random.uniform(-0.02, 0.02, (count, 3))
+    points -= np.outer(points @ normal - 0.05, normal)
+    forces = random.normal(size=(count, 3)) - 4 * normal
+    discs = flat_contact(points, forces, normal, DEPTH)
+    np.testing.assert_allclose(discs.force.sum(axis=0), forces.sum(axis=0), rtol=1e-12)
+    moment = np.cross(points, forces).sum(axis=0)
+    np.testing.assert_allclose(np.cross(discs.place, discs.force).sum(axis=0), moment, atol=1e-12)
+    assert (discs.force @ normal < 0).all()
+
+
+def pull_at_the_foot(data, pull: float) -> None:
+    """A force in N on the box where it touches the skin, along it."""
+    data.body("box").xfrc_applied[:3] = pull * ALONG
+    data.body("box").xfrc_applied[3:] = np.cross([0, 0, -0.004], pull * ALONG)
+
+
+@pytest.mark.parametrize("pull", [0.0, 1.5, -2.5])
+def test_the_skin_feels_the_weight_and_the_pull_of_a_box_that_sticks(mujoco, box, inverse, pull):
+    """The box is pulled along the skin at its foot, with less than friction holds."""
+    model, data, touch = box
+    pull_at_the_foot(data, pull)
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    assert np.abs(data.qvel).max() < 1e-2
+    np.testing.assert_allclose(force_on(touch, inverse), [pull, 0, -WEIGHT], atol=0.02 * WEIGHT)
+
+
+def test_a_box_that_slips_drags_the_skin_along_by_friction_times_weight(mujoco, box, inverse):
+    model, data, touch = box
+    pressed, there = touch.touches()[0].press.position, data.body("box").xpos.copy()
+    # Pulled as hard as friction brakes it, it goes on at the same speed and does not tip.
+    data.qvel[:3] = 0.1 * ALONG
+    pull_at_the_foot(data, FRICTION * WEIGHT)
+    for _ in range(80):
+        mujoco.mj_step(model, data)
+    force, press = force_on(touch, inverse), touch.touches()[0].press
+    np.testing.assert_allclose(force, press.force, atol=0.02 * WEIGHT)
+    assert force[0] == pytest.approx(-FRICTION * force[2], rel=0.02)
+    # Slip is seen: what presses moves along the skin as far as the box does.
+    moved = (data.body("box").xpos - there) @ ALONG
+    assert moved > 5e-3
+    assert (press.position - pressed)[0] == pytest.approx(moved, abs=1e-3)
+
+
+def test_the_back_of_a_body_feels_nothing(mujoco):
+    """The same box below the skin, in free fall upwards."""
+    upwards = BOX.replace("<option", '<option gravity="0 0 9.81"').replace("0.1079", "0.0901")
+    model = mujoco.MjModel.from_xml_string(upwards)
+    data = mujoco.MjData(model)
+    touch = MujocoSkin(model, data, pad())
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    assert data.ncon > 0
+    assert not touch.touches()
+    np.testing.assert_allclose(touch.read().stress, 0.0, atol=1.0)
+
+
+@pytest.mark.parametrize(
+    ("scene", "seconds", "force"),
+    [
+        # A steel ball of 20 mm; a box of 0.3 kg in the air; a leg that is pushed down by 450 N.
+        ("ball", 0.6, [0, 0, -9.81 * 7800 * 4 / 3 * np.pi * 0.02**3]),
+        ("gripper", 1.6, [0, 0, -0.3 * 9.81]),
+        ("foot", 0.8, [0, 0, -450]),
+    ],
+)
+def test_shipped_scenes(mujoco, scene, seconds, force):
+    """They play, bear the weight, and are the same whenever they are asked for a time."""
+    path = SCENES / f"{scene}.xml"
+    skin = read_skin(scene_skin(path))
+    load = MujocoLoad(path, skin)
+    np.testing.assert_allclose(load.total(seconds)[0], force, atol=0.02 * np.linalg.norm(force))
+    once = np.concatenate(load.at(seconds), axis=None)
+    load.play(0.5 * seconds)
+    again = load.at(load.period + seconds), MujocoLoad(path, skin).at(seconds)
+    for fields in again:
+        np.testing.assert_array_equal(np.concatenate(fields, axis=None), once)
+    rows = next(iter(simulate(skin, load, rate=100.0)))
+    assert len(rows) == len(skin.cubes)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<mujoco", "MuJoCo cannot read it"),
+        ("<mujoco/>", "names no skin"),
+        (BOX.replace('"pad"', '"plate"'), "has no body pad.*bodies are world, plate, box"),
+        (
+            BOX.replace("0.05 0.05 0.005", "0.01 0.05 0.005"),
+            "no geom of body pad .* above cube c00",
+        ),
+        (
+            BOX.replace("</body>", WEDGE, 1),
+            "cube c.* lies .* mm below the surface, the others 4 mm",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_named(mujoco, tmp_path, text, said):
+    path = tmp_path / "scene.xml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said) as caught:
+        if "body" in text:
+            MujocoLoad(path, pad())
+        else:
+            scene_skin(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_mujoco_the_install_line_is_given(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ConfigError, match=r"pip install 'cube-tensor-driver\[mujoco\]'"):
+        scene_skin(SCENES / "ball.xml")
+
+
+def test_the_demo_says_in_one_line_why_it_does_not_start(capfd):
+    assert main(["demo", "--mujoco", "no_such_scene.xml"]) == 1
+    assert main(["demo", "--mujoco", str(SCENES / "ball.xml"), "--cubes", "3"]) == 1
+    no_file, two = capfd.readouterr().err.splitlines()
+    assert "no_such_scene.xml: no such file" in no_file and "--config" in two
