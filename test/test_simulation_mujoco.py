@@ -3,19 +3,21 @@ roll; the discs and patches that this is made of, against exact sums."""
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from conftest import ROOT
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, check_skin_data, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.elastic import contact
-from cube_tensor_driver.elastic.discs import SIZES, Discs
+from cube_tensor_driver.elastic.disc_tables import SIZES, DiscTables
 from cube_tensor_driver.elastic.inverse import SurfaceInverse
 from cube_tensor_driver.elastic.layer import Layer
 from cube_tensor_driver.simulation.mujoco import MujocoSkin
@@ -92,7 +94,7 @@ def test_discs_are_those_of_point_forces():
     cubes[0, :2] = middle[0]  # right below: the direction to the disc is lost there
     radius = SIZES[[0, 4, 8, 12, 16, 18]] * DEPTH
     place = cubes[:, None, :2] - middle
-    stress, gradient = Discs(Layer(poisson=0.3), DEPTH).field(
+    stress, gradient = DiscTables(Layer(poisson=0.3), DEPTH).field(
         place, np.broadcast_to(forces, (20, 6, 3)), radius
     )
     exact = [
@@ -215,6 +217,14 @@ def test_what_does_not_fit_is_named(mujoco, tmp_path, text, said):
         else:
             scene_skin(path)
     assert "\n" not in str(caught.value)
+
+
+def test_the_program_of_the_page_runs(mujoco, monkeypatch, capsys):
+    page = (ROOT / "docs" / "simulation.md").read_text()
+    _, program = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(ROOT)
+    exec(program, {})
+    assert re.fullmatch(r"greatest pressure \d+\.\d kPa\n", capsys.readouterr().out)
 
 
 def test_without_mujoco_the_install_line_is_given(monkeypatch):

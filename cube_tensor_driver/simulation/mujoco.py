@@ -16,7 +16,7 @@ hold in the model's reference configuration (qpos0). The surface is that of the 
 the cubes.
 
 Each cube sees a layer whose surface lies `depth` above it, across its own z axis, as in `load.py`;
-patches.py says how contact points become tractions, discs.py what these do to a cube. Contacts with
+patches.py says how contact points become tractions, elastic/disc_tables.py what these do to a cube. Contacts with
 the back of a body, where no cube looks, are not felt. The contact's own damping is MuJoCo's.
 
 MuJoCo is the extra `mujoco` of this package; it is loaded when a skin is made.
@@ -37,7 +37,7 @@ from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows, StressRows
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
-from ..elastic.discs import Discs as DiscTables
+from ..elastic.disc_tables import DiscTables
 from ..elastic.layer import Layer
 from .load import Press, surface_normal
 from .patches import Discs, flat_contact, hertz_radius

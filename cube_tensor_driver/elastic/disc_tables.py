@@ -54,7 +54,7 @@ _BACK = np.linalg.pinv(np.concatenate([_CIRCULAR.real, _CIRCULAR.imag])).T
 """(28, 24) FIELD from real and imaginary parts of the circular components."""
 
 
-class Discs:
+class DiscTables:
     """Tables for cubes at one depth in a layer.
 
     Parameters: layer; depth: from the cubes' centres to the surface, m. Raises ElasticError where
@@ -64,7 +64,9 @@ class Discs:
     def __init__(self, layer: Layer, depth: float) -> None:
         layer.check_depth(depth)
         self.layer, self.depth = layer, depth
-        table = cached("discs", [layer.thickness, layer.poisson, depth], self._tables)["table"]
+        table = cached("disc_tables", [layer.thickness, layer.poisson, depth], self._tables)[
+            "table"
+        ]
         # Every place together with the next one: one look-up for an interpolation.
         self._table = np.concatenate([table[:, :-1], table[:, 1:]], axis=2)
 
