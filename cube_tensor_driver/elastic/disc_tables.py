@@ -64,9 +64,8 @@ class DiscTables:
     def __init__(self, layer: Layer, depth: float) -> None:
         layer.check_depth(depth)
         self.layer, self.depth = layer, depth
-        table = cached("disc_tables", [layer.thickness, layer.poisson, depth], self._tables)[
-            "table"
-        ]
+        key = [layer.thickness, layer.poisson, depth]
+        table = cached("disc_tables", key, self._tables)["table"]
         # Every place together with the next one: one look-up for an interpolation.
         self._table = np.concatenate([table[:, :-1], table[:, 1:]], axis=2)
 
@@ -85,7 +84,8 @@ class DiscTables:
         radius: (L,) m
 
         Each disc carries Hertz's traction, 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2). Beyond REACH
-        depths everything counts as zero. As `contact.field`, order xx yy zz yz zx xy, tension positive.
+        depths everything counts as zero. Order xx yy zz yz zx xy, tension positive, as in
+        `contact.field`.
         """
         x, y = np.moveaxis(np.asarray(place, float), -1, 0)
         fx, fy, fz = np.moveaxis(np.asarray(force, float), -1, 0)

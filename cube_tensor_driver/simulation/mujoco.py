@@ -16,8 +16,9 @@ hold in the model's reference configuration (qpos0). The surface is that of the 
 the cubes.
 
 Each cube sees a layer whose surface lies `depth` above it, across its own z axis, as in `load.py`;
-patches.py says how contact points become tractions, elastic/disc_tables.py what these do to a cube. Contacts with
-the back of a body, where no cube looks, are not felt. The contact's own damping is MuJoCo's.
+patches.py says how contact points become tractions, elastic/disc_tables.py what these do to a cube.
+Contacts with the back of a body, where no cube looks, are not felt. The contact's own damping is
+MuJoCo's.
 
 MuJoCo is the extra `mujoco` of this package; it is loaded when a skin is made.
 """
