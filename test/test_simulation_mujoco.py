@@ -221,7 +221,7 @@ def test_what_does_not_fit_is_named(mujoco, tmp_path, text, said):
 
 def test_the_program_of_the_page_runs(mujoco, monkeypatch, capsys):
     page = (ROOT / "docs" / "simulation.md").read_text()
-    _, program = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    *_, program = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     monkeypatch.chdir(ROOT)
     exec(program, {})
     assert re.fullmatch(r"greatest pressure \d+\.\d kPa\n", capsys.readouterr().out)
@@ -233,7 +233,8 @@ def test_without_mujoco_the_install_line_is_given(monkeypatch):
         scene_skin(SCENES / "ball.xml")
 
 
-def test_the_demo_says_in_one_line_why_it_does_not_start(capfd):
+def test_the_demo_says_in_one_line_why_it_does_not_start(mujoco, capfd):
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     assert main(["demo", "--mujoco", "no_such_scene.xml"]) == 1
     assert main(["demo", "--mujoco", str(SCENES / "ball.xml"), "--cubes", "3"]) == 1
     no_file, two = capfd.readouterr().err.splitlines()

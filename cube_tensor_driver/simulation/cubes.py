@@ -15,6 +15,7 @@ from ..core.errors import ConfigError
 from ..core.modes import COMPONENTS, to_matrix
 from ..core.oscillator import pad_frequency, stress_slope
 from ..device.protocol import NOT_MEASURED
+from .imperfections import Imperfections, PadBehaviour
 from .sample_log import ABSENT
 
 
@@ -23,7 +24,7 @@ class SimulatedCubes:
 
     noise: standard deviation of a frequency relative to itself, 0 for none; None: what the
     calibration of each cube states. drift: relative change of every rest frequency per second;
-    seed: of the noise.
+    seed: of the noise and, with theirs, of the imperfections.
     """
 
     def __init__(
@@ -32,6 +33,7 @@ class SimulatedCubes:
         *,
         noise: float | None = 0.0,
         drift: float = 0.0,
+        imperfections: Imperfections | None = None,
         seed: int = 0,
     ) -> None:
         self.n_pads = calibrations[0].layout.n_pads
@@ -42,6 +44,10 @@ class SimulatedCubes:
             for calibration, rows in self._groups:
                 self._noise[rows] = frequency_noise(calibration)
         self._is_noisy = bool(self._noise.any())
+        self._behaviour = None
+        if imperfections is not None:
+            shape = (len(calibrations), self.n_pads)
+            self._behaviour = PadBehaviour(imperfections, shape, seed)
 
     def frequency(
         self, stress: NDArray[np.float64], gradient: NDArray[np.float64], seconds: float
@@ -51,13 +57,16 @@ class SimulatedCubes:
 
         A pad beyond what its law allows reads NOT_MEASURED, as an oscillator that stopped would.
         """
-        hertz = np.empty((len(stress), self.n_pads))
+        on_pads = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
             state = true_state(calibration, stress[rows], gradient[rows])
+            on_pads[rows] = state @ calibration.response.T
+        if self._behaviour is not None:
+            on_pads = self._behaviour.reported(on_pads, seconds)
+        hertz = np.empty_like(on_pads)
+        for calibration, rows in self._groups:
             rest = calibration.rest_frequency * (1 + self._drift * seconds)
-            hertz[rows] = pad_frequency(
-                state @ calibration.response.T, rest, calibration.beta, calibration.modulus
-            )
+            hertz[rows] = pad_frequency(on_pads[rows], rest, calibration.beta, calibration.modulus)
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
         return np.nan_to_num(np.rint(hertz * 1e3), nan=NOT_MEASURED).astype("<u4")
@@ -103,9 +112,15 @@ def frequency_noise(calibration: Calibration) -> NDArray[np.float64]:
     return relative
 
 
-def hub_cubes(skin: Skin, *, noise: float | None = 0.0, drift: float = 0.0) -> list[HubCubes]:
+def hub_cubes(
+    skin: Skin,
+    *,
+    noise: float | None = 0.0,
+    drift: float = 0.0,
+    imperfections: Imperfections | None = None,
+) -> list[HubCubes]:
     """The cubes of each simulated hub of a skin, in the order of its links; without those that
-    carry none. noise and drift as in `SimulatedCubes`.
+    carry none. noise, drift and imperfections as in `SimulatedCubes`.
 
     ConfigError: cubes of one hub have different numbers of pads.
     """
@@ -121,7 +136,9 @@ def hub_cubes(skin: Skin, *, noise: float | None = 0.0, drift: float = 0.0) -> l
                 f"link {link.name}: its cubes have {sorted(widths)} pads; all cubes of a hub must "
                 "have the same number"
             )
-        cubes = SimulatedCubes(calibrations, noise=noise, drift=drift, seed=number)
+        cubes = SimulatedCubes(
+            calibrations, noise=noise, drift=drift, imperfections=imperfections, seed=number
+        )
         hubs.append(HubCubes(link, members, cubes))
     return hubs
 

@@ -40,6 +40,7 @@ from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..elastic.disc_tables import DiscTables
 from ..elastic.layer import Layer
+from .imperfections import Imperfections
 from .load import Press, surface_normal
 from .patches import Discs, flat_contact, hertz_radius
 from .source import SkinPads
@@ -110,7 +111,7 @@ class MujocoSkin:
 
     Parameters: model, data: of MuJoCo; data is read after each step. thickness: of the elastomer
     over rigid ground, m; inf: a half space. young: Pa, sets how wide round contacts are; poisson.
-    noise, drift: as in `simulate`. Setting up takes seconds the first time.
+    noise, drift, imperfections: as in `simulate`. Setting up takes seconds the first time.
 
     ConfigError: MuJoCo is not installed, the model has no body of that name, or a cube does not
     lie below the surface of its body. ElasticError: thickness, poisson and depth make no layer.
@@ -127,6 +128,7 @@ class MujocoSkin:
         poisson: float = POISSONS_RATIO,
         noise: float | None = 0.0,
         drift: float = 0.0,
+        imperfections: Imperfections | None = None,
     ) -> None:
         self._mujoco = load_mujoco()
         self.model, self.data, self.skin = model, data, skin
@@ -139,7 +141,7 @@ class MujocoSkin:
         self._tables = _tables(Layer(thickness, poisson), round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
         self._curvature = _curvatures(model, self._mujoco)
-        self._pads = SkinPads(skin, noise=noise, drift=drift)
+        self._pads = SkinPads(skin, noise, drift, imperfections)
         self._reconstructor = Reconstructor(skin)
         self._scans = 0
 

@@ -17,6 +17,7 @@ from ..core.rows import FrequencyRows
 from ..device.protocol import NOT_MEASURED
 from .cubes import hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
+from .imperfections import Imperfections
 from .load import AnyLoad, Load, LoadMemory, default_script
 from .sample_log import SEQUENCE_RANGE
 
@@ -31,6 +32,7 @@ def simulate(
     duration: float | None = None,
     noise: float = 0.0,
     drift: float = 0.0,
+    imperfections: Imperfections | None = None,
 ) -> SimulatedSource:
     """The frequencies that hubs of this skin would send under a load, scan by scan.
 
@@ -40,6 +42,7 @@ def simulate(
     duration: s of simulated time; None: without end
     noise: standard deviation of a frequency relative to itself (8e-6 is usual)
     drift: relative change of every rest frequency per second
+    imperfections: of the pads: spread, creep, failure; None: they are as calibrated
 
     ConfigError: a rate that hubs refuse, a duration that is not greater than 0, an unusable load
     script, or cubes of one hub with different numbers of pads.
@@ -54,7 +57,7 @@ def simulate(
         raise ConfigError(f"rate is {rate!r}, allowed: {low:g} to {high:g} samples per second")
     if duration is not None and not duration > 0:
         raise ConfigError(f"duration is {duration!r}, allowed: a time greater than 0 s, or None")
-    source = SimulatedSource(skin, load, round(1e6 / rate), duration, noise, drift)
+    source = SimulatedSource(skin, load, round(1e6 / rate), duration, noise, drift, imperfections)
     hub_cubes(skin)
     return source
 
@@ -75,6 +78,7 @@ class SimulatedSource:
     duration: float | None = None
     noise: float = 0.0
     drift: float = 0.0
+    imperfections: Imperfections | None = None
     scans: int = 0
 
     @property
@@ -90,7 +94,7 @@ class SimulatedSource:
         }
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        pads = SkinPads(self.skin, noise=self.noise, drift=self.drift)
+        pads = SkinPads(self.skin, self.noise, self.drift, self.imperfections)
         fields = LoadMemory(self.load)
         self.scans = 0
         for number in itertools.count():
@@ -108,13 +112,19 @@ class SimulatedSource:
 
 
 class SkinPads:
-    """What the pads of a whole skin measure. noise, drift: as in `SimulatedCubes`.
+    """What the pads of a whole skin measure. noise and so on: as in `SimulatedCubes`.
 
     ConfigError: cubes of one hub have different numbers of pads.
     """
 
-    def __init__(self, skin: Skin, *, noise: float | None = 0.0, drift: float = 0.0) -> None:
-        self._hubs = hub_cubes(skin, noise=noise, drift=drift)
+    def __init__(
+        self,
+        skin: Skin,
+        noise: float | None = 0.0,
+        drift: float = 0.0,
+        imperfections: Imperfections | None = None,
+    ) -> None:
+        self._hubs = hub_cubes(skin, noise=noise, drift=drift, imperfections=imperfections)
         self._cube = np.concatenate([hub.skin_cubes for hub in self._hubs]).astype(np.uint16)
         self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
 

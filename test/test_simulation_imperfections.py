@@ -1,0 +1,64 @@
+"""Imperfect pads: creep against its closed form, and spread and failure as often as asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.simulation.imperfections import Imperfections, PadBehaviour
+from cube_tensor_driver.simulation.source import simulate
+
+CREEP = ((0.1, 0.5), (0.05, 20.0))
+
+
+def test_foam_creeps_under_a_step_and_recovers():
+    """v (1 + sum c (1 - exp(-t/tau))) while it is pressed for 3 s, and what is left of it after."""
+    pads = PadBehaviour(Imperfections(creep=CREEP), (1, 1), 0)
+    pads.reported(np.zeros((1, 1)), 0.0)
+    pressed, held = 1e4, 3.0
+    for time in np.arange(0.01, 6.0, 0.01):
+        found = pads.reported(np.full((1, 1), pressed * (time < held + 5e-3)), time)[0, 0]
+        loaded, after = min(time, held), max(time - held, 0.0)
+        crept = sum(c * -np.expm1(-loaded / tau) * np.exp(-after / tau) for c, tau in CREEP)
+        assert found == pytest.approx(pressed * (crept + (after < 5e-3)), rel=1e-9)
+
+
+def test_gains_spread_and_pads_fail_as_often_as_asked_for_and_always_alike():
+    stress, wanted = np.full((500, 24), -1e4), Imperfections(gain_spread=0.05, dead=0.1, seed=3)
+    found = PadBehaviour(wanted, stress.shape, 0).reported(stress, 1.0)
+    # Of 12,000 pads; four standard deviations of the estimates.
+    assert np.isnan(found).mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / 12e3))
+    assert np.nanstd(found / stress) == pytest.approx(0.05, rel=4 / np.sqrt(2 * 10.8e3))
+    again = PadBehaviour(wanted, stress.shape, 0).reported(stress, 1.0)
+    np.testing.assert_array_equal(again, found)
+    assert not np.array_equal(PadBehaviour(wanted, stress.shape, 1).reported(stress, 1.0), found)
+
+
+def test_a_simulated_skin_has_them():
+    """Dead pads are NaN; creep shows after the load has lasted, and nothing else changes."""
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    dead = next(iter(simulate(skin, imperfections=Imperfections(dead=0.5))))
+    assert 0.2 < np.isnan(dead.frequency).mean() < 0.8
+    sound, same, creeping = (
+        list(simulate(skin, rate=10.0, duration=3.0, imperfections=one))[-1].frequency
+        for one in (None, Imperfections(), Imperfections(creep=CREEP))
+    )
+    np.testing.assert_array_equal(same, sound)
+    assert np.abs(creeping - sound).max() > 10
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"gain_spread": -0.1}, "gain_spread is -0.1"),
+        ({"dead": 2.0}, "dead is 2.0"),
+        ({"dead": float("nan")}, "dead is nan"),
+        ({"creep": ((0.1, 0.0),)}, r"creep is \(0.1, 0.0\)"),
+    ],
+)
+def test_values_out_of_range_are_named(asked, said):
+    with pytest.raises(ConfigError, match=said):
+        Imperfections(**asked)
