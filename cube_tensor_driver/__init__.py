@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .bags.source import open_bag
     from .config.skin import read_skin
     from .core.errors import CubeError
+    from .core.forces import Forces
     from .core.reconstructor import Reconstructor
     from .core.rows import FrequencyRows, StressRows
     from .device.live import open_links
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CubeError",
+    "Forces",
     "FrequencyRows",
     "Reconstructor",
     "StressRows",
@@ -47,6 +49,7 @@ __path__ = pkgutil.extend_path(__path__, __name__)
 # Loaded when somebody asks for them: a node needs no bags, and a notebook no serial ports.
 _HOMES = {
     "CubeError": ".core.errors",
+    "Forces": ".core.forces",
     "FrequencyRows": ".core.rows",
     "Reconstructor": ".core.reconstructor",
     "StressRows": ".core.rows",

@@ -1,12 +1,16 @@
 """Tensor algebra against its definitions."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cube_tensor_driver.core.errors import CubeError
+from cube_tensor_driver.core.forces import Forces
 from cube_tensor_driver.core.modes import SPACE, to_matrix, to_six
+from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.symmetry import group
 from cube_tensor_driver.core.tensor import (
     contact_wrench,
@@ -143,3 +147,33 @@ def test_the_wrench_is_the_integral_over_the_face():
     )
     force, torque = contact_wrench(np.full((1, 6), np.nan), np.full((1, 9), np.nan), side)
     assert not force.any() and not torque.any()
+
+
+def test_forces_are_the_traction_of_the_parents_stress_on_each_turned_face():
+    """One stress in the parent frame, seen by cubes that are turned in all ways."""
+    angles = RNG.uniform(-3, 3, (20, 3))
+    side = RNG.uniform(0.002, 0.006, 20)
+    cubes = [
+        SimpleNamespace(xyz=(k, 0, 0), rpy=tuple(rpy), calibration=SimpleNamespace(half_side=w / 2))
+        for k, (rpy, w) in enumerate(zip(angles, side, strict=True))
+    ]
+    skin = SimpleNamespace(cubes=cubes)
+    turned = np.array([rotation_from_rpy(*rpy) for rpy in angles])
+    parent = STRESS[0]
+    seen = np.array([rotate_stress(parent, rotation.T) for rotation in turned])
+    expected = side[:, None] ** 2 * traction(parent, turned[:, :, 2])
+    order = RNG.permutation(20)
+    rows = StressRows.of(order, seen[order], np.zeros((20, 9)))
+    np.testing.assert_allclose(Forces(skin)(rows), expected[order], atol=1e-15)
+    whole = Forces(skin, side=0.01)(rows)
+    np.testing.assert_allclose(whole, (0.01 / side[order, None]) ** 2 * expected[order], atol=1e-15)
+
+    # the last row of each cube; a cube without one, and one that observes nothing, have NaN
+    blind = np.where(np.arange(20)[:, None] == 4, np.nan, seen[:19][np.arange(20) % 19])
+    rows = StressRows.of(np.arange(20) % 19, blind, np.zeros((20, 9)))
+    force = Forces(skin).of_skin(rows)
+    assert np.flatnonzero(np.isnan(force).any(axis=1)).tolist() == [4, 19]
+    np.testing.assert_allclose(force[0], expected[0], atol=1e-15)
+    flat = SimpleNamespace(cubes=[SimpleNamespace(**vars(cubes[0]) | {"rpy": (0, 0, 0)})])
+    planar = StressRows.of([0], [[1, np.nan, -3, np.nan, 2, np.nan]], np.zeros((1, 9)))
+    np.testing.assert_allclose(Forces(flat)(planar), [np.array([2, 0, -3]) * side[0] ** 2])

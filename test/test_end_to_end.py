@@ -23,12 +23,14 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from played_hub import REST, SINGLE, PlayedHub, greeting, sample
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
 
 from conftest import ROOT, decoded
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
+from cube_tensor_driver.core.forces import Forces
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
 from cube_tensor_driver.processes.children import Children, ros_arguments
@@ -128,15 +130,19 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     raw = ros.listen(SkinFrequencies, "frequencies")
     tensors = ros.listen(StressTensorStamped, "cubes/c05/stress")
     wrenches = ros.listen(WrenchStamped, "cubes/c05/wrench")
+    clouds = ros.listen(PointCloud2, "forces")
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     with Children(tmp_path) as children:
         for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
             if process.node and scans > 1:
                 process.parameters["publish_period"] = scans / skin.rate
+            if process.executable == "reconstruction":
+                process.parameters["forces"] = True
             children.start(process)
         ros.wait(
             lambda: len(batches) > 50 and len(raw) > 80 and len(tensors) > 20 and len(wrenches) > 20
         )
+        ros.wait(lambda: len(clouds) > 20)
         ros.wait(
             lambda: (
                 {status.name for array in diagnostics for status in array.status}
@@ -206,6 +212,20 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
         rtol=1e-6,
         atol=1e-30,
     )
+
+    # one point per cube: where it is, and the force of its last row in the message
+    stamped = {(one.header.stamp.sec, one.header.stamp.nanosec): one for one in batches}
+    cloud, batch = next(
+        (one, stamped[key])
+        for one in clouds
+        if (key := (one.header.stamp.sec, one.header.stamp.nanosec)) in stamped
+    )
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "fx", "fy", "fz"]
+    assert cloud.header.frame_id == "skin_base" and cloud.width == 16
+    points = np.frombuffer(cloud.data, "<f4").reshape(16, 6)
+    np.testing.assert_allclose(points[:, :3], [cube.xyz for cube in skin.cubes], rtol=1e-6)
+    expected = Forces(skin).of_skin(decoded(batch).rows)
+    np.testing.assert_array_equal(points[:, 3:], expected.astype(np.float32))
 
     # the latched info holds all that makes the same tensors of the recorded frequencies again
     info = infos[0]

@@ -104,6 +104,12 @@ def rpy_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
     return np.array(euler.mat2euler(rotation_from_quaternion(quaternion), "sxyz"))
 
 
+def face_force(stress: np.ndarray, side: np.ndarray | float) -> np.ndarray:
+    """(N, 3) w^2 sigma n: the force in N on the square face +z of a reference side in m, in the
+    frame of stress (N, 6) Pa. Components that are not observed count as 0."""
+    return side**2 * np.nan_to_num(stress)[..., [4, 3, 2]]
+
+
 def contact_wrench(
     stress: np.ndarray, gradient: np.ndarray, side: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +122,6 @@ def contact_wrench(
     needs gradients of shear, which pads of normal stress do not see, so it is 0. Components that
     are not observed count as 0.
     """
-    s, g = np.nan_to_num(stress), np.nan_to_num(gradient)
-    force = side**2 * s[..., [4, 3, 2]]
+    g = np.nan_to_num(gradient)
     torque = side**4 / 12 * np.stack([g[..., 7], -g[..., 6], np.zeros_like(g[..., 0])], axis=-1)
-    return force, torque
+    return face_force(stress, side), torque

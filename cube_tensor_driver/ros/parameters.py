@@ -79,9 +79,10 @@ RECONSTRUCTION = (
     Parameter(
         "wrench_side",
         0.0,
-        "Side of the face that wrenches refer to, m; 0: the cube's own.",
+        "Side of the face that wrenches and forces refer to, m; 0: the cube's own.",
         span=(0.0, 10.0),
     ),
+    Parameter("forces", False, "Publish one force per cube on `forces`, as a point cloud."),
     Parameter(
         "publish_period",
         0.0,

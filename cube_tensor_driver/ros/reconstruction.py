@@ -49,7 +49,9 @@ class Reconstruction(CubeNode):
         quality = batch_queue(self, skin.rate, len(skin.cubes))
         self._scan_limit = scan_limit(self, skin.rate)
         side = self.value("wrench_side") or None
-        self._publisher = StressPublisher(self, skin, reconstructor, quality, side)
+        self._publisher = StressPublisher(
+            self, skin, reconstructor, quality, side, bool(self.value("forces"))
+        )
         made.callback(self._publisher.close)
         self._info = self.create_publisher(SkinInfo, "info", LATCHED)
         made.callback(self.destroy_publisher, self._info)

@@ -14,6 +14,7 @@ from ..config.skin import Skin
 from ..core.reconstructor import Reconstructor
 from ..core.rows import StressRows
 from .cube_topics import CubeTopics
+from .force_cloud import ForceCloud
 from .node import BUFFERS_KEPT
 
 LISTENERS_S = 0.5
@@ -21,8 +22,11 @@ LISTENERS_S = 0.5
 
 
 class StressPublisher:
-    """Publishers of one reconstruction. side: of the face that wrenches refer to, m; None: each
-    cube's own."""
+    """Publishers of one reconstruction.
+
+    side: of the face that wrenches and forces refer to, m; None: each cube's own
+    forces: publish one force per cube, too
+    """
 
     def __init__(
         self,
@@ -31,11 +35,13 @@ class StressPublisher:
         reconstructor: Reconstructor,
         quality: QoSProfile,
         side: float | None,
+        forces: bool,
     ) -> None:
         self._node = node
         self._buffer = lru_cache(maxsize=BUFFERS_KEPT)(stress_codec.buffer)
         self._publisher = node.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._cubes = CubeTopics(node, skin, reconstructor, side)
+        self._forces = ForceCloud(node, skin, quality, side) if forces else None
         self._timer = node.create_timer(LISTENERS_S, self._cubes.find_listeners)
 
     def publish(self, stress: StressRows, stamp_ns: int, frame_id: bytes) -> None:
@@ -44,8 +50,12 @@ class StressPublisher:
         message.fill(stress)
         self._publisher.publish(message.data(stamp_ns))
         self._cubes.publish(stress)
+        if self._forces is not None:
+            self._forces.publish(stress, stamp_ns)
 
     def close(self) -> None:
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
         self._cubes.close()
+        if self._forces is not None:
+            self._forces.close()
