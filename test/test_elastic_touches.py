@@ -85,6 +85,29 @@ def test_stated_deviations_are_those_of_the_errors(cubes):
     assert errors.field[2] < 0.03 and errors.field[2] < errors.field[1] < errors.field[0]
 
 
+def test_two_balls_that_touch_are_one_contact_with_the_force_and_place_of_both(inverse):
+    """What is no disc is no disc to the fit either: its shapes take it up, and not the force."""
+    random, force = np.random.default_rng(5), np.array([0.0, 0.0, -1.5])
+    for centre in np.array([[5e-3, 4e-3], [-2e-3, 6e-3]]):
+        apart = 1.25e-3 * np.array([0.6, 0.8])
+        values = sum(ball(inverse, 2.5e-3, centre + sign * apart, force) for sign in (-1, 1))
+        (found,) = Touches(inverse, LEAST).update(noisy(values, random))
+        assert found.normal_force == pytest.approx(3, rel=0.02)
+        assert abs(found.normal_force - 3) < 4 * found.force_uncertainty
+        assert np.linalg.norm(found.position[:2] - centre) < 0.1e-3
+
+
+def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact_is():
+    """Its nearest cube does not. A fit that begins on the wrong side stays there: 7 mm off."""
+    bench = Bench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3), side=1)
+    force, random = np.array([0.6, -0.3, -3.0]), np.random.default_rng(6)
+    for centre in np.array([[11.7e-3, -4.4e-3], [6e-3, 9e-3]]):
+        values = bench.truth(bench.poses.position[:, :2], 5e-3, force, centre)
+        (found,) = Touches(bench.inverse, LEAST).update(bench.measured(values, random))
+        assert np.linalg.norm(found.position[:2] - centre) < 0.3e-3
+        assert found.position_uncertainty < 0.3e-3
+
+
 def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their_ids(inverse):
     random, touches = np.random.default_rng(3), Touches(inverse, LEAST)
     first, second = np.array([-4e-3, 1e-3]), np.array([14e-3, 1e-3])

@@ -26,6 +26,7 @@ class Disc:
 
     id: the same as long as it is followed
     place: (2,) m; size: radius, m; force: (3,) N; alpha: Pa, of what is left around it
+    doubt: m^2, variance of the place because it may lie elsewhere, inf before the first fit
     """
 
     id: int
@@ -34,6 +35,7 @@ class Disc:
     size: float
     force: Array
     alpha: float
+    doubt: float = np.inf
 
 
 class DiscModel:

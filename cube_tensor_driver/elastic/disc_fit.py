@@ -3,10 +3,13 @@
 With the forces f of discs whose middles c and radii a are given, this is linear. The steps of c and
 ln a are those of Gauss and Newton, with the covariance of what is left as weight::
 
-    y = sum_j R(c_j, a_j) f_j + H rest + e,      W = (alpha^2 K + N)^-1
+    y = sum_j (R(c_j, a_j) + sum_k s_jk D_k(c_j, a_j)) f_j + H rest + e
+    W = (alpha^2 K + S + N)^-1
 
-K is the prior of kernels.py, N the noise. alpha has the greatest (restricted) likelihood: where
-contacts are no Hertz contacts, it grows, and so do all standard deviations.
+K is the prior of kernels.py, N the noise. D moves pressure within a contact and leaves its force
+and place: it makes it longer along x or along a diagonal, and emptier or fuller at its rim. The
+shapes s have the covariance S, see SHAPE. alpha has the greatest (restricted) likelihood: where
+contacts are like none of these, it grows, and so do all standard deviations.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); N. A. C. Cressie, Statistics for
 Spatial Data (1993), 2.6.1 (restricted likelihood).
@@ -20,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from ..core.modes import COMPONENTS
 from .inverse import AMPLITUDE, MODEL_ERROR, SurfaceInverse
 from .kernels import SIZES
 
@@ -34,16 +38,26 @@ GREATEST_FORCE = 1e3
 OF_OTHERS = 1.3
 """Part of the mean size of a cube's components that has the model's error in each of them, too: an
 error of a pad's gain turns the great ones into the small ones."""
+SHAPE = np.array([0.7, 0.7, 1.0])
+"""Standard deviation of a contact's shapes. Two balls that touch each other have 1.1 in length, a
+rigid flat punch has 1 in flatness."""
+SHIFT, WIDER = 0.5, 0.2
+"""Parts of a contact's radius and of its logarithm by which D moves pressure."""
 COLD, WARM = 8, 3
 """Steps for a contact that has just begun, and for one that goes on."""
+SETTLED = 0.02
+"""A step that moves a contact by less, over the depth, and changes its size by a smaller part, is
+the last but one: what follows it is of second order."""
 _TRIED = {COLD: np.array([0.1, 0.3, 1.0, 3.0, 10.0]), WARM: np.array([0.5, 1.0, 2.0])}
 """Factors of alpha that are compared at a time."""
+_STEPS = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
+_AROUND = np.concatenate([_STEPS[1:], np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]]) / np.sqrt(2)])
 
 
 class Scan:
     """What some cubes see: values, their noise and prior, laid flat.
 
-    y: (D,) known values; noise, prior: (D, D)
+    y: (D,) known values; noise, prior: (D, D); sees_all: nothing is unknown
 
     Parameters: values: (n, C) of these cubes, NaN where unknown. prior: (n C, n C) their
     covariance. place: (n, 2) m, angle: (n,) rad, as `SurfaceInverse.flattened` gives them.
@@ -75,11 +89,13 @@ class Scan:
         self.y, self.noise = filled.ravel()[self._known], noise[both]
         self.prior = prior[both]
         self.size = len(self.y)
+        self.sees_all = self.size == n * len(COMPONENTS)
 
-    def response(self, middle: Array, size: float) -> Array:
-        """(D, 3) of a contact with force 1 N."""
-        seen = self.kernels.response(self.place - middle, self.angle, size)[:, self.columns]
-        return seen.reshape(-1, 3)[self._known]
+    def responses(self, middles: Array, size: float) -> Array:
+        """(K, D, 3) of contacts with force 1 N at K places (K, 2)."""
+        place = (self.place - middles[:, None]).reshape(-1, 2)
+        seen = self.kernels.response(place, np.tile(self.angle, len(middles)), size)
+        return seen[:, self.columns].reshape(len(middles), -1, 3)[:, self._known]
 
     def cross(self, points: Array) -> Array:
         """(points, 3, D) covariance of the traction at points with the values."""
@@ -92,7 +108,10 @@ class Scan:
 
 class Fitted(NamedTuple):
     """Contacts middles (J, 2), sizes (J,), forces (J, 3), what is left (alpha, factor, weighted
-    rest W r) and the linearised problem: J (D, 6 contacts), J' W J + prior."""
+    rest W r) and the linearised problem: J (D, 6 contacts), J' W J + prior.
+
+    score: -2 ln of the restricted likelihood, to compare fits of the same values
+    """
 
     middles: Array
     sizes: Array
@@ -102,6 +121,7 @@ class Fitted(NamedTuple):
     rest: Array
     jacobian: Array
     normal: Array
+    score: float
 
 
 def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> Fitted:
@@ -119,64 +139,85 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
     prior[3::6] = prior[4::6] = scan.pitch**-2
     for axis in range(3):
         prior[axis::6] = GREATEST_FORCE**-2
+    forces, before, score = np.zeros((count, 3)), np.inf, np.inf
+    last = False
     for step in range(steps + 1):
-        response = np.concatenate(
-            [scan.response(m, np.exp(a)) for m, a in zip(middles, logs, strict=True)], axis=1
-        )
-        factor = _factor(scan, alpha)
+        last |= step == steps
+        parts = [_Parts(scan, m, np.exp(a)) for m, a in zip(middles, logs, strict=True)]
+        response = np.concatenate([part.response for part in parts], axis=1)
+        shapes = [part.shapes @ force for part, force in zip(parts, forces, strict=True)]
+        shape = np.concatenate(shapes).T  # (D, 3 contacts)
+        noise = scan.noise + shape @ shape.T
+        factor = _factor(scan, noise, alpha)
         weighted = cho_solve(factor, response)
         forces = np.linalg.lstsq(response.T @ weighted, weighted.T @ scan.y, rcond=None)[0]
         forces = forces.reshape(count, 3)
         jacobian = np.empty((scan.size, 6 * count))
-        for j in range(count):
-            jacobian[:, 6 * j : 6 * j + 3] = response[:, 3 * j : 3 * j + 3]
-            jacobian[:, 6 * j + 3 : 6 * j + 6] = _slopes(scan, middles[j], logs[j], forces[j])
+        for j, (part, force) in enumerate(zip(parts, forces, strict=True)):
+            jacobian[:, 6 * j : 6 * j + 3] = part.response
+            jacobian[:, 6 * j + 3 : 6 * j + 6] = (part.slopes @ force).T
         residual = scan.y - response @ forces.ravel()
-        if step == steps or (steps == COLD and step % 2 == 0):
-            alpha = _best_alpha(scan, jacobian, residual, alpha * _TRIED[steps])
-            factor = _factor(scan, alpha)
+        if last or (steps == COLD and step % 2 == 0):
+            before = alpha
+            alpha, score = _best_alpha(scan, noise, jacobian, residual, alpha * _TRIED[steps])
+            factor = _factor(scan, noise, alpha)
         weighted = cho_solve(factor, jacobian)
         normal = jacobian.T @ weighted + np.diag(prior)
         normal[np.diag_indices(len(normal))] *= 1 + 1e-9
-        if step == steps:
+        if last:
             break
         right = weighted.T @ residual
         right[5::6] -= (logs - usual) * SIZE_SPREAD**-2
         change = np.linalg.lstsq(normal, right, rcond=None)[0].reshape(count, 6)
+        moved = max(np.abs(change[:, 3:5]).max() / depth, np.abs(change[:, 5]).max())
+        last = moved < SETTLED and (steps == WARM or alpha == before)
         middles += np.clip(change[:, 3:5], -depth / 2, depth / 2)
         middles = np.clip(middles, start - scan.pitch, start + scan.pitch)
         logs = np.clip(logs + np.clip(change[:, 5], -0.5, 0.5), low, high)
     rest = cho_solve(factor, residual)
-    return Fitted(middles, np.exp(logs), forces, alpha, factor, rest, jacobian, normal)
+    return Fitted(middles, np.exp(logs), forces, alpha, factor, rest, jacobian, normal, score)
 
 
-def _factor(scan: Scan, alpha: float) -> tuple[Array, bool]:
-    return cho_factor(alpha**2 * scan.prior + scan.noise, lower=True)
+class _Parts:
+    """What a contact of force 1 N makes, and how that changes with its place and shape.
 
+    response: (D, 3); slopes: (3, D, 3) by c_x, c_y and ln a
+    shapes: (3, D, 3) D, each times its standard deviation
+    """
 
-def _slopes(scan: Scan, middle: Array, log_size: float, force: Array) -> Array:
-    """(D, 3) derivatives of what a contact makes by c_x, c_y and ln a."""
-    step, share = scan.kernels.depth / 50, 0.02
-    slopes = np.empty((scan.size, 3))
-    for axis in (0, 1):
-        ahead = step * np.eye(2)[axis]
-        difference = scan.response(middle + ahead, np.exp(log_size)) - scan.response(
-            middle - ahead, np.exp(log_size)
+    def __init__(self, scan: Scan, middle: Array, size: float) -> None:
+        step = scan.kernels.depth / 50
+        here = scan.responses(
+            middle + np.concatenate([step * _STEPS, SHIFT * size * _AROUND]), size
         )
-        slopes[:, axis] = difference @ force / (2 * step)
-    wider, narrower = (scan.response(middle, np.exp(log_size + d)) for d in (share, -share))
-    slopes[:, 2] = (wider - narrower) @ force / (2 * share)
-    return slopes
+        narrower, wider = (
+            scan.responses(middle[None], size * np.exp(share))[0] for share in (-WIDER, WIDER)
+        )
+        self.response = here[0]
+        ahead = here[1:5].reshape(2, 2, *self.response.shape)
+        along = (ahead[:, 0] - ahead[:, 1]) / (2 * step)
+        self.slopes = np.concatenate([along, (wider - narrower)[None] / (2 * WIDER)])
+        axes = here[5:].reshape(4, 2, *self.response.shape).sum(axis=1) / 4
+        same_size = (1 - np.exp(-2 * WIDER)) / (np.exp(2 * WIDER) - np.exp(-2 * WIDER))
+        mixed = same_size * wider + (1 - same_size) * narrower
+        shapes = np.stack([axes[0] - axes[1], axes[2] - axes[3], self.response - mixed])
+        self.shapes = SHAPE[:, None, None] * shapes
 
 
-def _best_alpha(scan: Scan, jacobian: Array, residual: Array, alphas: Array) -> float:
-    """The one of some alphas with the greatest restricted likelihood."""
+def _factor(scan: Scan, noise: Array, alpha: float) -> tuple[Array, bool]:
+    return cho_factor(alpha**2 * scan.prior + noise, lower=True)
+
+
+def _best_alpha(
+    scan: Scan, noise: Array, jacobian: Array, residual: Array, alphas: Array
+) -> tuple[float, float]:
+    """The one of some alphas with the greatest restricted likelihood, and its score."""
     tried = np.clip(alphas, 1e-4 * AMPLITUDE, AMPLITUDE)
     scale = np.linalg.norm(jacobian, axis=0)
     columns = jacobian / np.where(scale > 0, scale, 1.0)
     scores = []
     for one in tried:
-        factor = _factor(scan, one)
+        factor = _factor(scan, noise, one)
         weighted = cho_solve(factor, np.column_stack([columns, residual]))
         normal = columns.T @ weighted[:, :-1] + 1e-12 * np.eye(columns.shape[1])
         projected = columns.T @ weighted[:, -1]
@@ -186,4 +227,5 @@ def _best_alpha(scan: Scan, jacobian: Array, residual: Array, alphas: Array) -> 
         )
         logs = 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1]
         scores.append(misfit + logs)
-    return float(tried[int(np.argmin(scores))])
+    best = int(np.argmin(scores))
+    return float(tried[best]), float(scores[best])

@@ -212,7 +212,8 @@ def field_rotation(angle: Array) -> Array:
     six[:, 4, 4], six[:, 4, 3], six[:, 3, 4], six[:, 3, 3] = c, -s, s, c
     out = np.zeros((len(angle), 24, 24))
     out[:, :6, :6] = six
-    gradient = np.einsum("nab,nij->naibj", six, _vector_rotation(angle))
+    turn = _vector_rotation(angle)
+    gradient = six[:, :, None, :, None] * turn[:, None, :, None, :]
     out[:, 6:, 6:] = gradient.reshape(len(angle), 18, 18)
     return out
 

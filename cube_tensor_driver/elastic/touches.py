@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .disc import Disc, DiscModel
-from .disc_choice import DROPPED, beginning, remaining, same
+from .disc_choice import beginning, remaining, same
 from .disc_fit import COLD, USUAL_SIZE, WARM, Fitted, Scan, fit
 from .disc_load import Load, load_of
 from .inverse import AMPLITUDE, SurfaceInverse, TractionField, covariance_matrix
@@ -26,8 +26,12 @@ NEAR = 16
 """Cubes next to a contact that it is computed from."""
 MOST = 10
 """Contacts at a time."""
-MUCH_LEFT = 0.02
-"""Alpha over AMPLITUDE from which on a contact counts as no Hertz contact."""
+MUCH_LEFT, WIDE_SIZE = 0.02, 2.5
+"""Alpha over AMPLITUDE from which on a contact is fitted once more, beginning with this radius over
+the depth."""
+CERTAIN = 0.005
+"""Pitches by which a place may be in doubt without that it is asked again where the contact is."""
+_CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 FIRST_ALPHA = 0.05
 """Alpha over AMPLITUDE from which the fit of a new contact begins."""
 
@@ -103,37 +107,8 @@ class Touches:
             self._discs.append(disc)
             self._fit(y, [*group, disc], COLD)
             self._discs = remaining(model, self._discs, self._least)
-        self._add_rest(rest, below)
         contacts = [self._contacts[disc.id] for disc in self._discs if disc.id in self._contacts]
         return sorted(contacts, key=lambda contact: -contact.normal_force)
-
-    def _add_rest(self, rest: TractionField, below: Array) -> None:
-        """Force and place of contacts that are no Hertz contacts: with all that is left nearby.
-
-        The few cubes of a fit do not reach over a wide contact; the windows of the field do.
-        """
-        middles = np.array([self._model.middle(disc) for disc in self._discs])
-        for number, disc in enumerate(self._discs):
-            contact = self._contacts.get(disc.id)
-            if contact is None or disc.alpha < MUCH_LEFT * AMPLITUDE:
-                continue
-            points, place, turn = self._model.points_around(disc)
-            apart = np.linalg.norm(self._inverse.points[points][:, None] - middles, axis=2)
-            mine = apart.argmin(axis=1) == number
-            mine &= below[points] > DROPPED * below[points[mine]].max(initial=0.0)
-            load = np.einsum("nji,nj->ni", turn[mine], rest.traction[points[mine]])
-            load *= self._inverse.area
-            force = disc.force + load.sum(axis=0)
-            if not force[2] < 0:
-                continue
-            shift = place[mine].T @ load[:, 2] / force[2]
-            rotation = self._inverse.poses.rotation[disc.home]
-            self._contacts[disc.id] = contact._replace(
-                position=middles[number] + rotation[:, :2] @ shift,
-                force=rotation @ force,
-                normal_force=float(-force[2]),
-                shear_force=float(np.hypot(force[0], force[1])),
-            )
 
     def _new(self, point: int) -> Disc:
         inverse = self._inverse
@@ -182,9 +157,44 @@ class Touches:
         alpha = max(disc.alpha for disc in discs)
         fitted = fit(scan, middles, sizes, alpha, steps)
         for j, disc in enumerate(discs):
+            fitted = self._otherwise(scan, fitted, disc, j, at[j], turn[j])
+        for j, disc in enumerate(discs):
             self._put(disc, fitted, j, cubes, place, angle)
             load = load_of(scan, fitted, j)
+            load = load._replace(place_variance=load.place_variance + disc.doubt / 2)
             self._contacts[disc.id] = self._tracked(disc.id, load, cubes, place, angle)
+
+    def _otherwise(
+        self, scan: Scan, fitted: Fitted, disc: Disc, j: int, at: Array, turn: Array
+    ) -> Fitted:
+        """The best of this fit and of others that begin where it does not find its way to.
+
+        at, turn: (2,), (2, 2) of the home of contact j. Much that is left may be a wide contact. On
+        another side of a cube that does not see all components, a contact looks nearly the same.
+        Both are tried for those that are new or were in doubt.
+        """
+        tried = [fitted]
+
+        def begin(middle: Array, size: float) -> None:
+            middles, sizes = fitted.middles.copy(), fitted.sizes.copy()
+            middles[j], sizes[j] = middle, size
+            tried.append(fit(scan, middles, sizes, FIRST_ALPHA * AMPLITUDE, COLD))
+
+        limit = MUCH_LEFT * AMPLITUDE
+        if fitted.alpha > limit and (disc.doubt > 0 or disc.alpha <= limit):
+            begin(fitted.middles[j], WIDE_SIZE * self._inverse.depth)
+        if disc.doubt > 0 and not scan.sees_all:
+            best = min(tried, key=lambda one: one.score)
+            away = np.abs(turn.T @ (best.middles[j] - at))
+            away = np.maximum(away, self._inverse.pitch / 4)
+            for corner in _CORNERS:
+                begin(at + turn @ (corner * away), USUAL_SIZE * self._inverse.depth)
+        best = min(tried, key=lambda one: one.score)
+        weight = np.exp([(best.score - one.score) / 2 for one in tried])
+        squares = [((one.middles[j] - best.middles[j]) ** 2).sum() for one in tried]
+        doubt = float(weight @ squares / weight.sum())
+        disc.doubt = doubt if doubt > (CERTAIN * self._inverse.pitch) ** 2 else 0.0
+        return best
 
     def _put(
         self, disc: Disc, fitted: Fitted, j: int, cubes: Index, place: Array, angle: Array
