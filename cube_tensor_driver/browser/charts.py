@@ -186,6 +186,7 @@ class Chart:
                 axes=axes,
                 scales=self._scales(),
                 padding=(10, 12, 0, 0),
+                cursor={"sync": {"key": "skin"}},  # both plots show the values of one instant
                 order=self._order + 1,
             )
 
