@@ -165,11 +165,13 @@ def test_defaults(computed):
 def test_every_flag_reaches_the_solver(computed):
     flags = (
         "--plane stress --width 30 --height 20 --side 5 --young 1e5 --poisson 0.4 --rigid "
-        "--symmetry mirrors --pad 1.5 --pad-centre 1.25 --meshes 2 --neglect xx"
+        "--symmetry mirrors --pad 1.5 --pad-centre 1.25 --meshes 2 --neglect xx --x 1 --z -2"
     )
     assert cli.main(["fem", *flags.split()]) == 1
     body, layout, symmetry, meshes, _ = computed[0]
-    assert body == bodies.Body(0.03, 0.03, 0.02, 0.005, 1e5, 0.4, np.inf, 0.30, "stress")
+    assert body == bodies.Body(
+        0.03, 0.03, 0.02, 0.005, 1e5, 0.4, np.inf, 0.30, "stress", 1e-3, -2e-3
+    )
     assert layout.pad_size == pytest.approx(0.6) and layout.positions[1] == pytest.approx(
         [0.5, 0, 1]
     )
@@ -206,6 +208,7 @@ def refused(capsys, arguments, words):
     ("flags", "words"),
     [
         ("--poisson 0.5", ["poisson is 0.5", "[0, 0.5)"]),
+        ("--z 4", ["4 mm off the body's middle along z", "3.3 mm off at most"]),
         ("--side 11", ["side is 11 mm", "height is 11 mm"]),
         (
             "--pad 1.2 --pad-centre 0.5",

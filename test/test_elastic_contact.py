@@ -180,6 +180,23 @@ def test_patches_converge_and_carry_their_force(patch):
     assert patch(5)[1].sum(axis=0) == pytest.approx([0.3, 0, -1])
 
 
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 2.5, 4.0])
+def test_a_hertz_contact_is_good_at_the_depth_that_its_order_is_for(ratio):
+    x = np.linspace(0, 3, 41)
+    points = np.stack([x, 0.3 * x, np.full(len(x), -1.0)], axis=1)
+    order = contact.hertz_order(ratio, 1.0)
+    made = contact.field(points, *contact.hertz(ratio, [0.3, 0, -1], order=order), 0.48)
+    exact = contact.field(points, *contact.hertz(ratio, [0.3, 0, -1], order=40), 0.48)
+    for a, b in zip(made, exact, strict=True):
+        assert np.abs(a - b).max() < 1e-3 * np.abs(b).max()
+
+
+@pytest.mark.parametrize("radius, depth", [(0.0, 1.0), (1.0, 0.0), (1.0, -1.0)])
+def test_no_order_without_a_contact_above_the_point(radius, depth):
+    with pytest.raises(ElasticError, match="radius is"):
+        contact.hertz_order(radius, depth)
+
+
 def test_leading_axes_broadcast():
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (4, 3)) - [0, 0, 1.5]

@@ -79,6 +79,29 @@ def reactions(ends, order, traction):
 # exact solutions
 
 
+@pytest.mark.parametrize("place", [(1e-9, 0.0), (0.0, 1e-9), (-1e-9, 1e-9)])
+@pytest.mark.parametrize("cube_young", [RIGID, 200e9], ids=["rigid", "steel"])
+def test_without_its_mirrors_a_body_gives_the_same(place, cube_young):
+    """A cube next to the middle is solved on all of the body, one in the middle on a quarter."""
+    layout, off = LAYOUTS["planar"], Body(x=place[0], z=place[1], cube_young=cube_young)
+    middle = compute_response(Body(cube_young=cube_young), layout, meshes=1).matrix
+    assert np.abs(compute_response(off, layout, meshes=1).matrix - middle).max() < 1e-5
+
+
+def test_a_cube_off_the_middle_feels_the_field_at_its_place_and_the_free_surface():
+    layout = LAYOUTS["planar"]
+    soft = Body(cube_young=0.3e6, cube_poisson=0.48, x=2e-3, z=-1e-3)
+    matrix = compute_response(soft, layout, meshes=1).matrix
+    assert np.abs(matrix - applied(layout, PLANE)).max() < 1e-6
+    up, down = (compute_response(Body(z=z), layout, meshes=1).matrix for z in (2e-3, -2e-3))
+    middle = compute_response(Body(), layout, meshes=1).matrix
+    # Turned over, pads and modes change places.
+    below = [layout.index(name.translate(str.maketrans("+-", "-+"))) for name in layout.pads]
+    turned = [1.0 if name in ("zz", "zx", "xx") else -1.0 for name in PLANE.names]
+    assert np.abs(up - down[below] * turned).max() < 1e-6
+    assert np.linalg.norm(up - middle) == pytest.approx(0.148 * np.linalg.norm(middle), rel=0.02)
+
+
 @pytest.mark.parametrize("plane", ["strain", "stress"])
 @pytest.mark.parametrize("layout", [HALVES, LAYOUTS["planar"]], ids=["halves", "strips"])
 def test_without_a_cube_pads_feel_the_applied_field(plane, layout):

@@ -68,6 +68,21 @@ def arguments(parser: Parser) -> None:
         help="side of the cube, mm (default: %(default)g)",
     )
     parser.add_argument(
+        "--x",
+        type=number,
+        default=0.0,
+        metavar="MM",
+        help="place of the cube's middle along x, from that of the body, mm (default: 0)",
+    )
+    parser.add_argument(
+        "--z",
+        type=number,
+        default=0.0,
+        metavar="MM",
+        help="the same along z, mm; off the middle a mesh is larger: in space twice for each of "
+        "the two (default: 0)",
+    )
+    parser.add_argument(
         "--young",
         type=positive,
         default=YOUNGS_MODULUS,
@@ -217,6 +232,8 @@ def body_of(options: argparse.Namespace, layout: Layout) -> Body:
         poisson=options.poisson,
         cube_young=math.inf if options.rigid else STEEL_PA,
         plane=options.plane or "strain",
+        x=options.x * 1e-3,
+        z=options.z * 1e-3,
     )
 
 
@@ -228,8 +245,11 @@ def describe(body: Body, layout: Layout) -> str:
         plane = ""
     size = " x ".join(f"{1e3 * length:g}" for length in lengths)
     cube = "rigid" if math.isinf(body.cube_young) else "steel"
+    where = ""
+    if body.x or body.z:
+        where = f", {1e3 * body.x:g} mm along x and {1e3 * body.z:g} mm along z off its middle"
     law = f"E {body.young / 1e6:g} MPa, nu {body.poisson:g}{plane}"
-    return f"{cube} cube of {1e3 * body.side:g} mm in a body of {size} mm ({law})"
+    return f"{cube} cube of {1e3 * body.side:g} mm in a body of {size} mm{where} ({law})"
 
 
 def command_of(options: argparse.Namespace) -> str:

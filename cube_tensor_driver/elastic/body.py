@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.defaults import HALF_SIDE, POISSONS_RATIO, YOUNGS_MODULUS
 from ..core.errors import ElasticError
 from ..core.layout import Layout
-from .mesh import block, section
+from .mesh import block, sections
 
 Array = NDArray[np.float64]
 
@@ -39,12 +38,14 @@ _CLOSEST_EDGES = 1e-3
 
 @dataclass(frozen=True)
 class Body:
-    """A box of elastomer with a cube bonded in its middle; lengths in m, moduli in Pa.
+    """A box of elastomer with a cube bonded in it; lengths in m, moduli in Pa.
 
     width, depth, height: along x, y and z (depth in 3-D only); side: of the cube
     young, poisson: of the body
     cube_young, cube_poisson: of the cube; cube_young = inf makes it rigid
     plane: "strain" or "stress", for layouts in a plane
+    x, z: where the cube's middle is, from that of the body
+    ground: the lower face is bonded to rigid ground
     Raises ElasticError when no such body can be computed.
     """
 
@@ -57,6 +58,9 @@ class Body:
     cube_young: float = 200e9
     cube_poisson: float = 0.30
     plane: str = "strain"
+    x: float = 0.0
+    z: float = 0.0
+    ground: bool = False
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "height", "side", "young", "cube_young"):
@@ -77,6 +81,13 @@ class Body:
                     f"the cube's side is {self.side * 1e3:g} mm but the body's {name} is "
                     f"{getattr(self, name) * 1e3:g} mm; the body must be at least 1.1 times as "
                     "large"
+                )
+        for name, across in (("x", "width"), ("z", "height")):
+            value, most = getattr(self, name), (getattr(self, across) - 1.1 * self.side) / 2
+            if not abs(value) <= most:
+                raise ElasticError(
+                    f"the cube is {value * 1e3:g} mm off the body's middle along {name}; within "
+                    f"this {across} it can be {most * 1e3:g} mm off at most"
                 )
         if self.plane not in ("strain", "stress"):
             raise ElasticError(f"plane is {self.plane!r}; it must be 'strain' or 'stress'")
@@ -118,11 +129,15 @@ def check_pads(body: Body, layout: Layout) -> None:
 
 
 def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
-    """Mesh of the body's positive part, lengths in d0; level 0 is the coarsest, 2 the finest.
+    """Mesh of the body about the cube's middle, lengths in d0; level 0 is the coarsest, 2 the
+    finest. Where the body is its own mirror image it is the positive part.
 
     Raises ElasticError when the edges of pads are too close to each other for it.
     """
-    half = [(body.width, body.depth, body.height)[k] / body.side for k in field_axes(layout)]
+    axes = list(field_axes(layout))
+    half = np.array([body.width, body.depth, body.height])[axes] / body.side
+    place = np.array([body.x, 0.0, body.z])[axes] / (body.side / 2)
+    whole = (place != 0) | (body.ground & (np.array(axes) == 2))
     stops = _pad_edges(layout)
     steps = np.diff(np.unique([0.0, *stops[stops < 1], 1.0]))
     if steps.min() < _CLOSEST_EDGES:
@@ -132,14 +147,14 @@ def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
             f"{mm * _CLOSEST_EDGES:g} mm; make the pads wider, or move their edges together or "
             "apart"
         )
-    return _mesh(half, stops, level, layout.planar)
+    return _mesh(np.where(whole, half + place, 0.0).tolist(), (half - place).tolist(), stops, level)
 
 
-def _mesh(half: Sequence[float], stops: Array, level: int, planar: bool) -> skfem.Mesh:
-    if planar:
-        return section(half, stops, level)
+def _mesh(lower: list[float], upper: list[float], stops: Array, level: int) -> skfem.Mesh:
+    if len(upper) == 2:
+        return sections(lower, upper, stops, level)
     sizes = BRICK_SIZES[level]
-    return block(half, stops, sizes.face, sizes.edge, sizes.growth)
+    return block(upper, stops, sizes.face, sizes.edge, sizes.growth, lower)
 
 
 def _pad_edges(layout: Layout) -> Array:

@@ -1,6 +1,6 @@
 """The response matrix of a cube by finite elements: the mean stress of each pad under each mode.
 
-The body is a box with the cube bonded in its middle. The tractions of a mode load its outer faces:
+The body is a box with the cube bonded in it. The tractions of a mode load its outer faces:
 without the cube, the mode's field would be everywhere in the body.
 """
 
@@ -30,6 +30,10 @@ from .solid import Parity, Solid, lame
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 """progress(done, total, what)"""
+
+
+_STIFF = 1e6
+"""Young's modulus of a rigid cube over that of the body, where the cube cannot be held."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +102,7 @@ def compute_response(
     check_pads(body, layout)
     grids = [make_mesh(body, layout, level) for level in range(meshes)]
     check_memory(grids[-1])
-    total = meshes * 2 ** len(field_axes(layout))
+    total = sum(2 ** int(np.sum(grid.p.min(axis=1) >= 0)) for grid in grids)
     done = itertools.count()
 
     def report(what: str) -> None:
@@ -211,7 +215,10 @@ def make_solid(body: Body, layout: Layout, grid: Any = None) -> Solid:
     cube = None
     if not np.isinf(body.cube_young):
         cube = lame(body.cube_young / body.young, body.cube_poisson, plane)
-    return Solid(grid or make_mesh(body, layout, 2), lame(1.0, body.poisson, plane), cube)
+    elif body.ground:  # it can move, as nothing else in a body without rigid motions
+        cube = lame(_STIFF, 0.0, plane)
+    mesh = grid or make_mesh(body, layout, 2)
+    return Solid(mesh, lame(1.0, body.poisson, plane), cube, body.ground)
 
 
 def linear_response(
@@ -244,10 +251,9 @@ def pad_stresses(
     forces(parity): nodal forces (dofs, n) of the loads' parts of this parity
     """
     stresses: Array | float = 0.0
-    parities = itertools.product((1, -1), repeat=solid.dim)
     # Parities that share their factors follow each other.
-    for parity in sorted(parities, key=lambda p: solid.with_sorted_axes(p)[0], reverse=True):
-        report("parity " + "".join("+" if sign > 0 else "-" for sign in parity))
+    for parity in sorted(solid.parities, key=lambda p: solid.with_sorted_axes(p)[0], reverse=True):
+        report("parity " + "".join("-0+"[sign + 1] for sign in parity))
         pads = [pad for pad in range(layout.n_pads) if _sees(layout, pad, parity)]
         load = forces(parity)
         part = np.zeros((layout.n_pads, load.shape[1]))
@@ -255,34 +261,38 @@ def pad_stresses(
         if pads and len(used):
             reactions = solid.reactions(solid.solve(parity, load[:, used]))
             for pad in pads:
-                part[pad, used] = _pad_stress(solid, reactions, parity, layout, pad)
+                dofs, weights = pad_weights(solid, parity, layout, pad)
+                part[pad, used] = weights @ reactions[dofs]
         stresses = stresses + part
     return np.asarray(stresses)
 
 
 def _part(field: Array, parity: Parity) -> Array:
     """The components of tensors (modes, dim, ..., dim) of one parity: an index k flips axis k."""
+    signs = np.array(parity)
     indices = np.indices(field.shape[1:])
     odd = np.stack([np.sum(indices == k, axis=0) % 2 == 1 for k in range(len(parity))], axis=-1)
-    return field * np.all(odd == (np.array(parity) < 0), axis=-1)
+    return field * np.all((odd == (signs < 0)) | (signs == 0), axis=-1)
 
 
 def _sees(layout: Layout, pad: int, parity: Parity) -> bool:
     """False where the pad's mean stress is zero, because the field is odd about its middle."""
     axes = list(field_axes(layout))
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
-    return bool(np.all((np.array(parity) > 0) | (np.abs(centre) > 1e-9) | (normal != 0)))
+    return bool(np.all((np.array(parity) >= 0) | (np.abs(centre) > 1e-9) | (normal != 0)))
 
 
-def _pad_stress(solid: Solid, reactions: Array, parity: Parity, layout: Layout, pad: int) -> Array:
+def pad_weights(
+    solid: Solid, parity: Parity, layout: Layout, pad: int
+) -> tuple[NDArray[np.int64], Array]:
+    """Dofs (m,) and weights (m,) with weights @ reactions[dofs] = mean normal stress of a pad."""
     axes, half = list(field_axes(layout)), layout.pad_size / 2
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
     axis = int(np.argmax(np.abs(normal)))
     intervals = [
         (max(c - half, -1.0), min(c + half, 1.0)) for k, c in enumerate(centre) if k != axis
     ]
-    sign = parity[axis] if normal[axis] < 0 else 1
-    return sign * solid.mean_stress(reactions, parity, axis, intervals)
+    return solid.pad_weights(parity, axis, float(np.sign(normal[axis])), intervals)
 
 
 def _observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Meshes of the positive quarter or eighth of a box with a cube |x_k| <= 1 in its middle.
+"""Meshes of a box with a cube |x_k| <= 1 in it, of the positive part where a mirror allows that.
 
 Lengths are in d0. The stress is infinite at the corner (in space, the edges) of the cube, so
 elements shrink towards it. Elements end at the edges of pads. Meshes are symmetric under exchange
@@ -7,6 +7,7 @@ of axes where the box and the pads are.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
@@ -30,6 +31,7 @@ def section(
     level: int = 1,
     smallest: float = 1e-8,
     largest: float = np.inf,
+    ring: float = 0.5,
 ) -> skfem.MeshTri:
     """Triangles on [0, half[0]] x [0, half[1]], in rings around the cube's corner (1, 1).
 
@@ -38,9 +40,10 @@ def section(
     smallest: size of the last ring over the first; what the rings leave out at 1e-8 is less than
     1e-4 of any entry of the response
     largest: the longest side of a triangle away from the cube
+    ring: the half side of the first ring, or less where it does not fit
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
-    rho = min(0.5, 1.0 - inner[-1], *(h - 1.0 for h in half))
+    rho = min(ring, 1.0 - inner[-1], *(h - 1.0 for h in half))
     face = np.append(_inner(inner, 1.0 - rho, 0.5), 1.0)
     lines = [np.concatenate([face, _outer(1.0 + rho, h, rho, 2.0, largest)]) for h in half]
     base = skfem.MeshTri.init_tensor(*lines)
@@ -48,29 +51,65 @@ def section(
     ring_points, ring_triangles = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
     points = np.concatenate([base.p.T, ring_points])
     triangles = np.concatenate([base.t.T[away], ring_triangles + base.p.shape[1]])
-    # Points as complex numbers: np.unique of rows (axis=0) swallows Ctrl-C.
-    unique, inverse = np.unique(points[triangles.ravel()] @ [1, 1j], return_inverse=True)
-    mesh = skfem.MeshTri(np.array([unique.real, unique.imag]), inverse.reshape(-1, 3).T.copy())
+    mesh = _joined(points.T, triangles.T)
     return mesh.refined(level - 1) if level > 1 else mesh
+
+
+def sections(
+    lower: Sequence[float], upper: Sequence[float], stops: Iterable[float], level: int
+) -> skfem.MeshTri:
+    """The same on [-lower[0], upper[0]] x [-lower[1], upper[1]].
+
+    Where `lower` is 0, there is the positive part only.
+    """
+    stops = list(stops)
+    present = [h for h in (*lower, *upper) if h > 0]
+    ring = min(0.5, *(h - 1.0 for h in present))
+    sides = [((1, u), (-1, l)) if l > 0 else ((1, u),) for l, u in zip(lower, upper, strict=True)]
+    return _glued(
+        [
+            (section((x, z), stops, level, ring=ring), (sx, sz))
+            for (sx, x), (sz, z) in itertools.product(*sides)
+        ]
+    )
 
 
 def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
     """All of the section from its positive quarter."""
+    return _glued([(quarter, signs) for signs in itertools.product((1, -1), repeat=2)])
+
+
+def _glued(parts: Sequence[tuple[skfem.MeshTri, tuple[int, ...]]]) -> skfem.MeshTri:
+    """One mesh of quarters, each with the signs of its axes, which share their edges' points."""
     points: list[Array] = []
     triangles: list[NDArray[np.int64]] = []
-    for sx, sz in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
-        points.append(quarter.p * np.array([[sx], [sz]]) + 0.0)  # + 0.0: no negative zeros
-        triangles.append(quarter.t + quarter.nvertices * len(triangles))
-    unique, inverse = np.unique(np.concatenate(points, axis=1), axis=1, return_inverse=True)
-    return skfem.MeshTri(
-        np.ascontiguousarray(unique), inverse.reshape(-1)[np.concatenate(triangles, axis=1)]
+    first = 0
+    for quarter, signs in parts:
+        points.append(quarter.p * np.array(signs)[:, None])
+        triangles.append(quarter.t + first)
+        first += quarter.nvertices
+    return _joined(np.concatenate(points, axis=1), np.concatenate(triangles, axis=1))
+
+
+def _joined(points: Array, triangles: NDArray[np.int64]) -> skfem.MeshTri:
+    """A mesh of points (2, n) of which some are the same, and triangles (3, m)."""
+    # As complex numbers: np.unique of rows (axis=0) swallows Ctrl-C. + 0.0: no negative zeros.
+    unique, inverse = np.unique(
+        (points + 0.0).T[triangles.T.ravel()] @ [1, 1j], return_inverse=True
     )
+    return skfem.MeshTri(np.array([unique.real, unique.imag]), inverse.reshape(-1, 3).T.copy())
 
 
 def block(
-    half: Sequence[float], stops: Iterable[float], size: float, smallest: float, growth: float
+    half: Sequence[float],
+    stops: Iterable[float],
+    size: float,
+    smallest: float,
+    growth: float,
+    lower: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> skfem.MeshHex:
-    """Bricks on the product of [0, half[k]]: `size` on a face, `smallest` at the cube's edges.
+    """Bricks on the product of [-lower[k], half[k]]: `size` on a face, `smallest` at the cube's
+    edges.
 
     Away from the cube they grow by the factor `growth`. Where the cube's part of the stress has
     decayed, a linear field is left, which needs no fine mesh: there they grow faster.
@@ -78,11 +117,16 @@ def block(
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
     face = np.concatenate([_inner(inner, inner[-1], size), fine[1:]])
-    lines = []
-    for h in half:
+
+    def line(h: float) -> Array:
         near = 1.0 + _graded(min(h - 1.0, _NEAR), smallest, growth)
         far = _outer(near[-1], h, near[-1] - near[-2], _FAR_GROWTH, np.inf)
-        lines.append(np.concatenate([face, near[1:], far[1:]]))
+        return np.concatenate([face, near[1:], far[1:]])
+
+    lines = [
+        np.concatenate([-line(l)[:0:-1], line(h)]) if l > 0 else line(h)
+        for l, h in zip(lower, half, strict=True)
+    ]
     return skfem.MeshHex.init_tensor(*lines)
 
 

@@ -39,20 +39,17 @@ def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: 
     return from_middle(stop) - from_middle(start)
 
 
-def face_integral(nodes: Array, forces: Array, order: int, start: float, stop: float) -> float:
-    """Integral of the traction from start to stop from nodal forces (n,) along a face.
-
-    nodes: (n,) positions from corner to corner, -1 to 1, symmetric about the middle. The forces are
-    split into an even and an odd part.
+def face_weights(nodes: Array, order: int, start: float, stop: float) -> Array:
+    """The same for all of a face: nodes (n,) from corner to corner, -1 to 1, symmetric about the
+    middle. The forces are split into an even and an odd part.
     """
     half = len(nodes) // 2
-    right, left = forces[half:], forces[half::-1]
-    even, odd = (right + left) / 2, (right - left) / 2
-    even[0] /= 2  # the middle node belongs to both halves
-    return sum(
-        float(interval_weights(nodes[half:], order, parity, start, stop) @ part)
-        for parity, part in ((1, even), (-1, odd))
-    )
+    even, odd = (interval_weights(nodes[half:], order, sign, start, stop) for sign in (1, -1))
+    weights = np.zeros(len(nodes))
+    weights[half:] = (even + odd) / 2
+    weights[half::-1] += (even - odd) / 2
+    weights[half] = even[0] / 2  # the middle node belongs to both halves
+    return weights
 
 
 def _from_middle(nodes: Array, order: int, parity: int, stop: float) -> Array:

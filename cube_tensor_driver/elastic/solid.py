@@ -1,8 +1,9 @@
-"""Linear elasticity of a box with a bonded cube in its middle, solved in its positive part.
+"""Linear elasticity of a box with a bonded cube, solved in its positive part.
 
-Box and cube are symmetric under the mirrors x_k -> -x_k, so every load splits into parts of one
+Where box and cube are symmetric under the mirrors x_k -> -x_k, every load splits into parts of one
 *parity* (+1 even or -1 odd for each axis), and each part is solved where all coordinates are
 positive. On the plane x_k = 0 an even field has u_k = 0; an odd one has the other components zero.
+Along an axis without a mirror all of the box is solved, and the parity is 0.
 Lengths are in units of d0. For all w::
 
     int sigma(u) : eps(w) dV = int_outer w . (sigma_load n) dS = int sigma_load : eps(w) dV
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from skfem.helpers import ddot, dot, sym_grad, trace
 
-from .pads import interval_weights
+from .pads import face_weights, interval_weights
 
 Array = NDArray[np.float64]
 Parity = tuple[int, ...]
@@ -102,19 +103,28 @@ class Solid:
     basis: the elements; its dofs are the unknown displacements
     positions: (dim, dofs) of each of them, d0; component: (dofs,) the axis that it is along
     body: stiffness of the body without the cube; total: of both (dofs, dofs)
+    parities: of the fields that make up any field
 
-    Parameters: mesh: the positive part of the box, from elastic.mesh, lengths in d0. body: Lame's
-    lambda and mu of the body. cube: the same of the cube in the same unit, or None for a rigid one.
+    Parameters: mesh: from elastic.mesh, lengths in d0; an axis has a mirror where the mesh is
+    positive. body: Lame's lambda and mu of the body. cube: the same of the cube in the same unit,
+    or None for a rigid one. ground: the lower face is held; then the cube is elastic.
     """
 
     def __init__(
-        self, mesh: skfem.Mesh, body: tuple[float, float], cube: tuple[float, float] | None
+        self,
+        mesh: skfem.Mesh,
+        body: tuple[float, float],
+        cube: tuple[float, float] | None,
+        ground: bool = False,
     ) -> None:
         self.dim = int(mesh.dim())
         self.order = 4 if self.dim == 2 else 2
         scalar = skfem.ElementTriP4() if self.dim == 2 else skfem.ElementHex2()
         element = skfem.ElementVector(scalar)
-        inside = np.all(mesh.p[:, mesh.t].mean(axis=1) < 1.0, axis=0)
+        inside = np.all(np.abs(mesh.p[:, mesh.t].mean(axis=1)) < 1.0, axis=0)
+        signs = [(0,) if low < -_SAME else (1, -1) for low in mesh.p.min(axis=1)]
+        self.parities: list[Parity] = list(itertools.product(*signs))
+        self._ground = ground
         self.basis = skfem.Basis(mesh, element, intorder=2 * self.order)
         self.positions = self.basis.doflocs
         self.component = np.zeros(self.basis.N, dtype=int)
@@ -203,23 +213,30 @@ class Solid:
         """Nodal forces (dofs, n) on the body by what holds it: on the cube's surface, the cube."""
         return np.asarray(self.body @ u)
 
-    def mean_stress(
-        self, reactions: Array, parity: Parity, axis: int, intervals: Sequence[tuple[float, float]]
-    ) -> Array:
-        """Mean normal stress (n,) on a pad of the face x_axis = 1.
+    def pad_weights(
+        self, parity: Parity, axis: int, side: float, intervals: Sequence[tuple[float, float]]
+    ) -> tuple[NDArray[np.int64], Array]:
+        """Dofs (m,) and weights (m,): weights @ reactions[dofs] is the mean normal stress of a pad
+        on the face x_axis = side, which is 1 or -1.
 
-        reactions: (dofs, n); intervals: of the pad, in [-1, 1], one per other axis
+        intervals: of the pad, in [-1, 1], one per other axis
         """
         others = [k for k in range(self.dim) if k != axis]
+        # What is on the other side of a mirror is read on this one.
+        face = side if parity[axis] == 0 else 1.0
+        sign = -face if side == face else -parity[axis]
         x = self.positions
-        on_face = _at(x[axis], 1.0) & np.all(x[others] < 1.0 + _SAME, axis=0)
+        on_face = _at(x[axis], face) & np.all(np.abs(x[others]) < 1.0 + _SAME, axis=0)
         dofs = np.flatnonzero(on_face & (self.component == axis))
-        weights = np.ones(len(dofs))
+        weights = np.full(len(dofs), float(sign))
         for k, (start, stop) in zip(others, intervals, strict=True):
             nodes, index = np.unique(np.round(x[k, dofs], 14), return_inverse=True)
-            w = interval_weights(nodes, self.order, parity[k], start, stop)
+            if parity[k] == 0:
+                w = face_weights(nodes, self.order, start, stop)
+            else:
+                w = interval_weights(nodes, self.order, parity[k], start, stop)
             weights *= w[index] / (stop - start)
-        return np.asarray(-weights @ reactions[dofs])
+        return dofs, weights
 
     def _part(self, elements: NDArray[np.bool_]) -> skfem.Basis:
         """The basis on some of the elements."""
@@ -231,24 +248,32 @@ class Solid:
         )
 
     def _held(self, parity: Parity) -> NDArray[np.bool_]:
-        """(dofs,) which are zero: by the mirrors, in a rigid cube, or to stop a rigid motion.
+        """(dofs,) which are zero: by mirrors and ground, in a rigid cube, or to stop rigid motions.
 
-        A parity leaves at most one rigid motion. A rigid cube can be held altogether, since this
-        motion is free for the body, too.
+        A translation is odd along its axis, a rotation along both axes of its plane. A rigid cube
+        can be held altogether, since these motions are free for the body, too.
         """
         x, c = self.positions, self.component
         held = np.zeros(len(c), dtype=bool)
         for k, sign in enumerate(parity):
-            held |= _at(x[k], 0.0) & ((c == k) == (sign > 0))
+            if sign != 0:
+                held |= _at(x[k], 0.0) & ((c == k) == (sign > 0))
+        if self._ground:
+            return held | _at(x[-1], x[-1].min())
         if self.rigid:
-            return held | np.all(x < 1.0 + _SAME, axis=0)
-        odd = [k for k, sign in enumerate(parity) if sign < 0]
-        if len(odd) == 1:  # translation along the odd axis
-            held |= (c == odd[0]) & np.all(_at(x, 0.0), axis=0)
-        elif len(odd) == 2:  # rotation in the plane of the two
-            at = np.zeros(self.dim)
-            at[odd[1]] = 1.0
-            held |= (c == odd[0]) & np.all(_at(x, at[:, None]), axis=0)
+            return held | np.all(np.abs(x) < 1.0 + _SAME, axis=0)
+
+        def has(*odd: int) -> bool:
+            return all(sign == 0 or (sign < 0) == (k in odd) for k, sign in enumerate(parity))
+
+        for k in range(self.dim):
+            if has(k):  # translation
+                held |= (c == k) & np.all(_at(x, 0.0), axis=0)
+        for i, j in itertools.combinations(range(self.dim), 2):
+            if has(i, j):  # rotation
+                at = np.zeros(self.dim)
+                at[j] = 1.0
+                held |= (c == i) & np.all(_at(x, at[:, None]), axis=0)
         return held
 
 

@@ -103,7 +103,8 @@ def true_components(points: Array, width: float, force: Array, centre: Array) ->
     width: of the contact, m; force: (3,) N; centre: (2,) m. The gradient is in Pa/m.
     """
     below = np.column_stack([points[:, :2], np.full(len(points), -SURFACE_DEPTH)])
-    sources, forces = contact.hertz(width / 2, force, centre)
+    order = contact.hertz_order(width / 2, SURFACE_DEPTH)
+    sources, forces = contact.hertz(width / 2, force, centre, order)
     stress, gradient = contact.field(below, sources, forces, POISSONS_RATIO)
     return np.concatenate([stress, gradient[:, :3].reshape(len(points), 9)], axis=1)
 

@@ -21,7 +21,7 @@ from ..core.layout import LAYOUTS, Layout
 from ..elastic.body import Body
 from ..elastic.memory import check_memory
 from ..elastic.mesh import mirrored, section
-from ..elastic.pads import face_integral
+from ..elastic.pads import face_weights
 from ..elastic.solid import lame
 from .material import Material
 from .newton import Balance, Constraints, factors, find_balance
@@ -296,7 +296,7 @@ class VirtualBench:
             along, forces = self._face_forces(force, axis, normal[axis])
             normal_forces = axes[axis] @ forces * normal[axis]
             start, stop = position[1 - axis] - half, position[1 - axis] + half
-            means[pad] = face_integral(along, normal_forces, 2, start, stop) / (2 * half)
+            means[pad] = face_weights(along, 2, start, stop) @ normal_forces / (2 * half)
         return means
 
     def _face_forces(self, force: Array, axis: int, sign: float) -> tuple[Array, Array]:
