@@ -67,7 +67,8 @@ def _add_common(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """1 if a table could not be made. CubeError: nothing was begun."""
     from ..bags.reprocess_all import RECIPE
-    from ..lerobot.export import Choices, check_empty, export_lerobot
+    from ..lerobot.choices import Choices
+    from ..lerobot.export import check_empty, export_lerobot
     from ..terminal.exporting import say_exported
     from ..terminal.output import progress_bar
 

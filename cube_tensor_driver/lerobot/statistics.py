@@ -44,7 +44,10 @@ class Statistics:
     def add_all(self, other: Statistics) -> None:
         """Take in what another one has."""
         self._combine(other._count, other._mean, other._squares, other._least, other._most)
-        self._sample += other._sample
+        # Each part has a sample of its own share; all are to have the same.
+        for values in other._sample:
+            chosen = self._random.random(len(values)) < self._share / other._share
+            self._sample.append(values[chosen])
 
     def _combine(
         self,

@@ -20,8 +20,8 @@ COLUMNS: dict[str, Any] = {
     "left_out": np.uint32,
 }
 """What a window has beside the tensors, as in `StressRows`."""
-TOGETHER_BYTES = 32 << 20
-"""Windows that are handed on at a time."""
+TOGETHER_BYTES, TOGETHER = 32 << 20, 128
+"""Windows that are handed on at a time, and how many at most: images may go with them."""
 
 
 class Windows:
@@ -38,7 +38,8 @@ class Windows:
         self._counts, self._depth, self._cubes = counts, depth, cubes
         self._due = counts.sum(axis=1, dtype=np.int64)
         values = depth * cubes * (len(COMPONENTS) + 6)
-        self._together = min(self.frames, max(1, TOGETHER_BYTES // (4 * values)))
+        most = max(1, TOGETHER_BYTES // (4 * values))
+        self._together = min(self.frames, most, TOGETHER)
         self._arrays: dict[str, NDArray[Any]] = {}
         self._filled = np.zeros((0, cubes), np.int64)
         self._make(2 * self._together)
