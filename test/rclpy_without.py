@@ -18,17 +18,12 @@ def no_events_executor() -> None:
 def no_matched_event() -> None:
     import rclpy.event_handler as events
 
-    of_publisher = events.PublisherEventCallbacks.__init__
-    of_subscription = events.SubscriptionEventCallbacks.__init__
+    full = events.PublisherEventCallbacks.__init__
 
-    def publisher(self, *, deadline=None, liveliness=None):
-        of_publisher(self, deadline=deadline, liveliness=liveliness)
+    def __init__(self, *, deadline=None, liveliness=None):
+        full(self, deadline=deadline, liveliness=liveliness)
 
-    def subscription(self, *, deadline=None, liveliness=None, message_lost=None):
-        of_subscription(self, deadline=deadline, liveliness=liveliness, message_lost=message_lost)
-
-    events.PublisherEventCallbacks.__init__ = publisher
-    events.SubscriptionEventCallbacks.__init__ = subscription
+    events.PublisherEventCallbacks.__init__ = __init__
 
 
 def no_callback_after_parameters_are_set() -> None:

@@ -72,6 +72,6 @@ def test_what_a_late_subscriber_loses_is_counted(ros, executor):
 
 def test_a_publisher_that_begins_again_is_no_loss():
     lost = LostMessages()
-    for number in (5, 6, 7, 1, 2, 3, 6, 7):
+    for number in (5, 6, 7, 1, 2, 3, 6, 7, 8, 11, 12):
         lost.came(number)
-    assert lost.count == 2
+    assert lost.count == 4

@@ -162,7 +162,7 @@ class _Evidence:
         )
 
     def _is_complete(self, cube: int, begin_us: int, end_us: int) -> bool:
-        rows = self._record.frequencies.rows
+        rows = self._record.stress.rows
         begin_ns, end_ns = (self._start_time_ns + 1000 * time for time in (begin_us, end_us))
         came = (rows.cube == cube) & (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
         period_us = self._period_us(begin_us)

@@ -29,7 +29,6 @@ __all__ = [
     "after_parameters_are_set",
     "make_executor",
     "on_matched",
-    "subscription_events",
     "with_number",
 ]
 
@@ -57,14 +56,6 @@ def on_matched(callback: Callable[[int], None]) -> PublisherEventCallbacks | Non
         callback(event.current_count)
 
     return PublisherEventCallbacks(matched=matched)
-
-
-def subscription_events(**callbacks: Any) -> SubscriptionEventCallbacks:
-    """Events of a subscription that call back by name, without those that this rclpy lacks."""
-    known = inspect.signature(SubscriptionEventCallbacks).parameters
-    return SubscriptionEventCallbacks(
-        **{name: callback for name, callback in callbacks.items() if name in known}
-    )
 
 
 def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:

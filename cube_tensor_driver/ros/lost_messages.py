@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from .compat import SubscriptionEventCallbacks, subscription_events
+from .compat import SubscriptionEventCallbacks
 
 
 class LostMessages:
@@ -31,15 +31,17 @@ class LostMessages:
 
     def events(self) -> SubscriptionEventCallbacks:
         """For the subscription."""
-        return subscription_events(message_lost=self._on_lost, matched=self._on_matched)
+        return SubscriptionEventCallbacks(message_lost=self._on_lost)
 
     def came(self, number: int | None) -> None:
         """A message came, and this is its number; None: not known."""
         newest, self._newest = self._newest, number
         if number is None or newest is None:
             return
-        goes_on = number - 1 in self._others
+        is_next = number == newest + 1
+        goes_on = not is_next and number - 1 in self._others
         if goes_on or number <= newest:
+            # Of another publisher: one of several, or a new one, which begins at 1.
             self._several |= goes_on
             self._others.append(newest)
             self._gap = 0
@@ -49,10 +51,3 @@ class LostMessages:
 
     def _on_lost(self, event: Any) -> None:
         self._reported = event.total_count
-
-    def _on_matched(self, event: Any) -> None:
-        """A publisher came or went. What a new one sent before it was met is no loss."""
-        self._several = False
-        if event.current_count_change > 0 and self._newest is not None:
-            self._others.append(self._newest)
-            self._newest, self._gap = None, 0

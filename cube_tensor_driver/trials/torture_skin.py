@@ -119,6 +119,11 @@ def play(
         {
             "faults": dict(sorted(kinds.items())),
             "deeds": dict(sorted(Counter(deed.kind for deed in deeds.done).items())),
+            "timeline": [
+                f"{deed.kind}: {_seconds(deed.begin_ns, sample_log)} to "
+                f"{_seconds(deed.end_ns, sample_log)} s"
+                for deed in deeds.done
+            ],
             "deeds_failed": len(failed) - len(refused),
             "failed": failed,
             "refused": refused,
@@ -128,6 +133,11 @@ def play(
             "crashes": sum(text.count("Traceback") for text in logs.values()),
         },
     )
+
+
+def _seconds(time_ns: int, log: SampleLog) -> float:
+    """Of the simulator's time, as in the judge's examples."""
+    return round(1e-9 * (time_ns - log.start_time_ns), 3)
 
 
 def _processes(
