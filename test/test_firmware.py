@@ -96,7 +96,8 @@ def hub_frequency(tmp_path_factory: pytest.TempPathFactory):
     begin=st.integers(0, 2**32 - 1),
 )
 def test_reciprocal_counting_resolves_one_tick(hub_frequency, hertz, phase, counter, begin):
-    """Against edges of an oscillator in exact fractions, wherever the counter wraps."""
+    """Against edges of an oscillator in exact fractions, wherever the counter wraps: right to one
+    tick, and rounded to the nearest mHz of what was counted."""
     period = Fraction(counter, hertz)
     window = Fraction(counter, 400)
     n = int(window / period - phase)
@@ -107,6 +108,7 @@ def test_reciprocal_counting_resolves_one_tick(hub_frequency, hertz, phase, coun
     else:
         # 1/2 mHz of rounding
         assert abs(found - 1000 * hertz) <= Fraction(1000 * found, last - first) + Fraction(1, 2)
+        assert abs(found - Fraction(1000 * n * counter, last - first)) <= Fraction(1, 2)
 
 
 def test_a_pad_that_stands_still_or_is_too_fast_is_not_measured(hub_frequency):

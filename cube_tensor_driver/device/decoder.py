@@ -140,8 +140,9 @@ class NativeDecoder:
 
 def unpacked(raws: list[bytes]) -> list[Frame]:
     """The frames of what the decoder in C gives, which has looked at their lengths."""
-    frames = [UNPACK[raw[0]](raw, len(raw) - OVERHEAD) for raw in raws]
-    return [frame for frame in frames if frame is not None]
+    return [
+        frame for raw in raws if (frame := UNPACK[raw[0]](raw, len(raw) - OVERHEAD)) is not None
+    ]
 
 
 Decoder = PythonDecoder if wire is None else NativeDecoder
