@@ -64,11 +64,18 @@ class MujocoLoad:
     Other parameters and what is raised: as in `MujocoSkin`, and ConfigError for the scene.
     """
 
-    def __init__(self, path: Path, skin: Skin, *, thickness: float = np.inf) -> None:
+    def __init__(
+        self,
+        path: Path,
+        skin: Skin,
+        *,
+        thickness: float = np.inf,
+        noise: float | None = 0.0,
+    ) -> None:
         self._mujoco = load_mujoco()
         model = read_scene(path)
         data = self._mujoco.MjData(model)
-        self.touch = MujocoSkin(model, data, skin, thickness=thickness)
+        self.touch = MujocoSkin(model, data, skin, thickness=thickness, noise=noise)
         self.poses, self.depth = self.touch.poses, self.touch.depth
         self._times, self._controls = _timeline(path, model)
         self.repeats = float(self._times[-1]) if len(self._times) else None
@@ -90,6 +97,30 @@ class MujocoLoad:
         self._restart()
         while self._step < self._number(seconds):
             self._go_on()
+
+    def picture(
+        self, width: int, height: int, *, lookat: Array, distance: float, azimuth: float
+    ) -> NDArray[np.uint8]:
+        """The scene as it is now, pixels (height, width, 3), without a display.
+
+        lookat: (3,) m, in the middle; distance: of the camera, m; azimuth: degrees
+
+        ConfigError: OpenGL cannot draw here.
+        """
+        mujoco = self._mujoco
+        camera = mujoco.MjvCamera()
+        camera.lookat[:], camera.distance = lookat, distance
+        camera.azimuth, camera.elevation = azimuth, -12.0
+        try:
+            with mujoco.Renderer(self.touch.model, height, width) as renderer:
+                renderer.update_scene(self.touch.data, camera)
+                pixels: NDArray[np.uint8] = renderer.render()
+        except (ImportError, AttributeError, RuntimeError, OSError, mujoco.FatalError) as error:
+            raise ConfigError(
+                f"MuJoCo cannot draw without a display ({error}): apt-get install libegl1 "
+                "libegl-mesa0, and set MUJOCO_GL=egl"
+            ) from None
+        return pixels
 
     def _at(self, seconds: float) -> list[Touch]:
         number = self._number(seconds)

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
-FINEST = 4
-"""Triangles along a side of each triangle of the hull, at most."""
+MOST = 8
+"""Discs along a side of a flat contact, at most."""
 
 
 class Discs(NamedTuple):
@@ -51,45 +51,53 @@ def flat_contact(points: Array, forces: Array, normal: Array, spacing: float) ->
     """Discs of a flat contact.
 
     points: (K, 3) m; forces: (K, 3) N; normal: (3,) out of the skin; spacing: of the discs, m, as
-    long as FINEST allows it.
+    long as MOST allows it.
     """
-    basis = _plane(normal)
+    basis = _plane(*normal.tolist())
     middle = points.mean(axis=0)
     flat = (points - middle) @ basis
     pressing = np.maximum(-forces @ normal, 0.0)
     if not pressing.sum() > 0:
         return Discs(points, forces, np.zeros(len(points)))
     hull = _hull(flat, 0.1 * spacing)
-    corners = hull.points[hull.vertices]
-    fan = [np.broadcast_to(corners[0], corners[2:].shape), corners[1:-1], corners[2:]]
-    triangles = np.stack(fan, axis=1)
-    first, second = (triangles[:, k] - triangles[:, 0] for k in (1, 2))
-    areas = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
-    area = areas.sum()
-    centroid = areas @ triangles.mean(axis=1) / area
+    cells = _cells(hull, spacing)
+    centroid = cells.mean(axis=0)
     centre = pressing @ flat / pressing.sum()
     distance = -(hull.equations[:, :2] @ np.stack([centre, centroid], 1) + hull.equations[:, 2:])
     shrink = float(np.clip(distance[:, 0] / distance[:, 1], 0.0, 1.0).min())
-    side = shrink * np.linalg.norm(np.ptp(corners, axis=0)) / np.sqrt(2)
-    fine = int(np.clip(np.ceil(side / spacing), 1, FINEST))
-    inside = np.einsum("pk,tkx->tpx", _barycentric(fine), triangles).reshape(-1, 2)
-    part = np.repeat(areas / area, fine**2) / fine**2
-    arm = shrink * (inside - centroid)
-    discs = (
-        part[:, None] * forces.sum(axis=0)
-        + part[:, None] * _torsion(flat - centre, forces @ basis, arm, part) @ basis.T
-    )
-    return Discs(middle + (centre + arm) @ basis.T, discs, shrink * np.sqrt(part * area))
+    arm, part = shrink * (cells - centroid), 1 / len(cells)
+    torsion = _torsion(flat - centre, forces @ basis, arm) @ basis.T
+    radius = np.full(len(cells), shrink * np.sqrt(part * hull.volume))
+    return Discs(middle + (centre + arm) @ basis.T, part * forces.sum(axis=0) + torsion, radius)
 
 
-def _torsion(from_centre: Array, tangential: Array, arm: Array, part: Array) -> Array:
-    """(L, 2) traction times area over `part` with the moment about the normal of the points' own
-    forces, all but that of their sum."""
+def _cells(hull: ConvexHull, spacing: float) -> Array:
+    """(L, 2) middles of equal cells of a hull, on a grid along its longest edge."""
+    corners = hull.points[hull.vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    along = edges[np.argmax((edges**2).sum(axis=1))]
+    along = along / np.linalg.norm(along)
+    axes = np.array([along, [-along[1], along[0]]])
+    low, high = (getattr(corners @ axes.T, name)(axis=0) for name in ("min", "max"))
+    counts = np.clip(np.ceil((high - low) / spacing), 1, MOST).astype(int)
+    lines = [
+        low[k] + (np.arange(count) + 0.5) / count * (high[k] - low[k])
+        for k, count in enumerate(counts.tolist())
+    ]
+    cells = np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2) @ axes
+    inside = (cells @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0).all(axis=1)
+    return cells[inside] if inside.any() else corners.mean(axis=0, keepdims=True)
+
+
+def _torsion(from_centre: Array, tangential: Array, arm: Array) -> Array:
+    """(L, 2) N on each disc: together the moment about the normal that the points' tangential
+    forces have about the centre."""
     moment = from_centre[:, 0] @ tangential[:, 1] - from_centre[:, 1] @ tangential[:, 0]
-    polar = part @ (arm**2).sum(axis=1)
+    polar = (arm**2).sum()
     if not polar > 0:
         return np.zeros_like(arm)
-    return moment / polar * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    torsion: Array = moment / polar * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    return torsion
 
 
 def _hull(flat: Array, least: float) -> ConvexHull:
@@ -101,23 +109,12 @@ def _hull(flat: Array, least: float) -> ConvexHull:
         return ConvexHull((flat[:, None] + square).reshape(-1, 2))
 
 
-def _plane(normal: Array) -> Array:
-    """(3, 2) two axes across the normal; with it they are right-handed."""
-    axis = np.zeros(3)
+@lru_cache(maxsize=64)
+def _plane(x: float, y: float, z: float) -> Array:
+    """(3, 2) two axes across the normal (x, y, z); with it they are right-handed. Kept, for a flat
+    skin has one normal."""
+    normal, axis = np.array([x, y, z]), np.zeros(3)
     axis[np.argmin(np.abs(normal))] = 1.0
     first = np.cross(axis, normal)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(normal, first)], axis=1)
-
-
-@lru_cache(maxsize=FINEST)
-def _barycentric(fine: int) -> Array:
-    """(fine², 3) the centroids of a triangle's fine² equal parts."""
-    corners = []
-    for i in range(fine):
-        for j in range(fine - i):
-            corners.append((i + 1 / 3, j + 1 / 3))
-            if i + j < fine - 1:
-                corners.append((i + 2 / 3, j + 2 / 3))
-    two = np.array(corners) / fine
-    return np.column_stack([1 - two.sum(axis=1), two])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -12,13 +13,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from matplotlib.figure import Figure
 from visualization_msgs.msg import MarkerArray
 
 from ..config.package_data import package_data
+from ..config.skin import read_skin
 from ..core.errors import ConfigError, CubeError
 from ..plot.cube_drawing import draw_cube
 from ..plot.experiments import draw_prototype
 from ..plot.field import draw_field, draw_field_study, field_tables
+from ..plot.fingers import draw_fingers
 from ..plot.markers import draw_markers
 from ..plot.pads_example import draw_pads, draw_sweep
 from ..plot.style import save
@@ -31,6 +36,7 @@ from ..research.paper import experiments
 from ..research.traction_study import MAIN, PITCHES, WRONG, traction_example
 from ..research.traction_study import study as traction_study
 from ..ros.session import node_session
+from ..simulation.mujoco_scene import MujocoLoad, scene_skin
 from .bench import bench_scale
 
 START_S = 30.0
@@ -51,6 +57,8 @@ indenters:
       shear: [1.0, 0.4, 0]
 """
 """Presses beside the cube c05, whose numbers the browser view shows at first, and rests there."""
+SHAKEN_S = 2.62
+"""When the box of the gripper is accelerated most, s."""
 PHOTOGRAPH_S = 120.0
 """How long the browser may take to make its picture."""
 PERIOD = 160
@@ -80,6 +88,10 @@ def make_pictures(folder: Path) -> None:
                 "no view.png: it needs Chromium, apt-get install chromium chromium-driver",
                 file=sys.stderr,
             )
+    try:
+        save(_gripper(), folder / "gripper.png")
+    except ConfigError as error:
+        print(f"no gripper.png: {error}", file=sys.stderr)
     bench_scale(
         counts=COUNTS,
         rate=RATE,
@@ -108,6 +120,19 @@ def make_pictures(folder: Path) -> None:
     (folder / "field.json").write_text(json.dumps(table) + "\n")
     written = ", ".join(sorted(path.name for path in folder.iterdir()))
     print(f"{field_tables(study)}\nwrote {written} to {folder}")
+
+
+def _gripper() -> Figure:
+    """The gripper while it shakes its box, and what its fingers feel. ConfigError: no OpenGL."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    scene = package_data() / "config" / "mujoco" / "gripper.xml"
+    skin = read_skin(scene_skin(scene))
+    load = MujocoLoad(scene, skin, noise=None)
+    load.play(SHAKEN_S)
+    pixels = load.picture(760, 900, lookat=np.array([0.0, 0.0, 0.1]), distance=0.25, azimuth=150.0)
+    links = np.array([cube.link for cube in skin.cubes])
+    fingers = {name: np.flatnonzero(links == name) for name in ("left", "right")}
+    return draw_fingers(pixels, load.poses, load.touch.read(), fingers, load.depth)
 
 
 @contextmanager
