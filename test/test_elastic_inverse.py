@@ -14,6 +14,7 @@ from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.inverse import SurfaceInverse
 from cube_tensor_driver.elastic.layer import Layer
 from cube_tensor_driver.elastic.surface import Surface
+from cube_tensor_driver.research.curved_skin import cylinder_stress, flat_error
 
 DEPTH, PITCH, COUNT = 5e-3, 8e-3, 7
 ACROSS = [k for k, name in enumerate(COMPONENTS) if "y" in name]
@@ -152,6 +153,17 @@ def test_a_skin_that_observes_nothing_and_a_patch_without_points():
         SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(), DEPTH, side=0)
     with pytest.raises(ElasticError, match="between 0 and"):
         SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(3e-3), DEPTH)
+
+
+def test_a_curved_skin_laid_flat_is_off_by_half_its_depth_over_its_radius():
+    """On a cylinder: its surface is free of traction, and the error goes as 1 / radius."""
+    angle = np.linspace(0.1, np.pi - 0.1, 20)
+    outward = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    traction = np.einsum("nij,nj->ni", cylinder_stress(0.045 * outward, 0.045), outward)
+    assert np.abs(traction).max() < 1e-9 * 2 / np.pi / 0.045
+    forearm = flat_error(0.045, DEPTH, 12.6e-3)
+    assert forearm == pytest.approx(DEPTH / (2 * 0.045), rel=0.1)
+    assert flat_error(0.45, DEPTH, 12.6e-3) == pytest.approx(forearm / 10, rel=0.05)
 
 
 def test_it_is_made_of_a_skin_as_read_from_its_file():

@@ -35,7 +35,9 @@ Array = NDArray[np.float64]
 
 CUBES = ("24-pad", "planar", "planar, crosswise")
 METHODS = ("interpolation", "inverse", "inverse with contacts")
-SHAPES = ("ball", "flat punch")
+SHAPES = ("ball", "flat punch", "rounded punch", "two balls")
+"""A rounded punch is the mean of flat ones from 0.6 of its radius on. Two balls touch each other,
+and together are as wide as a ball."""
 GAIN_ERROR = 0.01
 """Standard deviation of a pad's gain against what its calibration says."""
 CASES = 16
@@ -121,9 +123,20 @@ class Bench:
         return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
 
     def _load(self, width: float, force: Array, centre: Array) -> tuple[Array, Array]:
-        if self.setting.shape == SHAPES[0]:
-            return contact.hertz(width / 2, force, centre, _ORDER)
-        return flat_punch(width / 2, force, centre, _ORDER)
+        shape, radius = self.setting.shape, width / 2
+        if shape == SHAPES[0]:
+            return contact.hertz(radius, force, centre, _ORDER)
+        if shape == SHAPES[1]:
+            return flat_punch(radius, force, centre, _ORDER)
+        if shape == SHAPES[2]:
+            radii = np.linspace(0.6, 1.0, 8) * radius
+            parts = [flat_punch(one, force / 8, centre, _ORDER) for one in radii]
+        else:
+            apart = radius / 2 * np.array([0.8, 0.6])
+            places = (centre - apart, centre + apart)
+            parts = [contact.hertz(radius / 2, force / 2, place, _ORDER) for place in places]
+        sources, forces = zip(*parts, strict=True)
+        return np.concatenate(sources), np.concatenate(forces)
 
     def measured(self, field: Array, random: np.random.Generator) -> Array:
         """(cubes, 15) what the pipeline makes of a field (cubes, 24) in the skin's frame."""
@@ -247,6 +260,13 @@ PITCHES = tuple(
     Setting(cubes=cubes, pitch=pitch, depth=4e-3) for pitch in (12e-3, 24e-3) for cubes in CUBES[:2]
 )
 _PLAIN = Setting()
+SHAPED = tuple(
+    Setting(cubes=cubes, pitch=pitch, depth=4e-3, shape=shape)
+    for shape in SHAPES[1:]
+    for pitch in (12e-3, 24e-3)
+    for cubes in CUBES[:2]
+)
+"""Loads that are no balls."""
 WRONG = {
     "everything as known": _PLAIN,
     "5 % gain spread": replace(_PLAIN, gain_error=0.05),

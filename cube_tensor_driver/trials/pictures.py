@@ -33,7 +33,7 @@ from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..research.field_study import WIDTHS, field_example, field_study
 from ..research.pads_example import planar_calibration, sweep
 from ..research.paper import experiments
-from ..research.traction_study import MAIN, PITCHES, WRONG, traction_example
+from ..research.traction_study import MAIN, PITCHES, SHAPED, WRONG, traction_example
 from ..research.traction_study import study as traction_study
 from ..ros.session import node_session
 from ..simulation.mujoco_scene import MujocoLoad, scene_skin
@@ -115,6 +115,9 @@ def make_pictures(folder: Path) -> None:
     print(traction_table({name: settings[one] for name, one in WRONG.items()}))
     by_pitch = traction_study(PITCHES, [2e-3, 5e-3, 10e-3, 20e-3], cases=4)
     print(traction_table({f"{s.cubes}, {1e3 * s.pitch:g} mm": e for s, e in by_pitch.items()}))
+    shaped = traction_study(SHAPED, [5e-3, 10e-3, 20e-3], cases=4)
+    names_of = {s: f"{s.shape}, {s.cubes}, {1e3 * s.pitch:g} mm" for s in shaped}
+    print(traction_table({names_of[s]: errors for s, errors in shaped.items()}))
     names = ("pitches", "widths", "error", "position", "force")
     table = {name: getattr(study, name).tolist() for name in names}
     (folder / "field.json").write_text(json.dumps(table) + "\n")
