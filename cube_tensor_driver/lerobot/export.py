@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -27,7 +28,8 @@ Report = Callable[[float, float, str], None]
 class Exported(NamedTuple):
     """What was written, and what was not.
 
-    rows: samples of cubes; depth: samples in a window; features: of the other topics
+    rows: samples of cubes; features: of the other topics
+    depth: samples in a window; usual: samples in most windows
     outside, unknown, empty: as in `BagPlan`, of all bags
     """
 
@@ -35,6 +37,7 @@ class Exported(NamedTuple):
     frames: int
     rows: int
     depth: int
+    usual: int
     features: list[str]
     outside: int
     unknown: int
@@ -78,6 +81,7 @@ def export_lerobot(
         data_set.frames,
         rows,
         depth,
+        math.ceil(max(plan.rate for plan in plans) / choices.fps),
         [topic.key for topic in topics.values()],
         sum(plan.outside for plan in plans),
         sum(plan.unknown for plan in plans),

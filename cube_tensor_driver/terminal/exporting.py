@@ -21,6 +21,12 @@ def say_exported(folder: Path, exported: Exported) -> None:
         f"{folder}: {exported.episodes} episodes, {exported.frames} frames, {exported.rows} "
         f"samples, {exported.depth} in a window; {others}"
     )
+    if exported.depth > 2 * exported.usual:
+        say(
+            f"usual are {exported.usual} samples in a window, but one frame holds "
+            f"{exported.depth}: hubs paused, or stamps are in doubt; --marks can leave that out",
+            "yellow",
+        )
     left_out = {
         "samples outside of the marks": exported.outside,
         "samples of cubes that the skin does not have": exported.unknown,
