@@ -192,6 +192,16 @@ def test_shipped_scenes(mujoco, scene, seconds, force):
     assert len(rows) == len(skin.cubes)
 
 
+def test_a_scene_without_keyframes_goes_on_and_is_the_same_when_asked_again(mujoco, tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(BOX.replace('timestep="0.001"', 'timestep="0.005"'))
+    load = MujocoLoad(path, pad())
+    assert load.repeats is None
+    first = load.total(0.02)[0]
+    np.testing.assert_allclose(load.total(2.5)[0], [0, 0, -WEIGHT], atol=0.02 * WEIGHT)
+    np.testing.assert_array_equal(load.total(0.02)[0], first)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
