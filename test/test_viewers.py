@@ -63,6 +63,17 @@ DISPLAYS = {
         "History Length",
         "Topic",
     },
+    "PointCloud2": {
+        "Style",
+        "Size (m)",
+        "Position Transformer",
+        "Color Transformer",
+        "Channel Name",
+        "Use rainbow",
+        "Min Color",
+        "Max Color",
+        "Topic",
+    },
     "TF": {
         "Show Names",
         "Show Axes",
@@ -241,6 +252,8 @@ def test_rviz_shows_our_topics_as_they_are_offered():
     short, long = force * wrench["Force Arrow Scale"]
     assert wrench["Enabled"] and wrench["Arrow Width"] < short and long < 0.06
     assert rviz["Visualization Manager"]["Global Options"]["Fixed Frame"] == "skin_base"
+    surface = displays["PointCloud2"]
+    assert topic_of(surface)["Value"] == "traction" and surface["Channel Name"] == "pressure"
 
 
 def test_foxglove_reads_every_name_of_ours():

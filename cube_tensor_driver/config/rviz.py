@@ -10,8 +10,10 @@ from .package_data import package_data
 from .skin import Skin
 from .yaml import read_yaml
 
-DISTANCE, LEAST_DISTANCE = 1.8, 0.05
-"""Of the camera: in diagonals of the skin, and at least, in m."""
+DISTANCE, LEAST_DISTANCE = 1.5, 0.05
+"""Of the camera: in diagonals of the skin with its legend, and at least, in m."""
+LEGEND = 0.8
+"""Height of the legend of `markers`, below the skin, in widths of the skin."""
 
 
 def rviz_view(skin: Skin) -> dict[str, Any]:
@@ -21,8 +23,9 @@ def rviz_view(skin: Skin) -> dict[str, Any]:
     manager = view["Visualization Manager"]
     position = np.array([cube.xyz for cube in skin.cubes])
     low, high = position.min(axis=0), position.max(axis=0)
+    middle = skin.cubes[int(np.linalg.norm(position - (low + high) / 2, axis=1).argmin())]
+    low[1] -= LEGEND * (high[0] - low[0])
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    middle = skin.cubes[int(np.linalg.norm(position - centre, axis=1).argmin())]
     manager["Global Options"]["Fixed Frame"] = skin.parent_frame
     displays = {display["Name"]: display for display in manager["Displays"]}
     displays["Wrench"]["Topic"]["Value"] = f"cubes/{middle.name}/wrench"
