@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from visualization_msgs.msg import MarkerArray
 
 from ..config.package_data import package_data
@@ -89,7 +88,7 @@ def make_pictures(folder: Path) -> None:
                 file=sys.stderr,
             )
     try:
-        save(_gripper(), folder / "gripper.png")
+        _draw_gripper(folder / "gripper.png")
     except ConfigError as error:
         print(f"no gripper.png: {error}", file=sys.stderr)
     bench_scale(
@@ -125,7 +124,7 @@ def make_pictures(folder: Path) -> None:
     print(f"{field_tables(study)}\nwrote {written} to {folder}")
 
 
-def _gripper() -> Figure:
+def _draw_gripper(path: Path) -> None:
     """The gripper while it shakes its box, and what its fingers feel. ConfigError: no OpenGL."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     scene = package_data() / "config" / "mujoco" / "gripper.xml"
@@ -135,7 +134,7 @@ def _gripper() -> Figure:
     pixels = load.picture(760, 900, lookat=np.array([0.0, 0.0, 0.1]), distance=0.25, azimuth=150.0)
     links = np.array([cube.link for cube in skin.cubes])
     fingers = {name: np.flatnonzero(links == name) for name in ("left", "right")}
-    return draw_fingers(pixels, load.poses, load.touch.read(), fingers, load.depth)
+    save(draw_fingers(pixels, load.poses, load.touch.read(), fingers, load.depth), path)
 
 
 @contextmanager
