@@ -269,11 +269,15 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
         os.kill(driver, signal.SIGKILL)
         wait_for("link hub1: hub 0x2 with 8 cubes of 8 pads")
         asked = GetParameters.Request(names=["rate", "publish_period", "config"])
-        rate, period, config = ros.call(
-            GetParameters, "/robot1/hand/driver/get_parameters", asked
-        ).values
-        assert (rate.double_value, period.double_value) == (80.0, 0.05)
-        assert config.string_value == str(SKIN)
+
+        def parameters() -> tuple[float, float, str]:
+            rate, period, config = ros.call(
+                GetParameters, "/robot1/hand/driver/get_parameters", asked
+            ).values
+            return rate.double_value, period.double_value, config.string_value
+
+        # A driver that has just started again may not have declared all of them yet.
+        ros.wait(lambda: parameters() == (80.0, 0.05, str(SKIN)))
         begun = len(heard)
         ros.wait(lambda: len(heard) > begun + 20)
         process.send_signal(signal.SIGINT)
