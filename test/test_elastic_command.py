@@ -25,7 +25,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import memory
-from cube_tensor_driver.research import paper
+from cube_tensor_driver.research import paper, rod_shear
 from cube_tensor_driver.research.layout_study import LayoutStudy
 from cube_tensor_driver.terminal.output import progress_bar
 
@@ -421,6 +421,10 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
         "cube_tensor_driver.plot.paper.rod_sweep",
         lambda progress: paper.rod_sweep(NARROW, places=(0.0, 2e-3), progress=progress),
     )
+    monkeypatch.setattr(
+        "cube_tensor_driver.plot.paper.rod_shear",
+        lambda progress: rod_shear.rod_shear(NARROW, places=(0.0, 2e-3), progress=progress),
+    )
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())
     assert made == [
@@ -429,6 +433,7 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
         "figure_4.png",
         "paper.json",
         "rod_positions.png",
+        "rod_shear.png",
     ]
     assert json.loads((tmp_path / "p" / "paper.json").read_text())["rod positions"]["place"] == [
         0.0,
@@ -508,6 +513,12 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
     said += [
         ", ".join(f"{value:.3f}" for value in slab[:, column]) for column in (1, 3)
     ]  # zx and zz_x
-    assert len(said) == 22
+    recovered = found["rod shear"]
+    names = ("truth", "same_load", "eq_4", "tensor", "points", "pads")
+    for place, *shears in zip(*(recovered[name] for name in ("place", *names)), strict=True):
+        if place:
+            numbers = " | ".join(f"{shear / 1e3:.1f}" for shear in shears)
+            said.append(f"| {1e3 * place:g} | {numbers} |")
+    assert len(said) == 30
     for words in said:
         assert words in text, words

@@ -254,7 +254,7 @@ def pad_stresses(
     # Parities that share their factors follow each other.
     for parity in sorted(solid.parities, key=lambda p: solid.with_sorted_axes(p)[0], reverse=True):
         report("parity " + "".join("-0+"[sign + 1] for sign in parity))
-        pads = [pad for pad in range(layout.n_pads) if _sees(layout, pad, parity)]
+        pads = [pad for pad in range(layout.n_pads) if sees(layout, pad, parity)]
         load = forces(parity)
         part = np.zeros((layout.n_pads, load.shape[1]))
         used = np.flatnonzero(np.any(load != 0, axis=0))
@@ -275,8 +275,8 @@ def _part(field: Array, parity: Parity) -> Array:
     return field * np.all((odd == (signs < 0)) | (signs == 0), axis=-1)
 
 
-def _sees(layout: Layout, pad: int, parity: Parity) -> bool:
-    """False where the pad's mean stress is zero, because the field is odd about its middle."""
+def sees(layout: Layout, pad: int, parity: Parity) -> bool:
+    """False where a pad's mean stress is zero, because the field is odd about its middle."""
     axes = list(field_axes(layout))
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
     return bool(np.all((np.array(parity) >= 0) | (np.abs(centre) > 1e-9) | (normal != 0)))

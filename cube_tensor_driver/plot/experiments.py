@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ..core.modes import PLANE
 from ..research.paper import Experiment
+from ..research.rod_shear import RodShear
 from .style import curve_style, print_style, symbol
 
 PADS = tuple(f"$f_{number}$ of pad C{number}" for number in range(1, 5))
@@ -18,6 +19,13 @@ _ROD_CURVES = {
     "signal": "signal for shear",
     "shear": "part that is the true local shear",
     "crosstalk": "rest: cross-talk",
+}
+_RECOVERED = {
+    "truth": "true, same rod without the cube",
+    "same_load": "true, same pressure",
+    "eq_4": "four pads, eq. 4",
+    "points": "eight pads: tensor, points",
+    "pads": "eight pads: influence functions",
 }
 _SMALL = 1e-3
 """Of the greatest stress: panels whose curves are all below it show no axis of values."""
@@ -86,6 +94,23 @@ def draw_rod_sweep(table: dict[str, list[float]]) -> Figure:
         title="Rod pressed 1 mm: signal for shear over its position, bonded bottom",
         xlabel="distance of the rod's middle from the cube's / mm",
         ylabel="$-v_1 + v_2 + v_3 - v_4$ / kPa",
+    )
+    axis.legend(handlelength=4)
+    return figure
+
+
+@print_style()
+def draw_rod_shear(result: RodShear) -> Figure:
+    """Shear at the cube under the rod, as each way of recovering it has it, and true."""
+    figure = Figure(figsize=(6, 3.6))
+    axis = figure.subplots()
+    for number, (name, label) in enumerate(_RECOVERED.items()):
+        values = getattr(result, name)
+        axis.plot(1e3 * result.place, values / 1e3, label=label, **curve_style(number))
+    axis.set(
+        title="Rod pressed 1 mm: shear at the cube over the rod's position",
+        xlabel="distance of the rod's middle from the cube's / mm",
+        ylabel=r"$\sigma_{zx}$ / kPa",
     )
     axis.legend(handlelength=4)
     return figure

@@ -7,11 +7,17 @@ from pathlib import Path
 from ..config.output_files import write_json
 from ..elastic.fem import Progress
 from ..research.paper import Experiment, experiments, figure_4, rod_sweep
+from ..research.rod_shear import rod_shear
 from .deformation import draw_figure_4
-from .experiments import draw_experiment, draw_rod_sweep
+from .experiments import draw_experiment, draw_rod_shear, draw_rod_sweep
 from .style import save
 
-BEGIN_END = {"linear": (0.01, 0.12), "finite": (0.12, 0.96), "rod": (0.96, 1.0)}
+BEGIN_END = {
+    "linear": (0.01, 0.10),
+    "finite": (0.10, 0.82),
+    "rod": (0.82, 0.85),
+    "shear": (0.85, 1.0),
+}
 """When the parts begin and end, as measured parts of the whole time; before them comes Fig. 4."""
 
 
@@ -32,6 +38,10 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
     written.append(folder / "rod_positions.png")
     save(draw_rod_sweep(table), written[-1])
     numbers["rod positions"] = table
+    recovered = rod_shear(progress=_part(report, "shear"))
+    written.append(folder / "rod_shear.png")
+    save(draw_rod_shear(recovered), written[-1])
+    numbers["rod shear"] = {name: column.tolist() for name, column in vars(recovered).items()}
     written.append(folder / "paper.json")
     write_json(written[-1], numbers)
     return written

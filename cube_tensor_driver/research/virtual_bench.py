@@ -175,6 +175,15 @@ class VirtualBench:
             raise ElasticError("an element is inside out; press less")
         return balance.force
 
+    def rod_pressure(self, step: Step) -> tuple[Array, Array]:
+        """Places (n,) m along x and forces (n,) N/m with which the rod of a linear step presses."""
+        u = self.solve(step)
+        if u is None or step.rod is None or self.finite:
+            raise ElasticError("give a linear step with a rod, that presses less")
+        force = self.rod_contact(step.rod).force(u)
+        dofs = np.flatnonzero((force != 0) & (self.section.component == 1))
+        return self._half_side * self.section.basis.doflocs[0, dofs], self._half_side * force[dofs]
+
     def rod_contact(self, rod: Rod) -> RodContact:
         """A rod's contact with the top."""
         return RodContact(self._top, rod, self._half_side, self.body.young, self.finite)

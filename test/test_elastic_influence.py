@@ -1,0 +1,72 @@
+"""Influence functions of pads against direct solutions, a known field and their own convergence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.core.errors import ElasticError
+from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.elastic import fem
+from cube_tensor_driver.elastic.body import Body, make_mesh
+from cube_tensor_driver.elastic.influence import compute_influence
+
+LAYER = Body(width=40e-3, ground=True, cube_young=float("inf"), z=1e-3)
+PLANAR = LAYOUTS["planar"]
+
+
+@pytest.fixture(scope="module")
+def influence():
+    return compute_influence(LAYER, PLANAR, 0)
+
+
+def test_reciprocity_gives_what_a_force_on_the_surface_does(influence):
+    """A direct solution under the force, on a body that is solved without mirrors."""
+    body = replace(LAYER, x=1e-9)
+    solid = fem.make_solid(body, PLANAR, make_mesh(body, PLANAR, 0))
+    x, c = solid.positions, solid.component
+    for place, component in ((0, 0), (0, 1), (1, 1), (-3, 0), (-3, 1)):
+        top = np.flatnonzero((np.abs(x[1] - x[1].max()) < 1e-12) & (c == component))
+        dof = top[np.argmin(np.abs(x[0, top] - place))]
+        forces = np.zeros((solid.basis.N, 1))
+        forces[dof] = 1.0
+        direct = fem.pad_stresses(solid, PLANAR, lambda _, f=forces: f)[:, 0] / (body.side / 2)
+        node = np.argmin(np.abs(influence.place[:, 0] - x[0, dof] * body.side / 2))
+        given = influence.pads[:, node, component]
+        assert np.abs(direct - given).max() < 1e-4 * np.abs(influence.pads).max()
+
+
+def test_pressure_everywhere_is_the_calibration_s_response_to_it():
+    """What the layer has without the cube, by the response of a cube in a free box."""
+    rigid = Body(width=80e-3, height=24e-3, ground=True, cube_young=float("inf"))
+    soft = replace(rigid, cube_young=rigid.young, cube_poisson=rigid.poisson)
+    of_cube, of_layer = (compute_influence(body, PLANAR, 0) for body in (rigid, soft))
+    seen, field = (
+        np.trapezoid(i.pads[:, :, 1], i.place[:, 0], axis=1) for i in (of_cube, of_layer)
+    )
+    response, applied = (
+        fem.compute_response(replace(body, ground=False), PLANAR, "slab", meshes=1).matrix
+        for body in (rigid, soft)
+    )
+    expected = response @ np.linalg.lstsq(applied, field)[0]
+    assert np.abs(seen - expected).max() < 0.05 * np.abs(seen).max()
+
+
+def test_influence_converges_with_the_mesh(influence):
+    x = np.linspace(-10e-3, 10e-3, 41)
+    coarse = influence.along_x(x)
+    fine = compute_influence(LAYER, PLANAR, 1).along_x(x)
+    assert np.abs(coarse - fine).max() < 0.02 * np.abs(fine).max()
+
+
+def test_without_a_cube_the_layer_carries_the_pressure():
+    soft = replace(LAYER, cube_young=LAYER.young, cube_poisson=LAYER.poisson)
+    influence = compute_influence(soft, PLANAR, 0)
+    x = np.linspace(-20e-3, 20e-3, 2001)
+    upper = influence.along_x(x)[:2, :, 1]
+    assert np.trapezoid(upper, x, axis=1) == pytest.approx(1.0, rel=0.03)
+
+
+def test_a_body_without_ground_is_refused():
+    with pytest.raises(ElasticError, match="ground=True"):
+        compute_influence(Body(), PLANAR)
