@@ -61,10 +61,10 @@ def draw_fingers(
             place[:, 2],
             along[:, 0],
             along[:, 2],
-            color="white",
+            color="black",
             angles="xy",
             scale_units="xy",
-            scale=ARROW_KPA / 8,
+            scale=ARROW_KPA / 5,
             width=0.012,
         )
         label = f"shear {ARROW_KPA:g} kPa"
