@@ -121,7 +121,7 @@ class Person:
     pressed: the cube and the side that it presses now.
     """
 
-    script = SimpleNamespace(period=None)
+    repeats = None
 
     def __init__(self, skin: Skin, turns: list[np.ndarray]) -> None:
         self._position = np.array([cube.xyz for cube in skin.cubes])

@@ -144,7 +144,7 @@ class Conversation:
         self._ask("slower", Request(Command.SET_PERIOD, SLOWER_US), seconds=NEW_PERIOD_S)
         self._ask("stop samples", Request(Command.STOP), seconds=0.3)
         self._ask("stop again", Request(Command.STOP))
-        self._ask("start again", Request(Command.START), seconds=1.2)
+        self._ask("start after stop", Request(Command.START), seconds=1.2)
 
     def _host_that_does_not_read(self) -> None:
         self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=1.2)
