@@ -193,11 +193,24 @@ def test_a_tensor_that_the_reconstruction_counts_as_lost_is_not_missing(played):
         assert {name for name in WRONG if judge(said_so, log)[name]} == figures
 
 
+def test_what_comes_to_a_reconstruction_that_is_down_has_no_tensor(played):
+    """From the last message that it made tensors of, until it is back."""
+    record, log = played
+    stamp_ns = record.stress.rows.stamp_ns
+    down = (stamp_ns > stamp_ns[ROW]) & (stamp_ns < stamp_ns[ROW] + 100_000_000)
+    rest = received(record.stress.rows.select(~down))
+    for late_ns, figures in ((0, set()), (-50_000_000, {"missing_tensors"})):
+        begin_ns, end_ns = int(stamp_ns[ROW]) + 10_000_000, int(stamp_ns[down].max()) + late_ns
+        deed = Deed("restart reconstruction", begin_ns, end_ns, True)
+        killed = judge(replace(record, stress=rest, deeds=(deed,)), log)
+        assert {name for name in WRONG if killed[name]} == figures
+
+
 def test_what_a_driver_counted_just_before_it_was_killed_is_not_known(played):
     record, log = played
     stamp_ns = record.frequencies.rows.stamp_ns
     dead_ns = int(stamp_ns[-1]) + 1
-    dead = Deed("restart driver", dead_ns, dead_ns, True, stress_rows=(len(stamp_ns),) * 2)
+    dead = Deed("restart driver", dead_ns, dead_ns, True)
     for unsaid_ns, figures in ((1_400_000_000, set()), (1_600_000_000, {"miscounted"})):
         unsaid = np.count_nonzero(stamp_ns > dead_ns - unsaid_ns)
         counters = {**record.counters, "rows published": len(stamp_ns) - int(unsaid)}

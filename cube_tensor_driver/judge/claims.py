@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..simulation.sample_log import LinkLog, SampleLog
 from .frequencies import FrequencyVerdict
-from .record import NEW_DRIVER, Record
+from .record import Record
 from .samples import NONE, Samples
 from .tensors import TensorVerdict
 
@@ -40,11 +40,11 @@ def miscounted(
         lost + counters["rows of unknown cubes"] + counters["rows with another number of pads"]
     )
     # The driver counts on until it is stopped.
-    known = verdict.judged & ~_near_death(record, samples.time_ns)
+    known = verdict.judged & ~record.near_death(samples.time_ns, SAID_EVERY_NS)
     missing, at_end = int(verdict.missing[known].sum()), int(verdict.missing.sum())
     unknowable = _lost_with_power(record, log, samples, verdict)
     published, came = counters["rows published"], len(record.frequencies.rows)
-    unsaid = int(np.count_nonzero(_near_death(record, record.frequencies.sent_ns)))
+    unsaid = int(np.count_nonzero(record.near_death(record.frequencies.sent_ns, SAID_EVERY_NS)))
     wrong = 0
     # Without a number of rows of what did not come here nobody can say how many there were.
     if not record.frequencies.missed:
@@ -58,15 +58,6 @@ def miscounted(
         "missing": missing,
         "lost_with_power": unknowable,
     }
-
-
-def _near_death(record: Record, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(N,) times in which a driver counted what it could not say any more, or there was none."""
-    near = np.zeros(len(time_ns), bool)
-    for deed in record.deeds:
-        if deed.kind in NEW_DRIVER:
-            near |= (time_ns > deed.begin_ns - SAID_EVERY_NS) & (time_ns < deed.end_ns)
-    return near
 
 
 def _lost_with_power(

@@ -85,7 +85,6 @@ class Deed:
     begin_ns, end_ns: wall clock
     done: whether it succeeded; answer: what the node said
     cubes: that were tared
-    stress_rows: how many rows of stress had come at its begin and at its end
     """
 
     kind: str
@@ -94,7 +93,6 @@ class Deed:
     done: bool
     answer: str = ""
     cubes: tuple[int, ...] = ()
-    stress_rows: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -118,3 +116,11 @@ class Record:
     messages_lost: int
     begin_ns: int
     end_ns: int
+
+    def near_death(self, time_ns: NDArray[np.int64], before_ns: int) -> NDArray[np.bool_]:
+        """(N,) wall clock, whether there was no driver, or one that was killed so soon after."""
+        near = np.zeros(len(time_ns), bool)
+        for deed in self.deeds:
+            if deed.kind in NEW_DRIVER:
+                near |= (time_ns > deed.begin_ns - before_ns) & (time_ns < deed.end_ns)
+        return near

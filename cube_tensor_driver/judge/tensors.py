@@ -33,10 +33,10 @@ AT_LIMIT = 0.01
 """So near to its limit (relative) a residual may be above it or not."""
 OF_ROW = PAD_FAULT | RESIDUAL | INVALID | TEMPERATURE | STAMP
 """Status bits of the row itself; the others are of its cube's pads."""
+LAST_WORDS_NS = 200_000_000
+"""So long before its death a driver's messages may not have come here."""
 GAP_NS = 50_000_000
 """How far rows of a message that did not come here may be from those around it."""
-NEAR = 200
-"""Rows before and behind a pause of the reconstruction whose stamps say when it was."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ def judge_tensors(
     frequencies, stress = record.frequencies.rows, record.stress.rows
     source = _find(_keys(frequencies), _keys(stress))
     invented = (source == NONE) & ~record.frequencies.in_gap(stress.stamp_ns, GAP_NS)
+    # The last messages of a driver that was killed may have come to the reconstruction alone.
+    invented &= ~record.near_death(record.stress.sent_ns, LAST_WORDS_NS)
     known = np.flatnonzero(source != NONE)
     times = np.bincount(source[known], minlength=len(frequencies))
     missing = _missing(record, times == 0)
@@ -196,22 +198,20 @@ def _find(keys: NDArray[np.uint64], wanted: NDArray[np.uint64]) -> NDArray[np.in
 def _missing(record: Record, without: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(N,) rows of the judged time without a tensor that nothing explains.
 
-    What explains them: messages that did not come here; a node that was down, from the newest row
-    before that had its tensor to the first one after; and as many messages as the reconstruction
+    What explains them: messages that did not come here; a node that was down, for all that was sent
+    since the last message before that had its tensor; and as many messages as the reconstruction
     says that it lost.
     """
-    frequencies, stress = record.frequencies.rows, record.stress.rows
+    frequencies = record.frequencies.rows
     judged = (frequencies.stamp_ns >= record.begin_ns) & (frequencies.stamp_ns < record.end_ns)
     missing = without & judged & ~record.stress.in_gap(frequencies.stamp_ns, GAP_NS)
+    sent_ns = record.frequencies.sent_ns
     for deed in record.deeds:
         if deed.kind in (*DOWN, *NEW_DRIVER):
-            before, after = deed.stress_rows
-            begin_ns = stress.stamp_ns[max(0, before - NEAR) : before].min(initial=2**62)
-            end_ns = stress.stamp_ns[after : after + NEAR].max(initial=0)
-            down = (frequencies.stamp_ns >= begin_ns) & (frequencies.stamp_ns <= end_ns + GAP_NS)
-            missing &= ~down
+            before = sent_ns[~without & (sent_ns <= deed.begin_ns)]
+            missing &= (sent_ns <= before.max(initial=0)) | (sent_ns > deed.end_ns)
     # Rows of one message were sent at one time.
-    messages = len(np.unique(record.frequencies.sent_ns[missing]))
+    messages = len(np.unique(sent_ns[missing]))
     if messages <= record.messages_lost:
         missing[:] = False
     return missing

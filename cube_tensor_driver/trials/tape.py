@@ -107,12 +107,6 @@ class Tape(Generic[AnyRows]):
         self.take()
         self._number = 0
 
-    def rows_so_far(self) -> int:
-        """How many rows have come."""
-        self.take()
-        self._join()
-        return self._rows
-
     def cubes_so_far(self) -> int:
         """How many cubes rows have come of."""
         self._join()
