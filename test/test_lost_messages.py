@@ -75,3 +75,7 @@ def test_a_publisher_that_begins_again_is_no_loss():
     for number in (5, 6, 7, 1, 2, 3, 6, 7, 8, 11, 12):
         lost.came(number)
     assert lost.count == 4
+    lost.events()
+    for number in (40, 41, 44, 45):
+        lost.came(number)
+    assert lost.count == 6

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..simulation.sample_log import LinkLog, SampleLog
 from .frequencies import FrequencyVerdict
-from .record import Record
+from .record import NEW_DRIVER, Record
 from .samples import NONE, Samples
 from .tensors import TensorVerdict
 
@@ -40,7 +40,7 @@ def miscounted(
         lost + counters["rows of unknown cubes"] + counters["rows with another number of pads"]
     )
     # The driver counts on until it is stopped.
-    known = verdict.judged & ~record.near_death(samples.time_ns, SAID_EVERY_NS)
+    known = verdict.judged & ~_between_drivers(record, samples, verdict)
     missing, at_end = int(verdict.missing[known].sum()), int(verdict.missing.sum())
     unknowable = _lost_with_power(record, log, samples, verdict)
     published, came = counters["rows published"], len(record.frequencies.rows)
@@ -58,6 +58,27 @@ def miscounted(
         "missing": missing,
         "lost_with_power": unknowable,
     }
+
+
+def _between_drivers(
+    record: Record, samples: Samples, verdict: FrequencyVerdict
+) -> NDArray[np.bool_]:
+    """(S,) samples that no driver could say anything of: the last ones before it was killed, up to
+    the first one of their hub that came to the next."""
+    unknown = np.zeros(len(samples), bool)
+    sent_ns = record.frequencies.sent_ns
+    for deed in record.deeds:
+        if deed.kind not in NEW_DRIVER:
+            continue
+        came = verdict.sample[(sent_ns > deed.begin_ns) & (verdict.sample != NONE)]
+        came = came[samples.time_ns[came] > deed.begin_ns]
+        for link in np.unique(samples.link).tolist():
+            of_next = samples.time_ns[came[samples.link[came] == link]]
+            first_ns = of_next.min(initial=np.iinfo(np.int64).max)
+            of_link = samples.link == link
+            last_ns = deed.begin_ns - SAID_EVERY_NS
+            unknown |= of_link & (samples.time_ns > last_ns) & (samples.time_ns < first_ns)
+    return unknown
 
 
 def _lost_with_power(

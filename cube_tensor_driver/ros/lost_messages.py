@@ -19,7 +19,7 @@ class LostMessages:
     only what DDS reports is counted."""
 
     def __init__(self) -> None:
-        self._left_out = self._reported = 0
+        self._before = self._left_out = self._reported = 0
         self._newest: int | None = None  # number
         self._gap = 0  # just before the newest; counted when its publisher goes on
         self._others: deque[int] = deque(maxlen=8)  # newest numbers of publishers before
@@ -27,10 +27,13 @@ class LostMessages:
 
     @property
     def count(self) -> int:
-        return max(self._left_out, self._reported)
+        return self._before + max(self._left_out, self._reported)
 
     def events(self) -> SubscriptionEventCallbacks:
-        """For the subscription."""
+        """For a subscription that is new: what was lost before stays counted."""
+        self._before, self._left_out, self._reported = self.count, 0, 0
+        self._newest, self._gap, self._several = None, 0, False
+        self._others.clear()
         return SubscriptionEventCallbacks(message_lost=self._on_lost)
 
     def came(self, number: int | None) -> None:

@@ -38,6 +38,7 @@ class Reconstruction(CubeNode):
         # In one process with the driver, its thread calls `on_rows`; services run in the main one.
         self._lock = threading.Lock()
         self._configured = ExitStack()
+        self._lost = LostMessages()
         self._updater = Diagnostics(self, self._statuses, lambda: self.guard.errors)
 
     def configure(self) -> None:
@@ -58,7 +59,6 @@ class Reconstruction(CubeNode):
         folder = None if self._recorded else tare_folder(self.value("tare_folder"))
         self._taring = Taring(self, skin, reconstructor, folder, self._lock, self._publish_info)
         made.callback(self._taring.close)
-        self._lost = LostMessages()
         self._diagnostics = ReconstructionDiagnostics(skin, reconstructor, self._taring, self._lost)
         uids = self.create_subscription(SkinInfo, "driver/info", self._taring.on_info, LATCHED)
         made.callback(self.destroy_subscription, uids)
