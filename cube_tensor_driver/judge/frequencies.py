@@ -11,7 +11,7 @@ from ..core.status import STAMP
 from ..simulation.faults import CUT_FAULTS
 from ..simulation.sample_log import SampleLog
 from .expected import Expected
-from .record import STOPPING, Record
+from .record import LAST_WORDS_NS, STOPPING, Record
 from .samples import CHUNK, NONE, Samples
 
 RECOVERY_S = 6.0
@@ -130,4 +130,5 @@ def _explained(record: Record, log: SampleLog, samples: Samples) -> NDArray[np.b
         if deed.kind in STOPPING:
             begin_ns, end_ns = deed.begin_ns - 1e9 * BEFORE_S, deed.end_ns + 1e9 * RESTART_S
             explained |= (samples.time_ns >= begin_ns) & (samples.time_ns <= end_ns)
+    explained |= record.near_death(samples.time_ns, LAST_WORDS_NS)
     return explained | record.frequencies.in_gap(samples.time_ns, GAP_NS)

@@ -73,6 +73,9 @@ NEW_DRIVER = ("restart driver",)
 """Deeds that kill the driver and start it again."""
 STOPPING = ("cycle driver", *NEW_DRIVER)
 """Deeds during which nobody takes what the hubs send."""
+LAST_WORDS_NS = 500_000_000
+"""What a driver was sent, or sent itself, so shortly before it was killed may not have come: a busy
+host is late."""
 DOWN = ("restart reconstruction", "reconfigure reconstruction")
 """Deeds during which there is no reconstruction."""
 

@@ -17,7 +17,7 @@ from ..core.pipeline import Pipeline
 from ..core.rows import FrequencyRows, StressRows
 from ..core.status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .expected import Expected
-from .record import DOWN, NEW_DRIVER, Record
+from .record import DOWN, LAST_WORDS_NS, NEW_DRIVER, Record
 from .rest import RestEpochs
 from .samples import CHUNK, NONE
 
@@ -33,8 +33,6 @@ AT_LIMIT = 0.01
 """So near to its limit (relative) a residual may be above it or not."""
 OF_ROW = PAD_FAULT | RESIDUAL | INVALID | TEMPERATURE | STAMP
 """Status bits of the row itself; the others are of its cube's pads."""
-LAST_WORDS_NS = 200_000_000
-"""So long before its death a driver's messages may not have come here."""
 GAP_NS = 50_000_000
 """How far rows of a message that did not come here may be from those around it."""
 
