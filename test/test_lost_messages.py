@@ -31,7 +31,7 @@ def test_what_a_late_subscriber_loses_is_counted(ros, executor):
 
     node = rclpy.create_node("late")
     node.create_subscription(
-        UInt32, "late", with_number(take), DEPTH, event_callbacks=lost.events()
+        UInt32, "late", with_number(take), DEPTH, event_callbacks=lost.new_subscription()
     )
     spinner = executor()
     spinner.add_node(node)
@@ -75,7 +75,7 @@ def test_a_publisher_that_begins_again_is_no_loss():
     for number in (5, 6, 7, 1, 2, 3, 6, 7, 8, 11, 12):
         lost.came(number)
     assert lost.count == 4
-    lost.events()
+    lost.new_subscription()
     for number in (40, 41, 44, 45):
         lost.came(number)
     assert lost.count == 6

@@ -1,4 +1,5 @@
-"""Counts the messages of a topic that were sent and did not come, of one subscription.
+"""Counts the messages of a topic that were sent and did not come, of one
+subscription after the other.
 
 DDS numbers the messages of each publisher. A number that is left out is a message that is gone for
 good: the network lost it, or it was dropped because this process was away longer than its queue
@@ -29,8 +30,8 @@ class LostMessages:
     def count(self) -> int:
         return self._before + max(self._left_out, self._reported)
 
-    def events(self) -> SubscriptionEventCallbacks:
-        """For a subscription that is new: what was lost before stays counted."""
+    def new_subscription(self) -> SubscriptionEventCallbacks:
+        """Begin to count of a new subscription: its events. What was lost before stays counted."""
         self._before, self._left_out, self._reported = self.count, 0, 0
         self._newest, self._gap, self._several = None, 0, False
         self._others.clear()

@@ -69,7 +69,7 @@ class Reconstruction(CubeNode):
                 with_number(self._on_frequencies),
                 quality,
                 raw=True,
-                event_callbacks=self._lost.events(),
+                event_callbacks=self._lost.new_subscription(),
             )
             made.callback(self.destroy_subscription, frequencies)
         self._publish_info()
