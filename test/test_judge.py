@@ -13,8 +13,9 @@ from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import STUCK
-from cube_tensor_driver.judge.expected import Expected
+from cube_tensor_driver.judge.expected import Expected, load_tables
 from cube_tensor_driver.judge.record import CubeMessages, Deed, Received, Record
+from cube_tensor_driver.judge.rest import MARGIN_NS
 from cube_tensor_driver.judge.samples import Samples
 from cube_tensor_driver.judge.verdict import judge
 from cube_tensor_driver.simulation.faults import Fault
@@ -58,7 +59,14 @@ def played(tmp_path_factory):
         LinkLog("hub0", (0, 1), 0, (run,), spoiled=((0, 70),)),
         LinkLog("hub1", (2, 3), 0, (before, after)),
     )
-    log = SampleLog(0, links, RECORDS)
+    return recorded(skin, SampleLog(0, links, RECORDS))
+
+
+def recorded(skin, log, deeds=(), rest_after=None):
+    """(record, log) of what a program without a fault makes of a log.
+
+    rest_after: (wall clock in ns, rest frequencies of all cubes) of a tare
+    """
     samples = Samples(log)
     expected = Expected(skin, log, samples, INSTANTS)
     order = np.argsort(samples.time_us, kind="stable")
@@ -77,14 +85,19 @@ def played(tmp_path_factory):
     )
     reconstruct = Reconstructor(skin)
     scans = np.split(np.arange(len(cube)), np.flatnonzero(np.diff(samples.time_us[of])) + 1)
-    stress = concatenate([reconstruct(frequencies.select(scan)) for scan in scans])
+    made = []
+    for scan in map(frequencies.select, scans):
+        if rest_after is not None and scan.stamp_ns[0] > rest_after[0]:
+            reconstruct.rest_frequency = rest_after[1]
+        made.append(reconstruct(scan))
+    stress = concatenate(made)
     record = Record(
         skin=skin,
         instants=INSTANTS,
         frequencies=received(frequencies),
         stress=received(stress),
         cube_messages=CubeMessages(0, frozenset({skin.frame(skin.cubes[0])}), (), ()),
-        deeds=(),
+        deeds=deeds,
         counters={
             "lost_on_the_way": 1,
             "dropped_in_hub": 0,
@@ -175,6 +188,47 @@ def test_rows_that_are_missing_or_came_twice_are_found(played):
     assert "repeated" in found(played, frequencies.select(one_twice))
     assert found(played, stress=stress.select(all_but_one)) == {"missing_tensors"}
     assert found(played, stress=stress.select(one_twice)) == {"repeated"}
+
+
+TARED_NS, HELD_CUBES = 3_200_000_000, (0, 1)
+
+
+@pytest.fixture(scope="module")
+def tared(played):
+    """Makes (record, log) of a tare of the cubes of hub0 at TARED_NS: by its error, and by how long
+    their load had stayed."""
+    skin, log = played[0].skin, played[1]
+
+    def make(error, stayed_ns):
+        start_us = (TARED_NS - stayed_ns) // 1000
+        hold = FaultRecord(start_us, 3_900_000, Fault("hold", link="hub0"))
+        held = replace(log, faults=(hold,))
+        readings, _ = load_tables(skin, INSTANTS)
+        rest = np.array([cube.calibration.rest_frequency for cube in skin.cubes])
+        instant = start_us // PERIOD_US % INSTANTS
+        rest[list(HELD_CUBES)] = readings[instant, HELD_CUBES] * 1e-3 * (1 + error)
+        deed = Deed("tare", TARED_NS, TARED_NS, True, cubes=HELD_CUBES)
+        return recorded(skin, held, (deed,), (TARED_NS, rest))
+
+    return make
+
+
+def test_a_tare_of_another_load_is_found(tared):
+    stayed_ns = 2_600_000_000
+    assert found(tared(0.0, stayed_ns)) == set()
+    assert found(tared(50e-6, stayed_ns)) == {"wrong_tensors"}
+
+
+def test_what_a_tare_of_a_load_that_did_not_stay_gives_is_not_judged(tared):
+    """It averages both loads, where they differ by less than noise does."""
+    record, log = tared(50e-6, 1_000_000_000)
+    assert found((record, log)) == set()
+    rows = record.stress.rows
+    after = (rows.stamp_ns >= TARED_NS - MARGIN_NS) & np.isin(rows.cube, HELD_CUBES)
+    assert judge(record, log)["tensors_not_judged"] == np.count_nonzero(after)
+    other_cube = 2
+    wrong = changed(rows, np.flatnonzero(rows.cube == other_cube)[-1], stress=lambda stress: 1.1 * stress)
+    assert found((record, log), stress=wrong) == {"wrong_tensors"}
 
 
 def test_what_the_driver_counts_is_checked(played):

@@ -123,20 +123,22 @@ class Expected:
         temperature[celsius == TEMPERATURE_UNKNOWN] = np.nan
         return Readings(frequency, certain, temperature, pad_fault, sound, instant)
 
-    def held(self, cubes: list[int], time_ns: int) -> NDArray[np.float64]:
-        """(cubes, P) Hz that sound cubes read while their load stays, at a simulated time."""
-        time_us = time_ns // 1000
-        link = self._link[cubes[0]]
-        records = [
-            record
+    def held(self, cubes: list[int], begin_ns: int, end_ns: int) -> NDArray[np.float64] | None:
+        """(cubes, P) Hz that sound cubes of one link read all of a simulated time; None if their
+        load did not stay, or nothing was sampled."""
+        begin_us, end_us = begin_ns // 1000, end_ns // 1000
+        link, time_us = self._link[cubes[0]], self._samples.time_us
+        mine = (self._samples.link == link) & (time_us >= begin_us) & (time_us <= end_us)
+        # The load is held at an instant of the hub's table, whose numbers depend on the period.
+        instants = {
+            record.start_us // period % len(self._millihertz)
             for number, record in self.records("hold")
-            if number == link and record.start_us <= time_us < record.end_us
-        ]
-        load_us = records[-1].start_us if records else time_us
-        mine = np.flatnonzero(self._samples.link == link)
-        near = mine[np.abs(self._samples.time_us[mine] - time_us).argmin()]
-        instant = load_us // self._samples.period_us[near] % len(self._millihertz)
-        return np.asarray(self._millihertz[instant, cubes] * 1e-3, np.float64)
+            if number == link and record.start_us <= begin_us and end_us < record.end_us
+            for period in np.unique(self._samples.period_us[mine]).tolist()
+        }
+        if len(instants) != 1:
+            return None
+        return np.asarray(self._millihertz[instants.pop(), cubes] * 1e-3, np.float64)
 
     def _warmer(
         self, link: NDArray[np.int64], time_us: NDArray[np.int64], certain: NDArray[np.bool_]

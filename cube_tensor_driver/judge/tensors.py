@@ -47,6 +47,7 @@ class TensorVerdict:
     invented: made from no row that came; repeated: from one that had its tensor already
     missing: rows of frequencies without a tensor that nothing explains
     without: messages of frequencies of which no row has a tensor
+    not_judged: rows of cubes whose rest frequencies nobody knows
     """
 
     source: NDArray[np.int64]
@@ -56,6 +57,7 @@ class TensorVerdict:
     repeated: int
     missing: int
     without: int
+    not_judged: int
     examples: tuple[str, ...]
 
 
@@ -74,14 +76,16 @@ def judge_tensors(
     sent_ns = record.frequencies.sent_ns
     epochs = RestEpochs(record, expected, start_time_ns)
     reference = Reference(record, expected)
-    bad = np.zeros(len(stress), bool)
+    bad, not_judged = np.zeros((2, len(stress)), bool)
     for at in range(0, len(known), CHUNK):
         chosen = known[at : at + CHUNK]
         made, measured = stress.select(chosen), frequencies.select(source[chosen])
         made_ns = record.stress.sent_ns[chosen]
         right = np.zeros(len(chosen), bool)
-        for rest, applies in epochs.choices(made_ns):
-            right |= applies & reference.agrees(made, measured, rest)
+        for choice in epochs.choices(made_ns):
+            unknown = ~choice.known[made.cube]
+            right |= choice.applies & (unknown | reference.agrees(made, measured, choice.rest))
+            not_judged[chosen] |= choice.applies & unknown
         right &= reference.agrees_with_load(
             made, sample[source[chosen]], epochs.untared(made.cube, made_ns)
         )
@@ -102,6 +106,7 @@ def judge_tensors(
         repeated=int(np.maximum(times - 1, 0).sum()),
         missing=int(np.count_nonzero(missing)),
         without=len(np.setdiff1d(sent_ns, sent_ns[times > 0])),
+        not_judged=int(np.count_nonzero(not_judged)),
         examples=tuple(examples),
     )
 

@@ -46,6 +46,7 @@ def judge(record: Record, log: SampleLog) -> dict[str, Any]:
         "wrong": frequencies.wrong + frequencies.invented,
         "repeated": frequencies.repeated + tensors.repeated,
         "tensors": tensors.tensors,
+        "tensors_not_judged": tensors.not_judged,
         "missing_tensors": tensors.missing,
         "wrong_tensors": tensors.wrong + tensors.invented,
         "faults_to_flag": health.faults,

@@ -25,23 +25,24 @@ DEEDS = {
 """What is done to the nodes."""
 ROUND_S = 30.0
 ROUND: tuple[tuple[float, dict[str, Any]], ...] = (
+    (0.6, {"kind": "hold", "link": "hub0", "seconds": 5.0}),
     (0.8, {"deed": "stall reconstruction", "seconds": 1.0}),
-    (2.2, {"kind": "hold", "link": "hub0", "seconds": 5.5}),
-    (2.4, {"deed": "rate", "value": RATE / 2}),
-    (3.7, {"deed": "rate", "value": RATE}),
-    (4.7, {"deed": "tare"}),
-    (6.4, {"deed": "clear"}),
-    (8.5, {"kind": "hold", "link": "hub0", "seconds": 5.0}),
-    (10.8, {"deed": "tare"}),
-    (12.0, {"deed": "restart reconstruction"}),
+    (3.6, {"deed": "tare"}),
+    (5.2, {"deed": "clear"}),
+    (5.3, {"deed": "rate", "value": RATE / 2}),
+    (6.4, {"deed": "rate", "value": RATE}),
+    (8.2, {"kind": "hold", "link": "hub0", "seconds": 5.3}),
+    (11.1, {"deed": "tare"}),
+    (12.2, {"deed": "restart reconstruction"}),
     (16.0, {"deed": "clear"}),
     (17.5, {"deed": "reconfigure reconstruction"}),
     (19.5, {"deed": "cycle driver"}),
     (21.5, {"deed": "stall subscriber", "seconds": 3.0}),
     (25.5, {"deed": "restart driver"}),
 )
-"""What comes in each round, in s after its begin. The load stays for a tare 2.3 s before, because
-a tare takes the last whole second of what has come, and a busy host is late."""
+"""What comes in each round, in s after its begin. The load stays for a tare 2.9 s before, because
+a tare takes the last whole second of what has come, and a busy host is late. The rate does not
+change then: where in the load a hub is depends on its period."""
 ONCE = ("restart reconstruction", "restart driver")
 """Only in the first round: memory is judged by how it grows in the life of a process."""
 HELD_HUB = 0
