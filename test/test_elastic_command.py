@@ -423,7 +423,7 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     )
     monkeypatch.setattr(
         "cube_tensor_driver.plot.paper.rod_shear",
-        lambda progress: rod_shear.rod_shear(NARROW, places=(0.0, 2e-3), progress=progress),
+        lambda progress: rod_shear.rod_shear(NARROW, places=(2e-3,), progress=progress),
     )
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())

@@ -17,7 +17,7 @@ MAX_GAP = 1 << 20
 """A longer gap (17 minutes at 1 kHz) means that the hub restarted, not that samples were lost."""
 RESTART_US = 1_000_000
 """A sample with a number below the first one seen is late if its device time is at most so far
-back; otherwise it belongs to a new run of the hub."""
+away; otherwise it belongs to a new run of the hub."""
 _WRAP = 0x1_0000_0000
 
 
@@ -66,6 +66,7 @@ class SequenceTracker:
         self._first = 0
         self._next = 0
         self._newest_us = 0
+        self._set_back = 0  # number of the first sample after the clock was last set back
 
     def update(self, sequence: int, device_us: int) -> Arrival:
         """Classify and count one sample by its sequence number (u32) and device time (µs).
@@ -85,8 +86,10 @@ class SequenceTracker:
         number = self._next + ahead
         if 0 <= ahead <= MAX_GAP:
             self.counters.missing += ahead
-            arrival = Arrival.NEW if device_us >= self._newest_us else Arrival.SET_BACK
-            self.counters.resets += arrival is Arrival.SET_BACK
+            arrival = Arrival.NEW
+            if device_us < self._newest_us:
+                arrival, self._set_back = Arrival.SET_BACK, number
+                self.counters.resets += 1
             self._next = number + 1
             self._newest_us = device_us
             return self._deliver(number, device_us, arrival)
@@ -139,15 +142,20 @@ class SequenceTracker:
     def _fits(self, number: int, device_us: int) -> bool:
         """Whether a sample from before the newest belongs to the same run.
 
-        It does if its device time lies between those of its neighbours.
+        It does if its device time lies between those of its neighbours; where the clock was set
+        back, between those before or between those after that.
         """
         if any(other == number for other, _ in self._seen):
             return False
         if number < self._first:
-            return 0 <= self._newest_us - device_us < RESTART_US
-        return all(
-            (us <= device_us) if other < number else (us >= device_us) for other, us in self._seen
-        )
+            return abs(self._newest_us - device_us) < RESTART_US
+        before = [entry for entry in self._seen if entry[0] < self._set_back]
+        after = [entry for entry in self._seen if entry[0] >= self._set_back]
+        if number > self._set_back:
+            return _is_in_order(number, device_us, after)
+        if number < max(before)[0]:
+            return _is_in_order(number, device_us, before)
+        return any(_is_in_order(number, device_us, entries) for entries in (before, after))
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
         self.counters.resets += 1
@@ -160,7 +168,7 @@ class SequenceTracker:
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
-        self._first = sequence
+        self._first = self._set_back = sequence
         self._next = sequence + 1
         self._newest_us = device_us
         return self._deliver(sequence, device_us, arrival)
@@ -169,6 +177,11 @@ class SequenceTracker:
         self.counters.delivered += 1
         self._seen.append((number, device_us))
         return arrival
+
+
+def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -> bool:
+    """Whether the device times grow with the numbers."""
+    return all((us <= device_us) if other < number else (us >= device_us) for other, us in seen)
 
 
 class Account:
