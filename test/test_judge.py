@@ -227,7 +227,9 @@ def test_what_a_tare_of_a_load_that_did_not_stay_gives_is_not_judged(tared):
     after = (rows.stamp_ns >= TARED_NS - MARGIN_NS) & np.isin(rows.cube, HELD_CUBES)
     assert judge(record, log)["tensors_not_judged"] == np.count_nonzero(after)
     other_cube = 2
-    wrong = changed(rows, np.flatnonzero(rows.cube == other_cube)[-1], stress=lambda stress: 1.1 * stress)
+    wrong = changed(
+        rows, np.flatnonzero(rows.cube == other_cube)[-1], stress=lambda stress: 1.1 * stress
+    )
     assert found((record, log), stress=wrong) == {"wrong_tensors"}
 
 

@@ -75,7 +75,9 @@ class RestEpochs:
                 epoch = untared
                 if deed.kind == "tare":
                     cubes, begin_ns = list(deed.cubes), deed.begin_ns - AVERAGED_NS
-                    held = expected.held(cubes, begin_ns - start_time_ns, deed.end_ns - start_time_ns)
+                    held = expected.held(
+                        cubes, begin_ns - start_time_ns, deed.end_ns - start_time_ns
+                    )
                     epoch = self._epochs[-1].tared(cubes, held)
                 self._epochs.append(epoch._replace(begin_ns=deed.end_ns))
 
@@ -102,4 +104,3 @@ class RestEpochs:
         for begin, end in self._unclear:
             unclear |= (sent_ns >= begin) & (sent_ns <= end)
         return unclear
-
