@@ -190,6 +190,15 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path, page):
         see(ros, page, lambda text: abs(shown(text) + 20e3) < 200)
         assert page.execute_script("return document.querySelectorAll('.uplot canvas').length") == 2
 
+        # another browser chooses for itself
+        chosen = page.current_window_handle
+        page.switch_to.new_window("tab")
+        page.get(url)
+        see(ros, page, lambda text: all(one in text for one in expected) and shown(text) > -100)
+        page.close()
+        page.switch_to.window(chosen)
+        see(ros, page, lambda text: abs(shown(text) + 20e3) < 200)
+
         # What the page shows as tared is tared on the topic. The load must not have moved before:
         # a tare would be refused.
         ros.wait(

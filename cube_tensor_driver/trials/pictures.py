@@ -8,13 +8,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from visualization_msgs.msg import MarkerArray
 
 from ..config.package_data import package_data
 from ..config.skin import read_skin
@@ -23,7 +21,6 @@ from ..plot.cube_drawing import draw_cube
 from ..plot.experiments import draw_prototype
 from ..plot.field import draw_field, draw_field_study, field_tables
 from ..plot.fingers import draw_fingers
-from ..plot.markers import draw_markers
 from ..plot.pads_example import draw_pads, draw_sweep
 from ..plot.style import save
 from ..plot.traction import draw_traction, traction_table
@@ -34,7 +31,6 @@ from ..research.pads_example import planar_calibration, sweep
 from ..research.paper import experiments
 from ..research.traction_study import MAIN, PITCHES, SHAPED, WRONG, traction_example
 from ..research.traction_study import study as traction_study
-from ..ros.session import node_session
 from ..simulation.mujoco_scene import MujocoLoad, scene_skin
 from .bench import bench_scale
 
@@ -60,8 +56,6 @@ SHAKEN_S = 2.62
 """When the box of the gripper is accelerated most, s."""
 PHOTOGRAPH_S = 120.0
 """How long the browser may take to make its picture."""
-PERIOD = 160
-"""Marker messages in one period of the demo's load: 8 s at 20 Hz."""
 COUNTS, RATE, MEASURE_S = [1, 4, 16, 64, 256, 1024, 4096], 100.0, 6.0
 """Cubes, Hz and seconds of the scale plot: most machines can do that."""
 
@@ -78,15 +72,14 @@ def make_pictures(folder: Path) -> None:
         raise ConfigError(
             f"{folder}: {error.strerror}; name a folder that can be written"
         ) from None
-    with _demo_skin() as children:
-        save(draw_markers(_strongest(children)), folder / "markers.png")
-        if shutil.which("chromedriver"):
+    if shutil.which("chromedriver"):
+        with _demo_skin() as children:
             _photograph(children, folder / "view.png")
-        else:
-            print(
-                "no view.png: it needs Chromium, apt-get install chromium chromium-driver",
-                file=sys.stderr,
-            )
+    else:
+        print(
+            "no view.png: it needs Chromium, apt-get install chromium chromium-driver",
+            file=sys.stderr,
+        )
     try:
         _draw_gripper(folder / "gripper.png")
     except ConfigError as error:
@@ -139,7 +132,7 @@ def _draw_gripper(path: Path) -> None:
 
 @contextmanager
 def _demo_skin() -> Iterator[Children]:
-    """The simulated demo skin under its load, with markers and the browser view."""
+    """The simulated demo skin under its load, with the browser view."""
     skin = package_data() / "config" / "skin_demo.yaml"
     with (
         tempfile.TemporaryDirectory(prefix="cube_pictures_") as name,
@@ -148,33 +141,10 @@ def _demo_skin() -> Iterator[Children]:
         load = Path(name) / "load.yaml"
         load.write_text(LOAD)
         hubs = SimulatedHubs(Path(name) / "ports", load=load, noise=None)
-        for process in skin_processes(skin, markers=True, contacts=True, simulated=hubs):
+        for process in skin_processes(skin, contacts=True, simulated=hubs):
             children.start(process)
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         yield children
-
-
-def _strongest(children: Children) -> MarkerArray:
-    """The message of the largest load in one period. CubeError: too few messages came."""
-    heard: list[tuple[float, MarkerArray]] = []
-
-    def keep(message: MarkerArray) -> None:
-        marker = {marker.ns: marker for marker in message.markers}
-        # Arrows are drawn relative to the range, whose top is in the legend.
-        top = float(marker["legend"].text.split(" to ")[1].split()[0])
-        heard.append((top * sum(point.z for point in marker["traction"].points), message))
-
-    with node_session("pictures") as (node, executor):
-        node.create_subscription(MarkerArray, "markers", keep, 10)
-        until = time.monotonic() + START_S
-        while len(heard) < PERIOD and time.monotonic() < until:
-            executor.spin_once(timeout_sec=0.1)
-            children.check()
-    if len(heard) < PERIOD:
-        raise CubeError(
-            f"{len(heard)} of {PERIOD} markers within {START_S:g} s:\n{children.log('markers')}"
-        )
-    return max(heard, key=lambda load_and_message: load_and_message[0])[1]
 
 
 def _photograph(children: Children, path: Path) -> None:
