@@ -53,8 +53,9 @@ Array = NDArray[np.float64]
 SAME_DEPTH = 0.1
 """How far a cube's depth may be from the others', over the depth: there is one table for all."""
 FINENESS = 1.5
-"""Distance of the discs of a flat contact over the depth, at which cubes no longer tell them
-apart."""
+"""Distance of the discs of a flat contact over the depth. Of the gripper's box, with ten times as
+many discs a side, stress differs by up to 7 % and gradients by 28 % of their largest, below the
+edge; with 1.0 instead by 3 and 10 %, in twice the time."""
 
 
 def load_mujoco() -> Any:
