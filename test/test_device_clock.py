@@ -283,6 +283,11 @@ SEQUENCES = {
     "gap over the wrap": ([(TOP - 1, 50), (1, 80)], [N, N], (2, 2, 0, 0, 0)),
     "late over the wrap": ([(TOP, 50), (1, 70), (0, 60)], [N, N, L], (3, 0, 0, 1, 0)),
     "restart from far": ([(5000, 50_000), (0, 1)], [N, R], (2, 0, 0, 0, 1)),
+    "restart, then one late": (
+        [(5000, 50_000), (3, 31), (2, 21), (0, 1), (4, 41)],
+        [N, R, L, L, N],
+        (5, 1, 0, 2, 1),
+    ),
     "restart to a seen number": (
         [(0, 900), (1, 910), (0, 2), (1, 12)],
         [N, N, R, N],

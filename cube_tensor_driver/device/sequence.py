@@ -151,7 +151,7 @@ class SequenceTracker:
             return abs(self._newest_us - device_us) < RESTART_US
         before = [entry for entry in self._seen if entry[0] < self._set_back]
         after = [entry for entry in self._seen if entry[0] >= self._set_back]
-        if number > self._set_back:
+        if number >= self._set_back:
             return _is_in_order(number, device_us, after)
         if number < max(before)[0]:
             return _is_in_order(number, device_us, before)
@@ -164,7 +164,7 @@ class SequenceTracker:
         if sequence <= MAX_GAP:
             # Numbers begin at 0 with power-up, so all before this one are missing.
             self.counters.missing += sequence
-            self._first = 0
+            self._first = self._set_back = 0
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:

@@ -3,6 +3,7 @@ compares every row that came with what was measured and what was done."""
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import threading
 import time
@@ -15,7 +16,7 @@ from ..processes.domain import own_domain
 from ..terminal.output import progress_bar
 from .mutations import MUTATIONS
 from .running import interruption, report
-from .torture_skin import play
+from .torture_skin import NotBegunError, play
 
 MUTATED_S = 10.0
 """How long a mutated torture lasts: long enough for each kind of fault and each deed but
@@ -73,7 +74,12 @@ def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) ->
         for number, name in enumerate(names):
             progress(number, len(names), name)
             duration = RESTARTED_S if MUTATIONS[name].needs_restart else MUTATED_S
-            figures = torture(duration, seed, interrupted, name)
+            try:
+                figures = torture(duration, seed, interrupted, name)
+            except NotBegunError as error:
+                # Now and then DDS connects a process in one direction alone.
+                print(f"{name}: again, because {error}", file=sys.stderr)
+                figures = torture(duration, seed, interrupted, name)
             caught_by = failures(figures)
             results[name] = {
                 "caught": bool(caught_by),

@@ -23,6 +23,7 @@ from ..bags.message_codec import frequency_codec, stress_codec
 from ..config.grid import grid
 from ..config.skin import Skin, read_skin
 from ..config.yaml import write_yaml
+from ..core.errors import CubeError
 from ..judge.expected import load_tables
 from ..judge.record import Deed, Record
 from ..processes.children import Children
@@ -69,6 +70,10 @@ class Played:
     figures: dict[str, Any]
 
 
+class NotBegunError(CubeError):
+    """The nodes run, and nothing comes of them."""
+
+
 def play(
     duration: float, seed: int, folder: Path, interrupted: Event, mutation: str = ""
 ) -> Played:
@@ -96,6 +101,9 @@ def play(
             began_s, begin_ns = time.monotonic(), time.time_ns()
             observer = recorder.observer
             observer.spin(START_S, lambda: recorder.stress.cubes_so_far() == len(skin.cubes))
+            if not recorder.stress.count:
+                logs = "\n".join(children.log(name)[-500:] for name in NODES)
+                raise NotBegunError(f"no tensor came within {START_S:g} s:\n{logs}")
             threads = memory.threads()
             _torture(observer, deeds, ports, duration, seed)
             observer.spin(SETTLE_S - LAST_S)
