@@ -102,8 +102,8 @@ def play(
             observer = recorder.observer
             observer.spin(START_S, lambda: recorder.stress.cubes_so_far() == len(skin.cubes))
             if not recorder.stress.count:
-                logs = "\n".join(children.log(name)[-500:] for name in NODES)
-                raise NotBegunError(f"no tensor came within {START_S:g} s:\n{logs}")
+                said = "\n".join(children.log(name)[-500:] for name in NODES)
+                raise NotBegunError(f"no tensor came within {START_S:g} s:\n{said}")
             threads = memory.threads()
             _torture(observer, deeds, ports, duration, seed)
             observer.spin(SETTLE_S - LAST_S)
