@@ -7,6 +7,8 @@ import time
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.cube_table import CubeAddress
@@ -114,6 +116,62 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
     assert [taken(), taken(), taken()] == [[5, 5, 4, 4], [5, 5], None]
     give(0, 6), give(1, 6)
     assert taken() == [6] * 4 and scan.rows_waiting() == 0
+
+
+def taken(scan, max_scans=None):
+    """Sequences of the rows that are complete, one list for each time they are built."""
+    lists = []
+    while scan.is_complete():
+        rows = scan.build(max_scans=max_scans)
+        lists.append([] if rows is None else rows.sequence[::2].tolist())
+    return lists
+
+
+def test_links_that_are_late_by_different_times_make_whole_scans():
+    """As where this process cannot keep up. Parts of scans would cost it even more time."""
+    scan = two_links()
+
+    def give(link, *numbers):
+        for number in numbers:
+            scan.add(link, [sample(number, [[1.0, 1.0]] * 2)], [1000 * number + link])
+
+    give(0, 0), give(1, 0)
+    taken(scan)
+    give(0, 1, 2), give(1, 7, 8)
+    assert taken(scan) == [[1, 7, 2, 8]]
+    give(0, 3), give(1, 9, 10)
+    assert taken(scan) == [[3, 9]] and scan.rows_waiting() == 2, "the second has given one more"
+    give(0, 4), give(1, 11)
+    assert taken(scan) == [[4, 10]]
+    give(0, 5, 6), give(1, 12, 13, 14)
+    assert taken(scan) == [[5, 11, 6, 12]]
+    scan.set_live(0, False)
+    assert taken(scan) == [[13, 14]], "nobody waits for a link that is gone"
+    give(0, 7), give(1, *range(15, 21))
+    assert taken(scan) == [[7, *range(15, 21)]], "so far ahead nothing waits"
+    give(1, 21), give(0, 21)
+    assert taken(scan) == [[21, 21]], "and then they are in step again"
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(*[st.integers(0, 3)] * 2), max_size=30), st.sampled_from([None, 1, 4]))
+def test_each_sample_is_built_once_and_in_order(turns, max_scans):
+    """However late the links are, and by whatever."""
+    scan, given, built = two_links(), [0, 0], [[], []]
+    for turn, counts in enumerate([*turns, None]):
+        for link in (0, 1):
+            if counts is None:
+                scan.set_live(link, False)
+                continue
+            for _ in range(counts[link]):
+                number, stamp_ns = given[link], 1_000_000 * turn + given[link]
+                scan.add(link, [sample(number, [[1.0, 1.0]] * 2)], [stamp_ns])
+                given[link] += 1
+        while scan.is_complete():
+            rows = scan.build(max_scans=max_scans)
+            for link, cubes in enumerate(((1, 2), (0, 3))):
+                built[link] += rows.sequence[np.isin(rows.cube, cubes)][::2].tolist()
+    assert built == [list(range(count)) for count in given] and scan.rows_waiting() == 0
 
 
 @pytest.mark.parametrize("begins, lost", [(1, ()), (3, ()), (4, ()), (0, (11, 12))])
