@@ -70,10 +70,6 @@ class Played:
     figures: dict[str, Any]
 
 
-class NotBegunError(CubeError):
-    """The nodes run, and nothing comes of them."""
-
-
 def play(
     duration: float, seed: int, folder: Path, interrupted: Event, mutation: str = ""
 ) -> Played:
@@ -103,7 +99,7 @@ def play(
             observer.spin(START_S, lambda: recorder.stress.cubes_so_far() == len(skin.cubes))
             if not recorder.stress.count:
                 said = "\n".join(children.log(name)[-500:] for name in NODES)
-                raise NotBegunError(f"no tensor came within {START_S:g} s:\n{said}")
+                raise CubeError(f"no tensor came within {START_S:g} s:\n{said}")
             threads = memory.threads()
             _torture(observer, deeds, ports, duration, seed)
             observer.spin(SETTLE_S - LAST_S)
