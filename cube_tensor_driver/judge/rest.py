@@ -24,8 +24,8 @@ how long a message may take."""
 RESTORE_NS = 2_000_000_000
 """After a restart, until the driver has said who the cubes are and their tare is restored."""
 AVERAGED_NS = 2_500_000_000
-"""A tare averages a second, in whole windows of 0.25 s and the one that is not over, of data that
-may be a second old."""
+"""A tare averages a second, in whole windows of half a second and the one that is not over, of data
+that may be a second old."""
 CHANGES = ("tare", "clear")
 
 
