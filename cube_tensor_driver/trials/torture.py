@@ -74,8 +74,8 @@ def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) ->
     with progress_bar() as progress:
         for number, name in enumerate(names):
             progress(number, len(names), name)
-            # Each in a process of its own: after 32 tortures in one, Fast DDS 2.14 brought nothing to
-            # it any more, each time it was tried.
+            # Each in a process of its own: after 32 tortures in one process Fast DDS 2.14 brought
+            # nothing to it any more, each time it was tried.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
                 figures = process.submit(_mutated_torture, name, seed).result()
             caught_by = failures(figures)
