@@ -9,8 +9,9 @@
 #define QUIET_US 2.0
 #define MEMORY_US 50000.0
 #define SMOOTHING 64
-/* and in device/clock.py. */
+/* in device/clock_line.py, */
 #define JITTER_SMOOTHING 64
+/* and in device/clock.py. */
 #define MAX_DELAY_NS INT64_C(60000000000)
 
 #define MAX_DEVICE_US (INT64_C(1) << 50)

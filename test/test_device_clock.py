@@ -10,14 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cube_tensor_driver.device.clock import (
-    JUMPED,
-    LYING,
-    STANDS_STILL,
-    WINDOW,
-    ClockMap,
-    HostClockWatch,
-)
+from cube_tensor_driver.device.clock import JUMPED, ClockMap
+from cube_tensor_driver.device.clock_line import WINDOW, ClockLine
+from cube_tensor_driver.device.host_clock import HostClockWatch
+from cube_tensor_driver.device.hub_clock import LYING, STANDS_STILL
 from cube_tensor_driver.device.sequence import Arrival, SequenceTracker
 
 BASE_S = 0.3e-3  # delay that every sample has; stamps are late by it, and compared with it
@@ -252,11 +248,12 @@ def test_sample_out_of_order_gets_its_own_time() -> None:
 
 
 def test_no_growth() -> None:
-    clock = ClockMap()
+    line = ClockLine()
     for k in range(10 * WINDOW):
-        clock.update([1_000_000 * k], EPOCH_NS + 10**9 * k)
-    assert len(clock._points) == WINDOW
-    assert clock.update([], EPOCH_NS) == []
+        line.add((1e9 * k, 0.0))
+        line.close_bucket(10**9 * k)
+    assert len(line) == WINDOW
+    assert ClockMap().update([], EPOCH_NS) == []
 
 
 def test_device_time_of_64_bits() -> None:

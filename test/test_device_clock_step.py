@@ -14,8 +14,9 @@ from test_device_clock import BASE_S, EPOCH_NS, random_delays, stalls, usb_burst
 
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.chain import LiveLinks
-from cube_tensor_driver.device.clock import JUMPED, STANDS_STILL, ClockMap
+from cube_tensor_driver.device.clock import JUMPED, ClockMap
 from cube_tensor_driver.device.cube_table import CubeAddress
+from cube_tensor_driver.device.hub_clock import STANDS_STILL
 from cube_tensor_driver.device.link import LinkConfig
 from cube_tensor_driver.device.protocol import Hello, Sample
 from cube_tensor_driver.device.reader import LinkFrames

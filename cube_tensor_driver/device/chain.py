@@ -17,9 +17,10 @@ from dataclasses import dataclass, field
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
 from ..core.status import STAMP
-from .clock import ClockMap, HostClockWatch
+from .clock import ClockMap
 from .cube_table import CubeAddress
 from .follower import Follower
+from .host_clock import HostClockWatch
 from .link import Link, LinkConfig, LinkState
 from .link_log import LinkLog, Log
 from .native import SLOWER, wire

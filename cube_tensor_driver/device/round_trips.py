@@ -9,6 +9,7 @@ slow in both directions, and never wrong by more than half their distance.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -26,9 +27,14 @@ class RoundTrip(NamedTuple):
 
 
 class RoundTrips:
-    """The newest round trips of one hub that agree."""
+    """The newest round trips of one hub that agree, and what they say.
+
+    offset_ns: host time minus (1 + drift) * device time; inf without round trips
+    bound_ns: how far that can be off
+    """
 
     def __init__(self) -> None:
+        self.offset_ns, self.bound_ns = math.inf, 0.0
         self._kept: deque[RoundTrip] = deque(maxlen=KEPT)
 
     def __len__(self) -> int:
@@ -48,13 +54,13 @@ class RoundTrips:
         while self._kept and self._kept[-1].device_ns + self._kept[-1].high_ns > host_ns:
             self._kept.pop()
 
-    def offset(self, drift: float, uncertainty: float) -> tuple[float, float]:
-        """Host time minus (1 + drift) * device time, and how far that can be off, ns.
-
-        uncertainty: of the drift. At least one round trip must have been added.
-        """
+    def find_offset(self, drift: float, uncertainty: float) -> None:
+        """Find the offset for this drift, which may be off by `uncertainty`."""
+        if not self._kept:
+            self.offset_ns, self.bound_ns = math.inf, 0.0
+            return
         newest = self._kept[-1].device_ns
-        low, high = float("-inf"), float("inf")
+        low, high = -math.inf, math.inf
         for one in reversed(self._kept):
             drifted = drift * one.device_ns
             slack = uncertainty * abs(newest - one.device_ns)
@@ -63,4 +69,4 @@ class RoundTrips:
             if next_low > next_high:
                 break  # a clock was set: those before tell nothing any more
             low, high = next_low, next_high
-        return (low + high) / 2, (high - low) / 2
+        self.offset_ns, self.bound_ns = (low + high) / 2, (high - low) / 2

@@ -11,7 +11,7 @@ from itertools import groupby, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ...device.clock import MAX_DRIFT
+from ...device.clock_line import MAX_DRIFT
 from ...device.protocol import Hello, Sample, Stats
 from ..conversation import UNREAD_S
 from ..transcript import Transcript
