@@ -276,6 +276,8 @@ def test_foxglove_reads_every_name_of_ours():
     assert set(scene["cameraState"]) <= CAMERA and set(scene["layers"]["grid"]) <= GRID
     assert scene["followMode"] in ("follow-pose", "follow-position", "follow-none")
     assert scene["topics"]["/markers"]["visible"] and scene["followTf"] == "skin_base"
+    # The axes of a frame are 1 m long by default, and a skin has a frame in each cube.
+    assert scene["scene"]["transforms"]["axisScale"] < 0.004
 
     def leaves(node: object) -> list[str]:
         return (
