@@ -181,6 +181,8 @@ def test_commands_of_a_page_run(page, tmp_path, domain, monkeypatch, capfd):
         arguments = shlex.split(command)[1:]
         if command in {*ELSEWHERE, *OF_CI}:
             continue
+        if "--mujoco" in arguments:
+            pytest.importorskip("mujoco", reason=f"{command} needs MuJoCo: pip install mujoco")
         if command in ENDLESS:
             run_until(arguments, tmp_path, ENDLESS[command])
         elif arguments[0] in HERE:
