@@ -97,6 +97,23 @@ def test_two_balls_that_touch_are_one_contact_with_the_force_and_place_of_both(i
         assert np.linalg.norm(found.position[:2] - centre) < 0.1e-3
 
 
+@pytest.mark.parametrize("centre", [(4.4e-3, 3.0e-3), (-0.3e-3, -4.8e-3)])
+def test_two_balls_beside_each_other_without_a_valley_are_told_apart_by_likelihood(inverse, centre):
+    """Below them the pressure has one peak. One contact in their place misses a third of the
+    force; a flat punch just as wide stays one."""
+    random, apart = np.random.default_rng(9), 5.5e-3 * np.array([0.8, 0.6])
+    touches = Touches(inverse, LEAST)
+    for _ in range(2):
+        values = ball(inverse, 12e-3, centre + apart, (0, 0, -2.0))
+        values += ball(inverse, 10e-3, centre - apart, (0, 0.3, -1.0))
+        strong, weak = touches.update(noisy(values, random))
+        for found, force, sign in ((strong, 2, 1), (weak, 1, -1)):
+            assert found.normal_force == pytest.approx(force, rel=0.05)
+            assert np.linalg.norm(found.position[:2] - centre - sign * apart) < 0.3e-3
+    (one,) = Touches(inverse, LEAST).update(flat_punch(inverse, 20e-3, centre, (0, 0, -3.0)))
+    assert one.normal_force == pytest.approx(3, rel=0.1)
+
+
 def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact_is():
     """Its nearest cube does not. A fit that begins on the wrong side stays there: 7 mm off."""
     bench = Bench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3), side=1)

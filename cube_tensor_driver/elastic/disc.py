@@ -27,6 +27,8 @@ class Disc:
     id: the same as long as it is followed
     place: (2,) m; size: radius, m; force: (3,) N; alpha: Pa, of what is left around it
     doubt: m^2, variance of the place because it may lie elsewhere, inf before the first fit
+    asked: Pa, what was left around it when it was asked last whether it is two
+    told_apart: from its neighbour, by likelihood (disc_split.py)
     """
 
     id: int
@@ -36,6 +38,8 @@ class Disc:
     force: Array
     alpha: float
     doubt: float = np.inf
+    asked: float = 0.0
+    told_apart: bool = False
 
 
 class DiscModel:

@@ -23,6 +23,9 @@ VALLEY, NO_VALLEY = 0.8, 0.92
 """Between two contacts the pressure falls below this part of the fainter one's; two between which
 it does not fall below the second number become one."""
 
+INSIDE = 0.6
+"""Part of the sum of their radii below which two contacts that were told apart are one again."""
+
 
 def beginning(
     model: DiscModel, discs: list[Disc], rest: Array, below: Array, tried: list[Array], least: float
@@ -46,9 +49,17 @@ def beginning(
 
 
 def same(model: DiscModel, discs: list[Disc], below: Array) -> tuple[Disc, Disc] | None:
-    """Two contacts without a valley between them, the older first; None: there are none."""
+    """Two contacts without a valley between them, the older first; None: there are none.
+
+    Two that their likelihood told apart need no valley, but may not lie in each other.
+    """
     for older, younger in itertools.combinations(discs, 2):
-        if valley(model, model.middle(older), model.middle(younger), below) > NO_VALLEY:
+        here, there = model.middle(older), model.middle(younger)
+        if older.told_apart and younger.told_apart:
+            one = float(np.linalg.norm(here - there)) < INSIDE * (older.size + younger.size)
+        else:
+            one = valley(model, here, there, below) > NO_VALLEY
+        if one:
             return older, younger
     return None
 
@@ -64,7 +75,8 @@ def remaining(model: DiscModel, discs: list[Disc], least: float) -> list[Disc]:
     limit = max(least / 2, DROPPED * strongest)
     kept: list[Disc] = []
     for disc in sorted(discs, key=lambda one: one.id):
-        apart = [np.linalg.norm(model.middle(disc) - model.middle(one)) for one in kept]
+        others = [one for one in kept if not (disc.told_apart and one.told_apart)]
+        apart = [np.linalg.norm(model.middle(disc) - model.middle(one)) for one in others]
         alone = min(apart, default=np.inf) >= MERGED * model.inverse.pitch
         if peaks[disc.id] > limit and alone:
             kept.append(disc)

@@ -8,11 +8,12 @@ ln a are those of Gauss and Newton, with the covariance of what is left as weigh
 
 K is the prior of kernels.py, N the noise. D moves pressure within a contact and leaves its force
 and place: it makes it longer along x or along a diagonal, and emptier or fuller at its rim. The
-shapes s have the covariance S, see SHAPE. alpha has the greatest (restricted) likelihood: where
-contacts are like none of these, it grows, and so do all standard deviations.
+shapes s have the covariance S, see SHAPE. alpha has the greatest evidence, the likelihood with
+forces, places and sizes integrated over their priors: where contacts are like none of these, alpha
+grows, and so do all standard deviations.
 
-Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); N. A. C. Cressie, Statistics for
-Spatial Data (1993), 2.6.1 (restricted likelihood).
+Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); D. J. C. MacKay, Bayesian
+interpolation, Neural Computation 4 (1992) 415 (evidence).
 """
 
 from __future__ import annotations
@@ -43,12 +44,16 @@ SHAPE = np.array([0.7, 0.7, 1.0])
 rigid flat punch has 1 in flatness."""
 SHIFT, WIDER = 0.5, 0.2
 """Parts of a contact's radius and of its logarithm by which D moves pressure."""
-COLD, WARM = 8, 3
-"""Steps for a contact that has just begun, and for one that goes on."""
+COLD, WARM, LOOK = 8, 3, 0
+"""Steps for a contact that has just begun, for one that goes on, and to see how likely it is."""
 SETTLED = 0.02
 """A step that moves a contact by less, over the depth, and changes its size by a smaller part, is
 the last but one: what follows it is of second order."""
-_TRIED = {COLD: np.array([0.1, 0.3, 1.0, 3.0, 10.0]), WARM: np.array([0.5, 1.0, 2.0])}
+_TRIED = {
+    COLD: np.array([0.1, 0.3, 1.0, 3.0, 10.0]),
+    WARM: np.array([0.5, 1.0, 2.0]),
+    LOOK: np.array([1.0]),
+}
 """Factors of alpha that are compared at a time."""
 _STEPS = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
 _AROUND = np.concatenate([_STEPS[1:], np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]]) / np.sqrt(2)])
@@ -110,7 +115,8 @@ class Fitted(NamedTuple):
     """Contacts middles (J, 2), sizes (J,), forces (J, 3), what is left (alpha, factor, weighted
     rest W r) and the linearised problem: J (D, 6 contacts), J' W J + prior.
 
-    score: -2 ln of the restricted likelihood, to compare fits of the same values
+    score: -2 ln of the evidence (Laplace), to compare fits of the same values, also with other
+        numbers of contacts
     """
 
     middles: Array
@@ -127,7 +133,8 @@ class Fitted(NamedTuple):
 def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> Fitted:
     """Fit contacts, beginning at middles (J, 2) m, sizes (J,) m and alpha, Pa.
 
-    steps: COLD or WARM. The columns of the problem are, per contact, f_x, f_y, f_z, c_x, c_y, ln a.
+    steps: COLD, WARM or LOOK. The columns of the problem are, per contact, f_x, f_y, f_z, c_x,
+    c_y, ln a.
     """
     depth, count = scan.kernels.depth, len(middles)
     middles, logs = middles.copy(), np.log(sizes)
@@ -159,7 +166,8 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
         residual = scan.y - response @ forces.ravel()
         if last or (steps == COLD and step % 2 == 0):
             before = alpha
-            alpha, score = _best_alpha(scan, noise, jacobian, residual, alpha * _TRIED[steps])
+            tried = alpha * _TRIED[steps]
+            alpha, score = _best_alpha(scan, noise, jacobian, residual, prior, tried)
             factor = _factor(scan, noise, alpha)
         weighted = cho_solve(factor, jacobian)
         normal = jacobian.T @ weighted + np.diag(prior)
@@ -209,22 +217,18 @@ def _factor(scan: Scan, noise: Array, alpha: float) -> tuple[Array, bool]:
 
 
 def _best_alpha(
-    scan: Scan, noise: Array, jacobian: Array, residual: Array, alphas: Array
+    scan: Scan, noise: Array, jacobian: Array, residual: Array, prior: Array, alphas: Array
 ) -> tuple[float, float]:
-    """The one of some alphas with the greatest restricted likelihood, and its score."""
+    """The one of some alphas with the greatest evidence, and its score. prior: precisions (P,)."""
     tried = np.clip(alphas, 1e-4 * AMPLITUDE, AMPLITUDE)
-    scale = np.linalg.norm(jacobian, axis=0)
-    columns = jacobian / np.where(scale > 0, scale, 1.0)
+    columns = jacobian / np.sqrt(prior)
     scores = []
     for one in tried:
         factor = _factor(scan, noise, one)
         weighted = cho_solve(factor, np.column_stack([columns, residual]))
-        normal = columns.T @ weighted[:, :-1] + 1e-12 * np.eye(columns.shape[1])
+        normal = columns.T @ weighted[:, :-1] + np.eye(columns.shape[1])
         projected = columns.T @ weighted[:, -1]
-        misfit = (
-            residual @ weighted[:, -1]
-            - projected @ np.linalg.lstsq(normal, projected, rcond=None)[0]
-        )
+        misfit = residual @ weighted[:, -1] - projected @ np.linalg.solve(normal, projected)
         logs = 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1]
         scores.append(misfit + logs)
     best = int(np.argmin(scores))

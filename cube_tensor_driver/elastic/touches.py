@@ -8,6 +8,7 @@ disc_choice.py decides how many there are.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from .disc import Disc, DiscModel
 from .disc_choice import beginning, remaining, same
 from .disc_fit import COLD, USUAL_SIZE, WARM, Fitted, Scan, fit
 from .disc_load import Load, load_of
+from .disc_split import split
 from .inverse import AMPLITUDE, SurfaceInverse, TractionField, covariance_matrix
 
 Array = NDArray[np.float64]
@@ -158,6 +160,7 @@ class Touches:
         fitted = fit(scan, middles, sizes, alpha, steps)
         for j, disc in enumerate(discs):
             fitted = self._otherwise(scan, fitted, disc, j, at[j], turn[j])
+        fitted = self._split(scan, fitted, discs)
         for j, disc in enumerate(discs):
             self._put(disc, fitted, j, cubes, place, angle)
             load = load_of(scan, fitted, j)
@@ -195,6 +198,24 @@ class Touches:
         doubt = float(weight @ squares / weight.sum())
         disc.doubt = doubt if doubt > (CERTAIN * self._inverse.pitch) ** 2 else 0.0
         return best
+
+    def _split(self, scan: Scan, fitted: Fitted, discs: list[Disc]) -> Fitted:
+        """Contacts that are two each become two, also in `discs`. Asked again where twice as much
+        is left."""
+        limit = MUCH_LEFT * AMPLITUDE
+        for j, disc in enumerate(list(discs)):
+            if fitted.alpha <= limit:
+                disc.asked = 0.0
+            elif fitted.alpha > 2 * disc.asked and len(self._discs) < MOST:
+                disc.asked = fitted.alpha
+                two = split(scan, fitted, j, FIRST_ALPHA * AMPLITUDE, limit)
+                if two is not None:
+                    fitted, disc.told_apart = two, True
+                    twin = replace(disc, id=self._next_id)
+                    self._next_id += 1
+                    discs.append(twin)
+                    self._discs.append(twin)
+        return fitted
 
     def _put(
         self, disc: Disc, fitted: Fitted, j: int, cubes: Index, place: Array, angle: Array
