@@ -167,8 +167,7 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
         if last or (steps == COLD and step % 2 == 0):
             before = alpha
             tried = alpha * _TRIED[steps]
-            alpha, score = _best_alpha(scan, noise, jacobian, residual, prior, tried)
-            factor = _factor(scan, noise, alpha)
+            alpha, score, factor = _best_alpha(scan, noise, jacobian, residual, prior, tried)
         weighted = cho_solve(factor, jacobian)
         normal = jacobian.T @ weighted + np.diag(prior)
         normal[np.diag_indices(len(normal))] *= 1 + 1e-9
@@ -213,23 +212,27 @@ class _Parts:
 
 
 def _factor(scan: Scan, noise: Array, alpha: float) -> tuple[Array, bool]:
-    return cho_factor(alpha**2 * scan.prior + noise, lower=True)
+    # The transpose is the same matrix, in the order of LAPACK.
+    matrix = (alpha**2 * scan.prior + noise).T
+    return cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
 
 
 def _best_alpha(
     scan: Scan, noise: Array, jacobian: Array, residual: Array, prior: Array, alphas: Array
-) -> tuple[float, float]:
-    """The one of some alphas with the greatest evidence, and its score. prior: precisions (P,)."""
-    tried = np.clip(alphas, 1e-4 * AMPLITUDE, AMPLITUDE)
+) -> tuple[float, float, tuple[Array, bool]]:
+    """The one of some alphas with the greatest evidence, its score and its factor.
+
+    prior: precisions (P,) of what the columns of the jacobian belong to
+    """
     columns = jacobian / np.sqrt(prior)
-    scores = []
-    for one in tried:
-        factor = _factor(scan, noise, one)
+    best = (AMPLITUDE, np.inf, (np.empty((0, 0)), True))
+    for alpha in np.unique(np.clip(alphas, 1e-4 * AMPLITUDE, AMPLITUDE)).tolist():
+        factor = _factor(scan, noise, alpha)
         weighted = cho_solve(factor, np.column_stack([columns, residual]))
         normal = columns.T @ weighted[:, :-1] + np.eye(columns.shape[1])
         projected = columns.T @ weighted[:, -1]
         misfit = residual @ weighted[:, -1] - projected @ np.linalg.solve(normal, projected)
         logs = 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1]
-        scores.append(misfit + logs)
-    best = int(np.argmin(scores))
-    return float(tried[best]), float(scores[best])
+        if misfit + logs < best[1]:
+            best = (alpha, float(misfit + logs), factor)
+    return best

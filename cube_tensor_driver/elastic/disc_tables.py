@@ -1,12 +1,7 @@
 """Stress and gradient at cubes under many discs of traction, fast enough for every step of a robot.
 
 The field of a disc depends on the distance r, and turns with the direction phi = atan2(y, x) from
-the disc to the cube. In the circular components of `_NAMES`, of order m = 0 to 3 about z, and with
-the force (F_r, F_t, F_z) along and across that direction, it is::
-
-    c = exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t),     R, T, Z real
-
-The tables R, T and Z are those of kernels.py at each distance and radius.
+the disc to the cube. The tables are the R, T and Z of circular.py at each distance and radius.
 """
 
 from __future__ import annotations
@@ -14,44 +9,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.modes import STRESS
 from .cache import cached
+from .circular import BACK, ORDERS, circular_table
 from .kernels import PER_DEPTH, REACH, Waves
-from .layer import FIELD, Layer
+from .layer import Layer
 
 Array = NDArray[np.float64]
 
 SIZES = np.geomspace(0.1, 5.0, 23)
 """Radii of the discs in the tables over the depth; others are rounded, by 10 % at most."""
-
-
-def _circular() -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
-    """(14, 24) circular components of FIELD, and the order (14,) of each."""
-
-    def of(name: str) -> NDArray[np.complex128]:
-        return np.eye(len(FIELD))[FIELD.index(name)].astype(complex)
-
-    def plane(suffix: str) -> list[tuple[int, NDArray[np.complex128]]]:
-        """Mean of xx and yy, zz; (zx, yz) as a vector; (xx - yy) / 2 and xy."""
-        s = {name: of(name + suffix) for name in STRESS}
-        return [
-            (0, (s["xx"] + s["yy"]) / 2),
-            (0, s["zz"]),
-            (1, s["zx"] + 1j * s["yz"]),
-            (2, (s["xx"] - s["yy"]) / 2 + 1j * s["xy"]),
-        ]
-
-    rows = plane("") + plane("_z")
-    for (order, along_x), (_, along_y) in zip(plane("_x"), plane("_y"), strict=True):
-        rows.append((order + 1, along_x + 1j * along_y))
-        if order > 0:
-            rows.append((order - 1, along_x - 1j * along_y))
-    return np.stack([row for _, row in rows]), np.array([order for order, _ in rows])
-
-
-_CIRCULAR, _ORDERS = _circular()
-_BACK = np.linalg.pinv(np.concatenate([_CIRCULAR.real, _CIRCULAR.imag])).T
-"""(28, 24) FIELD from real and imaginary parts of the circular components."""
 
 
 class DiscTables:
@@ -72,9 +38,7 @@ class DiscTables:
     def _tables(self) -> dict[str, NDArray[np.float32]]:
         """table (sizes, places, 3, 14): R, Z and T of each component, from r = 0 on."""
         field = Waves(self.layer, self.depth).discs(SIZES * self.depth)[:, 1:]
-        circular = np.einsum("cf,srfi->sric", _CIRCULAR, field)
-        parts = [circular[:, :, 0].real, circular[:, :, 2].real, circular[:, :, 1].imag]
-        return {"table": np.stack(parts, axis=2).astype(np.float32)}
+        return {"table": circular_table(field).astype(np.float32)}
 
     def field(self, place: ArrayLike, force: ArrayLike, radius: ArrayLike) -> tuple[Array, Array]:
         """Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, each the sum over L discs.
@@ -103,8 +67,8 @@ class DiscTables:
         parts = load.reshape(*r.shape, 2, 6) @ self._table[self._size(radius), first]
         circular = parts[..., 0, :] + 1j * parts[..., 1, :]
         powers = np.stack([np.ones_like(turn), turn, turn**2, turn**3], axis=-1)
-        total = np.einsum("nlc,nlc->nc", circular, powers.astype(np.complex64)[..., _ORDERS])
-        field = np.concatenate([total.real, total.imag], axis=1).astype(float) @ _BACK
+        total = np.einsum("nlc,nlc->nc", circular, powers.astype(np.complex64)[..., ORDERS])
+        field = np.concatenate([total.real, total.imag], axis=1).astype(float) @ BACK
         return field[:, :6], field[:, 6:].reshape(-1, 6, 3)
 
     def _size(self, radius: ArrayLike) -> NDArray[np.intp]:

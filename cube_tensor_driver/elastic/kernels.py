@@ -24,6 +24,7 @@ from scipy.special import jv
 
 from ..core.modes import COMPONENTS, STRESS
 from .cache import cached
+from .circular import BACK, ORDERS, circular_table
 from .layer import FIELD, Layer
 
 Array = NDArray[np.float64]
@@ -72,28 +73,24 @@ class Kernels:
         self.pressure_variance = float(self._covariance[1, _ZZ, _ZZ])
 
     def _tables(self) -> dict[str, Array]:
-        """cross (places, 24, 3), covariance (places, 24, 24), response (sizes, places, 24, 3)."""
+        """cross (places, 24, 3), covariance (places, 24, 24), response (sizes, places, 3, 14) as
+        in circular.py."""
         waves = Waves(self.layer, self.depth)
         transfer = waves.transfer
         weighted = transfer * (self._prior(waves.k)[:, None, None, None] * [SHEAR**2, SHEAR**2, 1])
         return {
             "cross": waves.line(weighted),
             "covariance": waves.line(weighted @ transfer.conj().swapaxes(2, 3)),
-            "response": waves.discs(SIZES * self.depth),
+            "response": circular_table(waves.discs(SIZES * self.depth)),
         }
 
     def response(self, place: Array, angle: Array, size: float) -> Array:
         """(N, 15, 3) of cubes at `place` from the middle of a disc with force 1 N; size: m."""
-        r, direction = _polar(place)
-        table = self._disc_table(size)
-        return self._turned(_at(table, r / self.step, self._last), direction, angle)
+        return self._disc(place, angle, size, BACK[:, _OBSERVED] * self._row_scale)
 
     def field(self, place: Array, size: float) -> Array:
         """(N, 24, 3) FIELD in Pa and Pa/m at `place` from the middle of such a disc."""
-        r, direction = _polar(place)
-        table = _at(self._disc_table(size), r / self.step, self._last)
-        turn = _vector_rotation(direction).swapaxes(1, 2)
-        return field_rotation(direction) @ (table @ turn)
+        return self._disc(place, np.zeros(len(place)), size, BACK)
 
     def cross(self, place: Array, angle: Array) -> Array:
         """(N, 15, 3) covariance of cubes at `place` from a point with the point's traction."""
@@ -118,13 +115,27 @@ class Kernels:
         zero = np.zeros(len(place))
         return -self.response(place, zero, size)[:, _ZZ] @ force
 
-    def _disc_table(self, size: float) -> Array:
-        """(places, 24, 3) of a disc of this radius, m."""
+    def _disc(self, place: Array, angle: Array, size: float, back: Array) -> Array:
+        """(N, rows, 3) under a disc, in frames turned by `angle`; back: (28, rows) as BACK."""
+        r, direction = _polar(place)
+        position = r / self.step
+        needed = int(min(position.max(initial=0.0), self._last)) + 4
+        parts = _at(self._disc_table(size, needed), position, self._last)
+        radial, normal, across = parts[:, 0], parts[:, 1], 1j * parts[:, 2]
+        c, s = np.cos(direction)[:, None], np.sin(direction)[:, None]
+        forces = np.stack([c * radial - s * across, s * radial + c * across, normal], axis=1)
+        turn = np.exp(1j * (direction - angle))
+        powers = np.stack([np.ones_like(turn), turn, turn**2, turn**3], axis=1)
+        circular = powers[:, None, ORDERS] * forces
+        rows = np.concatenate([circular.real, circular.imag], axis=2) @ back
+        return np.asarray(rows.swapaxes(1, 2))
+
+    def _disc_table(self, size: float, places: int) -> Array:
+        """(places, 3, 14) of a disc of this radius, m, as far as it is needed."""
         position = np.log(size / self.depth / SIZES[0]) / np.log(SIZES[1] / SIZES[0])
         first, weight = _cubic(np.clip(position, 1.0, len(SIZES) - 2.001))
-        near = slice(int(first) - 1, int(first) + 3)
-        table: Array = np.einsum("s,srfi->rfi", weight, self._response[near])
-        return table
+        near = self._response[int(first) - 1 : int(first) + 3, :places]
+        return np.asarray(np.tensordot(weight, near, axes=1))
 
     def _prior(self, wave: Array) -> Array:
         lengths = np.array(LENGTHS) * self.depth
