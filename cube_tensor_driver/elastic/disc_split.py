@@ -10,15 +10,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .disc_fit import COLD, LOOK, Fitted, Scan, fit
+from .disc_fit import COLD, LOOK, USUAL_SIZE, Fitted, Scan, fit
 
 Array = NDArray[np.float64]
 
 FITTED = 3
 """Pairs that are fitted, those likeliest at first sight."""
-OVERLAP = 0.8
-"""Part of the sum of their radii by which two contacts are at least apart: bodies do not press on
-the same place."""
+OVERLAP, BESIDE = 0.8, 1.5
+"""Sums of their radii by which two contacts are at least and at most apart: bodies do not press on
+the same place, and between those farther apart there is a valley (disc_choice.py)."""
 FAINTEST = 0.1
 """Part of the greater force that the smaller one has at least: the rim of a punch is no contact."""
 _ANGLES = 2 * np.pi * np.arange(8) / 8
@@ -31,12 +31,14 @@ def split(scan: Scan, one: Fitted, j: int, alpha: float, enough: float) -> Fitte
     They must be likelier, press, lie beside each other and leave less than `enough`. Fits begin at
     `alpha`. Both in Pa.
     """
-    pairs = [_begin(scan, one, j, *pair, alpha) for pair in _pairs(one.middles[j], one.sizes[j])]
+    size = max(one.sizes[j], USUAL_SIZE * scan.kernels.depth)
+    pairs = [_begin(scan, one, j, *pair, alpha) for pair in _pairs(one.middles[j], size)]
     likeliest = sorted(pairs, key=lambda pair: pair.score)[:FITTED]
     fitted = [fit(scan, pair.middles, pair.sizes, alpha, COLD) for pair in likeliest]
     two = min(fitted, key=lambda pair: pair.score)
-    distance = np.linalg.norm(two.middles[:-1] - two.middles[-1], axis=1)
-    beside = (distance > OVERLAP * (two.sizes[:-1] + two.sizes[-1])).all()
+    radii = two.sizes[:-1] + two.sizes[-1]
+    apart = np.linalg.norm(two.middles[:-1] - two.middles[-1], axis=1) / radii
+    beside = apart.min() > OVERLAP and apart[j] < BESIDE
     pressing = np.sort(-two.forces[[j, -1], 2])
     both = pressing[0] > FAINTEST * pressing[1]
     return two if two.score < one.score and two.alpha < enough and beside and both else None

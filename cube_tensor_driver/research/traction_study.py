@@ -263,6 +263,7 @@ def study(
     widths: Sequence[float],
     cases: int = CASES,
     progress: Callable[[Setting, Errors], None] | None = None,
+    seed: int = 8,
 ) -> dict[Setting, list[Errors]]:
     """Errors of each setting at each width (m)."""
     results: dict[Setting, list[Errors]] = {}
@@ -270,7 +271,7 @@ def study(
         bench = Bench(setting)
         results[setting] = []
         for width in widths:
-            results[setting].append(bench.errors(width, cases))
+            results[setting].append(bench.errors(width, cases, seed))
             if progress is not None:
                 progress(setting, results[setting][-1])
     return results
@@ -283,10 +284,7 @@ PITCHES = tuple(
 )
 _PLAIN = Setting()
 SHAPED = tuple(
-    Setting(cubes=cubes, pitch=pitch, depth=4e-3, shape=shape)
-    for shape in SHAPES[1:]
-    for pitch in (12e-3, 24e-3)
-    for cubes in CUBES[:2]
+    replace(setting, shape=shape) for shape in SHAPES[1:] for setting in (*MAIN[:2], *PITCHES)
 )
 """Loads that are no balls."""
 WRONG = {
