@@ -7,7 +7,6 @@ import logging
 import os
 import queue
 import select
-import selectors
 import socket
 import threading
 import time
@@ -23,6 +22,7 @@ import pytest
 from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device import cobs, tcp
 from cube_tensor_driver.device import reader as reader_module
+from cube_tensor_driver.device import session as session_module
 from cube_tensor_driver.device.decoder import Decoder
 from cube_tensor_driver.device.link import LinkConfig, LinkState
 from cube_tensor_driver.device.protocol import (
@@ -277,23 +277,18 @@ def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     """Two looks of one wake-up may both find the port gone; frames of before the loss are delivered
     all the same."""
     reader = Reader([LinkConfig("a", hub.port)], lambda batch: None, lambda *state: None)
-    (link,), (session,) = reader.links, reader._sessions
+    (link,) = reader.links
     link.open()
-    session.greeted = True
-    selector = selectors.DefaultSelector()
-    selector.register(link, selectors.EVENT_READ, 0)
-    lost, data = LinkError("gone", "lost"), [make_sample(1)]
-    reads = [(5, data), (6, lost), (7, lost), (8, data)]
+    hello, sample = Hello(0xC0FFEE, 1, 8, 10_000, np.arange(2, dtype="<u8")), make_sample(1)
+    lost = LinkError("gone", "lost")
+    reads = [(5, [hello, sample]), (6, lost), (7, lost), (8, [sample])]
     read = [LinkRead(0, at, result) for at, result in reads]
-    received, failed = reader._handle_reads(selector, read)
-    assert [(at, [frame.sequence for frame in frames]) for _, at, frames, _ in received] == [
-        (5, [1])
-    ]
+    received, failed = reader._handle_reads(read)
+    assert [(at, frames) for _, at, frames, _ in received] == [(5, [hello, sample])]
     assert failed == {0: lost}
     # Closed after the frames are delivered: a link that delivers is waited for.
     assert link.is_open
     link.close()
-    selector.close()
 
 
 def test_started_before_the_port_exists(start: Start, tmp_path: Path) -> None:
@@ -449,7 +444,7 @@ def test_a_hub_with_another_period_is_asked_once_and_named(
 
 
 def test_hub_that_does_not_answer_is_asked_again(start: Start, hub: PtyHub, monkeypatch) -> None:
-    monkeypatch.setattr(reader_module, "HELLO_S", 0.05)
+    monkeypatch.setattr(session_module, "HELLO_S", 0.05)
     start(LinkConfig("a", hub.port))
     for _ in range(3):
         hub.expect(Command.HELLO)
@@ -489,7 +484,7 @@ def test_stopped_link_is_not_silent(start: Start, hub: PtyHub) -> None:
 
 
 def test_link_without_a_byte_is_opened_anew(start: Start, hub: PtyHub, monkeypatch) -> None:
-    monkeypatch.setattr(reader_module, "REOPEN_S", 0.4)
+    monkeypatch.setattr(session_module, "REOPEN_S", 0.4)
     watch = start(LinkConfig("a", hub.port))
     watch.state(LinkState.WAITING, "silent")
     watch.state(LinkState.OPEN)
@@ -672,7 +667,7 @@ def test_the_answer_to_the_last_question_for_the_time_is_delivered(
     start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rule T5. Neither twice nor with another number; with the time of the question."""
-    monkeypatch.setattr(reader_module, "ASK_TIME_S", 0.05)
+    monkeypatch.setattr(session_module, "ASK_TIME_S", 0.05)
     clock = iter(range(1, 1_000_000))
     watch = start(LinkConfig("a", hub.port), clock_ns=lambda: next(clock))
     asked: list[tuple[int, int]] = []
@@ -702,7 +697,7 @@ def test_a_hub_that_does_not_know_the_time_is_not_asked_again_until_it_restarts(
     start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rule T4. The link falls silent after many times the interval of the questions."""
-    monkeypatch.setattr(reader_module, "ASK_TIME_S", 0.01)
+    monkeypatch.setattr(session_module, "ASK_TIME_S", 0.01)
     watch = start(LinkConfig("a", hub.port))
     hub.greet()
     hub.sample(1)

@@ -7,7 +7,7 @@ import pytest
 from test_device_clock import EPOCH_NS
 
 from cube_tensor_driver.device.clock import CONTRARY_ANSWERS, ClockMap
-from cube_tensor_driver.device.reader import ASK_TIME_S
+from cube_tensor_driver.device.session import ASK_TIME_S
 
 DRIFT_PPM = 40.0
 RATE = 100

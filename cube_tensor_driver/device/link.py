@@ -1,13 +1,13 @@
 """One link: a byte stream from and to a hub over a serial port, a pseudo-terminal or TCP.
 
-Nothing here blocks, has a thread or knows a frame; `reader.py` drives it. Serial ports are opened
+Nothing here blocks, has a thread or knows a frame; `session.py` drives it. Serial ports are opened
 by pyserial, by their path only, and read with ``os.read``, which gives up to 4 kB per call. What
 goes wrong is a `LinkError`. Its `kind` is one word, its text names the fix:
 
     no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
     refused  no_answer  unreachable  unresolved                       opening a TCP link
     lost  overflow                                                    while open
-    silent  wrong_hub                                                 found by the reader
+    silent  wrong_hub                                                 found by the session
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ class LinkConfig:
 class Link:
     """One link, opened and closed many times.
 
-    state, error: set by the reader.
-    period_problem: set by the reader: what the hub made of the sample period, if that is wrong.
+    state, error: set by the session.
+    period_problem: set by the session: what the hub made of the sample period, if that is wrong.
     decoder, hello, counters: kept over reconnects; hello is the hub's last, None before the first.
     """
 
