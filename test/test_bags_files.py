@@ -538,7 +538,7 @@ def test_fit_of_a_bag_names_the_option_that_is_missing(bag, tmp_path, capsys):
         ("nowhere", "name a bag"),
         ("empty", "repair"),
         ("text.mcap", "damaged, or no bag"),
-        ("text.txt", "damaged"),
+        ("text.txt", "no bag; name the folder of a bag"),
     ],
 )
 def test_what_is_no_bag_is_refused(tmp_path, name, words, capsys):
@@ -674,7 +674,7 @@ def test_plot_and_info(bag, tmp_path, capsys):
     assert "no cube 'c99'" in capsys.readouterr().err
     assert main(["bag", "info", str(bag)]) == 0
     text = capsys.readouterr().out
-    assert "skin skin: 16 cubes" in text and read_skin(SKIN).cubes[0].calibration.id in text
+    assert "skin 'skin': 16 cubes" in text and read_skin(SKIN).cubes[0].calibration.id in text
     row = next(line for line in text.splitlines() if " c07 " in line)
     assert [cell.strip() for cell in row.split("│")[3:6]] == ["300", "100.0", "0"]
     with BagWriter(tmp_path / "empty"):

@@ -38,7 +38,7 @@ def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
     np.testing.assert_allclose(xyz.mean(axis=0), 0, atol=1e-9)  # coordinates are rounded to 1 nm
     assert np.unique(xyz, axis=0).shape == (1260, 3)
     done = cube("config", "check", path)
-    assert done.returncode == 0 and "1260 planar on 16 links" in done.stdout
+    assert done.returncode == 0 and "1260 cubes (1260 planar), 16 links" in done.stdout
 
     robot = ElementTree.fromstring(cube("urdf", path).stdout)
     links = {link.get("name") for link in robot.iter("link")}

@@ -258,7 +258,7 @@ def test_parameters_that_are_not_there_or_refused_are_said(skin, capfd):
     assert main(["param", "reconstruction", "nope"]) == 1
     assert "/reconstruction has no parameter nope; it has: " in capfd.readouterr().err
     assert main(["param", "reconstruction", "tare_duration", "banana"]) == 1
-    assert "tare_duration is not set to banana: " in capfd.readouterr().err
+    assert "tare_duration is not set to banana: needed is a number" in capfd.readouterr().err
 
 
 def test_parameters_of_nobody(nobody, capfd):

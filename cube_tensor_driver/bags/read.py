@@ -87,6 +87,10 @@ def damage(path: Path) -> Iterator[None]:
     except OSError as error:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
     except DAMAGE as error:
+        if path.is_file() and path.suffix not in (".mcap", ".db3"):
+            raise BagError(
+                f"{path}: no bag; name the folder of a bag, or a file that ends in .mcap or .db3"
+            ) from None
         text = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
             f"{path}: damaged, or no bag ({text[:200]}); "

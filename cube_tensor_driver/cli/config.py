@@ -122,8 +122,9 @@ def check_file(path: Path) -> int:
     if skin is None or mistakes:
         return 1
     layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
-    cubes = ", ".join(f"{number} {name}" for name, number in layouts.items())
+    by_layout = ", ".join(f"{number} {name}" for name, number in layouts.items())
+    cubes = f"{len(skin.cubes)} {'cube' if len(skin.cubes) == 1 else 'cubes'} ({by_layout})"
     rate = "the rate of the hubs" if skin.rate is None else f"{skin.rate:g} Hz"
     links = f"{len(skin.links)} {'link' if len(skin.links) == 1 else 'links'}"
-    print(f"{path}: skin {skin.name}, {cubes} on {links}, {rate}: nothing wrong")
+    print(f"{path}: skin {skin.name!r}: {cubes}, {links}, {rate}: nothing wrong")
     return 0

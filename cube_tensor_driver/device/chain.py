@@ -390,6 +390,6 @@ def _values(link: Link, record: _LinkRecord, log: LinkLog) -> dict[str, object]:
     }
     stats = record.account.stats_frame
     if stats is not None:
-        values["hub uptime s"] = 1e-3 * stats.uptime_ms
+        values["hub uptime s"] = stats.uptime_ms / 1000
         values["hub supply mV"] = stats.supply_mv or "unknown"
     return values

@@ -14,6 +14,8 @@ from .asking import ask, domain_text, find_services
 from .session import node_session
 
 LIST = "/list_parameters"
+NEEDED = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+"""What a user has to write for a parameter of this type."""
 
 
 def list_nodes() -> list[str]:
@@ -46,11 +48,13 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
         full = _find(node, executor, name)
         _check(full, parameter, _names(node, executor, full))
         value = get_parameter_value(text)
-        whole = value.type == ParameterType.PARAMETER_INTEGER
-        if whole and isinstance(_values(node, executor, full, [parameter])[parameter], float):
+        kind = type(_values(node, executor, full, [parameter])[parameter])
+        if kind is float and value.type == ParameterType.PARAMETER_INTEGER:
             value = ParameterValue(
                 type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value)
             )
+        if kind in NEEDED and not isinstance(parameter_value_to_python(value), kind):
+            raise ConfigError(f"{full}: {parameter} is not set to {text}: needed is {NEEDED[kind]}")
         request = SetParameters.Request(parameters=[Parameter(name=parameter, value=value)])
         answer = ask(node, executor, SetParameters, f"{full}/set_parameters", request)
         result = answer.results[0]

@@ -50,6 +50,10 @@ def _topics(bag: Bag, seconds: float) -> Table:
     return table
 
 
+def _cubes(count: int) -> str:
+    return f"{count} {'cube' if count == 1 else 'cubes'}"
+
+
 def _show_skin(bag: Bag, topic: str, console: Console) -> None:
     try:
         info = skin_infos(bag, topic)[-1]
@@ -57,12 +61,13 @@ def _show_skin(bag: Bag, topic: str, console: Console) -> None:
         console.print(str(error), style="red", markup=False)
         return
     console.print(
-        f"skin {info.name}: {len(info.cubes)} cubes in {info.header.frame_id}, "
-        f"info version {info.version}"
+        f"skin {info.name!r}: {_cubes(len(info.cubes))} in {info.header.frame_id}, "
+        f"info version {info.version}",
+        markup=False,
     )
     for name, count in Counter(cube.calibration_id for cube in info.cubes).items():
         layouts = {cube.layout for cube in info.cubes if cube.calibration_id == name}
-        console.print(f"  calibration {name}, layout {', '.join(sorted(layouts))}: {count} cubes")
+        console.print(f"  calibration {name}, layout {', '.join(sorted(layouts))}: {_cubes(count)}")
     table = Table("cube", "uid")
     for name in ("samples", "Hz", "lost", "gaps", "longest gap / ms"):
         table.add_column(name, justify="right")

@@ -21,7 +21,7 @@ def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: s
         f"{name} {'not possible' if count is None else count}"
         for name, count in coefficient_counts(layout).items()
     ]
-    console.print(f"coefficients of the response matrix per symmetry:   {'   '.join(counts)}")
+    console.print(f"coefficients by symmetry: {', '.join(counts)}")
     console.print(f"symmetry {symmetry}; {source}", markup=False)
     for part in ("uniform", "gradient"):
         condition = result[f"condition_{part}"]

@@ -161,7 +161,7 @@ class LiveTable:
     def _empty_table(self, form: _Form) -> Table:
         cubes = len(self._count)
         count = f"{cubes} {'cube' if cubes == 1 else 'cubes'}"
-        title = f"skin {self._skin.name}: {count}. Tension is positive; "
+        title = f"skin {self._skin.name!r}: {count}. Tension is positive; "
         table = Table(title=f"{title}{UNOBSERVED} is not observed{self.note}")
         if not form.has_lines:
             table.box, table.padding, table.show_edge = SIMPLE_HEAD, (0, 0), False

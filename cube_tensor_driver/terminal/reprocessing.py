@@ -18,7 +18,7 @@ class ReprocessingReport:
         self.failed = 0
         self._jobs = jobs
         self._console = Console(stderr=True, highlight=False)
-        self._progress = Progress(console=self._console)
+        self._progress = Progress(console=self._console, disable=not waiting)
         self._task = self._progress.add_task("reprocessing", total=waiting)
         if waiting < jobs:
             self._console.print(f"{jobs - waiting} of {jobs} bags are there already in {folder}")

@@ -231,6 +231,7 @@ class _Demo:
         spin(LAST_TENSORS_S, lambda: verification.beyond(end_ns))
         verification.compare(end_simulator(self._children, log), start_ns, end_ns)
         spin(LAST_TENSORS_S, verification.complete)
+        self._check_alone()
         return {
             **verification.result(),
             "crc_errors": sum(self._crc_errors.values()),
