@@ -20,9 +20,10 @@ from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.disc_tables import SIZES, DiscTables
 from cube_tensor_driver.elastic.inverse import SurfaceInverse
 from cube_tensor_driver.elastic.layer import Layer
+from cube_tensor_driver.elastic.polygon_tables import PolygonTables
 from cube_tensor_driver.simulation.mujoco import MujocoSkin
 from cube_tensor_driver.simulation.mujoco_scene import MujocoLoad, scene_skin
-from cube_tensor_driver.simulation.patches import flat_contact
+from cube_tensor_driver.simulation.patches import Polygon, flat_contact
 from cube_tensor_driver.simulation.source import simulate
 
 DEPTH, PITCH = 4e-3, 6e-3
@@ -106,6 +107,69 @@ def test_discs_are_those_of_point_forces():
     assert np.abs(gradient - slope).max() < 2e-3 * np.abs(slope).max()
 
 
+def under(polygon: Polygon, cubes: np.ndarray, layer: Layer) -> tuple[np.ndarray, np.ndarray]:
+    """Stress and gradient at cubes (N, 2) below a polygon on the plane z = 0."""
+    start = polygon.corners[:, :2] - cubes[:, None]
+    twist = np.full(start.shape[:2], polygon.twist)
+    foot = np.column_stack([cubes, np.zeros(len(cubes))]) - polygon.centre
+    traction = polygon.traction + polygon.twist * np.cross([0.0, 0.0, 1.0], foot)
+    traction = np.repeat(traction[:, None], start.shape[1], axis=1)
+    return PolygonTables(layer, DEPTH).field(start, np.roll(start, -1, axis=1), traction, twist)
+
+
+def point_forces(polygon: Polygon, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places (L, 3) m and forces (L, 3) N of its traction, by Gauss points in its triangles."""
+    t, weight = np.polynomial.legendre.leggauss(order)
+    u, v = (one.ravel() for one in np.meshgrid((t + 1) / 2, (t + 1) / 2))
+    share = np.outer(weight, weight).ravel() / 4 * u
+    normal = np.cross(*np.diff(polygon.corners[:3], axis=0))
+    normal /= np.linalg.norm(normal)
+    places, forces = [], []
+    legs = polygon.corners - polygon.centre
+    for one, other in zip(legs, np.roll(legs, -1, axis=0), strict=True):
+        arm = np.outer(u * (1 - v), one) + np.outer(u * v, other)
+        area = share * (np.cross(one, other) @ normal)
+        traction = polygon.traction + polygon.twist * np.cross(normal, arm)
+        places.append(polygon.centre + arm)
+        forces.append(area[:, None] * traction)
+    return np.concatenate(places), np.concatenate(forces)
+
+
+@pytest.mark.parametrize("corners", [3, 4, 6])
+def test_polygons_are_those_of_point_forces(corners):
+    """Stress and gradient under uniform traction and one that turns, in a half space."""
+    random = np.random.default_rng(corners)
+    angle = 2 * np.pi * np.arange(corners) / corners + 0.3
+    around = np.column_stack([0.02 * np.cos(angle), 0.006 * np.sin(angle), np.zeros(corners)])
+    centre = np.array([0.005, 0.002, 0.0])
+    polygon = Polygon(centre + around, centre, random.normal(size=3), 90.0)
+    cubes = random.uniform(-0.03, 0.03, (30, 2))
+    cubes[0] = polygon.corners[0, :2]  # right below a corner two edges have no distance
+    places = np.column_stack([cubes, np.full(30, -DEPTH)])
+    expected, slope = contact.field(places, *point_forces(polygon, 24), 0.3)
+    stress, gradient = under(polygon, cubes, Layer(poisson=0.3))
+    assert np.abs(stress - expected).max() < 2e-3 * np.abs(expected).max()
+    assert np.abs(gradient - slope).max() < 4e-3 * np.abs(slope).max()
+
+
+def test_a_square_on_a_layer_is_that_of_its_waves():
+    """On a thin layer on rigid ground: the transfer functions times the square's spectrum."""
+    layer, half = Layer(2 * DEPTH, 0.4), 2 * DEPTH
+    corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    square = Polygon(corners, np.zeros(3), np.array([1.0, -2.0, -3.0]), 0.0)
+    cubes = np.random.default_rng(1).uniform(-2 * half, 2 * half, (30, 2))
+    nodes, weight = np.polynomial.legendre.leggauss(160)
+    k, angle = (nodes + 1) * 8 / DEPTH, 2 * np.pi * (np.arange(192) + 0.5) / 192
+    kx, ky = (np.outer(k, turn(angle)).ravel() for turn in (np.cos, np.sin))
+    element = np.repeat(weight * 8 / DEPTH * k, 192) / 192 / (2 * np.pi)
+    spectrum = 4 * np.sin(half * kx) * np.sin(half * ky) / (kx * ky) * element
+    waves = np.exp(1j * (cubes @ [kx, ky])) * spectrum
+    expected = (waves @ (layer.transfer(kx, ky, DEPTH) @ square.traction)).real
+    stress, gradient = under(square, cubes, layer)
+    for found, wanted in ((stress, expected[:, :6]), (gradient, expected[:, 6:].reshape(-1, 6, 3))):
+        assert np.abs(found - wanted).max() < 4e-3 * np.abs(wanted).max()
+
+
 @pytest.mark.parametrize("count", [2, 3, 4, 8])
 def test_a_flat_contact_keeps_force_and_moments_and_nothing_pulls(count):
     random = np.random.default_rng(count)
@@ -114,11 +178,12 @@ def test_a_flat_contact_keeps_force_and_moments_and_nothing_pulls(count):
     points = random.uniform(-0.02, 0.02, (count, 3))
     points -= np.outer(points @ normal - 0.05, normal)
     forces = random.normal(size=(count, 3)) - 4 * normal
-    discs = flat_contact(points, forces, normal, DEPTH)
-    np.testing.assert_allclose(discs.force.sum(axis=0), forces.sum(axis=0), rtol=1e-12)
+    polygon = flat_contact(points, forces, normal, DEPTH / 4)
+    places, parts = point_forces(polygon, 3)
+    np.testing.assert_allclose(parts.sum(axis=0), forces.sum(axis=0), rtol=1e-12)
     moment = np.cross(points, forces).sum(axis=0)
-    np.testing.assert_allclose(np.cross(discs.place, discs.force).sum(axis=0), moment, atol=1e-12)
-    assert (discs.force @ normal < 0).all()
+    np.testing.assert_allclose(np.cross(places, parts).sum(axis=0), moment, atol=1e-12)
+    assert polygon.traction @ normal < 0
 
 
 def pull_at_the_foot(data, pull: float) -> None:

@@ -21,7 +21,15 @@ from numpy.typing import NDArray
 MOST_BYTES = 1 << 30
 """Of all files; the ones that were used longest ago go first."""
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-_CODE = ("layer.py", "circular.py", "kernels.py", "disc_tables.py", "inverse.py", "cache.py")
+_CODE = (
+    "layer.py",
+    "circular.py",
+    "kernels.py",
+    "disc_tables.py",
+    "polygon_tables.py",
+    "inverse.py",
+    "cache.py",
+)
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -54,3 +54,14 @@ def circular_table(field: Array) -> Array:
     circular = np.einsum("cf,...fi->...ic", CIRCULAR, field)
     parts = [circular[..., 0, :].real, circular[..., 2, :].real, circular[..., 1, :].imag]
     return np.stack(parts, axis=-2)
+
+
+def summed(
+    circular: NDArray[np.complex64], turn: NDArray[np.complexfloating]
+) -> tuple[Array, Array]:
+    """Stress (N, 6) and gradient (N, 6, 3), each the sum over L of the circular components
+    (N, L, 14) in frames that are turned by the angle of `turn` (N, L), |turn| = 1."""
+    powers = np.stack([np.ones_like(turn), turn, turn**2, turn**3], axis=-1)
+    total = (circular * powers.astype(np.complex64)[..., ORDERS]).sum(axis=1)
+    field = np.concatenate([total.real, total.imag], axis=1).astype(float) @ BACK
+    return field[:, :6], field[:, 6:].reshape(-1, 6, 3)

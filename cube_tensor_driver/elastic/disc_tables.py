@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .cache import cached
-from .circular import BACK, ORDERS, circular_table
+from .circular import circular_table, summed
 from .kernels import PER_DEPTH, REACH, Waves
 from .layer import Layer
 
@@ -66,10 +66,7 @@ class DiscTables:
         load[..., 1, :, 2] = weight * polar.imag[..., None]
         parts = load.reshape(*r.shape, 2, 6) @ self._table[self._size(radius), first]
         circular = parts[..., 0, :] + 1j * parts[..., 1, :]
-        powers = np.stack([np.ones_like(turn), turn, turn**2, turn**3], axis=-1)
-        total = np.einsum("nlc,nlc->nc", circular, powers.astype(np.complex64)[..., ORDERS])
-        field = np.concatenate([total.real, total.imag], axis=1).astype(float) @ BACK
-        return field[:, :6], field[:, 6:].reshape(-1, 6, 3)
+        return summed(circular, turn)
 
     def _size(self, radius: ArrayLike) -> NDArray[np.intp]:
         """Number of the nearest radius in the tables."""

@@ -16,7 +16,8 @@ hold in the model's reference configuration (qpos0). The surface is that of the 
 the cubes.
 
 Each cube sees a layer whose surface lies `depth` above it, across its own z axis, as in `load.py`;
-patches.py says how contact points become tractions, elastic/disc_tables.py what these do to a cube.
+patches.py says how contact points become tractions, elastic/disc_tables.py and polygon_tables.py
+what these do to a cube.
 Contacts with the back of a body, where no cube looks, are not felt. The contact's own damping is
 MuJoCo's.
 
@@ -40,9 +41,10 @@ from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..elastic.disc_tables import DiscTables
 from ..elastic.layer import Layer
+from ..elastic.polygon_tables import PolygonTables
 from .imperfections import Imperfections
 from .load import Press, surface_normal
-from .patches import Discs, flat_contact, hertz_radius
+from .patches import Polygon, flat_contact, hertz_radius
 from .source import SkinPads
 
 if TYPE_CHECKING:
@@ -52,10 +54,8 @@ Array = NDArray[np.float64]
 
 SAME_DEPTH = 0.1
 """How far a cube's depth may be from the others', over the depth: there is one table for all."""
-FINENESS = 1.5
-"""Distance of the discs of a flat contact over the depth. Of the gripper's box, with ten times as
-many discs a side, stress differs by up to 7 % and gradients by 28 % of their largest, below the
-edge; with 1.0 instead by 3 and 10 %, in twice the time."""
+LEAST = 0.3
+"""Width over the depth of what is flat and touches along a line."""
 
 
 def load_mujoco() -> Any:
@@ -88,20 +88,13 @@ class _Part(NamedTuple):
 class Touch(NamedTuple):
     """What touches a skin, in the skin's parent frame.
 
-    body: that is touched, its number; discs: of traction; normal: (3,) out of the skin
+    body: that is touched, its number; press: all of it as one round contact, of the same area;
+    polygon: what it is where it is flat, None where it is round
     """
 
     body: int
-    discs: Discs
-    normal: Array
-
-    @property
-    def press(self) -> Press:
-        """All of it as one, for `load.total`."""
-        force = self.discs.force.sum(axis=0)
-        part = self.discs.force @ self.normal
-        place = part @ self.discs.place / part.sum()
-        return Press("disc", place, self.normal, force, float(self.discs.radius.max()))
+    press: Press
+    polygon: Polygon | None = None
 
 
 class MujocoSkin:
@@ -139,7 +132,7 @@ class MujocoSkin:
             half_side=np.array([cube.calibration.half_side for cube in skin.cubes]),
         )
         self._parts, self.depth = self._attach()
-        self._tables = _tables(Layer(thickness, poisson), round(self.depth, 6))
+        self._discs, self._polygons = _tables(Layer(thickness, poisson), round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
         self._curvature = _curvatures(model, self._mujoco)
         self._pads = SkinPads(skin, noise, drift, imperfections)
@@ -177,18 +170,16 @@ class MujocoSkin:
         stress, gradient = np.zeros((n, 6)), np.zeros((n, 6, 3))
         for part in self._parts:
             mine = [touch for touch in touches if touch.body == part.body]
-            if not mine:
-                continue
-            position, rotation, _ = part.poses
-            columns = zip(*(touch.discs for touch in mine), strict=True)
-            discs = Discs(*(np.concatenate(column) for column in columns))
-            counts = [len(touch.discs.force) for touch in mine]
-            normal = np.repeat([touch.normal for touch in mine], counts, axis=0)
-            facing = np.maximum(rotation[:, :, 2] @ normal.T, 0.0)
-            place = (position[:, None] - discs.place) @ rotation
-            force = discs.force @ rotation * facing[..., None]
-            found = self._tables.field(place[..., :2], force, discs.radius)
-            stress[part.cubes], gradient[part.cubes] = found
+            presses = [touch.press for touch in mine if touch.polygon is None]
+            flat = [(t.polygon, t.press.normal) for t in mine if t.polygon is not None]
+            found = []
+            if presses:
+                found.append(_under_discs(part, presses, self._discs))
+            if flat:
+                found.append(_under_polygons(part, flat, self._polygons))
+            for one, its_gradient in found:
+                stress[part.cubes] += one
+                gradient[part.cubes] += its_gradient
         return stress, gradient
 
     def _touch(self, part: _Part, rows: NDArray[np.intp], side: int) -> list[Touch]:
@@ -212,12 +203,15 @@ class MujocoSkin:
         if not felt.any():
             return []
         place, force = place[felt], force[felt]
+        total = force.sum(axis=0)
         if len(place) > 1:
-            spacing = FINENESS * self.depth
-            return [Touch(part.body, flat_contact(place, force, normal, spacing), normal)]
+            polygon = flat_contact(place, force, normal, LEAST * self.depth)
+            radius = np.sqrt(total @ normal / (polygon.traction @ normal) / np.pi)
+            press = Press("disc", polygon.centre, normal, total, float(radius))
+            return [Touch(part.body, press, polygon)]
         curvature = self._curvature[contact.geom[rows[0]]].sum()
-        radius = hertz_radius(-float(force[0] @ normal), curvature, self._stiffness)
-        return [Touch(part.body, Discs(place, force, np.array([radius])), normal)]
+        radius = hertz_radius(-float(total @ normal), curvature, self._stiffness)
+        return [Touch(part.body, Press("sphere", place[0], normal, total, radius))]
 
     def _attach(self) -> tuple[list[_Part], float]:
         """The cubes on each body, and the depth of all. ConfigError: they do not fit."""
@@ -289,9 +283,44 @@ class MujocoSkin:
 
 
 @lru_cache(maxsize=8)
-def _tables(layer: Layer, depth: float) -> DiscTables:
+def _tables(layer: Layer, depth: float) -> tuple[DiscTables, PolygonTables]:
     """Kept: the skins of a robot are often alike."""
-    return DiscTables(layer, depth)
+    return DiscTables(layer, depth), PolygonTables(layer, depth)
+
+
+def _under_discs(part: _Part, presses: list[Press], tables: DiscTables) -> tuple[Array, Array]:
+    """Stress and gradient at the cubes of a part under round contacts."""
+    position, rotation, _ = part.poses
+    facing = np.maximum(rotation[:, :, 2] @ np.stack([press.normal for press in presses], 1), 0.0)
+    place = (position[:, None] - [press.position for press in presses]) @ rotation
+    force = np.stack([press.force for press in presses]) @ rotation * facing[..., None]
+    return tables.field(place[..., :2], force, [press.radius for press in presses])
+
+
+def _under_polygons(
+    part: _Part, flat: list[tuple[Polygon, Array]], tables: PolygonTables
+) -> tuple[Array, Array]:
+    """Stress and gradient at the cubes of a part under polygons and their normals.
+
+    A polygon is laid flat on a cube's plane, which leaves the part of its area by which it faces
+    the cube.
+    """
+    position, rotation, _ = part.poses
+    polygons = [polygon for polygon, _ in flat]
+    counts = [len(polygon.corners) for polygon in polygons]
+    number = np.repeat(np.arange(len(flat)), counts)
+    corners = np.concatenate([polygon.corners for polygon in polygons])
+    following = np.concatenate([np.roll(polygon.corners, -1, axis=0) for polygon in polygons])
+    places = np.concatenate([corners, following, [polygon.centre for polygon in polygons]])
+    local = ((places - position[:, None]) @ rotation)[..., :2]
+    start, end, centre = np.split(local, [len(corners), 2 * len(corners)], axis=1)
+    facing = np.maximum(rotation[:, :, 2] @ np.stack([normal for _, normal in flat], axis=1), 0.0)
+    twist = facing * [polygon.twist for polygon in polygons]
+    traction = np.stack([polygon.traction for polygon in polygons]) @ rotation
+    traction *= (facing > 0)[..., None]
+    traction[..., 0] += twist * centre[..., 1]
+    traction[..., 1] -= twist * centre[..., 0]
+    return tables.field(start, end, traction[:, number], twist[:, number])
 
 
 def _curvatures(model: MjModel, mujoco: Any) -> Array:
