@@ -411,6 +411,21 @@ def test_a_sound_hub_passes(kind, settings, is_tcp):
     assert not result.failed(), result.to_dict()
 
 
+class BusyHost(MemoryWire):
+    """Reads late and little at once, so that what it left unread comes in a later step."""
+
+    def listen(self, seconds: float) -> bytes:
+        data = super().listen(seconds)
+        self._out[:0] = data[200:]
+        self.ignore(0.005)
+        return data[:200]
+
+
+def test_samples_of_the_faster_period_are_not_due_while_the_port_is_closed():
+    result = check(BusyHost(made(HubInMemory, {})))
+    assert result.verdicts["L5"].outcome is Outcome.PASSED, result.to_dict()
+
+
 def test_every_rule_that_can_fail_has_its_broken_hub():
     """Those that are never tried say why."""
     sound = [checked(made(kind, {})) for kind in (HubInMemory, SplitsSamples, NoTime)]

@@ -8,6 +8,7 @@ from ...device.protocol import Command, Hello, Sample, Stats
 from ..conversation import AWAY_S
 from ..transcript import Transcript
 from ..verdict import ANY_FRAME, Verdict, failed, not_tried, passed, rule
+from .request import behind_ack
 from .sample import periods_us
 
 TELNET_COMMANDS = range(0xFB, 0xFF)  # WILL, WON'T, DO, DON'T
@@ -68,7 +69,8 @@ def host_goes_away(talk: Transcript) -> Verdict:
         return not_tried("this hub restarts when its port is opened, as L2 allows")
     taken = after[-1].taken - before[-1].taken & 0xFFFFFFFF
     seconds = 1e-3 * (after[-1].uptime_ms - before[-1].uptime_ms)
-    gaps = periods_us(talk.frames(Sample, "period again"))
+    # What a busy host reads before the ACK was taken at the faster period.
+    gaps = periods_us(behind_ack(talk.steps["period again"], Command.SET_PERIOD))[1:]
     due = 1e6 * seconds / float(np.median(gaps)) if len(gaps) else 0
     if taken < 0.7 * due:
         return failed(
