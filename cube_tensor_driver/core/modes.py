@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class Modes:
         m = self.n_modes
         return np.concatenate([self.stress.reshape(m, 9), self.gradient.reshape(m, 27)], axis=1).T
 
-    @property
+    @cached_property
     def reading(self) -> np.ndarray:
         """(M, 36): how each amplitude is read off a field; reading @ fields = 1."""
         rows = np.zeros((self.n_modes, 36))
@@ -68,6 +69,7 @@ class Modes:
             terms = _terms(name)
             for sign, place in terms:
                 row[place] = sign / len(terms)
+        rows.flags.writeable = False
         return rows
 
     @property

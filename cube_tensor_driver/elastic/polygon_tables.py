@@ -93,7 +93,7 @@ class PolygonTables:
         Beyond REACH depths point forces count as zero. Order xx yy zz yz zx xy, tension positive,
         as in `contact.field`.
         """
-        first, second = (np.asarray(one, float) @ [1, 1j] / self.depth for one in (start, end))
+        first, second = (_complex(np.asarray(one, float)) / self.depth for one in (start, end))
         along = second - first
         along /= np.maximum(np.abs(along), 1e-12)
         local = np.stack([first, second], axis=-1) * along.conj()[..., None]  # t - i d
@@ -107,10 +107,16 @@ class PolygonTables:
         tables = (weights[..., None, :] @ self._rows.take(places, axis=0)).view(np.complex64)
         tables = tables.reshape(*d.shape, 4, -1)
         load = np.asarray(traction, float)
-        v = (load @ [1, 1j, 0]) * beta.conj()
+        v = _complex(load) * beta.conj()
         loads = np.stack([v, v.conj(), load[..., 2], np.asarray(twist, float)], axis=-1)
         circular = loads[..., None, :].astype(np.complex64) @ tables
         return summed(circular[..., 0, :], beta)
+
+
+def _complex(vectors: Array) -> Complex:
+    """x + i y (...) of vectors (..., 2 or 3)."""
+    result: Complex = vectors[..., 0] + 1j * vectors[..., 1]
+    return result
 
 
 def _around(d: Array, t: Array) -> tuple[NDArray[np.float32], NDArray[np.intp]]:

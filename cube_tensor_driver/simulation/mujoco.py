@@ -307,20 +307,22 @@ def _under_polygons(
     """
     position, rotation, _ = part.poses
     polygons = [polygon for polygon, _ in flat]
-    counts = [len(polygon.corners) for polygon in polygons]
-    number = np.repeat(np.arange(len(flat)), counts)
-    corners = np.concatenate([polygon.corners for polygon in polygons])
-    following = np.concatenate([np.roll(polygon.corners, -1, axis=0) for polygon in polygons])
-    places = np.concatenate([corners, following, [polygon.centre for polygon in polygons]])
-    local = ((places - position[:, None]) @ rotation)[..., :2]
-    start, end, centre = np.split(local, [len(corners), 2 * len(corners)], axis=1)
+    following: list[int] = []  # the number of the corner where each edge ends
+    number: list[int] = []  # the edge's polygon
+    for one, polygon in enumerate(polygons):
+        first, size = len(number), len(polygon.corners)
+        following += [*range(first + 1, first + size), first]
+        number += [one] * size
+    places = np.concatenate([polygon.corners for polygon in polygons])
+    corners = (places - position[:, None]) @ rotation[..., :2]
+    centre = (np.stack([one.centre for one in polygons]) - position[:, None]) @ rotation[..., :2]
     facing = np.maximum(rotation[:, :, 2] @ np.stack([normal for _, normal in flat], axis=1), 0.0)
     twist = facing * [polygon.twist for polygon in polygons]
     traction = np.stack([polygon.traction for polygon in polygons]) @ rotation
     traction *= (facing > 0)[..., None]
     traction[..., 0] += twist * centre[..., 1]
     traction[..., 1] -= twist * centre[..., 0]
-    return tables.field(start, end, traction[:, number], twist[:, number])
+    return tables.field(corners, corners[:, following], traction[:, number], twist[:, number])
 
 
 def _curvatures(model: MjModel, mujoco: Any) -> Array:

@@ -69,7 +69,7 @@ def flat_contact(points: Array, forces: Array, normal: Array, least: float) -> P
         square = least / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         corners = _hull((flat[:, None] + square).reshape(-1, 2))
         area, centroid, polar = _moments(corners)
-    edges = np.roll(corners, -1, axis=0) - corners
+    edges = _following(corners) - corners
     of_centre, of_centroid = (
         edges[:, 0] * (place - corners)[:, 1] - edges[:, 1] * (place - corners)[:, 0]
         for place in (centre, centroid)
@@ -86,7 +86,7 @@ def flat_contact(points: Array, forces: Array, normal: Array, least: float) -> P
 def _moments(corners: Array) -> tuple[float, Array, float]:
     """Area, centroid (2,) and polar moment of area about it of a polygon (K, 2)."""
     x, y = corners.T
-    next_x, next_y = np.roll(corners, -1, axis=0).T
+    next_x, next_y = _following(corners).T
     double = x * next_y - next_x * y
     area = float(double.sum() / 2)
     if not area > 0:
@@ -94,6 +94,11 @@ def _moments(corners: Array) -> tuple[float, Array, float]:
     centroid = np.array([double @ (x + next_x), double @ (y + next_y)]) / (6 * area)
     squares = x * x + x * next_x + next_x * next_x + y * y + y * next_y + next_y * next_y
     return area, centroid, float(double @ squares / 12 - area * centroid @ centroid)
+
+
+def _following(corners: Array) -> Array:
+    """(K, 2) the corner after each of them; np.roll takes five times as long."""
+    return np.concatenate([corners[1:], corners[:1]])
 
 
 def _hull(flat: Array) -> Array:
