@@ -8,10 +8,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -240,6 +242,26 @@ def test_killed_recordings_lose_less_than_a_second(running, tmp_path):
         running.wait(lambda stamps=stamps: to_ns(heard[-1].header.stamp) >= stamps[-1])
         published = [to_ns(message.header.stamp) for message in heard]
         assert stamps == published[published.index(stamps[0]) : published.index(stamps[-1]) + 1]
+
+
+def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, monkeypatch):
+    from cube_tensor_driver.ros import recording
+
+    now = [100.0]
+    recorder = SimpleNamespace(error=None, counts={"/stress": 0})
+    recorder.find_topics = recorder.close = lambda: None
+
+    def spin_once(timeout_sec: float) -> None:
+        now[0] += timeout_sec
+        recorder.counts["/stress"] += now[0] >= 103.0  # found late
+
+    monkeypatch.setattr(recording, "Recorder", lambda *_: recorder)
+    monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    bag = SimpleNamespace(folder=tmp_path, messages=1)
+    executor = SimpleNamespace(spin_once=spin_once)
+    stop, show = threading.Event(), lambda *_: None
+    recording.fill(bag, None, executor, [], stop=stop, duration=5.0, show=show)
+    assert now[0] == pytest.approx(108.0, abs=2 * recording.SPIN_S)
 
 
 def test_record_says_what_is_wrong(domain, tmp_path):

@@ -27,7 +27,10 @@ def arguments(parser: Parser) -> None:
         help=f"topics to record (default: {' '.join(RECORDED)})",
     )
     parser.add_argument(
-        "--duration", type=positive, metavar="S", help="end after S seconds (default: Ctrl-C)"
+        "--duration",
+        type=positive,
+        metavar="S",
+        help="end S seconds after the first message (default: Ctrl-C)",
     )
     parser.add_argument(
         "--storage",

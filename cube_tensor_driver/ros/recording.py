@@ -39,7 +39,8 @@ def record(
     duration: float | None,
     show: Callable[[Recorder, float], None],
 ) -> Recorder:
-    """Record for `duration` s (None: until a signal) into a new bag; `BagWriter` says of what kind.
+    """Record for `duration` s from the first message on (None: until a signal) into a new bag;
+    `BagWriter` says of what kind. Without any message it ends after the same time.
 
     show: called once a second with the recorder and the seconds since the start.
     BagError: cannot be written; what was written before is made readable. Or nothing came: then
@@ -73,9 +74,13 @@ def fill(
     recorder = Recorder(node, names, bag)
     begin = find_at = show_at = time.monotonic()
     until = float("inf") if duration is None else begin + duration
+    came = False
     try:
         while not stop.is_set() and recorder.error is None:
             now = time.monotonic()
+            if not came and any(recorder.counts.values()):
+                # Finding the topics takes up to seconds on a busy machine.
+                came, until = True, until + now - begin
             if now >= until:
                 break
             executor.spin_once(timeout_sec=min(SPIN_S, until - now))
