@@ -294,12 +294,18 @@ def test_what_does_not_fit_is_named(mujoco, tmp_path, text, said):
     assert "\n" not in str(caught.value)
 
 
-def test_the_program_of_the_page_runs(mujoco, monkeypatch, capsys):
+def test_the_programs_of_the_page_run(mujoco, tmp_path, monkeypatch, capsys):
+    """A sensor, and hubs that the real driver reads: both see the ball."""
     page = (ROOT / "docs" / "simulation.md").read_text()
-    *_, program = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    monkeypatch.chdir(ROOT)
-    exec(program, {})
-    assert re.fullmatch(r"greatest pressure \d+\.\d kPa\n", capsys.readouterr().out)
+    *_, sensor, hubs = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "config").symlink_to(ROOT / "config")
+    monkeypatch.chdir(tmp_path)
+    exec(sensor + hubs, {})
+    said = capsys.readouterr().out
+    here, through_links = re.fullmatch(r"g\D+(\d+\.\d) kPa\ng\D+(\d+\.\d) kPa\n", said).groups()
+    assert float(here) > 1.0
+    assert float(through_links) == pytest.approx(float(here), rel=0.3)
+    assert not (tmp_path / "ports").exists()
 
 
 def test_without_mujoco_the_install_line_is_given(monkeypatch):

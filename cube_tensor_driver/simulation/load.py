@@ -54,19 +54,12 @@ class Press(NamedTuple):
     radius: float
 
 
-class AnyLoad(Protocol):
-    """What acts on the cubes of a skin: a script, or a robot in simulation.
+class Fields(Protocol):
+    """Stress and gradient at the cubes of a skin as time goes on.
 
-    poses: of the cubes; depth: from their centres to the surface, m
     repeats: time after which all comes again, s; None: never
     period: the same, or the time that counts as the whole of it, s
     """
-
-    @property
-    def poses(self) -> CubePoses: ...
-
-    @property
-    def depth(self) -> float: ...
 
     @property
     def repeats(self) -> float | None: ...
@@ -77,6 +70,19 @@ class AnyLoad(Protocol):
     def at(self, seconds: float) -> tuple[Array, Array]:
         """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
         the cubes' frames."""
+
+
+class AnyLoad(Fields, Protocol):
+    """What acts on the cubes of a skin: a script, or a robot in simulation.
+
+    poses: of the cubes; depth: from their centres to the surface, m
+    """
+
+    @property
+    def poses(self) -> CubePoses: ...
+
+    @property
+    def depth(self) -> float: ...
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
         """As the function `total`, of what touches the skin at this time."""
@@ -247,7 +253,7 @@ class LoadMemory:
     """The fields of a load at whole microseconds. Those of a periodic script are kept for the next
     time that it comes by there: each costs a contact problem for every cube."""
 
-    def __init__(self, load: AnyLoad) -> None:
+    def __init__(self, load: Fields) -> None:
         self._load = load
         period = load.repeats
         self._period_us = None if period is None else round(1e6 * period)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from .faults import Fault, HubSize
 from .hub import SimulatedHub
 from .injector import Injector, SimulatedLink
 from .line import Line, TcpLine
-from .load import AnyLoad, LoadMemory
+from .load import Fields, LoadMemory
 from .sample_log import ABSENT, LinkLog, SampleLog
 
 FIRST_UID = 0xC0BE_0000_0000_0001
@@ -63,7 +64,7 @@ class Simulator:
     def __init__(
         self,
         skin: Skin,
-        load: AnyLoad,
+        load: Fields,
         ports: Path,
         *,
         noise: float | None = 0.0,
@@ -117,7 +118,7 @@ class Simulator:
         """Simulated time: µs since the start."""
         return (time.monotonic_ns() - self._start_ns) // 1000
 
-    def run(self, stop: StopSignal) -> None:
+    def run(self, stop: Stop) -> None:
         """Play the hubs until `stop` is set: HELLO and STATS at 1 Hz, samples when asked for."""
         # SelectSelector, because epoll counts time in ms.
         with selectors.SelectSelector() as selector:
@@ -186,7 +187,7 @@ class Simulator:
             if link.hub.started and not link.prepared and now_us - link.hub.next_us > LATE_US:
                 link.hub.skip(now_us)
 
-    def _take_samples(self, now_us: int, stop: StopSignal) -> None:
+    def _take_samples(self, now_us: int, stop: Stop) -> None:
         """All samples that are due, one of each hub in turn: when this loop is late, no hub falls
         silent behind the others."""
         behind = True
@@ -237,6 +238,16 @@ class Simulator:
                 self._injector.add(Fault.parse(parse_yaml(line, "fault"), "fault"), self.now_us())
             except ConfigError as error:
                 print(f"simulator: {error}", file=sys.stderr, flush=True)
+
+
+class Stop(Protocol):
+    """requested: end now; fd: gets readable with it."""
+
+    @property
+    def requested(self) -> bool: ...
+
+    @property
+    def fd(self) -> int: ...
 
 
 class StopSignal:

@@ -1,0 +1,106 @@
+"""Simulated hubs in the background of a program that computes the load itself, such as a robot in
+simulation under a controller. The real driver reads them as it reads hardware.
+
+    touch = MujocoSkin(model, data, skin)
+    with BackgroundHubs(skin, "ports") as hubs:
+        while True:
+            mujoco.mj_step(model, data)
+            hubs.set_load(*touch.field(touch.touches()))
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..config.skin import Skin
+from ..core.errors import ConfigError
+from .simulator import Simulator
+
+Array = NDArray[np.float64]
+
+
+class BackgroundHubs:
+    """All hubs of a skin on pseudo-terminals, played by a thread in real time until `close`.
+
+    ports: folder in which they appear, each under the name of its link; `open_links` and the node
+        `driver` take it as `port_directory`
+    noise, drift: of the pads, as in `simulate`
+
+    A sample shows the load that was set last before the sample ahead of it was taken. Without a
+    load the skin is at rest.
+
+    ConfigError: cubes of one hub have different numbers of pads, or the folder cannot be used.
+    """
+
+    def __init__(
+        self, skin: Skin, ports: Path | str, *, noise: float | None = 0.0, drift: float = 0.0
+    ) -> None:
+        self._load = _Newest(len(skin.cubes))
+        self._simulator = Simulator(skin, self._load, Path(ports), noise=noise, drift=drift)
+        self._stop = _Stop()
+        self._thread = threading.Thread(target=self._simulator.run, args=(self._stop,), daemon=True)
+        self._thread.start()
+
+    def set_load(self, stress: ArrayLike, gradient: ArrayLike) -> None:
+        """What acts on the cubes from now on, as `MujocoSkin.field` gives it: stress (cubes, 6) in
+        Pa and gradient (cubes, 6, 3) in Pa/m, in the cubes' frames.
+
+        ConfigError: the shapes are not these.
+        """
+        self._load.set(np.array(stress, float), np.array(gradient, float))
+
+    def close(self) -> None:
+        """The hubs stop, and their ports vanish."""
+        self._stop.now()
+        self._thread.join()
+        self._simulator.close()
+        self._stop.close()
+
+    def __enter__(self) -> BackgroundHubs:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class _Newest:
+    """A `load.Fields` that somebody sets. It is swapped whole: another thread reads it."""
+
+    repeats: float | None = None
+    period = 0.0
+
+    def __init__(self, cubes: int) -> None:
+        self._field = np.zeros((cubes, 6)), np.zeros((cubes, 6, 3))
+
+    def set(self, stress: Array, gradient: Array) -> None:
+        cubes = len(self._field[0])
+        if stress.shape != (cubes, 6) or gradient.shape != (cubes, 6, 3):
+            raise ConfigError(
+                f"the load has a stress of shape {stress.shape} and a gradient of shape "
+                f"{gradient.shape}; a skin of {cubes} cubes takes ({cubes}, 6) and ({cubes}, 6, 3)"
+            )
+        self._field = stress, gradient
+
+    def at(self, seconds: float) -> tuple[Array, Array]:
+        return self._field
+
+
+class _Stop:
+    """A `simulator.Stop` for another thread."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self.fd, self._write = os.pipe()
+
+    def now(self) -> None:
+        self.requested = True
+        os.write(self._write, b"\0")
+
+    def close(self) -> None:
+        os.close(self.fd)
+        os.close(self._write)
