@@ -112,7 +112,7 @@ def draw_rod_shear(result: RodShear) -> Figure:
         xlabel="distance of the rod's middle from the cube's / mm",
         ylabel=r"$\sigma_{zx}$ / kPa",
     )
-    axis.legend(handlelength=4)
+    axis.legend(handlelength=4, fontsize=7)
     return figure
 
 

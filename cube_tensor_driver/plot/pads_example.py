@@ -91,7 +91,7 @@ def draw_sweep(sweep: Sweep) -> Figure:
     left.plot(x, 1e-3 * sweep.profile, "k", label="$\\sigma_{zz}$ in the plane of the sensor")
     near = np.array([-2.5, 2.5])
     tangent = 1e-3 * (sweep.value + 1e-3 * sweep.slope * near)
-    left.plot(near, tangent, "tab:red", lw=3, label="what a cube measures: value and slope")
+    left.plot(near, tangent, "tab:red", lw=3, label="value and slope at a cube")
     left.plot(0, 1e-3 * sweep.value, "s", color="tab:red")
     left.axvline(1e3 * BALL_X, color="0.6", ls=":", label="the ball presses here")
     left.set(xlabel="$x$ / mm", ylabel="$\\sigma_{zz}$ / kPa")
