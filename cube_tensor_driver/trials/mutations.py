@@ -421,7 +421,7 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
         _stress(_columns(sequence=lambda sequence: sequence + np.uint32(1))),
     ),
     "observed": (
-        "a component that is observed is said not to be",
+        "a component that is observed is marked as not observed",
         _stress(_columns(observed=lambda observed: observed & ~np.uint16(1))),
     ),
     "wrong tare": (
