@@ -146,9 +146,9 @@ def stage(page: Path, folder: Path) -> None:
         shutil.copy(ROOT / "config" / "calibration" / "planar.yaml", folder / "new.yaml")
     if page.name == "simulation.md":
         shutil.copy(ROOT / "config" / "cube.yaml", folder / "skin.yaml")
-        (folder / "load.yaml").write_text(
-            re.search(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S)[1]
-        )
+        worn, load, *_ = re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S)
+        (folder / "worn.yaml").write_text(worn)
+        (folder / "load.yaml").write_text(load)
 
 
 def test_documentation_builds_without_a_warning(tmp_path):

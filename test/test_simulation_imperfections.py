@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
-from cube_tensor_driver.simulation.imperfections import Imperfections, PadBehaviour
+from cube_tensor_driver.simulation.imperfections import (
+    Imperfections,
+    PadBehaviour,
+    read_imperfections,
+)
 from cube_tensor_driver.simulation.source import simulate
 
 CREEP = ((0.1, 0.5), (0.05, 20.0))
@@ -62,3 +68,28 @@ def test_a_simulated_skin_has_them():
 def test_values_out_of_range_are_named(asked, said):
     with pytest.raises(ConfigError, match=said):
         Imperfections(**asked)
+
+
+def test_a_file_has_the_same_fields(tmp_path: Path):
+    path = tmp_path / "worn.yaml"
+    path.write_text("{gain_spread: 0.03, creep: [[0.1, 0.5], [0.05, 20]], seed: 3}")
+    assert read_imperfections(path) == Imperfections(gain_spread=0.03, creep=CREEP, seed=3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[1]", r"found '\[1\]', allowed: a table of gain_spread, dead, creep, seed"),
+        ("{gain: 0.1}", r"found \"\['gain'\]\", allowed: a table"),
+        ("{dead: many}", "dead: found 'many', allowed: a number"),
+        ("{dead: 2}", "dead is 2, allowed"),
+        ("{seed: -1}", "seed is -1, allowed"),
+        ("{seed: 0.5}", "seed: found '0.5', allowed: a whole number"),
+        ("{creep: [0.1, 0.5]}", r"creep: found '\[0.1, 0.5\]', allowed: \[\[size, seconds\]"),
+    ],
+)
+def test_what_a_file_cannot_say_is_named(tmp_path: Path, text: str, said: str):
+    path = tmp_path / "worn.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=f"worn.yaml: {said}"):
+        read_imperfections(path)

@@ -48,6 +48,12 @@ def arguments(parser: Parser) -> None:
         "(default: as the calibrations state)",
     )
     parser.add_argument(
+        "--imperfections",
+        type=Path,
+        metavar="FILE",
+        help="spread of the gains, dead pads and creep (docs/simulation.md; default: none)",
+    )
+    parser.add_argument(
         "--duration",
         type=positive,
         metavar="S",
@@ -79,6 +85,7 @@ def run(options: argparse.Namespace) -> int:
         mujoco=options.mujoco,
         rate=options.rate,
         noise=options.noise,
+        imperfections=options.imperfections,
         duration=duration,
         headless=options.headless,
         view=options.view,

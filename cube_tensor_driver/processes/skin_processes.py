@@ -39,6 +39,7 @@ class SimulatedHubs:
     sample_log: file for a record of every sample it sends; None: none. instants: how many instants
     of the load it computes in advance, see `simulation.simulator.Simulator`; None: its default.
     noise: of the pads, relative to their frequencies; None: as the calibrations state.
+    imperfections: file of what else is wrong with the pads; None: nothing.
     """
 
     ports: Path
@@ -47,6 +48,7 @@ class SimulatedHubs:
     sample_log: Path | None = None
     instants: int | None = None
     noise: float | None = 0.0
+    imperfections: Path | None = None
 
     def process(self, config: Path) -> Process:
         """The simulator of the skin file `config`."""
@@ -61,6 +63,8 @@ class SimulatedHubs:
             arguments += ["--instants", str(self.instants)]
         if self.noise is not None:
             arguments += ["--noise", str(self.noise)]
+        if self.imperfections is not None:
+            arguments += ["--imperfections", str(self.imperfections)]
         module = "cube_tensor_driver.simulation.main"
         return Process("simulator", module, node=False, arguments=tuple(arguments))
 

@@ -17,11 +17,15 @@ Theory of Viscoelasticity (1982), 2.2.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.yaml import read_yaml
 from ..core.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -49,12 +53,50 @@ class Imperfections:
             raise ConfigError(f"gain_spread is {self.gain_spread!r}, allowed: 0 to below 1")
         if not 0 <= self.dead <= 1:
             raise ConfigError(f"dead is {self.dead!r}, allowed: a part of the pads from 0 to 1")
+        if self.seed < 0:
+            raise ConfigError(f"seed is {self.seed!r}, allowed: a whole number from 0 up")
         for size, time in self.creep:
             if not (size >= 0 and time > 0):
                 raise ConfigError(
                     f"a term of creep is {(size, time)!r}; give a size from 0 up and a time above "
                     "0 s"
                 )
+
+
+def read_imperfections(path: Path) -> Imperfections:
+    """A file with some of the fields of `Imperfections`, as YAML. ConfigError: it has another key
+    or a value that is none."""
+    data = read_yaml(path)
+    keys = tuple(Imperfections.__dataclass_fields__)
+    if not isinstance(data, dict) or not set(data) <= set(keys):
+        found = [key for key in data if key not in keys] if isinstance(data, dict) else data
+        raise ConfigError(
+            f"{path}: found {str(found)[:60]!r}, allowed: a table of {', '.join(keys)}"
+        )
+    for key, value in data.items():
+        if key == "creep":
+            fits = isinstance(value, list) and all(_is_pair(term) for term in value)
+        else:
+            fits = _is_number(value) and (key != "seed" or isinstance(value, int))
+        if not fits:
+            allowed = {"creep": "[[size, seconds], ...]", "seed": "a whole number"}
+            raise ConfigError(
+                f"{path}: {key}: found {str(value)[:60]!r}, allowed: {allowed.get(key, 'a number')}"
+            )
+    if "creep" in data:
+        data["creep"] = tuple((size, time) for size, time in data["creep"])
+    try:
+        return Imperfections(**data)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and type(value) is not bool and math.isfinite(value)
 
 
 class PadBehaviour:

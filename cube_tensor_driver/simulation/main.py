@@ -17,6 +17,7 @@ from ..config.skin import Skin, read_skin
 from ..config.yaml import read_yaml
 from ..core.errors import CubeError
 from .faults import parse_faults
+from .imperfections import read_imperfections
 from .load import AnyLoad, Load, default_script
 from .simulator import Simulator, StopSignal
 
@@ -37,6 +38,9 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument(
         "--drift", type=float, default=0.0, help="relative drift of the rest frequencies per second"
+    )
+    parser.add_argument(
+        "--imperfections", type=Path, help="what is wrong with the pads: YAML; docs/simulation.md"
     )
     parser.add_argument(
         "--log", type=Path, help="file for the log of what was sampled (JSON), written at the end"
@@ -77,6 +81,9 @@ def main(arguments: list[str] | None = None) -> int:
             options.ports,
             noise=options.noise,
             drift=options.drift,
+            imperfections=read_imperfections(options.imperfections)
+            if options.imperfections
+            else None,
             instants=options.instants,
             faults=faults,
             seed=options.seed,

@@ -24,6 +24,7 @@ from ..core.errors import ConfigError
 from .cubes import HubCubes, hub_cubes
 from .faults import Fault, HubSize
 from .hub import SimulatedHub
+from .imperfections import Imperfections
 from .injector import Injector, SimulatedLink
 from .line import Line, TcpLine
 from .load import Fields, LoadMemory
@@ -69,6 +70,7 @@ class Simulator:
         *,
         noise: float | None = 0.0,
         drift: float = 0.0,
+        imperfections: Imperfections | None = None,
         instants: int = 0,
         faults: Sequence[Fault] = (),
         seed: int = 0,
@@ -76,7 +78,7 @@ class Simulator:
     ) -> None:
         """ports: folder in which the ports appear, each under the name of its link.
 
-        noise, drift: of the pads, as in `SimulatedCubes`
+        noise, drift, imperfections: of the pads, as in `SimulatedCubes`
         instants: compute the load at so many times of its script beforehand and repeat them, one
             for each sample; 0: compute it as time goes on, with noise and drift
         faults: to carry out; seed: of what is random in them
@@ -92,7 +94,7 @@ class Simulator:
         self._links: list[PlayedLink] = []
         try:
             ports.mkdir(parents=True, exist_ok=True)
-            for carried in hub_cubes(skin, noise=noise, drift=drift):
+            for carried in hub_cubes(skin, noise=noise, drift=drift, imperfections=imperfections):
                 self._links.append(_connect(skin, carried, ports, tcp))
             sizes = {
                 link.name: asdict(HubSize(len(link.hub.cube_uids), link.hub.n_pads))

@@ -28,6 +28,7 @@ from ..plot.style import save
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.node import queue
+from ..simulation.imperfections import read_imperfections
 from ..simulation.load import AnyLoad, Load, default_script
 from ..simulation.load_verification import LoadVerification
 from ..simulation.mujoco_scene import MujocoLoad, scene_skin
@@ -50,6 +51,7 @@ def run_demo(
     mujoco: Path | None = None,
     rate: float | None = None,
     noise: float | None = None,
+    imperfections: Path | None = None,
     duration: float | None = None,
     headless: bool = False,
     view: bool = False,
@@ -63,6 +65,7 @@ def run_demo(
     mujoco: MuJoCo scene that takes the place of a load script; without `config` it names its skin
     rate: samples per second; None: the skin's, 100 where it has none
     noise: of the pads, relative to their frequencies; None: as the calibrations state
+    imperfections: file of what else is wrong with the pads; None: nothing
     duration: s to measure, after which figures are given; None: until Ctrl-C, without figures
     headless: without the live table
     view: show it in the browser too
@@ -79,10 +82,19 @@ def run_demo(
             skin = read_skin(path)
             rate = rate or skin.rate or RATE
             applied = _applied(skin, load, mujoco)
+            if imperfections is not None:
+                read_imperfections(imperfections)  # says in one line what is wrong with the file
             verification = LoadVerification(skin, applied) if duration else None
             log = folder / "log.json"
             ports = folder / "ports"
-            hubs = SimulatedHubs(ports, load=load, mujoco=mujoco, sample_log=log, noise=noise)
+            hubs = SimulatedHubs(
+                ports,
+                load=load,
+                mujoco=mujoco,
+                sample_log=log,
+                noise=noise,
+                imperfections=imperfections,
+            )
             processes = skin_processes(path, rate=rate, simulated=hubs)
             if view:
                 processes.append(VIEW)
