@@ -41,13 +41,18 @@ def test_skin_counts_what_was_sent(domain, tmp_path):
     path = tmp_path / "figures.json"
     # Pauses and a second floor are for figures only.
     code = f"""
-import functools, pathlib
+import functools, os, pathlib, sys
 from cube_tensor_driver.trials import bench
 bench.SETTLE_S = bench.DRAIN_S = 0.2
 bench._echo = functools.cache(bench._echo)
+os.environ["ROS_DOMAIN_ID"] = "77"
+domains, queue = set(), bench.queue
+bench.queue = lambda rate: domains.add(os.environ["ROS_DOMAIN_ID"]) or queue(rate)
 bench.bench_skin(
     cubes=3, rate=100.0, duration=0.6, publish_period=0.02, json_path=pathlib.Path({str(path)!r})
 )
+if domains & {{"77"}} or not domains or os.environ["ROS_DOMAIN_ID"] != "77":
+    sys.exit("the skins mix with those of domain 77")
 """
     command = [sys.executable, "-c", code]
     process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)

@@ -179,12 +179,15 @@ def test_echo_of_nothing_says_so_in_one_line(nobody, capfd):
 
 def test_topics_are_listed_with_rate_and_type(skin, capfd):
     assert main(["topics"]) == 0
-    lines = [line.split() for line in capfd.readouterr().out.splitlines()]
+    lines = [line.split(maxsplit=3) for line in capfd.readouterr().out.splitlines()]
     listed = {name: (float(rate), kind) for name, rate, _, kind in lines}
     assert listed["/info"] == (0, "cube_tensor_driver/msg/SkinInfo")
     rate, kind = listed["/stress"]
     assert 25 < rate < 75 and kind == "cube_tensor_driver/msg/SkinStress"
-    assert {"/cubes/c0/stress", "/cubes/c1/wrench", "/diagnostics"} <= listed.keys()
+    rate, kind = listed["/cubes/<name>/stress"]
+    assert 25 < rate < 75
+    assert kind == "cube_tensor_driver/msg/StressTensorStamped, 2 cubes: c0, c1"
+    assert {"/cubes/<name>/wrench", "/diagnostics"} <= listed.keys()
 
 
 def test_no_topics_is_said_in_one_line(nobody, capfd):

@@ -9,7 +9,8 @@ from .parser import Parser
 
 def arguments(parser: Parser) -> None:
     parser.epilog = (
-        "Listens for one second. Topics of single cubes are sent while somebody listens."
+        "Listens for one second. Topics of single cubes are sent while somebody listens; "
+        "of each kind it listens to the first cube's."
     )
 
 
@@ -20,5 +21,13 @@ def run(options: argparse.Namespace) -> int:
     width = max(len(topic.name) for topic in topics)
     for topic in topics:
         rate = "not installed here" if topic.rate is None else f"{topic.rate:.0f} Hz"
-        print(f"{topic.name:{width}}  {rate:>8}  {', '.join(topic.kinds)}")
+        print(f"{topic.name:{width}}  {rate:>8}  {', '.join(topic.kinds)}{_of(topic.cubes)}")
     return 0
+
+
+def _of(cubes: list[str]) -> str:
+    """Whose topics a line stands for."""
+    if not cubes:
+        return ""
+    names = ", ".join(cubes) if len(cubes) < 3 else f"{cubes[0]} … {cubes[-1]}"
+    return f", {len(cubes)} {'cubes' if len(cubes) > 1 else 'cube'}: {names}"
