@@ -311,6 +311,29 @@ except KeyboardInterrupt:
     assert done.stdout == "interrupted\n" and not done.stderr
 
 
+def test_control_c_ends_work_in_c():
+    """A lock that C code waits for without end, as a factorisation that no signal interrupts."""
+    code = """
+import ctypes, signal
+from cube_tensor_driver.terminal.interrupt import ends_at_once
+
+signal.signal(signal.SIGINT, lambda *_: None)  # also where the signal comes before the wait
+libc, lock = ctypes.CDLL(None), ctypes.create_string_buffer(64)
+with ends_at_once():
+    libc.pthread_mutex_lock(lock)
+    print("waiting", flush=True)
+    libc.pthread_mutex_lock(lock)
+"""
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        try:
+            assert process.stdout and process.stdout.readline() == "waiting\n"
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=20) == 130
+        finally:
+            process.kill()
+
+
 def test_an_interrupted_run_leaves_no_file(tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt

@@ -7,6 +7,7 @@ import pytest
 
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import fem
 from cube_tensor_driver.elastic.body import Body, make_mesh
 from cube_tensor_driver.elastic.influence import compute_influence
@@ -34,6 +35,30 @@ def test_reciprocity_gives_what_a_force_on_the_surface_does(influence):
         node = np.argmin(np.abs(influence.place[:, 0] - x[0, dof] * body.side / 2))
         given = influence.pads[:, node, component]
         assert np.abs(direct - given).max() < 1e-4 * np.abs(influence.pads).max()
+
+
+def test_reciprocity_in_space(monkeypatch):
+    """The same for 24 pads: forces on the plane y = 0, on a body without the mirror along x."""
+    monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),))
+    layer = Body(12e-3, 12e-3, 8e-3, ground=True, cube_young=float("inf"))
+    layout = LAYOUTS["cube"]
+    influence = compute_influence(layer, layout, 0)
+    body = replace(layer, x=1e-9)
+    solid = fem.make_solid(body, layout, make_mesh(body, layout, 0))
+    x, c = solid.positions, solid.component
+    on_line = (np.abs(x[2] - x[2].max()) < 1e-12) & (np.abs(x[1]) < 1e-9)
+    dofs = [
+        dof[np.argmin(np.abs(x[0, dof] - place))]
+        for place in (0, -2)
+        for dof in (np.flatnonzero(on_line & (c == 0)), np.flatnonzero(on_line & (c == 2)))
+    ]
+    forces = np.zeros((solid.basis.N, len(dofs)))
+    forces[dofs, range(len(dofs))] = 0.5  # half of the body carries half of a force on its mirror
+    direct = fem.pad_stresses(solid, layout, lambda p: forces if p[1] > 0 else 0 * forces)
+    for column, dof in zip(direct.T / (body.side / 2) ** 2, dofs, strict=True):
+        away = influence.place - x[:2, dof] * body.side / 2
+        given = influence.pads[:, np.argmin(np.hypot(*away.T)), c[dof]]
+        assert np.abs(column - given).max() < 1e-5 * np.abs(influence.pads).max()
 
 
 def test_pressure_everywhere_is_the_calibration_s_response_to_it():

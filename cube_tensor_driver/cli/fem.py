@@ -138,6 +138,7 @@ def run(options: argparse.Namespace) -> int:
     from ..core.symmetry import default_modes, find_structure, largest_symmetry
     from ..elastic.fem import compute_response
     from ..terminal.fem import show_response
+    from ..terminal.interrupt import ends_at_once
     from ..terminal.output import progress_bar
 
     layout = padded_layout(options)
@@ -148,7 +149,7 @@ def run(options: argparse.Namespace) -> int:
     body = body_of(options, layout)
 
     print(f"{describe(body, layout)}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
-    with progress_bar() as report:
+    with ends_at_once(), progress_bar() as report:
         result = compute_response(body, layout, symmetry, options.meshes, report)
     show_response(result)
     if options.json is not None:
