@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import BagError
 from ..elastic.surface import Contact
 from ..elastic.touches import TrackedContact
 from .message_codec import SECOND
@@ -58,6 +59,32 @@ def encode_traction(stamp_ns: int, frame_id: str, cloud: Array) -> bytes:
         data=data.reshape(-1).view(np.uint8),
         is_dense=True,
     )
+
+
+def decode_contacts(message: Any) -> list[Contact]:
+    """The contacts of a SkinContacts. ValueError: its arrays differ in length."""
+
+    def xyz(one: Any) -> Array:
+        return np.array([one.x, one.y, one.z])
+
+    vectors = message.position, message.normal, message.force
+    numbers = (getattr(message, name) for name in _NUMBERS)
+    return [
+        Contact(xyz(position), xyz(normal), xyz(force), *rest)
+        for position, normal, force, *rest in zip(*vectors, *numbers, strict=True)
+    ]
+
+
+def decode_traction(message: Any) -> Array:
+    """(M, 6) the cloud of a PointCloud2 from `traction`. BagError: it has other fields."""
+    names = tuple(field.name for field in message.fields)
+    if names != CLOUD or message.point_step != 4 * len(CLOUD):
+        raise BagError(
+            f"a point cloud has the fields {', '.join(names)}; those of the topic traction are "
+            f"{', '.join(CLOUD)}: listen to the topic of the node contacts"
+        )
+    points = np.frombuffer(bytes(message.data), "<f4")
+    return points.reshape(-1, len(CLOUD)).astype(float)
 
 
 def _column(contacts: Sequence[Any], name: str) -> Array:

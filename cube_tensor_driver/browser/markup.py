@@ -144,20 +144,28 @@ def legend(quantity: scene.Quantity, top: float) -> str:
     return box(bar + _div(TICKS_STYLE, ticks) + _div("text-align:center", meaning))
 
 
-def explanation(bar: float, stress: float, gradient: float) -> str:
+def explanation(bar: float, stress: float, gradient: float, sigma: float) -> str:
     """What is drawn, and how long arrows are. bar: length of the scale bar, m. stress, Pa, and
-    gradient, Pa/m: of arrows as long as the bar."""
+    gradient, Pa/m: of arrows as long as the bar. sigma: of the field's pressure, Pa; NaN: it is
+    interpolated."""
     long = f"as long as the bar ({1e3 * bar:g} mm):"
     lines = [
         ("#282c34", f"traction on the upper face, {long} <b>{stress / 1e3:.3g} kPa</b>"),
         ("#1969d2", f"pressure grows this way, {long} <b>{gradient / 1e6:.3g} kPa/mm</b>"),
     ]
     rows = "".join(f"<div><b style='color:{colour}'>➜</b> {text}</div>" for colour, text in lines)
+    rows += f"<div><b>▦</b> {_field(sigma)}</div>"
     rows += "<div><b>◯</b> the chosen cube; click another one to choose it</div>"
     rows += "<div>principal stresses: <b style='color:#d22828'>red</b> pulls, "
     rows += "<b style='color:#2850dc'>blue</b> pushes</div>"
     rows += "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>"
     return box(rows)
+
+
+def _field(sigma: float) -> str:
+    if np.isnan(sigma):
+        return "field: interpolated between the cubes, at their depth"
+    return f"field: on the surface, from the node <i>contacts</i>, ± {sigma / 1e3:.2g} kPa"
 
 
 def numbers(moment: Moment, cube: int, hertz: float) -> str:

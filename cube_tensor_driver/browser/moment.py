@@ -9,9 +9,28 @@ from numpy.typing import NDArray
 
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.scene import Newest
-from ..elastic.surface import Contact, Field, Surface
+from ..elastic.surface import Contact, Surface
 
 Array = NDArray[np.float64]
+
+
+class SurfaceField(NamedTuple):
+    """On the M points of a surface.
+
+    pressure, shear: (M,) Pa. sigma: standard deviation of the pressure, Pa; NaN: interpolated
+    between the cubes, at their depth.
+    """
+
+    pressure: Array
+    shear: Array
+    sigma: float = np.nan
+
+
+class Found(NamedTuple):
+    """What the node `contacts` found; None: it does not run, or not with the method inverse."""
+
+    contacts: list[Contact] | None = None
+    field: SurfaceField | None = None
 
 
 class Moment(NamedTuple):
@@ -26,20 +45,29 @@ class Moment(NamedTuple):
     residual: Array
     health: NDArray[np.integer]
     status: NDArray[np.integer]
-    field: Field
+    field: SurfaceField
     contacts: list[Contact]
 
     @classmethod
-    def of(cls, newest: Newest, health: NDArray[np.integer], surface: Surface) -> Moment:
-        """A copy: rows that come later do not change it."""
+    def of(
+        cls, newest: Newest, health: NDArray[np.integer], surface: Surface, found: Found
+    ) -> Moment:
+        """A copy: rows that come later do not change it. What was not found is interpolated."""
         values = newest.believed(health)
+        field, contacts = found.field, found.contacts
+        if field is None:
+            between = surface.field(values)
+            shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)
+            field = SurfaceField(between.pressure, shear)
+        if contacts is None:
+            contacts = surface.contacts(values, CONTACT_PRESSURE)
         return cls(
             values=values,
             residual=newest.residual.copy(),
             health=health,
             status=newest.status.copy(),
-            field=surface.field(values),
-            contacts=surface.contacts(values, CONTACT_PRESSURE),
+            field=field,
+            contacts=contacts,
         )
 
     @property

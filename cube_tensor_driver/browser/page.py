@@ -165,7 +165,7 @@ class Page:
         self._colours.write_legend(self._top)
         scene = self._scene
         self._meaning.content = markup.explanation(
-            scene.bar, scene.bar_stress(), scene.bar_gradient()
+            scene.bar, scene.bar_stress(), scene.bar_gradient(), moment.field.sigma
         )
         self._numbers.content = markup.numbers(moment, cube, rate[cube])
         self._health.content = markup.conditions(self._skin.names, moment.health, status.links)

@@ -65,17 +65,18 @@ class Colouring(NamedTuple):
     ) -> Colouring:
         """wanted: top of the range, SI; 0: it follows what there is, and `before`."""
         cubes = quantity.of(moment.values, moment.residual)
-        top = wanted or scene.automatic(quantity, cubes, before)
-        return cls(quantity, cubes, _field(moment, surface, quantity, cubes), top)
+        field = _field(moment, surface, quantity, cubes)
+        top = wanted or scene.automatic(quantity, np.concatenate([cubes, field]), before)
+        return cls(quantity, cubes, field, top)
 
 
 def _field(moment: Moment, surface: Surface, quantity: Quantity, cubes: Array) -> Array:
-    """(M,) on the points of the surface: interpolated if the quantity is pressure or shear,
+    """(M,) on the points of the surface: the field's if the quantity is pressure or shear,
     otherwise the value of the nearest cube."""
     if quantity is QUANTITIES["pressure"]:
         return moment.field.pressure
     if quantity is QUANTITIES["shear"]:
-        return np.linalg.norm(np.nan_to_num(moment.field.shear), axis=1)
+        return moment.field.shear
     return cubes[surface.cube]
 
 

@@ -35,6 +35,7 @@ from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S
+from .contacts_client import ContactsClient
 from .gate import HOSTS, check_host, guarded_server
 from .history import History, RowRate
 from .markup import PageStatus
@@ -77,6 +78,7 @@ class Viewer:
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
         self._replay = ReplayClient(self._node, self._services)
+        self._contacts = ContactsClient(self._node, self._guard)
         self._recorder = BagRecorder(recordings)
         self._links: dict[str, str] = {}
         self._pressed: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -188,7 +190,9 @@ class Viewer:
         # Without a browser there is nobody to draw for.
         if not self._pages:
             return
-        moment = Moment.of(followed.newest, health, shown.surface)
+        moment = Moment.of(
+            followed.newest, health, shown.surface, self._contacts.found(shown.surface)
+        )
         here = self._server.get_clients()
         for client_id, page in self._pages.items():
             if isinstance(page, Page) and client_id in here:

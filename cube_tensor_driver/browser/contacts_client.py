@@ -1,0 +1,79 @@
+"""What the node `contacts` finds, if it runs, for the page."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+from scipy.spatial import cKDTree
+from sensor_msgs.msg import PointCloud2
+
+from cube_tensor_driver.msg import SkinContacts
+
+from ..bags.contact_messages import decode_contacts, decode_traction
+from ..elastic.surface import Contact, Surface
+from ..ros.guard import CallbackGuard
+from .moment import Found, SurfaceField
+
+Array = NDArray[np.float64]
+
+NEIGHBOURS = 4
+"""Points of `traction` between which it is interpolated."""
+OLD_S = 1.0
+"""What came longer ago is not shown: the node has ended, or the skin says nothing."""
+
+
+class ContactsClient:
+    """Listens to `contacts` and `traction`."""
+
+    def __init__(self, node: Node, guard: CallbackGuard) -> None:
+        node.create_subscription(SkinContacts, "contacts", guard.wrap(self._receive_contacts), 2)
+        node.create_subscription(PointCloud2, "traction", guard.wrap(self._receive_traction), 2)
+        self._contacts: list[Contact] = []
+        self._cloud = np.empty((0, 6))
+        self._contacts_at = self._cloud_at = -np.inf
+        self._between: _Between | None = None
+
+    def found(self, surface: Surface) -> Found:
+        """What is not old: contacts, and the field on the points of a surface."""
+        oldest = time.monotonic() - OLD_S
+        contacts = self._contacts if self._contacts_at > oldest else None
+        if self._cloud_at < oldest or not len(self._cloud):
+            return Found(contacts)
+        places = self._cloud[:, :3]
+        if self._between is None or not self._between.fits(surface, places):
+            self._between = _Between(surface, places)
+        pressure, shear, sigma = self._between.values(self._cloud[:, 3:]).T
+        return Found(contacts, SurfaceField(pressure, shear, float(np.median(sigma))))
+
+    def _receive_contacts(self, message: SkinContacts) -> None:
+        self._contacts, self._contacts_at = decode_contacts(message), time.monotonic()
+
+    def _receive_traction(self, message: PointCloud2) -> None:
+        self._cloud, self._cloud_at = decode_traction(message), time.monotonic()
+
+
+class _Between:
+    """Interpolates on the points of a surface between the nearest of `places` (M, 3), which are
+    fewer, by their inverse squared distances."""
+
+    def __init__(self, surface: Surface, places: Array) -> None:
+        self._surface, self._places = surface, places
+        shape = len(surface.points), min(NEIGHBOURS, len(places))
+        # Its points are at the depth of the cubes.
+        up = surface.depth * surface.poses.rotation[surface.cube, :, 2]
+        distance, near = cKDTree(places).query(surface.points + up, shape[1])
+        self._near = near.reshape(shape)
+        weight = 1 / np.maximum(distance.reshape(shape), 1e-3 * surface.spacing) ** 2
+        self._weight = weight / weight.sum(axis=1, keepdims=True)
+
+    def fits(self, surface: Surface, places: Array) -> bool:
+        """Whether it was made for these."""
+        return surface is self._surface and np.array_equal(places, self._places)
+
+    def values(self, values: Array) -> Array:
+        """(points, C) of values (M, C) at the places."""
+        between: Array = np.einsum("pk,pkc->pc", self._weight, values[self._near])
+        return between

@@ -1,0 +1,88 @@
+"""What the page shows of the node `contacts`: its contacts, and its field on more points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="needs viser: pip install viser")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
+
+from cube_tensor_driver.bags.contact_messages import (
+    decode_traction,
+    encode_contacts,
+    encode_traction,
+)
+from cube_tensor_driver.browser import contacts_client
+from cube_tensor_driver.browser.contacts_client import ContactsClient
+from cube_tensor_driver.core.errors import BagError
+from cube_tensor_driver.core.scene import CubePoses
+from cube_tensor_driver.elastic.surface import Contact, Surface, patches
+from cube_tensor_driver.msg import SkinContacts
+
+DEPTH, PITCH = 0.004, 0.01
+
+
+class Node:
+    """Keeps the callbacks of a node, by topic, and wraps none."""
+
+    def __init__(self) -> None:
+        self.callbacks = {}
+
+    def create_subscription(self, kind, topic, callback, depth) -> None:
+        self.callbacks[topic] = callback
+
+    def wrap(self, callback):
+        return callback
+
+
+@pytest.fixture
+def poses() -> CubePoses:
+    x, y = np.meshgrid(PITCH * np.arange(4), PITCH * np.arange(4))
+    place = np.stack([x.ravel(), y.ravel(), np.zeros(16)], axis=1)
+    return CubePoses(place, np.tile(np.eye(3), (16, 1, 1)), np.full(16, 0.002))
+
+
+def cloud_of(poses: CubePoses) -> np.ndarray:
+    """As the node publishes it: 2 x 2 points on the surface above each cube."""
+    points = patches(poses, PITCH / 2, 2).reshape(-1, 3) + np.array([0, 0, DEPTH])
+    pressure = 1e3 + 1e5 * points[:, 0] - 2e5 * points[:, 1]
+    return np.column_stack([points, pressure, 0.3 * pressure, np.full(len(points), 70.0)])
+
+
+def test_field_and_contacts_of_the_node_are_shown_until_they_are_old(poses, monkeypatch):
+    node = Node()
+    client = ContactsClient(node, node)
+    surface = Surface(poses, DEPTH)
+    assert client.found(surface) == (None, None)
+    contact = Contact(np.ones(3), np.array([0, 0, 1.0]), np.arange(3.0), 2.0, 0.5, 1e-5, 1e-4, 0.1)
+    node.callbacks["contacts"](
+        deserialize_message(encode_contacts(5, "skin_base", [contact]), SkinContacts)
+    )
+    node.callbacks["traction"](
+        deserialize_message(encode_traction(5, "skin_base", cloud_of(poses)), PointCloud2)
+    )
+    (shown,), field = client.found(surface)
+    for name, value in contact._asdict().items():
+        np.testing.assert_array_equal(getattr(shown, name), value)
+    # The points lie a quarter of the way between those of the cloud. The weights 9 : 1.8 : 1.8 : 1
+    # of the inverse squares give 0.206 of the step instead: 0.044 of 500 + 1000 Pa too few.
+    x, y, _ = surface.points.T
+    inside = (x > 0) & (x < 3 * PITCH) & (y > 0) & (y < 3 * PITCH)
+    true = 1e3 + 1e5 * x - 2e5 * y
+    assert np.abs(field.pressure - true)[inside].max() < 0.05 * 1500
+    np.testing.assert_allclose(field.shear, 0.3 * field.pressure, rtol=1e-5)
+    assert field.sigma == 70.0
+    monkeypatch.setattr(contacts_client, "OLD_S", -1.0)
+    assert client.found(surface) == (None, None)
+
+
+def test_another_point_cloud_is_refused_in_words(poses):
+    data = encode_traction(5, "skin_base", cloud_of(poses))
+    message = deserialize_message(data, PointCloud2)
+    message.fields = message.fields[:3]
+    with pytest.raises(BagError, match="has the fields x, y, z; those of the topic traction are"):
+        decode_traction(message)
