@@ -7,6 +7,7 @@ pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS
+from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic.body import Body
 from cube_tensor_driver.research import paper
@@ -15,9 +16,11 @@ from cube_tensor_driver.research.layout_study import layout_study
 from cube_tensor_driver.research.material import Material
 from cube_tensor_driver.research.paper import dent, plates
 from cube_tensor_driver.research.rod import Rod
-from cube_tensor_driver.research.virtual_bench import VirtualBench
+from cube_tensor_driver.research.rod_parts import P_SHEAR, PARTS, split
+from cube_tensor_driver.research.virtual_bench import Step, VirtualBench
 
-BODY = Body()
+BODY, NARROW = Body(), Body(width=20e-3)
+NU = BODY.poisson
 
 
 @pytest.fixture
@@ -200,10 +203,53 @@ def test_prototype_signs():
     assert paper.prototype(frequency) == pytest.approx(np.array([[6.0, -2.0, 2.0]]))
 
 
-def test_rod_sweep_splits_the_signal(coarse):
-    table = paper.rod_sweep(Body(width=20e-3), places=(0.0, 2e-3))
-    assert np.allclose(np.array(table["shear"]) + table["crosstalk"], table["signal"])
-    assert abs(table["signal"][0]) < 1e-6 * abs(table["signal"][1])
+def test_a_rod_above_c2_raises_p_shear_only_with_c2_on_the_lower_face(coarse):
+    """C2's side is x > 0 on either face; P_grad rises with both, as in the paper's Fig. 8 (c)."""
+    pads = VirtualBench(NARROW, size=2.0).run([dent(NARROW, Rod(1e-3, 1e-3))]).pads
+    frequency = pad_frequency(pads, **paper.FOAM)
+    lower, upper = (
+        paper.prototype(frequency[:, face])[0] for face in (paper.ON_LOWER, paper.ON_UPPER)
+    )
+    assert lower.min() > 0
+    assert upper == pytest.approx(lower * [1, -1, 1])
+
+
+def test_the_parts_under_a_rod_sum_to_the_signal_of_the_bench(coarse):
+    """The parts know the field without the cube alone; a rod above the middle gives none."""
+    bench = VirtualBench(NARROW, size=1.0)
+    signal = P_SHEAR @ bench.pad_weights(bench.layout)
+    middle, beside = (dent(NARROW, Rod(1e-3, place)) for place in (0.0, 2e-3))
+    none, parts = (split(bench, step, [signal])[0] for step in (middle, beside))
+    assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([beside]).pads[0], rel=1e-6)
+    assert np.abs(none).max() < 1e-6 * np.abs(parts).max()
+
+
+@pytest.mark.parametrize(
+    ("part", "field"),
+    [
+        ("shear", lambda x, z: (z, 0 * x)),
+        ("normal", lambda x, z: (0.3 * x, z)),
+        ("gradients", lambda x, z: ((8 * NU - 6) * x * z, x**2 + z**2)),
+        ("second", lambda x, z: (x**3 - 3 * x * z**2, z**3 - 3 * z * x**2)),
+    ],
+)
+def test_a_field_of_one_order_has_one_part(monkeypatch, part, field):
+    """The whole surface is moved as the field says, which is in balance; V2 alone sees them all.
+
+    (x^3 - 3 x z^2, -3 x^2 z + z^3): no divergence, and both components are harmonic.
+    """
+    monkeypatch.setattr(benches, "CUBE_REFINEMENTS", 1)
+    half = np.array([NARROW.width, NARROW.height]) / 2
+
+    def moved(x):
+        outside = np.any(np.abs(x) > half[:, None] - 1e-9, axis=0)
+        return np.where(outside, 1e-4 * np.array(field(*(x / NARROW.side))), np.nan)
+
+    bench = VirtualBench(NARROW, size=1.0)
+    parts = split(bench, Step(moved), [bench.pad_weights(bench.layout)[1]])[0]
+    assert np.argmax(np.abs(parts)) == PARTS.index(part)
+    others = np.delete(parts, PARTS.index(part))
+    assert np.abs(others).max() < 5e-3 * np.abs(parts).max()
 
 
 def test_study_error_falls_with_the_square_of_the_side(monkeypatch):

@@ -25,7 +25,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import memory
-from cube_tensor_driver.research import paper, rod_shear
+from cube_tensor_driver.research import paper, rod_parts, rod_shear
 from cube_tensor_driver.research.layout_study import LayoutStudy
 from cube_tensor_driver.terminal.output import progress_bar
 
@@ -440,9 +440,10 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
 
     monkeypatch.setattr("cube_tensor_driver.terminal.output.progress_bar", bar)
     monkeypatch.setattr("cube_tensor_driver.plot.paper.experiments", one)
+    monkeypatch.setattr("cube_tensor_driver.research.virtual_bench.CUBE_REFINEMENTS", 0)
     monkeypatch.setattr(
-        "cube_tensor_driver.plot.paper.rod_sweep",
-        lambda progress: paper.rod_sweep(NARROW, places=(0.0, 2e-3), progress=progress),
+        "cube_tensor_driver.plot.paper.rod_parts",
+        lambda progress: rod_parts.rod_parts(NARROW, places=(2e-3,), progress=progress),
     )
     monkeypatch.setattr(
         "cube_tensor_driver.plot.paper.rod_shear",
@@ -455,19 +456,17 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
         "experiment_1_linear.png",
         "figure_4.png",
         "paper.json",
-        "rod_positions.png",
+        "rod_parts.png",
         "rod_shear.png",
     ]
-    assert json.loads((tmp_path / "p" / "paper.json").read_text())["rod positions"]["place"] == [
-        0.0,
-        2e-3,
-    ]
+    written = json.loads((tmp_path / "p" / "paper.json").read_text())
+    assert written["rod parts"]["sharp rod, strips"]["place"] == [2e-3]
     assert told == sorted(told) and told[0] == 0 and 0.8 < told[-1] <= 1  # one bar
 
 
 def _experiment() -> paper.Experiment:
     step = np.linspace(0, 1, 3)
-    rows = [np.outer(step, np.ones(n)) for n in (8, 4, 3, 7, 7)]
+    rows = [np.outer(step, np.ones(n)) for n in (8, 4, 3, 3, 7, 7)]
     return paper.Experiment("test", step, *rows)
 
 
@@ -523,15 +522,16 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
     pads = 1e-3 * np.array(found[f"{experiment['c']}, finite"]["pads"])[:, :4]
     both = pads @ np.array([[-1, 1, 1, -1], [1, -1, 1, -1]]).T
     said.append(" | ".join(f"{shear:.2f}, {grad:.2f}" for shear, grad in both[[3, 5, 7, 9, 11]]))
-    rods = found["rod positions"]
-    for place, *parts in zip(
-        *(rods[key] for key in ("place", "signal", "shear", "crosstalk")), strict=True
-    ):
-        if place:
-            numbers = [f"{part / 1e3 + 0.0:.1f}".replace("-0.0", "0.0") for part in parts]
-            said.append(
-                f"| {1e3 * place:g} | {' | '.join(numbers)} | {100 * parts[1] / parts[0]:.0f} % |"
-            )
+    for face, what in (("lower", "prototype"), ("upper", "upper")):
+        signals = [
+            ", ".join(f"{last(name, law, what, column):.2f}" for law in ("linear", "finite"))
+            for name, column in (("b", 1), ("c", 1), ("c", 2))
+        ]
+        said.append(f"| the {face} face | {' | '.join(signals)} |")
+    for rod in found["rod parts"].values():
+        for at, whole, parts in zip(rod["place"], rod["signal"], rod["parts"], strict=True):
+            shares = " | ".join(f"{round(100 * part / whole)}" for part in parts)
+            said.append(f"| {1e3 * at:g} | {whole / 1e3:.1f} | {shares} |")
     slab = read_calibration(ROOT / "config" / "calibration" / "planar_slab.yaml").response[:4]
     said += [
         ", ".join(f"{value:.3f}" for value in slab[:, column]) for column in (1, 3)
@@ -542,6 +542,6 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
         if place:
             numbers = " | ".join(f"{shear / 1e3:.1f}" for shear in shears)
             said.append(f"| {1e3 * place:g} | {numbers} |")
-    assert len(said) == 30
+    assert len(said) == 48
     for words in said:
         assert words in text, words

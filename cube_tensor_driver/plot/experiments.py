@@ -10,16 +10,20 @@ from matplotlib.figure import Figure
 
 from ..core.modes import PLANE
 from ..research.paper import Experiment
+from ..research.rod_parts import RodParts
 from ..research.rod_shear import RodShear
 from .style import curve_style, print_style, symbol
 
 PADS = tuple(f"$f_{number}$ of pad C{number}" for number in range(1, 5))
 SIGNALS = tuple(rf"$P_\mathrm{{{name}}}$" for name in ("normal", "shear", "grad"))
-_ROD_CURVES = {
-    "signal": "signal for shear",
-    "shear": "part that is the true local shear",
-    "crosstalk": "rest: cross-talk",
-}
+UPPER = "$P_\\mathrm{shear}$, C1 and C2\non the upper face"
+_PARTS = (
+    "uniform shear",
+    "uniform normal stresses",
+    "gradients",
+    "second derivatives",
+    "higher derivatives",
+)
 _RECOVERED = {
     "truth": "true, same rod without the cube",
     "same_load": "true, same pressure",
@@ -35,6 +39,7 @@ _SMALL = 1e-3
 def draw_experiment(result: Experiment, law: str) -> Figure:
     """Frequencies and P_normal, P_shear, P_grad as in Figs. 7 and 8, beside stress and gradient.
 
+    C1 and C2 are on the lower face; a dashed line is P_shear with both on the upper face.
     Stress and gradient are reconstructed from eight pads (full lines) or true (dashed).
     law: linear or finite, of the elastomer's model
     """
@@ -43,7 +48,10 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
     x = 1e3 * result.displacement
     _draw_columns(axes[0], x, result.frequency, PADS)
     axes[0].set(title="frequencies", ylabel="frequency / kHz")
-    _draw_columns(axes[1], x, result.prototype, SIGNALS)
+    for number, name in enumerate(SIGNALS):
+        style = curve_style(number) | {"linestyle": "-"}
+        axes[1].plot(x, result.prototype[:, number] / 1e3, label=name, **style)
+    axes[1].plot(x, result.upper[:, 1] / 1e3, label=UPPER, color="tab:red", linestyle="--")
     axes[1].set(title="prototype, eqs. 8 to 10", ylabel="signal / kHz")
     _draw_modes(axes[2], result, range(3), "stress", r"$\sigma$ / kPa")
     _draw_modes(axes[3], result, range(3, 7), "gradient", r"$d_0\,\partial\sigma$ / kPa")
@@ -83,19 +91,19 @@ def _draw_modes(axis: Any, result: Experiment, modes: range, title: str, label: 
 
 
 @print_style()
-def draw_rod_sweep(table: dict[str, list[float]]) -> Figure:
-    """The prototype's shear signal over rod positions, split into true shear and cross-talk."""
-    figure = Figure(figsize=(6, 3.6))
-    axis = figure.subplots()
-    place = 1e3 * np.array(table["place"])
-    for number, (key, label) in enumerate(_ROD_CURVES.items()):
-        axis.plot(place, np.array(table[key]) / 1e3, label=label, **curve_style(number))
-    axis.set(
-        title="Rod pressed 1 mm: signal for shear over its position, bonded bottom",
-        xlabel="distance of the rod's middle from the cube's / mm",
-        ylabel="$-v_1 + v_2 + v_3 - v_4$ / kPa",
-    )
-    axis.legend(handlelength=4)
+def draw_rod_parts(found: dict[str, RodParts]) -> Figure:
+    """The signal for shear over the rod's place and its parts, for strips on two kinds of rod."""
+    shown = {name: one for name, one in found.items() if name.endswith("strips")}
+    figure = Figure(figsize=(10, 3.8))
+    axes = figure.subplots(1, len(shown), sharey=True)
+    for axis, (name, one) in zip(axes, shown.items(), strict=True):
+        for number, values in enumerate((one.signal, *one.parts.T)):
+            label = ("signal", *_PARTS)[number]
+            axis.plot(1e3 * one.place, values / 1e3, label=label, **curve_style(number))
+        axis.set(title=name, xlabel="distance of the rod's middle from the cube's / mm")
+    axes[0].set_ylabel("$-v_1 + v_2 + v_3 - v_4$ / kPa")
+    axes[0].legend(handlelength=4)
+    figure.suptitle("Signal for shear and its parts; rod pressed 1 mm and held, bonded bottom")
     return figure
 
 
@@ -121,15 +129,17 @@ def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
     """P_normal, P_shear, P_grad over displacement, as the paper's Fig. 8 shows them."""
     figure = Figure(figsize=(9, 3.1))
     axes = figure.subplots(1, len(experiments))
-    values = 1e-3 * np.concatenate([experiment.prototype for experiment in experiments])
+    signals = [(experiment.prototype, experiment.upper) for experiment in experiments]
+    values = 1e-3 * np.concatenate([rows for both in signals for rows in both])
     margin = 0.05 * np.ptp(values)
     limits = (values.min() - margin, values.max() + margin)
     for axis, experiment in zip(axes, experiments, strict=True):
         x = 1e3 * experiment.displacement
         for values, name, style in zip(
-            experiment.prototype.T, SIGNALS, ("o-", "s--", "^:"), strict=True
+            experiment.prototype.T, SIGNALS, ("o-", "s-", "^:"), strict=True
         ):
             axis.plot(x, 1e-3 * values, style, color="black", mfc="white", ms=4, label=name)
+        axis.plot(x, 1e-3 * experiment.upper[:, 1], color="black", lw=1, dashes=(2, 2), label=UPPER)
         axis.set(title=experiment.name, xlabel="displacement / mm", ylim=limits)
         axis.title.set_fontsize(8)
     axes[0].set_ylabel(r"signal $\sum \pm\Delta f_i$ / kHz")

@@ -6,17 +6,18 @@ from pathlib import Path
 
 from ..config.output_files import write_json
 from ..elastic.fem import Progress
-from ..research.paper import Experiment, experiments, figure_4, rod_sweep
-from ..research.rod_shear import rod_shear
+from ..research.paper import Experiment, experiments, figure_4
+from ..research.rod_parts import RodParts, rod_parts
+from ..research.rod_shear import RodShear, rod_shear
 from .deformation import draw_figure_4
-from .experiments import draw_experiment, draw_rod_shear, draw_rod_sweep
+from .experiments import draw_experiment, draw_rod_parts, draw_rod_shear
 from .style import save
 
 BEGIN_END = {
-    "linear": (0.01, 0.10),
-    "finite": (0.10, 0.82),
-    "rod": (0.82, 0.85),
-    "shear": (0.85, 1.0),
+    "linear": (0.01, 0.19),
+    "finite": (0.19, 0.70),
+    "rod": (0.70, 0.83),
+    "shear": (0.83, 1.0),
 }
 """When the parts begin and end, as measured parts of the whole time; before them comes Fig. 4."""
 
@@ -34,14 +35,14 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
             written.append(folder / f"experiment_{number}_{law}.png")
             save(draw_experiment(result, law), written[-1])
             numbers[f"{result.name}, {law}"] = _numbers(result)
-    table = rod_sweep(progress=_part(report, "rod"))
-    written.append(folder / "rod_positions.png")
-    save(draw_rod_sweep(table), written[-1])
-    numbers["rod positions"] = table
+    parts = rod_parts(progress=_part(report, "rod"))
+    written.append(folder / "rod_parts.png")
+    save(draw_rod_parts(parts), written[-1])
+    numbers["rod parts"] = {name: _lists(one) for name, one in parts.items()}
     recovered = rod_shear(progress=_part(report, "shear"))
     written.append(folder / "rod_shear.png")
     save(draw_rod_shear(recovered), written[-1])
-    numbers["rod shear"] = {name: column.tolist() for name, column in vars(recovered).items()}
+    numbers["rod shear"] = _lists(recovered)
     written.append(folder / "paper.json")
     write_json(written[-1], numbers)
     return written
@@ -57,6 +58,10 @@ def _part(report: Progress, name: str) -> Progress:
     return report_part
 
 
+def _lists(table: RodParts | RodShear) -> dict[str, object]:
+    return {name: column.tolist() for name, column in vars(table).items()}
+
+
 def _numbers(result: Experiment) -> dict[str, object]:
-    names = ("displacement", "prototype", "pads", "recovered", "truth")
+    names = ("displacement", "prototype", "upper", "pads", "recovered", "truth")
     return {name: getattr(result, name).tolist() for name in names}

@@ -1,8 +1,10 @@
 """The source paper's section 3 (Fig. 4) and section 4 (Figs. 7 and 8) on the virtual bench.
 
-Numbers only; plot/experiments.py and plot/deformation.py draw them. The pads are the paper's
-prototype, C1 .. C4 = V1 .. V4. The paper does not give the modulus of their foam: FOAM is ours,
-stiff enough that no pad is crushed at 27 % compression.
+Numbers only; plot/experiments.py and plot/deformation.py draw them. The paper does not say on which
+faces the prototype's pads C1 .. C4 are. Here C1 and C2 are on the lower face: then P_shear and
+P_grad grow in its experiments as they do in the paper. With C1 and C2 on the upper face P_shear has
+the other sign, and nothing else changes. The paper does not give the modulus of the pads' foam:
+FOAM is ours, stiff enough that no pad is crushed at 27 % compression.
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ Array = NDArray[np.float64]
 FOAM = {"rest_frequency": REST_FREQUENCY, "beta": BETA, "modulus": 3e6}
 MODE_AMPLITUDE = 1e4
 """Of each mode in the pictures of deformation, Pa."""
+ON_LOWER, ON_UPPER = [2, 3, 0, 1], [0, 1, 2, 3]
+"""Columns of V1 .. V8 that are C1 .. C4, with C1 and C2 on the lower or on the upper face."""
 # Signs of P_shear and P_grad, the paper's eqs. 9 and 10.
 _SHEAR = np.array([-1.0, 1.0, 1.0, -1.0])
 _GRAD = np.array([1.0, -1.0, 1.0, -1.0])
@@ -40,8 +44,8 @@ class Experiment:
     """One experiment of section 4, a row per step.
 
     displacement: (n,) m
-    pads: (n, 8) Pa; frequency: (n, 4) Hz of C1 .. C4
-    prototype: (n, 3) P_normal, P_shear, P_grad, Hz
+    pads: (n, 8) Pa; frequency: (n, 4) Hz of C1 .. C4, with C1 and C2 on the lower face
+    prototype: (n, 3) P_normal, P_shear, P_grad, Hz; upper: the same, C1 and C2 on the upper face
     recovered, truth: (n, 7) plane modes in Pa, from all eight pads, and of the body without a cube
     """
 
@@ -50,6 +54,7 @@ class Experiment:
     pads: Array
     frequency: Array
     prototype: Array
+    upper: Array
     recovered: Array
     truth: Array
 
@@ -132,21 +137,22 @@ def _experiment(
 ) -> Experiment:
     with_cube = VirtualBench(body, finite=finite).run(protocol.steps, report)
     without = VirtualBench(body, cube=False, finite=finite).run(protocol.steps, report)
-    frequency = pad_frequency(with_cube.pads[:, :4], **FOAM)
+    frequency = pad_frequency(with_cube.pads, **FOAM)
     recover = make_estimator(calibration.matrix, np.ones(8), PLANE, targets=np.eye(7)).matrix
     return Experiment(
         name=protocol.name,
         displacement=protocol.displacement,
         pads=with_cube.pads,
-        frequency=frequency,
-        prototype=prototype(frequency),
+        frequency=frequency[:, ON_LOWER],
+        prototype=prototype(frequency[:, ON_LOWER]),
+        upper=prototype(frequency[:, ON_UPPER]),
         recovered=with_cube.pads @ recover.T,
         truth=without.state,
     )
 
 
 def prototype(frequency: Array) -> Array:
-    """P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4): eqs. 8 to 10 as printed."""
+    """P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4) of C1 .. C4, eqs. 8 to 10."""
     change = frequency - FOAM["rest_frequency"]
     return np.stack([-change.sum(axis=1), change @ _SHEAR, change @ _GRAD], axis=1)
 
@@ -184,40 +190,6 @@ def _on_bottom(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
     if bonded:
         moved[0, bottom] = sheared
     return moved
-
-
-def rod_sweep(
-    body: Body | None = None,
-    places: Sequence[float] = tuple(np.arange(9) * 1e-3),
-    pressed: float = 1e-3,
-    progress: Progress | None = None,
-) -> dict[str, list[float]]:
-    """How much of the prototype's shear signal under a rod is shear; linear body, bonded bottom.
-
-    places: of the rod along x, m. Returns columns, a row per place:
-    signal: -v1 + v2 + v3 - v4, Pa
-    shear: what the true local sigma_zx would give, 4 (c+d) sigma_zx, Pa
-    crosstalk: the rest, which comes of how the stress varies over the cube and of the plate that
-    holds the body, Pa
-    true_zx: the true local sigma_zx, Pa
-    """
-    body = body or Body()
-    with_cube, without = VirtualBench(body), VirtualBench(body, cube=False)
-    response = compute_response(body, LAYOUTS["planar"], "slab", meshes=1).matrix
-    shear_response = response[:4, PLANE.names.index("zx")]
-    columns = ("place", "signal", "shear", "crosstalk", "true_zx")
-    table: dict[str, list[float]] = {name: [] for name in columns}
-    for number, place in enumerate(places):
-        if progress is not None:
-            progress(number, len(places), f"rod at {1e3 * place:g} mm")
-        step = dent(body, Rod(pressed, place))
-        pads = with_cube.run([step]).pads[0, :4]
-        zx = float(without.run([step]).state[0, 1])
-        signal, shear = float(_SHEAR @ pads), float(_SHEAR @ shear_response * zx)
-        row = (float(place), signal, shear, signal - shear, zx)
-        for name, value in zip(columns, row, strict=True):
-            table[name].append(value)
-    return table
 
 
 def figure_4(body: Body | None = None) -> dict[str, Deformation]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 import skfem
 from numpy.typing import NDArray
 
@@ -23,6 +24,8 @@ _STIFFNESS = 300.0
 """k over Young's modulus, per d0: a pressure of three times E pushes in by a hundredth of d0."""
 _ONSET = 0.001
 """Length over which the contact sets in, d0."""
+_SAME = 1e-9
+"""Displacements that differ by less are the same, d0."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,16 @@ class RodContact:
         normal = self._stiffness * (dp**2 + p * ddp)
         bending = -self._stiffness * p * dp * curvature * curved
         return _push_change.assemble(self._facets, normal=normal, slope=slope, bending=bending)
+
+    def secant(self, u: Array, v: Array) -> sp.csr_matrix:
+        """Sparse (dofs, dofs) S with S (u - v) = force(u) - force(v), for linear theory."""
+        (p, dp, ddp, *_), (q, dq, *_) = self._penetration(u), self._penetration(v)
+        change = np.asarray(self._facets.interpolate(u - v))[1]
+        moved = np.abs(change) > _SAME
+        slope = (p * dp - q * dq) / np.where(moved, change, 1.0)
+        normal = self._stiffness * np.where(moved, slope, dp**2 + p * ddp)
+        none = np.zeros_like(normal)
+        return _push_change.assemble(self._facets, normal=normal, slope=none, bending=none)
 
     def _penetration(self, u: Array) -> tuple[Array, Array, Array, Array, Array]:
         """p, dp/dg, d²p/dg², dh/dx and d²h/dx² at the quadrature points."""

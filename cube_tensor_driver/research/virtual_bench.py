@@ -8,6 +8,7 @@ rod (rod.py), in steps of the load. No step may turn an element inside out.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -117,6 +118,8 @@ class VirtualBench:
     cube: False replaces the cube by elastomer; finite: True is the neo-Hookean body
     layout: of the pads, by default the planar one
     size: the longest side of an element away from the cube, in d0; below the top it is half of that
+
+    section: the finite elements; in_cube: (elements,) those in the cube's place
     """
 
     def __init__(
@@ -134,9 +137,9 @@ class VirtualBench:
         self._half_side = body.side / 2
         mesh = _bench_mesh(body, self.layout, cube, size)
         check_memory(mesh, _BYTES_PER_CORNER)
-        self._in_cube = np.all(np.abs(mesh.p[:, mesh.t].mean(axis=1)) < 1.0, axis=0)
+        self.in_cube = np.all(np.abs(mesh.p[:, mesh.t].mean(axis=1)) < 1.0, axis=0)
         lam, mu = lame(body.young, body.poisson, body.plane)
-        stiffness = np.where(self._in_cube & cube, _CUBE_STIFFNESS, 1.0)[:, None]
+        stiffness = np.where(self.in_cube & cube, _CUBE_STIFFNESS, 1.0)[:, None]
         self.section = Section(mesh, Material(lam * stiffness, mu * stiffness, finite))
         top = body.height / 2 / self._half_side
         self._top, bottom = self._horizontal(top), self._horizontal(-top)
@@ -183,6 +186,42 @@ class VirtualBench:
         force = self.rod_contact(step.rod).force(u)
         dofs = np.flatnonzero((force != 0) & (self.section.component == 1))
         return self._half_side * self.section.basis.doflocs[0, dofs], self._half_side * force[dofs]
+
+    def pad_weights(self, layout: Layout, angle: float = 0.0) -> Array:
+        """(P, dofs): nodal forces of the elastomer on a cube at an angle to pads' mean stresses.
+
+        layout: its pads end where elements of this bench's mesh end
+        """
+        c, s = np.cos(angle), np.sin(angle)
+        axes = np.array([[c, s], [-s, c]])
+        x, component = self.section.basis.doflocs, self.section.component
+        half = layout.pad_size / 2
+        weights = np.zeros((layout.n_pads, self.section.basis.N))
+        positions, normals = layout.positions[:, [0, 2]], layout.normals[:, [0, 2]]
+        for pad, (position, normal) in enumerate(zip(positions, normals, strict=True)):
+            axis = 0 if normal[0] else 1
+            start, stop = position[1 - axis] - half, position[1 - axis] + half
+            on_face = np.abs(x[axis] - normal[axis]) < 1e-9
+            on_face &= np.abs(x[1 - axis]) < 1 + 1e-9
+            for along in (0, 1):
+                face = np.flatnonzero(on_face & (component == along))
+                face = face[np.argsort(x[1 - axis, face])]
+                integral = face_weights(x[1 - axis, face], 2, start, stop)
+                weights[pad, face] = axes[axis, along] * normal[axis] * integral / (2 * half)
+        return weights
+
+    def without_cube(self) -> VirtualBench:
+        """A linear bench of the same mesh, with elastomer in the cube's place."""
+        bench = copy(self)
+        material = self.section.material
+        lam, mu = (np.full_like(one, one.min()) for one in (material.lam, material.mu))
+        bench.section = Section(self.section.mesh, Material(lam, mu, False))
+        return bench
+
+    def free(self, step: Step) -> NDArray[np.int64]:
+        """Numbers of the unknowns that a step from rest does not prescribe."""
+        rest = np.zeros(self.section.basis.N)
+        return np.flatnonzero(np.isnan(self._task(step, rest).constraints.prescribed))
 
     def rod_contact(self, rod: Rod) -> RodContact:
         """A rod's contact with the top."""
@@ -293,31 +332,9 @@ class VirtualBench:
         """
         section = self.section
         stress = section.material.stress(section.deformation(u))
-        force = -section.forces(stress, ~self._in_cube)
+        force = -section.forces(stress, ~self.in_cube)
         angle = self._rotation(u) if self.finite else 0.0  # linear: no second-order terms
-        c, s = np.cos(angle), np.sin(angle)
-        axes = np.array([[c, s], [-s, c]])
-        half = self.layout.pad_size / 2
-        means = np.zeros(self.layout.n_pads)
-        positions, normals = self.layout.positions[:, [0, 2]], self.layout.normals[:, [0, 2]]
-        for pad, (position, normal) in enumerate(zip(positions, normals, strict=True)):
-            axis = 0 if normal[0] else 1
-            along, forces = self._face_forces(force, axis, normal[axis])
-            normal_forces = axes[axis] @ forces * normal[axis]
-            start, stop = position[1 - axis] - half, position[1 - axis] + half
-            means[pad] = face_weights(along, 2, start, stop) @ normal_forces / (2 * half)
-        return means
-
-    def _face_forces(self, force: Array, axis: int, sign: float) -> tuple[Array, Array]:
-        """Nodes (n,) along a face of the cube, and their forces (2, n) of both components."""
-        x, component = self.section.basis.doflocs, self.section.component
-        on_face = (np.abs(x[axis] - sign) < 1e-9) & (np.abs(x[1 - axis]) < 1 + 1e-9)
-        face = np.flatnonzero(on_face)
-        rounded = np.round(x[1 - axis, face], 12)
-        along = np.unique(rounded)
-        forces = np.zeros((2, len(along)))
-        forces[component[face], np.searchsorted(along, rounded)] = force[face]
-        return along, forces
+        return self.pad_weights(self.layout, angle) @ force
 
     def _state(self, u: Array) -> Array:
         """The seven plane modes fitted to the Cauchy stress within d0/2 of the centre."""
