@@ -58,12 +58,13 @@ def test_field_and_contacts_of_the_node_are_shown_until_they_are_old(poses, monk
     client = ContactsClient(node, node)
     surface = Surface(poses, DEPTH)
     assert client.found(surface) == (None, None)
+    cloud = np.vstack([np.full(6, np.nan), cloud_of(poses)])
     contact = Contact(np.ones(3), np.array([0, 0, 1.0]), np.arange(3.0), 2.0, 0.5, 1e-5, 1e-4, 0.1)
     node.callbacks["contacts"](
         deserialize_message(encode_contacts(5, "skin_base", [contact]), SkinContacts)
     )
     node.callbacks["traction"](
-        deserialize_message(encode_traction(5, "skin_base", cloud_of(poses)), PointCloud2)
+        deserialize_message(encode_traction(5, "skin_base", cloud), PointCloud2)
     )
     (shown,), field = client.found(surface)
     for name, value in contact._asdict().items():

@@ -52,7 +52,8 @@ class ContactsClient:
         self._contacts, self._contacts_at = decode_contacts(message), time.monotonic()
 
     def _receive_traction(self, message: PointCloud2) -> None:
-        self._cloud, self._cloud_at = decode_traction(message), time.monotonic()
+        cloud = decode_traction(message)
+        self._cloud, self._cloud_at = cloud[np.isfinite(cloud).all(axis=1)], time.monotonic()
 
 
 class _Between:
