@@ -94,7 +94,7 @@ def _draw_modes(axis: Any, result: Experiment, modes: range, title: str, label: 
 def draw_rod_parts(found: dict[str, RodParts]) -> Figure:
     """The signal for shear over the rod's place and its parts, for strips on two kinds of rod."""
     shown = {name: one for name, one in found.items() if name.endswith("strips")}
-    figure = Figure(figsize=(10, 3.8))
+    figure = Figure(figsize=(10, 4.4))
     axes = figure.subplots(1, len(shown), sharey=True)
     for axis, (name, one) in zip(axes, shown.items(), strict=True):
         for number, values in enumerate((one.signal, *one.parts.T)):
@@ -102,7 +102,8 @@ def draw_rod_parts(found: dict[str, RodParts]) -> Figure:
             axis.plot(1e3 * one.place, values / 1e3, label=label, **curve_style(number))
         axis.set(title=name, xlabel="distance of the rod's middle from the cube's / mm")
     axes[0].set_ylabel("$-v_1 + v_2 + v_3 - v_4$ / kPa")
-    axes[0].legend(handlelength=4)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, handlelength=4, ncols=3, loc="outside lower center")
     figure.suptitle("Signal for shear and its parts; rod pressed 1 mm and held, bonded bottom")
     return figure
 
