@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from ..core.modes import COMPONENTS
-from .inverse import AMPLITUDE, MODEL_ERROR, SurfaceInverse
+from .inverse import AMPLITUDE, SurfaceInverse
 from .kernels import SIZES
 
 Array = NDArray[np.float64]
@@ -36,9 +36,10 @@ USUAL_SIZE, SIZE_SPREAD = 0.8, 1.0
 is measured."""
 GREATEST_FORCE = 1e3
 """Prior standard deviation of a force, N: none that matters, so that no force is possible, too."""
-OF_OTHERS = 1.3
-"""Part of the mean size of a cube's components that has the model's error in each of them, too: an
-error of a pad's gain turns the great ones into the small ones."""
+GAIN_ERROR = 0.0125
+"""Of every pad over the rms of its cube's pads. Noise that is the same on all pads has the
+covariance N of a cube's components; so such an error has GAIN_ERROR^2 y' N^-1 y / n times that. The
+pads of which a cube is pressed most have more than the mean: hence more than 0.01."""
 SHAPE = np.array([0.7, 0.7, 1.0])
 """Standard deviation of a contact's shapes. Two balls that touch each other have 1.1 in length, a
 rigid flat punch has 1 in flatness."""
@@ -82,14 +83,16 @@ class Scan:
         known = np.isfinite(values) & inverse.observed[cubes]
         self._known = known.ravel()
         filled = np.where(known, values, 0.0)
-        rms = np.sqrt((filled**2).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
-        error = MODEL_ERROR**2 * (filled**2 + (OF_OTHERS * rms[:, None]) ** 2)
+        both_known = known[:, :, None] & known[:, None, :]
+        pads = np.where(both_known, inverse.noise[cubes], 0.0)
+        whole = pads + np.eye(known.shape[1]) * ~known[:, None, :]
+        size = (filled * np.linalg.solve(whole, filled[..., None])[..., 0]).sum(axis=1)
+        size /= np.maximum(known.sum(axis=1), 1)
         n, width = values.shape
         one = np.arange(n)
         blocks = np.zeros((n, width, n, width))
-        blocks[one, :, one, :] = np.nan_to_num(inverse.noise[cubes])
+        blocks[one, :, one, :] = pads * (1 + GAIN_ERROR**2 * size)[:, None, None]
         noise: Array = blocks.reshape(n * width, -1)
-        noise[np.diag_indices(n * width)] += error.ravel()
         both = np.ix_(self._known, self._known)
         self.y, self.noise = filled.ravel()[self._known], noise[both]
         self.prior = prior[both]
