@@ -169,7 +169,7 @@ def test_a_stopped_oscillator_and_pads_that_a_cube_does_not_have_are_nan(tmp_pat
 
 def test_the_program_of_the_page_runs(tmp_path, monkeypatch, capsys):
     page = (ROOT / "docs" / "simulation.md").read_text()
-    program, imperfect, _ = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    program, imperfect, *_ = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     shutil.copy(FILE, tmp_path / "skin.yaml")
     monkeypatch.chdir(tmp_path)
     exec(program + imperfect, {})
