@@ -56,7 +56,7 @@ def traction_table(rows: Mapping[str, Sequence[Errors]]) -> str:
         for one in all_widths:
             cells = [
                 " / ".join(f"{value:.3f}" for value in one.field),
-                " / ".join(f"{value:.3f}" for value in one.force),
+                " / ".join(f"{100 * value:.1f} %" for value in one.force),
                 " / ".join(f"{1e3 * value:.2f}" for value in one.place),
                 *(" / ".join(f"{value:.1f}" for value in column) for column in one.seen.T),
             ]
