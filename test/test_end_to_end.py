@@ -90,7 +90,8 @@ def test_ended_demo_leaves_no_process(domain, number):
     if number == signal.SIGINT:
         assert time.monotonic() - start < 2.0  # what the README promises
         assert process.returncode == 0
-    _, left = psutil.wait_procs(children, timeout=0 if number == signal.SIGINT else 5)
+    # Killed, it ends none of its children: each ends by itself, which takes seconds under load.
+    _, left = psutil.wait_procs(children, timeout=0 if number == signal.SIGINT else 15)
     for child in left:
         child.kill()
     assert not left

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from ..core.errors import ConfigError
-from ..processes.children import END_WITH_PARENT
+from ..processes.children import end_with_parent
 
 END_S = 10.0
 """How long the recorder may take to finish its file."""
@@ -40,7 +40,7 @@ class BagRecorder:
             ) from None
         self.path = self._folder / time.strftime("skin_%Y%m%d_%H%M%S")
         command = [
-            *END_WITH_PARENT,
+            *end_with_parent(),
             sys.executable,
             "-m",
             "cube_tensor_driver.cli",

@@ -21,9 +21,8 @@ END_S = 1.2
 POLL_S = 0.05
 LOG_LINES = 10
 """Of a process that ended are part of the error message."""
-END_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
-"""In front of a command: the kernel ends it when the thread that started it is gone, even by
-SIGKILL. setpriv is part of util-linux."""
+HAS_SETPRIV = shutil.which("setpriv") is not None
+"""Part of util-linux."""
 
 
 class ChildError(CubeError):
@@ -53,7 +52,7 @@ class Children:
         So Ctrl-C does not reach it directly: it is ended by `end`, after what depends on it.
         """
         program = [process.program] if process.program else [sys.executable, "-m", process.module]
-        command = [*END_WITH_PARENT, *program, *process.arguments]
+        command = [*end_with_parent(), *program, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]
         with self._log_file(process.executable).open("ab") as log:
@@ -144,6 +143,15 @@ def ros_arguments(parameters: dict[str, Value]) -> list[str]:
         written = f"'{value}'" if isinstance(value, str) else str(value).lower()
         words += ["-p", f"{name}:={written}"]
     return words
+
+
+def end_with_parent() -> list[str]:
+    """In front of a command: the kernel ends it when the thread that started it is gone, even by
+    SIGKILL; and it does not start if this process was gone before the kernel was asked."""
+    if not HAS_SETPRIV:
+        return []
+    is_there = '[ "$PPID" = "$0" ] && exec "$@"'
+    return ["setpriv", "--pdeathsig", "TERM", "sh", "-c", is_there, str(os.getpid())]
 
 
 def _signal(process: subprocess.Popen[bytes], number: int) -> None:

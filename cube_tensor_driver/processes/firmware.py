@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 from ..core.errors import CubeError
-from .children import END_WITH_PARENT
+from .children import end_with_parent
 
 PACKAGES = {
     "make": "make",
@@ -74,7 +74,7 @@ class Emulator:
         with _listening(self._address) as host, _listening(ANY_ADDRESS) as pads:
             self.port = "socket://{}:{}".format(*host.getsockname())
             command = [
-                *END_WITH_PARENT,
+                *end_with_parent(),
                 "qemu-system-arm",
                 "-M",
                 MACHINE,
