@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-9
 """Of the correction, over the largest displacement."""
-_ITERATIONS = 30
+_ITERATIONS = 60
+"""A deep rod's tries converge at 32 to 54; given up at 30, they cost twice the corrections."""
 _LONGEST = 0.3
 """Largest correction of any unknown in one step."""
 _SHORTENINGS = 7
