@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import itertools
 import os
 import signal
@@ -13,7 +14,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import pytest
@@ -26,8 +26,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parents[1]
-# Any files that are there: it is their locks that count.
-DOOR, LOCK = ROOT / "pyproject.toml", ROOT / "package.xml"
 # Domains up to 101 leave the ports of the system alone.
 _domains = itertools.cycle(range(1, 101))
 
@@ -42,44 +40,58 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> object:
-    """No test of another worker runs beside one that is marked `alone`."""
+    """Beside a test that is marked `alone` one processor has no other test."""
     if not hasattr(item.config, "workerinput"):
         return (yield)
-    _quiet.acquire(is_alone(item))
+    turns = _turns(item.config)
+    turns.take(is_alone(item))
     try:
         return (yield)
     finally:
         if not (is_alone(item) and nextitem is not None and is_alone(nextitem)):
-            _quiet.release()
+            turns.give()
 
 
 def is_alone(item: pytest.Item) -> bool:
     return item.get_closest_marker("alone") is not None
 
 
-class _Quiet:
-    """A lock of all workers of a checkout: many share it, or one has it alone.
+class _Turns:
+    """The turns of a worker to run tests.
 
-    Who wants it holds the door until the lock is his: so nobody overtakes whoever wants it alone.
+    For a test it holds its own byte of a file; for one that runs alone also those of all other
+    workers but as many as there are other processors. Who wants a byte holds its door until the
+    byte is his: so nobody overtakes whoever waits for the byte of another.
     """
 
-    def __init__(self) -> None:
-        self._lock: IO[str] | None = None
+    def __init__(self, number: int, count: int, run: str) -> None:
+        """number, count: of this worker and of all; run: what names this run of the suite."""
+        others = [one for one in range(count) if one != number]
+        self._count = count
+        self._mine = number
+        self._paused = others[len(os.sched_getaffinity(0)) - 1 :]
+        # It stays open, or its locks would go.
+        self._file = (Path(tempfile.gettempdir()) / f"cube_tensor_turns_{run}").open("w")
+        self._held: set[int] = set()
 
-    def acquire(self, alone: bool) -> None:
-        if self._lock is None:
-            with DOOR.open() as door:
-                fcntl.flock(door, fcntl.LOCK_EX)
-                self._lock = LOCK.open()
-                fcntl.flock(self._lock, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+    def take(self, alone: bool) -> None:
+        for byte in {self._mine, *(self._paused if alone else ())} - self._held:
+            self._held.add(byte)
+            door = self._count + byte
+            fcntl.lockf(self._file, fcntl.LOCK_EX, 1, door)
+            fcntl.lockf(self._file, fcntl.LOCK_EX, 1, byte)
+            fcntl.lockf(self._file, fcntl.LOCK_UN, 1, door)
 
-    def release(self) -> None:
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+    def give(self) -> None:
+        fcntl.lockf(self._file, fcntl.LOCK_UN)
+        self._held.clear()
 
 
-_quiet = _Quiet()
+@functools.cache
+def _turns(config: pytest.Config) -> _Turns:
+    worker = config.workerinput
+    number = int(worker["workerid"].removeprefix("gw"))
+    return _Turns(number, worker["workercount"], worker["testrunuid"])
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from datetime import datetime, timezone
 from fnmatch import fnmatch
 from pathlib import Path
 from xml.etree import ElementTree
@@ -33,6 +34,8 @@ from std_srvs.srv import Trigger
 from conftest import ROOT, decoded
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.tare import write_tare
+from cube_tensor_driver.config.yaml import read_yaml, write_yaml
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.device.protocol import Hello, Sample, encode
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
@@ -168,6 +171,29 @@ def test_tare_is_refused_taken_told_kept_and_undone(stage):
     stage.wait(lambda: stage.infos[-1].cubes[0].rest_frequency[0] == 100e3)
     assert not list((stage.folder / "tare").iterdir())
     stage.children.check()
+
+
+def test_a_tared_skin_with_uids_starts_again(ros, tmp_path):
+    data = read_yaml(package_data() / "config" / "cube.yaml")
+    for number, cube in enumerate(data["cubes"]):
+        cube["uid"] = 0xABC0 + number
+        cube.pop("index", None)
+    config = tmp_path / "skin.yaml"
+    write_yaml(config, data)
+    cube = read_skin(config).cubes[0]
+    kept = 1.001 * cube.calibration.rest_frequency
+    created = datetime.now(timezone.utc)
+    write_tare(tmp_path / "tare", cube.uid, cube.calibration, kept, created)
+    with Children(tmp_path) as children:
+        processes = skin_processes(config, simulated=SimulatedHubs(tmp_path / "ports"))
+        for process in processes:
+            if process.executable == "reconstruction":
+                process.parameters["tare_folder"] = str(tmp_path / "tare")
+            children.start(process)
+        stress = ros.listen(SkinStress, "stress")
+        ros.wait(lambda: stress)
+        children.wait_for_line("reconstruction", "restored", 5)
+        children.check()
 
 
 def test_a_broken_pad_is_named_left_out_and_taken_back(stage):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from datetime import datetime, timezone
 
 import numpy as np
 import pytest
@@ -19,11 +18,9 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from conftest import free_domain, observer_node
 from cube_tensor_driver.bags.message_codec import frequency_codec
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.skin import read_skin
-from cube_tensor_driver.config.tare import write_tare
-from cube_tensor_driver.config.yaml import read_yaml, write_yaml
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
@@ -33,20 +30,34 @@ from cube_tensor_driver.srv import Tare
 ACTIVE = 3
 
 
-@pytest.fixture
-def skin(ros, tmp_path):
-    """A running simulated skin of one cube with all its nodes; none has ended at the end."""
-    with Children(tmp_path) as children:
+pytestmark = pytest.mark.xdist_group("peers")
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    """A running simulated skin of one cube with all its nodes, and we among its peers."""
+    folder = tmp_path_factory.mktemp("skin")
+    with (
+        free_domain() as domain,
+        observer_node(domain) as ros,
+        Children(folder) as children,
+    ):
         config = package_data() / "config" / "cube.yaml"
-        hubs = SimulatedHubs(tmp_path / "ports")
+        hubs = SimulatedHubs(folder / "ports")
         for process in skin_processes(config, simulated=hubs, markers=True, contacts=True):
             children.start(process)
-        stress = ros.listen(SkinStress, "stress")
-        ros.wait(lambda: stress)
-        yield ros
-        count = len(stress)
-        ros.wait(lambda: len(stress) > count + 10)
-        children.check()
+        yield ros, ros.listen(SkinStress, "stress"), children
+
+
+@pytest.fixture
+def skin(running):
+    """No node has ended after a test, and tensors come."""
+    ros, stress, children = running
+    ros.wait(lambda: stress)
+    yield ros
+    count = len(stress)
+    ros.wait(lambda: len(stress) > count + 10)
+    children.check()
 
 
 def test_a_transition_that_is_not_possible_now_is_refused(skin):
@@ -140,26 +151,3 @@ def test_an_info_of_any_content_ends_no_node(skin):
             count = len(received)
             publisher.publish(info)
             skin.wait(lambda received=received, count=count: len(received) > count)
-
-
-def test_a_tared_skin_with_uids_starts_again(ros, tmp_path):
-    data = read_yaml(package_data() / "config" / "cube.yaml")
-    for number, cube in enumerate(data["cubes"]):
-        cube["uid"] = 0xABC0 + number
-        cube.pop("index", None)
-    config = tmp_path / "skin.yaml"
-    write_yaml(config, data)
-    cube = read_skin(config).cubes[0]
-    kept = 1.001 * cube.calibration.rest_frequency
-    created = datetime.now(timezone.utc)
-    write_tare(tmp_path / "tare", cube.uid, cube.calibration, kept, created)
-    with Children(tmp_path) as children:
-        processes = skin_processes(config, simulated=SimulatedHubs(tmp_path / "ports"))
-        for process in processes:
-            if process.executable == "reconstruction":
-                process.parameters["tare_folder"] = str(tmp_path / "tare")
-            children.start(process)
-        stress = ros.listen(SkinStress, "stress")
-        ros.wait(lambda: stress)
-        children.wait_for_line("reconstruction", "restored", 5)
-        children.check()

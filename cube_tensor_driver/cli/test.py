@@ -23,8 +23,8 @@ def run(options: argparse.Namespace) -> int:
     if not words:
         words = ["test"]
         if importlib.util.find_spec("xdist") is not None:
-            # One more than processors: half of the time a test waits for processes it started.
-            workers = len(os.sched_getaffinity(0)) + 1
+            # Half of the time a test waits for processes it started.
+            workers = 2 * len(os.sched_getaffinity(0))
             words += ["-n", str(workers), "--dist", "loadgroup"]
     os.chdir(ROOT)
     os.execv(sys.executable, [sys.executable, "-m", "pytest", *words])
