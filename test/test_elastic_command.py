@@ -99,6 +99,31 @@ def test_space_on_a_coarse_mesh(coarse, tmp_path, capsys):
     assert "unobservable: yz_x, zx_y, xy_z" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("space", [False, True])
+def test_pads_under_loads_on_the_surface(coarse, tmp_path, capsys, space):
+    out = tmp_path / "surface.json"
+    arguments = ["fem", "--surface", "--width", "18", "--height", "8", "--meshes", "1", "--rigid"]
+    arguments += ["--json", str(out), "--figures", str(tmp_path), *(["--3d"] if space else [])]
+    assert cli.main(arguments) == 0
+    said = capsys.readouterr().out
+    study = json.loads(out.read_text())
+    place, pads = np.array(study["place"]), np.array(study["pads"])
+    assert pads.shape == ((24, len(place), 3) if space else (8, len(place), 2))
+    assert [(row["load"], row["width"], row["place"]) for row in study["rows"]] == [
+        (load, width, place)
+        for load in ("press", "rub")
+        for width in (2e-3, 5e-3, 10e-3)
+        for place in (0.0, 4e-3)
+    ]
+    above = study["rows"][0]
+    unit, places = (1e3, 2) if space else (1.0, 1)
+    ratio = above["said"]["zz"] / above["there"]["zz"]
+    numbers = [above[key]["zz"] / unit for key in ("said", "there")]
+    row = "press +2 +0 " + " ".join(f"+{number:.{places}f}" for number in numbers)
+    assert re.search(rf"{row} +{ratio:.2f}", said)
+    assert (tmp_path / "influence.png").stat().st_size > 10_000
+
+
 def test_a_layout_of_ones_own(tmp_path):
     path, out = tmp_path / "mine.yaml", tmp_path / "fem.json"
     path.write_text(
@@ -224,6 +249,8 @@ def refused(capsys, arguments, words):
         ("--layout round", ["unknown layout 'round'"]),
         ("--layout quad --symmetry full", ["lacks this symmetry"]),
         ("--neglect round", ["unknown mode 'round'", "zz_x"]),
+        ("--surface --width 8", ["width is 8 mm", "make it wider"]),
+        ("--surface -o x.yaml", ["-o x.yaml", "leave out one of them"]),
         ("-o none/cube.yaml", ["-o none/cube.yaml", "a folder that can be written"]),
         ("-o /proc/cube.yaml", ["-o /proc/cube.yaml", "a folder that can be written"]),
         ("--json .", ["--json .", "is no file"]),

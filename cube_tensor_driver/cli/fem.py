@@ -1,4 +1,4 @@
-"""./cube fem: a response matrix by finite elements, as tables, files and pictures."""
+"""./cube fem: what pads see by finite elements, as tables, files and pictures."""
 
 from __future__ import annotations
 
@@ -30,6 +30,12 @@ def arguments(parser: Parser) -> None:
         dest="space",
         action="store_true",
         help="compute in space, for 24 pads: takes minutes and up to 6 GB",
+    )
+    parser.add_argument(
+        "--surface",
+        action="store_true",
+        help="bond the lower face to rigid ground and compute what the pads see of forces on the "
+        "upper one, and what the cube says of balls there",
     )
     parser.add_argument(
         "--layout",
@@ -148,6 +154,9 @@ def run(options: argparse.Namespace) -> int:
     default_modes(layout).index(options.neglect)
     body = body_of(options, layout)
 
+    if options.surface:
+        return run_surface(options, body, layout)
+
     print(f"{describe(body, layout)}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
     with ends_at_once(), progress_bar() as report:
         result = compute_response(body, layout, symmetry, options.meshes, report)
@@ -158,6 +167,35 @@ def run(options: argparse.Namespace) -> int:
         draw(result, options.figures)
     if options.output is not None:
         write(options, result)
+    return 0
+
+
+def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
+    from ..config.output_files import write_json
+    from ..core.errors import ElasticError
+    from ..plot.influence import draw_influence
+    from ..plot.style import save
+    from ..research.surface_study import study_surface
+    from ..terminal.interrupt import ends_at_once
+    from ..terminal.output import progress_bar
+    from ..terminal.surface_study import show_surface
+
+    if options.output is not None:
+        raise ElasticError(
+            f"-o {options.output} is for a calibration, which --surface does not make; leave out "
+            "one of them, or write the tables with --json"
+        )
+    print(f"{describe(body, layout)} on rigid ground; {layout.n_pads} pads", flush=True)
+    with ends_at_once(), progress_bar() as report:
+        study = study_surface(body, layout, options.meshes, options.neglect, report)
+    show_surface(study)
+    if options.json is not None:
+        write_json(options.json, study.to_dict())
+    if options.figures is not None:
+        options.figures.mkdir(parents=True, exist_ok=True)
+        picture = draw_influence(study.influence, layout, body.side / 2)
+        save(picture, options.figures / "influence.png")
+        print(f"picture in {options.figures}")
     return 0
 
 

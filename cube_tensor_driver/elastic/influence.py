@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 from ..core.errors import ElasticError
 from ..core.layout import Layout
@@ -42,12 +43,15 @@ class Influence:
     place: Array
     pads: Array
 
-    def along_x(self, x: Array) -> Array:
-        """(P, m, dim) at places x (m,) m between the nodes; of layouts in a plane."""
-        moved = np.moveaxis(self.pads, 1, -1)
-        nodes = self.place[:, 0]
-        flat = [np.interp(x, nodes, row) for row in moved.reshape(-1, len(nodes))]
-        return np.moveaxis(np.reshape(flat, (*moved.shape[:2], len(x))), -1, 1)
+    def at(self, place: Array) -> Array:
+        """(P, m, dim) at places (m, dim - 1) m between the nodes, linear between them; 0 beyond
+        the body."""
+        axes = [np.unique(column) for column in self.place.T]
+        # The places are sorted, and all combinations of the axes.
+        nodes = np.moveaxis(self.pads, 1, 0)
+        grid = nodes.reshape(*map(len, axes), *nodes.shape[1:])
+        between = RegularGridInterpolator(tuple(axes), grid, bounds_error=False, fill_value=0.0)
+        return np.moveaxis(between(place), 0, 1)
 
 
 def compute_influence(
@@ -97,5 +101,5 @@ def _on_surface(solid: Solid, layout: Layout, report: Callable[[str], None]) -> 
     places = np.concatenate([here * signs[:-1] for signs in quadrants])
     pads = np.concatenate(list(total), axis=1)
     # A node on a mirror is there twice, with the same value.
-    _, first = np.unique(np.round(places, 9), axis=0, return_index=True)
-    return places[first], pads[:, first]
+    places, first = np.unique(np.round(places, 9), axis=0, return_index=True)
+    return places, pads[:, first]

@@ -27,7 +27,8 @@ from ..elastic.fem import Progress, compute_response
 from ..elastic.influence import compute_influence
 from ..elastic.inverse import MODEL_ERROR
 from ..elastic.kernels import LENGTHS, SHEAR
-from ..elastic.layer import FIELD, Layer
+from ..elastic.layer import Layer
+from ..elastic.line_load import line_load
 from .paper import dent
 from .rod import Rod
 from .virtual_bench import VirtualBench
@@ -36,8 +37,6 @@ Array = NDArray[np.float64]
 
 _STEP = 1e-4
 """Of the grid on the surface, m."""
-_WAVES = 4000
-"""Points in k; the field has decayed by exp(-30) at the last one."""
 _SIGNAL = np.array([-1.0, 1.0, 1.0, -1.0])
 """Eq. 4 of the four upper and lower pads, tension positive."""
 
@@ -80,8 +79,8 @@ def rod_shear(
     influence = compute_influence(replace(body, ground=True), layout)
 
     x = np.arange(-body.width / 2, body.width / 2 + _STEP / 2, _STEP)
-    of_points = _points(Layer(body.height, body.poisson), x, depth, body.side / 2)  # (7, m, 2)
-    of_pads = influence.along_x(x)  # (8, m, 2)
+    of_points = line_load(Layer(body.height, body.poisson), x, depth, body.side / 2)  # (7, m, 2)
+    of_pads = influence.at(x[:, None])  # (8, m, 2)
     shear = of_points[zx]
     from_points = _estimate(of_points, shear, x, depth)
     from_pads = _estimate(of_pads, shear, x, depth)
@@ -96,7 +95,7 @@ def rod_shear(
         modes = tensor @ seen
         four = _SIGNAL @ seen[:4] / (_SIGNAL @ response[:4, zx])
         at, force = with_cube.rod_pressure(step)
-        predicted = -influence.along_x(at)[:, :, 1] @ force
+        predicted = -influence.at(at[:, None])[:, :, 1] @ force
         same_load = -np.interp(at, x, shear[:, 1]) @ force
         found_shear = four, modes[zx], from_points @ modes, from_pads @ seen
         rows.append((truth, same_load, *found_shear, seen, predicted))
@@ -115,14 +114,3 @@ def _estimate(seen: Array, shear: Array, x: Array, depth: float) -> Array:
         cross += smooth @ shear[:, component]
     total[np.diag_indices(len(seen))] *= 1 + MODEL_ERROR**2
     return np.asarray(np.linalg.solve(total, cross), dtype=float)
-
-
-def _points(layer: Layer, x: Array, depth: float, scale: float) -> Array:
-    """(7, m, 2) plane modes at a cube, gradients times scale, per force along x and z at x, 1/m."""
-    k = (np.arange(_WAVES) + 0.5) * 30 / depth / _WAVES
-    transfer = layer.transfer(k, 0 * k, depth)[:, :, [0, 2]]
-    names = ["zz", "zx", "xx", "zz_x", "zz_z", "xx_z", "xx_x"]
-    rows = transfer[:, [FIELD.index(name) for name in names]]
-    rows[:, 3:] *= scale
-    wave = np.exp(-1j * np.outer(x, k)) * ((k[1] - k[0]) / np.pi)
-    return np.moveaxis(np.tensordot(wave, rows, axes=1).real, 0, 1)
