@@ -119,3 +119,7 @@ def test_a_small_cube_says_what_is_there():
     assert all(error < 0.02 for row in fine for error in row.values())
     (pressed,) = (k for k, row in enumerate(study.rows) if row[:3] == ("press", 5e-3, 0.0))
     assert 3 < coarse[pressed]["zz"] / fine[pressed]["zz"] < 6
+    for load, largest_one, other in (("press", "zz", "zx"), ("rub", "zx", "zz")):
+        (row,) = (row for row in study.rows if row[:3] == (load, 20e-3, 0.0))
+        sign = -1 if load == "press" else 1
+        assert sign * row.said[largest_one] > 10 > 1e4 * abs(row.said[other])
