@@ -102,7 +102,7 @@ def test_space_on_a_coarse_mesh(coarse, tmp_path, capsys):
 @pytest.mark.parametrize("space", [False, True])
 def test_pads_under_loads_on_the_surface(coarse, tmp_path, capsys, space):
     out = tmp_path / "surface.json"
-    arguments = ["fem", "--surface", "--width", "18", "--height", "8", "--meshes", "1", "--rigid"]
+    arguments = ["fem", "--surface", "--width", "14", "--height", "7", "--meshes", "1", "--rigid"]
     arguments += ["--json", str(out), "--figures", str(tmp_path), *(["--3d"] if space else [])]
     assert cli.main(arguments) == 0
     said = capsys.readouterr().out
@@ -112,7 +112,7 @@ def test_pads_under_loads_on_the_surface(coarse, tmp_path, capsys, space):
     assert [(row["load"], row["width"], row["place"]) for row in study["rows"]] == [
         (load, width, place)
         for load in ("press", "rub")
-        for width in (2e-3, 5e-3, 10e-3)
+        for width in (2e-3, 5e-3)
         for place in (0.0, 4e-3)
     ]
     above = study["rows"][0]

@@ -41,7 +41,7 @@ def test_reciprocity_gives_what_a_force_on_the_surface_does(influence):
 def test_reciprocity_in_space(monkeypatch):
     """The same for 24 pads: forces on the plane y = 0, on a body without the mirror along x."""
     monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),))
-    layer = Body(12e-3, 12e-3, 8e-3, ground=True, cube_young=float("inf"))
+    layer = Body(9e-3, 9e-3, 7e-3, ground=True, cube_young=float("inf"))
     layout = LAYOUTS["cube"]
     influence = compute_influence(layer, layout, 0)
     body = replace(layer, x=1e-9)

@@ -44,7 +44,7 @@ def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) 
     return np.concatenate([stress, gradient[:, :3].reshape(len(stress), 9)], axis=1)
 
 
-def errors(pitch: float, width: float, places: int = 8) -> tuple[float, float]:
+def errors(pitch: float, width: float, places: int = 4) -> tuple[float, float]:
     """Relative rms error of the pressure without and with gradients; contacts all over a cell."""
     skin = flat(7, 7, pitch)
     without, with_them = Surface(skin, DEPTH, 6, gradients=False), Surface(skin, DEPTH, 6)
