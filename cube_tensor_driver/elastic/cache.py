@@ -24,6 +24,7 @@ _DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 _CODE = (
     "layer.py",
     "circular.py",
+    "spectra.py",
     "kernels.py",
     "disc_tables.py",
     "polygon_tables.py",

@@ -49,13 +49,6 @@ BACK = np.linalg.pinv(np.concatenate([CIRCULAR.real, CIRCULAR.imag])).T
 """(28, 24) FIELD from real and imaginary parts of the circular components."""
 
 
-def circular_table(field: Array) -> Array:
-    """(..., 3, components) R, Z and T of a disc's FIELD (..., 24, 3) at places on the x axis."""
-    circular = np.einsum("cf,...fi->...ic", CIRCULAR, field)
-    parts = [circular[..., 0, :].real, circular[..., 2, :].real, circular[..., 1, :].imag]
-    return np.stack(parts, axis=-2)
-
-
 def summed(
     circular: NDArray[np.complex64], turn: NDArray[np.complexfloating]
 ) -> tuple[Array, Array]:

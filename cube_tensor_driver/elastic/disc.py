@@ -62,7 +62,9 @@ class DiscModel:
         seen = np.zeros((len(inverse.poses.position), len(inverse.columns)))
         for disc in discs:
             cubes, place, angle = self.cubes_around(disc.home)
-            response = inverse.kernels.response(place - disc.place, angle, disc.size)
+            response = inverse.kernels.response(
+                place - disc.place, angle, inverse.reading[cubes], disc.size
+            )
             seen[cubes] += response[:, inverse.columns] @ disc.force
         return seen
 

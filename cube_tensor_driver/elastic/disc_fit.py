@@ -80,6 +80,7 @@ class Scan:
     ) -> None:
         self.kernels, self.columns = inverse.kernels, inverse.columns
         self.pitch, self.place, self.angle = inverse.pitch, place, angle
+        self.reading = inverse.reading[cubes]
         known = np.isfinite(values) & inverse.observed[cubes]
         self._known = known.ravel()
         filled = np.where(known, values, 0.0)
@@ -102,14 +103,15 @@ class Scan:
     def responses(self, middles: Array, size: float) -> Array:
         """(K, D, 3) of contacts with force 1 N at K places (K, 2)."""
         place = (self.place - middles[:, None]).reshape(-1, 2)
-        seen = self.kernels.response(place, np.tile(self.angle, len(middles)), size)
+        angle, reading = (np.tile(one, len(middles)) for one in (self.angle, self.reading))
+        seen = self.kernels.response(place, angle, reading, size)
         return seen[:, self.columns].reshape(len(middles), -1, 3)[:, self._known]
 
     def cross(self, points: Array) -> Array:
         """(points, 3, D) covariance of the traction at points with the values."""
         offset = (self.place[None] - points[:, None]).reshape(-1, 2)
-        angle = np.tile(self.angle, len(points))
-        table = self.kernels.cross(offset, angle)[:, self.columns]
+        angle, reading = (np.tile(one, len(points)) for one in (self.angle, self.reading))
+        table = self.kernels.cross(offset, angle, reading)[:, self.columns]
         table = table.reshape(len(points), -1, 3)[:, self._known]
         return table.swapaxes(1, 2)
 

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .cache import cached
-from .circular import circular_table, summed
-from .kernels import PER_DEPTH, REACH, Waves
+from .circular import summed
+from .kernels import PER_DEPTH, REACH, disc_spectrum
 from .layer import Layer
+from .spectra import layer_spectra
 
 Array = NDArray[np.float64]
 
@@ -37,8 +38,10 @@ class DiscTables:
 
     def _tables(self) -> dict[str, NDArray[np.float32]]:
         """table (sizes, places, 3, 14): R, Z and T of each component, from r = 0 on."""
-        field = Waves(self.layer, self.depth).discs(SIZES * self.depth)[:, 1:]
-        return {"table": circular_table(field).astype(np.float32)}
+        spectra = layer_spectra(self.layer, self.depth)
+        discs = np.stack([disc_spectrum(spectra.k * size) for size in SIZES * self.depth])
+        r = np.arange(REACH * PER_DEPTH + 2) * self.depth / PER_DEPTH
+        return {"table": spectra.radial(r, discs).astype(np.float32)}
 
     def field(self, place: ArrayLike, force: ArrayLike, radius: ArrayLike) -> tuple[Array, Array]:
         """Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, each the sum over L discs.

@@ -35,7 +35,7 @@ from ..core.pipeline import Pipeline
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from .cache import cached
-from .kernels import Kernels
+from .kernels import Kernels, Reading
 from .layer import Layer
 from .surface import patches
 
@@ -106,26 +106,41 @@ class SurfaceInverse:
         )
         pipeline = Pipeline(skin.calibrations)
         noise = np.array([pipeline.covariance(cube) for cube in range(len(skin.cubes))])
-        self._set_up(poses, noise, Layer(thickness, poisson), depth, side)
+        self._set_up(poses, noise, Layer(thickness, poisson), depth, side, None)
 
     @classmethod
     def of_cubes(
-        cls, poses: CubePoses, noise: Array, layer: Layer, depth: float, side: int = 2
+        cls,
+        poses: CubePoses,
+        noise: Array,
+        layer: Layer,
+        depth: float,
+        side: int = 2,
+        reading: Reading | None = None,
     ) -> SurfaceInverse:
         """The same from poses and noise (cubes, 15, 15): the covariance of the components of each
-        cube in Pa and Pa/m, NaN where a component is not observed."""
+        cube in Pa and Pa/m, NaN where a component is not observed. reading: how the cubes see; by
+        default as points."""
         inverse = cls.__new__(cls)
-        inverse._set_up(poses, noise, layer, depth, side)
+        inverse._set_up(poses, noise, layer, depth, side, reading)
         return inverse
 
     def _set_up(
-        self, poses: CubePoses, noise: Array, layer: Layer, depth: float, side: int
+        self,
+        poses: CubePoses,
+        noise: Array,
+        layer: Layer,
+        depth: float,
+        side: int,
+        reading: Reading | None,
     ) -> None:
         if side < 1:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
         self.poses, self.depth, self.pitch, self.side = poses, depth, poses.pitch, side
         scale = float(np.median(poses.half_side))
-        self.kernels = Kernels(layer, depth, scale)
+        self.kernels = Kernels(layer, depth, scale, reading)
+        n = len(poses.position)
+        self.reading = np.zeros(n, np.intp) if reading is None else reading.of_cube
         self.spacing = poses.pitch / side
         self.area = self.spacing**2
         flat = patches(poses, self.spacing, side)
@@ -233,15 +248,15 @@ class _Windows:
         noise_kind = _distinct(np.nan_to_num(inverse.noise.reshape(len(middles), -1), nan=-1.0))
         looks = [place.reshape(len(middles), -1), np.cos(angle), np.sin(angle)]
         looks = [np.round(look / _SAME / 10) for look in looks]
-        self.kind = _distinct(np.concatenate([*looks, noise_kind[self.near]], axis=1))
+        looks += [noise_kind[self.near], inverse.reading[self.near]]
+        self.kind = _distinct(np.concatenate(looks, axis=1))
         kinds, first = np.unique(self.kind, return_index=True)
 
         def solve() -> dict[str, NDArray[Any]]:
             """The matrices of the kinds, each written in its place: together they may be large."""
             solved: dict[str, NDArray[Any]] = {}
             for number, one in enumerate(first):
-                noise = inverse.noise[self.near[one]]
-                window = _solve(inverse, place[one], angle[one], noise)._asdict()
+                window = _solve(inverse, self.near[one], place[one], angle[one])._asdict()
                 for name, array in window.items():
                     whole = solved.setdefault(
                         name, np.empty((len(first), *array.shape), array.dtype)
@@ -249,16 +264,11 @@ class _Windows:
                     whole[number] = array
             return solved
 
-        layer, kernels = inverse.kernels.layer, inverse.kernels
-        key: list[Any] = [
-            layer.thickness,
-            layer.poisson,
-            kernels.depth,
-            kernels.scale,
-            inverse.spacing,
-        ]
-        key += [inverse.side, inverse.columns, place[first], angle[first]]
-        solved = cached("windows", [*key, inverse.noise[self.near[first]]], solve)
+        near = self.near[first]
+        key: list[Any] = [*inverse.kernels.made_from, inverse.spacing, inverse.side]
+        key += [inverse.columns, place[first], angle[first]]
+        key += [inverse.noise[near], inverse.reading[near]]
+        solved = cached("windows", key, solve)
         self.gain, self.precision = solved["gain"], solved["precision"]
         self.prior, self.noise = solved["variance"], solved["noise"]
         counts = np.bincount(self.kind)
@@ -315,13 +325,14 @@ class _Window(NamedTuple):
     noise: Array
 
 
-def _solve(inverse: SurfaceInverse, place: Array, angle: Array, noise: Array) -> _Window:
-    """One window: matrix (rows, W C), P (W C, W C), variances (points x 2) at AMPLITUDE and by the
-    pads' noise. noise: (W, C, C), NaN where nothing is observed."""
+def _solve(inverse: SurfaceInverse, cubes: Index, place: Array, angle: Array) -> _Window:
+    """One window of cubes (W,): matrix (rows, W C), P (W C, W C), variances (points x 2) at
+    AMPLITUDE and by the pads' noise."""
     kernels, columns = inverse.kernels, inverse.columns
+    noise, reading = inverse.noise[cubes], inverse.reading[cubes]
     n, size = len(place), len(place) * len(columns)
     known = np.isfinite(noise[:, np.arange(len(columns)), np.arange(len(columns))]).ravel()
-    prior = AMPLITUDE**2 * covariance_matrix(kernels, columns, place, angle)
+    prior = AMPLITUDE**2 * covariance_matrix(kernels, columns, place, angle, reading)
     total, pads = prior.copy(), np.zeros_like(prior)
     for cube in range(n):
         part = slice(cube * len(columns), (cube + 1) * len(columns))
@@ -330,11 +341,11 @@ def _solve(inverse: SurfaceInverse, place: Array, angle: Array, noise: Array) ->
     total[np.diag_indices(size)] += MODEL_ERROR**2 * np.diag(prior)
     points = inverse._patch
     offset = (place[:, None] - points[None]).reshape(-1, 2)
-    turned = np.repeat(angle, len(points))
+    turned, which = np.repeat(angle, len(points)), np.repeat(reading, len(points))
     cross = np.empty((len(points), _ROWS, n, len(columns)))
-    of_traction = kernels.cross(offset, turned)[:, columns].reshape(n, len(points), -1, 3)
+    of_traction = kernels.cross(offset, turned, which)[:, columns].reshape(n, len(points), -1, 3)
     cross[:, :3] = of_traction.transpose(1, 3, 0, 2)
-    below = kernels.pressure(offset, turned)[:, columns].reshape(n, len(points), -1)
+    below = kernels.pressure(offset, turned, which)[:, columns].reshape(n, len(points), -1)
     cross[:, 3] = below.transpose(1, 0, 2)
     cross = AMPLITUDE**2 * cross.reshape(-1, size)[:, known]
     factor = cho_factor(total[np.ix_(known, known)])
@@ -348,14 +359,22 @@ def _solve(inverse: SurfaceInverse, place: Array, angle: Array, noise: Array) ->
     return _Window(gain, precision, np.maximum(_of_pressure(variance), 0), _of_pressure(by_noise))
 
 
-def covariance_matrix(kernels: Kernels, columns: Index, place: Array, angle: Array) -> Array:
+def covariance_matrix(
+    kernels: Kernels, columns: Index, place: Array, angle: Array, reading: Index
+) -> Array:
     """(n C, n C) prior covariance of the components of cubes, for unit variance of the pressure."""
-    n = len(place)
-    offset = (place[:, None] - place[None]).reshape(-1, 2)
-    table = kernels.covariance(offset, np.repeat(angle, n), np.tile(angle, n))
-    table = table[:, columns][:, :, columns].reshape(n, n, len(columns), len(columns))
-    matrix = table.transpose(0, 2, 1, 3).reshape(n * len(columns), -1)
-    return (matrix + matrix.T) / 2
+    n, width = len(place), len(columns)
+    one, other = np.triu_indices(n)
+    table = kernels.covariance(
+        place[one] - place[other], angle[one], reading[one], angle[other], reading[other]
+    )[:, columns][:, :, columns]
+    matrix = np.empty((n, width, n, width))
+    matrix[other, :, one] = table.swapaxes(1, 2)
+    matrix[one, :, other] = table
+    # A cube with itself is symmetric but for rounding.
+    own = np.arange(n)
+    matrix[own, :, own] = (table[one == other] + table[one == other].swapaxes(1, 2)) / 2
+    return matrix.reshape(n * width, -1)
 
 
 def _of_pressure(rows: Array) -> Array:

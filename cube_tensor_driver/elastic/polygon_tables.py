@@ -24,9 +24,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from .cache import cached
-from .circular import ORDERS, circular_table, summed
-from .kernels import PER_DEPTH, REACH, Waves
+from .circular import ORDERS, summed
+from .kernels import PER_DEPTH, REACH
 from .layer import Layer
+from .spectra import layer_spectra
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -57,9 +58,10 @@ class PolygonTables:
     def _tables(self) -> dict[str, NDArray[np.complex64]]:
         """table (rows, columns, 4, 14): A, B, Z and W of each component; rows are of d, columns of
         t, from -LONGEST on."""
-        waves = Waves(self.layer, self.depth)
-        along, normal, across = circular_table(waves.line(waves.transfer)[1:]).swapaxes(0, 1)
-        r = np.arange(len(along))[:, None] / PER_DEPTH
+        spectra = layer_spectra(self.layer, self.depth)
+        r = np.arange(REACH * PER_DEPTH + 2)[:, None] / PER_DEPTH
+        everywhere = np.ones((1, len(spectra.k)))
+        along, normal, across = spectra.radial(r[:, 0] * self.depth, everywhere)[0].swapaxes(0, 1)
         columns = [(along + across) / 2, (along - across) / 2, normal, across * r]
         over_r = CubicSpline(r[:, 0], np.stack(columns, axis=1) * r[..., None]).antiderivative()
 

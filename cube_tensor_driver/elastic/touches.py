@@ -262,7 +262,9 @@ class Touches:
             if len(self._priors) >= 2 * MOST:
                 self._priors.pop(next(iter(self._priors)))
             inverse = self._inverse
-            self._priors[key] = covariance_matrix(inverse.kernels, inverse.columns, place, angle)
+            self._priors[key] = covariance_matrix(
+                inverse.kernels, inverse.columns, place, angle, inverse.reading[cubes]
+            )
         return self._priors[key]
 
 
