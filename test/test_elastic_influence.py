@@ -10,7 +10,7 @@ from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import fem
 from cube_tensor_driver.elastic.body import Body, make_mesh
-from cube_tensor_driver.elastic.influence import compute_influence
+from cube_tensor_driver.elastic.reciprocity import compute_influence
 from cube_tensor_driver.research.surface_study import study_surface
 
 LAYER = Body(width=40e-3, ground=True, cube_young=float("inf"), z=1e-3)

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config.skin import Skin, SkinCube, SkinLink
-from ..config.yaml import parse_yaml
 from ..core.calibration import Calibration
-from ..core.errors import BagError, CalibrationError, ConfigError
+from ..core.errors import BagError, MessageError
 from ..core.reconstructor import Verdicts
 from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
 from .message_codec import SECOND
 from .read import Bag, damage
 from .recorded_verdicts import VerdictReader
+from .skin_info import cube_calibrations
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,18 +100,10 @@ def stamp_ns(info: Any) -> int:
 
 def settings_of(info: Any) -> Settings:
     """The settings that a SkinInfo describes. BagError: they contradict each other."""
-    texts = dict(zip(info.calibration_ids, info.calibrations, strict=False))
-    known: dict[str, Calibration] = {}
     try:
-        for name in {cube.calibration_id for cube in info.cubes}:
-            known[name] = Calibration.from_dict(parse_yaml(texts[name], f"calibration {name}"))
-    except (CalibrationError, ConfigError) as error:
-        raise BagError(f"info of the skin {info.name}: {error}") from None
-    except KeyError as error:
-        raise BagError(
-            f"info of the skin {info.name}: no calibration {error}, which a cube uses"
-        ) from None
-    calibrations = tuple(known[cube.calibration_id] for cube in info.cubes)
+        calibrations = cube_calibrations(info)
+    except MessageError as error:
+        raise BagError(str(error)) from None
     if not calibrations:
         raise BagError(f"info of the skin {info.name}: it has no cubes")
     widest = max(calibration.layout.n_pads for calibration in calibrations)

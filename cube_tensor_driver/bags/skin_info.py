@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import MessageError
+from ..config.yaml import parse_yaml
+from ..core.calibration import Calibration
+from ..core.errors import CalibrationError, ConfigError, MessageError
 from ..core.modes import COMPONENTS
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_quaternion
@@ -37,6 +39,25 @@ def cube_poses(info: Any) -> CubePoses:
             "it needs finite numbers and a size above 0"
         )
     return poses
+
+
+def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
+    """The calibration of each cube of an `info`; cubes with the same one share one object.
+
+    MessageError: a cube's calibration is missing, or none.
+    """
+    texts = dict(zip(info.calibration_ids, info.calibrations, strict=False))
+    known: dict[str, Calibration] = {}
+    try:
+        for name in {cube.calibration_id for cube in info.cubes}:
+            known[name] = Calibration.from_dict(parse_yaml(texts[name], f"calibration {name}"))
+    except (CalibrationError, ConfigError) as error:
+        raise MessageError(f"info of the skin {info.name}: {error}") from None
+    except KeyError as error:
+        raise MessageError(
+            f"info of the skin {info.name}: no calibration {error}, which a cube uses"
+        ) from None
+    return tuple(known[cube.calibration_id] for cube in info.cubes)
 
 
 def cubes_noise(info: Any) -> NDArray[np.float64]:

@@ -20,7 +20,7 @@ STEEL_PA = 200e9
 UNEXPLAINED = 1e-3
 """Part of the response that coefficients may leave out of a calibration; beyond it the whole matrix
 is written."""
-WRITTEN = ("json", "figures", "output")
+WRITTEN = ("json", "figures", "output", "influence")
 """Options that change nothing in the result."""
 
 
@@ -137,10 +137,16 @@ def arguments(parser: Parser) -> None:
         "--figures", kind="folder", help="write pictures of convergence, response and each load"
     )
     parser.add_output("-o", "--output", kind="yaml", help="calibration file to write")
+    parser.add_output(
+        "--influence",
+        help="with --surface --3d: write what the pads see of forces on the surface, for the "
+        "contacts of a skin (.npz)",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     from ..config.output_files import write_json
+    from ..core.errors import ElasticError
     from ..core.symmetry import default_modes, find_structure, largest_symmetry
     from ..elastic.fem import compute_response
     from ..terminal.fem import show_response
@@ -154,6 +160,11 @@ def run(options: argparse.Namespace) -> int:
     default_modes(layout).index(options.neglect)
     body = body_of(options, layout)
 
+    if options.influence is not None and not (options.surface and options.space):
+        raise ElasticError(
+            f"--influence {options.influence} is of a surface in space; add --surface --3d, or "
+            "leave it out"
+        )
     if options.surface:
         return run_surface(options, body, layout)
 
@@ -173,6 +184,7 @@ def run(options: argparse.Namespace) -> int:
 def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
     from ..config.output_files import write_json
     from ..core.errors import ElasticError
+    from ..elastic.influence_file import write_influence
     from ..plot.influence import draw_influence
     from ..plot.style import save
     from ..research.surface_study import study_surface
@@ -183,7 +195,7 @@ def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
     if options.output is not None:
         raise ElasticError(
             f"-o {options.output} is for a calibration, which --surface does not make; leave out "
-            "one of them, or write the tables with --json"
+            "one of them, or write the tables with --json or --influence"
         )
     print(f"{describe(body, layout)} on rigid ground; {layout.n_pads} pads", flush=True)
     with ends_at_once(), progress_bar() as report:
@@ -196,6 +208,9 @@ def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
         picture = draw_influence(study.influence, layout, body.side / 2)
         save(picture, options.figures / "influence.png")
         print(f"picture in {options.figures}")
+    if options.influence is not None:
+        write_influence(options.influence, study.influence, command_of(options))
+        print(f"wrote {options.influence}")
     return 0
 
 

@@ -132,7 +132,7 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
     if options.format != "bag":
         raise ConfigError(f"--contacts with --format {options.format}: only a bag holds contacts")
     method, *others = options.contacts
-    known = {one.name: one for one in CONTACTS if one.span is not None}
+    known = {one.name: one for one in CONTACTS if one.span is not None or one.name == "influence"}
     if method not in CONTACT_METHODS:
         raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
     values = {name: one.default for name, one in known.items()}
@@ -140,6 +140,9 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
         name, _, value = text.partition(":=")
         if name not in known:
             raise ConfigError(f"--contacts {text}: use NAME:=VALUE with one of {', '.join(known)}")
+        if name == "influence":
+            values[name] = value
+            continue
         low, high = known[name].span or (0.0, 0.0)
         try:
             values[name] = float(value)

@@ -32,6 +32,8 @@ BRICK_SIZES = (
     BrickSizes(0.25, 0.1, 1.5),
 )
 """Of the meshes in space, coarse to fine."""
+_LARGEST_BRICK = 2.0
+"""Of a body on ground, d0: where forces on its surface act, its field is not linear."""
 _CLOSEST_EDGES = 1e-3
 """Smallest distance of two pad edges, d0."""
 
@@ -147,14 +149,12 @@ def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
             f"{mm * _CLOSEST_EDGES:g} mm; make the pads wider, or move their edges together or "
             "apart"
         )
-    return _mesh(np.where(whole, half + place, 0.0).tolist(), (half - place).tolist(), stops, level)
-
-
-def _mesh(lower: list[float], upper: list[float], stops: Array, level: int) -> skfem.Mesh:
-    if len(upper) == 2:
+    lower, upper = np.where(whole, half + place, 0.0).tolist(), (half - place).tolist()
+    if layout.planar:
         return sections(lower, upper, stops, level)
     sizes = BRICK_SIZES[level]
-    return block(upper, stops, sizes.face, sizes.edge, sizes.growth, lower)
+    largest = _LARGEST_BRICK if body.ground else np.inf
+    return block(upper, stops, sizes.face, sizes.edge, sizes.growth, lower, largest)
 
 
 def _pad_edges(layout: Layout) -> Array:

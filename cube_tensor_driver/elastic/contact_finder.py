@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.scene import CubePoses
+from .influence_file import find_influence, read_influence
 from .inverse import SurfaceInverse
 from .layer import Layer
+from .pad_reading import read_pads
 from .surface import Contact, Surface
 from .touches import Touches, TrackedContact
 
@@ -28,6 +32,8 @@ class ContactSettings:
     at the cubes that counts as contact, Pa
     thickness: of the elastomer over rigid ground, m, 0: a half space; poisson: of the elastomer;
     both for the method inverse
+    influence: for the method inverse, which influence functions the pads have (influence_file.py);
+    then depth, thickness and poisson are theirs. Empty: cubes count as points
     """
 
     method: str = INTERPOLATION
@@ -35,6 +41,7 @@ class ContactSettings:
     least: float = CONTACT_PRESSURE
     thickness: float = 0.0
     poisson: float = POISSONS_RATIO
+    influence: str = ""
 
     @property
     def layer(self) -> Layer:
@@ -42,8 +49,11 @@ class ContactSettings:
         return Layer(self.thickness or np.inf, self.poisson)
 
     def check(self) -> None:
-        """ElasticError: there is no such layer, or it does not have this depth."""
+        """ElasticError: there is no such layer, or it does not have this depth. ConfigError: there
+        are no such influence functions."""
         self.layer.check_depth(self.depth)
+        if self.influence:
+            find_influence(self.influence)
 
 
 class ContactFinder(Protocol):
@@ -57,14 +67,16 @@ class ContactFinder(Protocol):
         pressure, shear and the standard deviation of the pressure, Pa. None: not known."""
 
 
-def contact_finder(settings: ContactSettings, poses: CubePoses, noise: Array) -> ContactFinder:
-    """noise: (cubes, 15, 15) covariance of the components. ElasticError: nothing to compute with.
+def contact_finder(
+    settings: ContactSettings, poses: CubePoses, noise: Array, calibrations: Sequence[Calibration]
+) -> ContactFinder:
+    """noise: (cubes, 15, 15) covariance of the components; calibrations: of the cubes.
 
-    The method inverse takes seconds to set up.
+    ElasticError, ConfigError: nothing to compute with. The method inverse takes seconds to set up.
     """
     if settings.method == INTERPOLATION:
         return _Interpolated(settings, poses)
-    return _Followed(settings, poses, noise)
+    return _Followed(settings, poses, noise, calibrations)
 
 
 class _Interpolated:
@@ -79,9 +91,19 @@ class _Interpolated:
 
 
 class _Followed:
-    def __init__(self, settings: ContactSettings, poses: CubePoses, noise: Array) -> None:
-        layer, depth = settings.layer, settings.depth
-        self._inverse = SurfaceInverse.of_cubes(poses, noise, layer, depth)
+    def __init__(
+        self,
+        settings: ContactSettings,
+        poses: CubePoses,
+        noise: Array,
+        calibrations: Sequence[Calibration],
+    ) -> None:
+        layer, depth, reading = settings.layer, settings.depth, None
+        if settings.influence:
+            influence = read_influence(find_influence(settings.influence))
+            layer, depth = influence.layer, influence.depth
+            reading = read_pads(influence, calibrations)
+        self._inverse = SurfaceInverse.of_cubes(poses, noise, layer, depth, reading=reading)
         self._touches = Touches(self._inverse, settings.least)
 
     def update(self, values: Array) -> list[TrackedContact]:

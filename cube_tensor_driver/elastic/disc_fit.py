@@ -103,14 +103,14 @@ class Scan:
     def responses(self, middles: Array, size: float) -> Array:
         """(K, D, 3) of contacts with force 1 N at K places (K, 2)."""
         place = (self.place - middles[:, None]).reshape(-1, 2)
-        angle, reading = (np.tile(one, len(middles)) for one in (self.angle, self.reading))
+        angle, reading = np.tile(self.angle, len(middles)), np.tile(self.reading, len(middles))
         seen = self.kernels.response(place, angle, reading, size)
         return seen[:, self.columns].reshape(len(middles), -1, 3)[:, self._known]
 
     def cross(self, points: Array) -> Array:
         """(points, 3, D) covariance of the traction at points with the values."""
         offset = (self.place[None] - points[:, None]).reshape(-1, 2)
-        angle, reading = (np.tile(one, len(points)) for one in (self.angle, self.reading))
+        angle, reading = np.tile(self.angle, len(points)), np.tile(self.reading, len(points))
         table = self.kernels.cross(offset, angle, reading)[:, self.columns]
         table = table.reshape(len(points), -1, 3)[:, self._known]
         return table.swapaxes(1, 2)

@@ -35,8 +35,10 @@ from ..core.pipeline import Pipeline
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from .cache import cached
+from .influence import Influence
 from .kernels import Kernels, Reading
 from .layer import Layer
+from .pad_reading import read_pads
 from .surface import patches
 
 Array = NDArray[np.float64]
@@ -87,7 +89,9 @@ class SurfaceInverse:
 
     Parameters: skin: as `read_skin` gives it. depth: from the cubes' centres to the surface, m.
     thickness: of the elastomer over rigid ground, m; inf: a half space. poisson: of the elastomer.
-    Raises ElasticError for what no layer is, and where no cube observes anything.
+    side: points along a side of a patch. influence: of the pads; then depth, thickness and poisson
+    are theirs. None: cubes count as points. Raises ElasticError for what no layer is, where no cube
+    observes anything, and for influence functions of other cubes.
     """
 
     def __init__(
@@ -98,6 +102,7 @@ class SurfaceInverse:
         thickness: float = np.inf,
         poisson: float = POISSONS_RATIO,
         side: int = 2,
+        influence: Influence | None = None,
     ) -> None:
         poses = CubePoses(
             position=np.array([cube.xyz for cube in skin.cubes]),
@@ -106,7 +111,11 @@ class SurfaceInverse:
         )
         pipeline = Pipeline(skin.calibrations)
         noise = np.array([pipeline.covariance(cube) for cube in range(len(skin.cubes))])
-        self._set_up(poses, noise, Layer(thickness, poisson), depth, side, None)
+        layer, reading = Layer(thickness, poisson), None
+        if influence is not None:
+            layer, depth = influence.layer, influence.depth
+            reading = read_pads(influence, skin.calibrations)
+        self._set_up(poses, noise, layer, depth, side, reading)
 
     @classmethod
     def of_cubes(

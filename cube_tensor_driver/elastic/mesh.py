@@ -107,12 +107,13 @@ def block(
     smallest: float,
     growth: float,
     lower: Sequence[float] = (0.0, 0.0, 0.0),
+    largest: float = np.inf,
 ) -> skfem.MeshHex:
     """Bricks on the product of [-lower[k], half[k]]: `size` on a face, `smallest` at the cube's
-    edges.
+    edges, `largest` far away.
 
     Away from the cube they grow by the factor `growth`. Where the cube's part of the stress has
-    decayed, a linear field is left, which needs no fine mesh: there they grow faster.
+    decayed, a linear field needs no fine mesh: there they grow faster.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
@@ -120,7 +121,7 @@ def block(
 
     def line(h: float) -> Array:
         near = 1.0 + _graded(min(h - 1.0, _NEAR), smallest, growth)
-        far = _outer(near[-1], h, near[-1] - near[-2], _FAR_GROWTH, np.inf)
+        far = _outer(near[-1], h, near[-1] - near[-2], _FAR_GROWTH, largest)
         return np.concatenate([face, near[1:], far[1:]])
 
     lines = [

@@ -24,11 +24,11 @@ from ..core.layout import LAYOUTS
 from ..core.modes import PLANE
 from ..elastic.body import Body
 from ..elastic.fem import Progress, compute_response
-from ..elastic.influence import compute_influence
 from ..elastic.inverse import MODEL_ERROR
 from ..elastic.kernels import LENGTHS, SHEAR
 from ..elastic.layer import Layer
 from ..elastic.line_load import line_load
+from ..elastic.reciprocity import compute_influence
 from .paper import dent
 from .rod import Rod
 from .virtual_bench import VirtualBench

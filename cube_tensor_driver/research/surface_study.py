@@ -28,10 +28,11 @@ from ..core.modes import PLANE
 from ..core.symmetry import largest_symmetry
 from ..elastic.body import Body
 from ..elastic.fem import compute_response
-from ..elastic.influence import Influence, compute_influence
+from ..elastic.influence import Influence
 from ..elastic.kernels import Kernels
 from ..elastic.layer import FIELD, Layer
 from ..elastic.line_load import line_load
+from ..elastic.reciprocity import compute_influence
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]

@@ -24,9 +24,11 @@ from ..core.pipeline import Pipeline
 from ..core.rows import FrequencyRows
 from ..core.tensor import rotation_from_rpy
 from ..elastic import contact
+from ..elastic.influence import Influence
 from ..elastic.inverse import SurfaceInverse
 from ..elastic.kernels import Kernels
 from ..elastic.layer import Layer
+from ..elastic.pad_reading import read_pads
 from ..elastic.surface import Surface
 from ..elastic.touches import Touches
 from .field_study import FORCE, FRICTION, WINDOW, FieldExample, flat_skin
@@ -87,8 +89,9 @@ class Errors:
 class Bench:
     """A skin of one setting, its inverse, and loads on it."""
 
-    def __init__(self, setting: Setting, side: int = 4) -> None:
-        """side: points along the side of a cube's patch"""
+    def __init__(self, setting: Setting, side: int = 4, influence: Influence | None = None) -> None:
+        """side: points along the side of a cube's patch; influence: what the inverse takes the pads
+        for, None: cubes count as points"""
         self.setting = setting
         skin = flat_skin(setting.pitch, max(_SIDE, 5 * setting.pitch))
         n = len(skin.position)
@@ -102,8 +105,11 @@ class Bench:
         self.calibration: Calibration = read_calibration(find_calibration(name, folder))
         self._pipeline = Pipeline([self.calibration] * n)
         noise = np.tile(self._pipeline.covariance(0), (n, 1, 1))
+        layer, reading = Layer(setting.known_thickness), None
+        if influence is not None:
+            reading = read_pads(influence, [self.calibration] * n)
         self.inverse = SurfaceInverse.of_cubes(
-            self.poses, noise, Layer(setting.known_thickness), setting.depth, side
+            self.poses, noise, layer, setting.depth, side, reading
         )
         self.surface = Surface(self.poses, setting.depth, side)
         self.window = np.abs(self.inverse.points[:, :2]).max(axis=1) < WINDOW / 2
@@ -138,15 +144,26 @@ class Bench:
         sources, forces = zip(*parts, strict=True)
         return np.concatenate(sources), np.concatenate(forces)
 
-    def measured(self, field: Array, random: np.random.Generator) -> Array:
-        """(cubes, 15) what the pipeline makes of a field (cubes, 24) in the skin's frame."""
+    def values(
+        self, width: float, force: Array, centre: Array, random: np.random.Generator
+    ) -> Array:
+        """(cubes, 15) what the pipeline makes of a load."""
+        field = self.truth(self.poses.position[:, :2], width, force, centre)
+        return self.measured(self._pads_in(field), random)
+
+    def _pads_in(self, field: Array) -> Array:
+        """(cubes, P) pad stresses, Pa, in a field (cubes, 24) in the skin's frame."""
         calibration, turn = self.calibration, self.poses.rotation
         stress = np.einsum("nai,nbj,nab->nij", turn, turn, to_matrix(field[:, :6]))
         gradient = to_matrix(field[:, 6:].reshape(-1, 6, 3).swapaxes(1, 2))  # (n, axis, 3, 3)
         gradient = np.einsum("nai,nbj,nck,ncab->nijk", turn, turn, turn, gradient)
         state = calibration.modes.state(stress, calibration.half_side * gradient)
-        pads = state @ calibration.response.T
-        pads *= 1 + self.setting.gain_error * random.standard_normal(pads.shape)
+        return np.asarray(state @ calibration.response.T)
+
+    def measured(self, pads: Array, random: np.random.Generator) -> Array:
+        """(cubes, 15) what the pipeline makes of pad stresses (cubes, P), Pa."""
+        calibration = self.calibration
+        pads = pads * (1 + self.setting.gain_error * random.standard_normal(pads.shape))
         rest = calibration.rest_frequency
         hertz = pad_frequency(pads, rest, calibration.beta, calibration.modulus)
         hertz *= 1 + FREQUENCY_NOISE * random.standard_normal(hertz.shape)
@@ -169,9 +186,7 @@ class Bench:
             load, centre = self.load(random)
             points = self.inverse.points[self.window, :2]
             true = -self.truth(points, width, load, centre)[:, 2]
-            values = self.measured(
-                self.truth(self.poses.position[:, :2], width, load, centre), random
-            )
+            values = self.values(width, load, centre, random)
             touches = Touches(self.inverse, CONTACT_PRESSURE)
             found: list[Any] = [
                 self.surface.contacts(values, CONTACT_PRESSURE),
@@ -232,8 +247,7 @@ def traction_example() -> FieldExample:
     bench = Bench(Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3), side=10)
     centre, width = bench.setting.pitch * np.array([0.35, 0.25]), 6e-3
     load = FORCE * np.array([FRICTION, 0.0, -1.0])
-    places = bench.poses.position[:, :2]
-    values = bench.measured(bench.truth(places, width, load, centre), np.random.default_rng(1))
+    values = bench.values(width, load, centre, np.random.default_rng(1))
     points = bench.inverse.points
     touches = Touches(bench.inverse, CONTACT_PRESSURE)
     touches.update(values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from sensor_msgs.msg import PointCloud2
 from cube_tensor_driver.msg import SkinContacts
 
 from ..bags.contact_messages import encode_contacts, encode_traction
-from ..bags.skin_info import cubes_noise
+from ..bags.skin_info import cube_calibrations, cubes_noise
 from ..core.errors import CubeError
 from ..elastic.contact_finder import INVERSE, ContactFinder, ContactSettings, contact_finder
 from .node import run
@@ -42,13 +43,13 @@ class Contacts(SkinSubscriberNode):
         return self._traction_is_wanted() or super().is_wanted(publisher)
 
     def set_up(self, skin: FollowedSkin) -> None:
-        names = ("method", "depth", "least", "thickness", "poisson")
+        names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
-        poses, noise = skin.poses, cubes_noise(skin.info)
+        noise, calibrations = cubes_noise(skin.info), cube_calibrations(skin.info)
         self._seen = 0
         self._finder: ContactFinder | None = None
         self._coming: Future[ContactFinder] | None = self._worker.submit(
-            contact_finder, settings, poses, noise
+            contact_finder, settings, skin.poses, noise, calibrations
         )
 
     def message(self, skin: FollowedSkin, health: np.ndarray) -> bytes | None:

@@ -159,6 +159,13 @@ CONTACTS = (
         "Poisson's ratio of the elastomer, for the method inverse.",
         span=(0.0, 0.5),
     ),
+    Parameter(
+        "influence",
+        "",
+        "For the method inverse, what the pads see of forces on the surface: the name of a shipped "
+        "table, or a file of `./cube fem --surface --influence`. Then depth, thickness and poisson "
+        "are those of the table. Empty: cubes count as points.",
+    ),
 )
 RECORDER = (Parameter("skin", "skin", "Name of the skin, for the name of the bag's folder."),)
 ECHO = (

@@ -80,10 +80,10 @@ class SkinSubscriber:
             return
         try:
             skin = FollowedSkin(info, cube_poses(info), Newest(len(info.cubes)))
+            self._on_skin(skin)
         except CubeError as error:
             self._refuse(error)
             return
-        self._on_skin(skin)
         self.skin = skin
 
     def _receive_stress(self, data: bytes) -> None:
