@@ -13,7 +13,7 @@ from .cache import cached
 from .circular import summed
 from .kernels import PER_DEPTH, REACH, disc_spectrum
 from .layer import Layer
-from .spectra import layer_spectra
+from .spectra import bessel_functions, layer_spectra
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class DiscTables:
         spectra = layer_spectra(self.layer, self.depth)
         discs = np.stack([disc_spectrum(spectra.k * size) for size in SIZES * self.depth])
         r = np.arange(REACH * PER_DEPTH + 2) * self.depth / PER_DEPTH
-        return {"table": spectra.radial(r, discs).astype(np.float32)}
+        return {"table": spectra.radial(bessel_functions(spectra.k, r), discs).astype(np.float32)}
 
     def field(self, place: ArrayLike, force: ArrayLike, radius: ArrayLike) -> tuple[Array, Array]:
         """Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, each the sum over L discs.

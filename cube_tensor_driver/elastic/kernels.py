@@ -25,7 +25,7 @@ from ..core.modes import COMPONENTS, STRESS
 from .cache import cached
 from .circular import BACK, CIRCULAR, ORDERS
 from .layer import FIELD, Layer
-from .spectra import Spectra, layer_spectra
+from .spectra import Bessel, Spectra, bessel_functions, layer_spectra
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -88,38 +88,37 @@ class Kernels:
         self.layer, self.depth, self.scale = layer, depth, scale
         self.step, self._last = depth / PER_DEPTH, REACH * PER_DEPTH
         # (-1, 0, ...) steps: cubic interpolation needs one more on the left.
-        self._r = np.arange(-1.0, self._last + 3) * self.step
+        r = np.arange(-1.0, self._last + 3) * self.step
         spectra, said, _ = reading or at_points
+        bessel = bessel_functions(spectra.k, r)
         self.readings = said * np.where(_GRADIENT, scale, 1.0)
         self._order = spectra.order
         self.variance = np.array([SHEAR**2, SHEAR**2, 1.0])
-        of_layer = [layer.thickness, layer.poisson, depth]
-        seen = [*of_layer, *vars(spectra).values()]
+        seen = [layer.thickness, layer.poisson, depth, *vars(spectra).values()]
         self.made_from = [*seen, self.readings]
-        self._field = cached("field", of_layer, lambda: self._discs(at_points.spectra))["discs"]
-        self._response = self._field
-        if reading is not None:
-            self._response = cached("response", seen, lambda: self._discs(spectra))["discs"]
-        tables = cached("kernels", seen, lambda: self._tables(spectra, at_points.spectra))
+        self._field = self._discs(at_points.spectra, bessel)
+        self._response = self._field if reading is None else self._discs(spectra, bessel)
+        tables = cached("kernels", seen, lambda: self._tables(spectra, at_points.spectra, bessel))
         self._cross, self._pressure = tables["cross"], tables["pressure"]
         self._even, self._odd = tables["even"], tables["odd"]
         self.pressure_variance = float(tables["own"])
 
-    def _discs(self, spectra: Spectra) -> dict[str, Array]:
-        """discs (sizes, places, 3, n): R, Z and T."""
+    def _discs(self, spectra: Spectra, bessel: Bessel) -> Array:
+        """(sizes, places, 3, n) R, Z and T of the discs of SIZES."""
         factors = np.stack([disc_spectrum(spectra.k * size) for size in SIZES * self.depth])
-        return {"discs": spectra.radial(self._r, factors)}
+        key = [self.depth, *vars(spectra).values()]
+        return cached("discs", key, lambda: {"discs": spectra.radial(bessel, factors)})["discs"]
 
-    def _tables(self, spectra: Spectra, at_points: Spectra) -> dict[str, Array]:
+    def _tables(self, spectra: Spectra, at_points: Spectra, bessel: Bessel) -> dict[str, Array]:
         """cross (places, 3, n): R, Z, T; even, odd (places, n, n): covariance of real and of
         imaginary parts; pressure (places, n): of real parts with the pressure at a point; own:
         its variance."""
         prior = _prior(spectra.k * self.depth) * self.depth**2
-        cross = spectra.radial(self._r, prior[None])[0] * np.array([SHEAR**2, 1, SHEAR**2])[:, None]
-        even, odd = spectra.covariance(spectra, self._r, prior, SHEAR)
-        at_point = at_points.covariance(at_points, self._r[1:2], prior, SHEAR)[0]
-        pressure = -spectra.covariance(at_points, self._r, prior, SHEAR)[0][:, :, _ZZ]
-        own = at_point[0, _ZZ, _ZZ]
+        cross = spectra.radial(bessel, prior[None])[0] * np.array([SHEAR**2, 1, SHEAR**2])[:, None]
+        even, odd = spectra.covariance(spectra, bessel, prior, SHEAR)
+        pressure = -spectra.covariance(at_points, bessel, prior, SHEAR)[0][:, :, _ZZ]
+        here = bessel_functions(spectra.k, np.zeros(1))
+        own = at_points.covariance(at_points, here, prior, SHEAR)[0][0, _ZZ, _ZZ]
         return {"cross": cross, "even": even, "odd": odd, "pressure": pressure, "own": own}
 
     def response(self, place: Array, angle: Array, reading: Index, size: float) -> Array:

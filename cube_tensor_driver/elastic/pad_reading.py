@@ -21,14 +21,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import jv
 
 from ..core.calibration import Calibration
 from ..core.errors import ElasticError
 from ..core.pipeline import Pipeline
 from .influence import Influence
 from .kernels import Reading
-from .spectra import Spectra, waves
+from .spectra import Spectra, bessel_functions, waves
 
 Array = NDArray[np.float64]
 
@@ -51,12 +50,10 @@ def read_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Read
     """
     kinds = list({id(one): one for one in calibrations}.values())
     number = {id(one): k for k, one in enumerate(kinds)}
+    pads = [_pads(influence, one) for one in kinds]
     spectra, made = _components(influence)
     pipeline = Pipeline(kinds)
-    said = [
-        made[:, _pads(influence, one)] @ np.nan_to_num(pipeline.matrix(k)).T
-        for k, one in enumerate(kinds)
-    ]
+    said = [made[:, mine] @ np.nan_to_num(pipeline.matrix(k)).T for k, mine in enumerate(pads)]
     of_cube = np.array([number[id(one)] for one in calibrations], np.intp)
     return Reading(spectra, np.stack(said), of_cube)
 
@@ -96,12 +93,13 @@ def _components(influence: Influence) -> tuple[Spectra, Array]:
     ]
     greatest = max(sizes[0] for _, sizes, _ in parts)
     k, wave_weight = waves(influence.depth)
+    bessel = bessel_functions(k, r)
     orders, spectra, made = [], [], []
     for order, (pads, sizes, shapes) in enumerate(parts):
         kept = sizes > NEGLIGIBLE * greatest
         along, normal, across = np.moveaxis(shapes[kept].reshape(kept.sum(), 3, -1) / root, 1, 0)
         integrals = [
-            2 * np.pi * (jv(order + shift, np.outer(k, r)) * (r * weight)) @ one.T
+            2 * np.pi * bessel(order + shift).T @ (one * (r * weight)).T
             for one, shift in ((along + across, -1), (along - across, 1), (normal, 0))
         ]
         orders += [order] * int(kept.sum())

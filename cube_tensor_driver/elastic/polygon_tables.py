@@ -27,7 +27,7 @@ from .cache import cached
 from .circular import ORDERS, summed
 from .kernels import PER_DEPTH, REACH
 from .layer import Layer
-from .spectra import layer_spectra
+from .spectra import bessel_functions, layer_spectra
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -61,7 +61,8 @@ class PolygonTables:
         spectra = layer_spectra(self.layer, self.depth)
         r = np.arange(REACH * PER_DEPTH + 2)[:, None] / PER_DEPTH
         everywhere = np.ones((1, len(spectra.k)))
-        along, normal, across = spectra.radial(r[:, 0] * self.depth, everywhere)[0].swapaxes(0, 1)
+        bessel = bessel_functions(spectra.k, r[:, 0] * self.depth)
+        along, normal, across = spectra.radial(bessel, everywhere)[0].swapaxes(0, 1)
         columns = [(along + across) / 2, (along - across) / 2, normal, across * r]
         over_r = CubicSpline(r[:, 0], np.stack(columns, axis=1) * r[..., None]).antiderivative()
 

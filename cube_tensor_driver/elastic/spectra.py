@@ -33,6 +33,7 @@ from .circular import CIRCULAR, ORDERS
 from .layer import Layer
 
 Array = NDArray[np.float64]
+Bessel = Callable[[int], Array]
 
 GREATEST = 25.0
 """Wavenumber times depth at which integrals end: the field has decayed by exp(-25)."""
@@ -55,11 +56,10 @@ class Spectra:
     minus: Array
     normal: Array
 
-    def radial(self, r: Array, factors: Array) -> Array:
-        """(factors, places, 3, n) R, Z and T at distances r (places,) m of forces that are spread
+    def radial(self, bessel: Bessel, factors: Array) -> Array:
+        """(factors, places, 3, n) R, Z and T at the places of `bessel` of forces that are spread
         with each of the factors (factors, waves)."""
-        bessel = _bessel(np.outer(r, self.k))
-        sums = np.zeros((3, len(factors), len(r), len(self.order)))
+        sums = np.zeros((3, len(factors), len(bessel(0)), len(self.order)))
         for order in np.unique(self.order):
             mine = self.order == order
             for part, spectrum, shift in zip(
@@ -72,9 +72,9 @@ class Spectra:
         return np.stack([(plus + minus) / 2, normal, (plus - minus) / 2], axis=2)
 
     def covariance(
-        self, other: Spectra, r: Array, factor: Array, shear: float
+        self, other: Spectra, bessel: Bessel, factor: Array, shear: float
     ) -> tuple[Array, Array]:
-        """(places, n, n') of the real parts and of the imaginary parts, at distances r (places,) m
+        """(places, n, n') of the real parts and of the imaginary parts, at the places of `bessel`
         along x from the other's; real and imaginary parts are independent there.
 
         factor: (waves,) spectrum of the pressure; shear: s
@@ -88,26 +88,26 @@ class Spectra:
         sign = (-1.0) ** other.order
         difference = self.order[:, None] - other.order
         total = self.order[:, None] + other.order
-        with_conjugate = self._integral(normal + half * same, difference, r, factor)
-        without = self._integral(sign * (normal - half * crossed), total, r, factor)
+        with_conjugate = self._integral(normal + half * same, difference, bessel, factor)
+        without = self._integral(sign * (normal - half * crossed), total, bessel, factor)
         return (with_conjugate + without) / 2, (with_conjugate - without) / 2
 
     def _integral(
-        self, spectrum: Array, order: NDArray[np.int64], r: Array, factor: Array
+        self, spectrum: Array, order: NDArray[np.int64], bessel: Bessel, factor: Array
     ) -> Array:
         """(places, n, n') int factor spectrum J_order(kr), with an order (n, n') for each."""
-        bessel = _bessel(np.outer(r, self.k))
-        result = np.zeros((len(r), *order.shape))
+        result = np.zeros((len(bessel(0)), *order.shape))
         for one in np.unique(order):
             mine = order == one
             result[:, mine] = (bessel(int(one)) * (self.weight * factor)) @ spectrum[:, mine]
         return result
 
 
-def _bessel(x: Array) -> Callable[[int], Array]:
-    """J(x) of any order; each is computed once, because it takes long."""
+def bessel_functions(k: Array, r: Array) -> Bessel:
+    """J(kr) (places, waves) of any order, at distances r (places,) m."""
+    x = np.outer(r, k)
 
-    @cache
+    @cache  # each takes long, and is needed many times
     def of(order: int) -> Array:
         return np.asarray(jv(order, x)) if order >= 0 else (-1) ** order * of(-order)
 

@@ -43,7 +43,7 @@ class LayerBench(Bench):
         turn = self.poses.rotation
         apart = np.einsum("nji,nsj->nsi", turn, sources - self.poses.position[:, None])
         seen = self._true.at(apart[..., :2].reshape(-1, 2))[self._pads]
-        seen = seen.reshape(len(pads := self._pads), len(turn), -1, 3)
+        seen = seen.reshape(-1, len(turn), len(sources), 3)
         local = np.einsum("nji,sj->nsi", turn, forces)
         return self.measured(np.einsum("pnsi,nsi->np", seen, local), random)
 
