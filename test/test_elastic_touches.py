@@ -119,8 +119,8 @@ def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact
     bench = Bench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3), side=1)
     force, random = np.array([0.6, -0.3, -3.0]), np.random.default_rng(6)
     for centre in np.array([[11.7e-3, -4.4e-3], [6e-3, 9e-3]]):
-        values = bench.truth(bench.poses.position[:, :2], 5e-3, force, centre)
-        (found,) = Touches(bench.inverse, LEAST).update(bench.measured(values, random))
+        values = bench.values(5e-3, force, centre, random)
+        (found,) = Touches(bench.inverse, LEAST).update(values)
         assert np.linalg.norm(found.position[:2] - centre) < 0.3e-3
         assert found.position_uncertainty < 0.3e-3
 
