@@ -23,12 +23,14 @@ from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE, POISSONS_RATIO, SURFACE_DEPTH
+from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import to_matrix
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.contact_finder import ContactSettings
+from cube_tensor_driver.elastic.influence_file import find_influence, read_influence
 
 FRAME = b"skin_base\0"
 FORCE = np.array([0.5, 0.0, -2.0])
@@ -94,6 +96,7 @@ def points_of(cloud: object) -> np.ndarray:
         (["inverse", "depth:=deep"], "needed is a number from 1e-05 to 1"),
         (["inverse", "poisson:=0.6"], "needed is a number from 0 to 0.5"),
         (["inverse", "thickness:=0.003"], "between 0 and the thickness"),
+        (["inverse", "influence:=none"], "one of the shipped: cube_11mm"),
         (["inverse", "--format", "csv"], "only a bag holds contacts"),
     ],
 )
@@ -102,6 +105,41 @@ def test_what_reprocess_cannot_use_is_one_line(tmp_path, capsys, given, words):
     assert main(["reprocess", str(tmp_path / "bag"), "-o", str(out), "--contacts", *given]) == 1
     error = capsys.readouterr().err
     assert words in " ".join(error.split()) and "Traceback" not in error and not out.exists()
+
+
+def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path):
+    """The force, by influence functions; cubes that count as points in this layer say 4 % more."""
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    from cube_tensor_driver.msg import SkinContacts
+    from cube_tensor_driver.ros.messages import info_message
+
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    influence = read_influence(find_influence("cube_11mm"))
+    calibration, centre = skin.calibrations[0], np.array([1e-3, -2e-3])
+    sources, forces = contact.hertz(3e-3, FORCE, centre, order=8)
+    which = [LAYOUTS["cube"].pads.index(pad) for pad in calibration.layout.pads]
+    pads = [
+        np.einsum("psi,si->p", influence.at(sources[:, :2] - cube.xyz[:2])[which], forces)
+        for cube in skin.cubes
+    ]
+    law = calibration.rest_frequency, calibration.beta, calibration.modulus
+    described = info_message(skin, Pipeline(skin.calibrations), time.time_ns())
+    described.sender = "reconstruction"
+    info = serialize_message(described)
+    bag = bag_of(tmp_path / "bag", skin, info, [pad_frequency(np.array(pads), *law)])
+    forces = []
+    for number, more in enumerate(
+        (["influence:=cube_11mm"], ["depth:=0.0055", "thickness:=0.011"])
+    ):
+        out = tmp_path / str(number)
+        assert main(["reprocess", str(bag), "-o", str(out), "--contacts", "inverse", *more]) == 0
+        (found,) = messages(out / bag.name, "/contacts")
+        forces.append(deserialize_message(found, SkinContacts))
+    (by_pads,), (by_points,) = ([one.z for one in found.force] for found in forces)
+    assert by_pads == pytest.approx(FORCE[2], rel=0.01)
+    assert abs(by_points / FORCE[2] - 1) > 0.03
 
 
 def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_path):

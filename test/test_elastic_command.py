@@ -25,6 +25,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.elastic import body as bodies
 from cube_tensor_driver.elastic import memory
+from cube_tensor_driver.elastic.influence_file import read_influence
 from cube_tensor_driver.research import paper, rod_parts, rod_shear
 from cube_tensor_driver.research.layout_study import LayoutStudy
 from cube_tensor_driver.terminal.output import progress_bar
@@ -101,9 +102,10 @@ def test_space_on_a_coarse_mesh(coarse, tmp_path, capsys):
 
 @pytest.mark.parametrize("space", [False, True])
 def test_pads_under_loads_on_the_surface(coarse, tmp_path, capsys, space):
-    out = tmp_path / "surface.json"
+    out, table = tmp_path / "surface.json", tmp_path / "table.npz"
     arguments = ["fem", "--surface", "--width", "14", "--height", "7", "--meshes", "1", "--rigid"]
     arguments += ["--json", str(out), "--figures", str(tmp_path), *(["--3d"] if space else [])]
+    arguments += ["--influence", str(table)] if space else []
     assert cli.main(arguments) == 0
     said = capsys.readouterr().out
     study = json.loads(out.read_text())
@@ -122,6 +124,10 @@ def test_pads_under_loads_on_the_surface(coarse, tmp_path, capsys, space):
     row = "press +2 +0 " + " ".join(f"+{number:.{places}f}" for number in numbers)
     assert re.search(rf"{row} +{ratio:.2f}", said)
     assert (tmp_path / "influence.png").stat().st_size > 10_000
+    if space:
+        written = read_influence(table)
+        assert (written.depth, written.layer.thickness) == (3.5e-3, 7e-3)
+        assert np.abs(written.pads - pads).max() < 2e-5 * np.abs(pads).max()
 
 
 def test_a_layout_of_ones_own(tmp_path):
@@ -251,6 +257,7 @@ def refused(capsys, arguments, words):
         ("--neglect round", ["unknown mode 'round'", "zz_x"]),
         ("--surface --width 8", ["width is 8 mm", "make it wider"]),
         ("--surface -o x.yaml", ["-o x.yaml", "leave out one of them"]),
+        ("--surface --influence x.npz", ["--influence x.npz", "add --surface --3d"]),
         ("-o none/cube.yaml", ["-o none/cube.yaml", "a folder that can be written"]),
         ("-o /proc/cube.yaml", ["-o /proc/cube.yaml", "a folder that can be written"]),
         ("--json .", ["--json .", "is no file"]),

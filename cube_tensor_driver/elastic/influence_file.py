@@ -41,6 +41,15 @@ def find_influence(name: str) -> Path:
     )
 
 
+def influence_problem(name: str) -> str:
+    """Why `find_influence` finds nothing, in words; empty if it does."""
+    try:
+        find_influence(name)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
 def write_influence(path: Path, influence: Influence, made_by: str) -> None:
     """Write influence functions, completely or not at all. Raises ConfigError if it cannot.
 

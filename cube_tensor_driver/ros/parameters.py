@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from ..config.port import port_problem
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.scene import QUANTITIES
+from ..elastic.influence_file import influence_problem
 
 
 class Parameter(NamedTuple):
@@ -165,6 +166,7 @@ CONTACTS = (
         "For the method inverse, what the pads see of forces on the surface: the name of a shipped "
         "table, or a file of `./cube fem --surface --influence`. Then depth, thickness and poisson "
         "are those of the table. Empty: cubes count as points.",
+        problem=influence_problem,
     ),
 )
 RECORDER = (Parameter("skin", "skin", "Name of the skin, for the name of the bag's folder."),)
