@@ -40,6 +40,9 @@ ELSEWHERE = {
     "./cube check socket://127.0.0.1:5331": (
         "test_firmware.test_hubs_keep_every_rule_on_real_lines"
     ),
+    "./cube fem --surface --3d --rigid --width 80 --meshes 2 --influence mine.npz": (
+        "test_elastic_command.test_pads_under_loads_on_the_surface"
+    ),
     "./cube record -o run1": "test_bags_ros.test_recorded_is_published_and_reprocessed_is_live",
     "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml": (
         "test_bags_files.test_fit_from_a_bag"

@@ -12,12 +12,31 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.defaults import CONTACT_PRESSURE
+from ..core.layout import LAYOUTS
+from ..elastic.body import Body
 from ..elastic.influence import Influence
-from .traction_study import Bench, Errors, Setting
+from ..elastic.influence_file import find_influence, read_influence
+from ..elastic.reciprocity import compute_influence
+from ..elastic.touches import Touches
+from .field_study import FORCE, FRICTION, FieldExample
+from .traction_study import CUBES, Bench, Errors, Setting
 
 Array = NDArray[np.float64]
 
 FORMS = ("points", "pads")
+BODY = Body(width=80e-3, depth=80e-3, cube_young=np.inf, ground=True)
+"""Of the shipped influence functions."""
+THIN = tuple(
+    Setting(
+        cubes=cubes,
+        depth=BODY.height / 2,
+        thickness=BODY.height,
+        known_thickness=BODY.height,
+    )
+    for cubes in CUBES
+)
+"""Pitch 8 mm, cubes in the middle of that layer, which is known."""
 
 
 class LayerBench(Bench):
@@ -48,23 +67,51 @@ class LayerBench(Bench):
         return self.measured(np.einsum("pnsi,nsi->np", seen, local), random)
 
 
+def coarse_influence() -> Influence:
+    """What the pads really see: finite elements on the coarsest mesh. Takes minutes."""
+    return compute_influence(BODY, LAYOUTS["cube"], 0)
+
+
+def benches(setting: Setting, true: Influence, side: int = 4) -> dict[str, LayerBench]:
+    """A bench for each of FORMS; pads are taken for those of the shipped influence functions."""
+    known = read_influence(find_influence("cube_11mm"))
+    return {
+        form: LayerBench(setting, true, influence, side)
+        for form, influence in zip(FORMS, (None, known), strict=True)
+    }
+
+
 def study_pads(
-    settings: Sequence[Setting],
     true: Influence,
-    known: Influence,
     widths: Sequence[float],
     cases: int,
-    progress: Callable[[str, Setting, Errors], None] | None = None,
-    seed: int = 8,
+    seed: int,
+    settings: Sequence[Setting] = THIN,
+    progress: Callable[[Setting, str, Errors], None] | None = None,
 ) -> dict[tuple[Setting, str], list[Errors]]:
     """Errors of each setting and each of FORMS at each width (m)."""
     results: dict[tuple[Setting, str], list[Errors]] = {}
     for setting in settings:
-        for form, influence in zip(FORMS, (None, known), strict=True):
-            bench = LayerBench(setting, true, influence)
+        for form, bench in benches(setting, true).items():
             results[setting, form] = []
             for width in widths:
                 results[setting, form].append(bench.errors(width, cases, seed))
                 if progress is not None:
-                    progress(form, setting, results[setting, form][-1])
+                    progress(setting, form, results[setting, form][-1])
     return results
+
+
+def layer_example(true: Influence) -> FieldExample:
+    """A contact of 5 mm between 24-pad cubes: pressure at the cubes' depth as it is, and as the
+    inverse with contacts computes it from points and from pads."""
+    load, centre = FORCE * np.array([FRICTION, 0.0, -1.0]), np.array([2.4e-3, 1.6e-3])
+    pressure = {}
+    for form, bench in benches(THIN[0], true, side=10).items():
+        points = bench.inverse.points
+        pressure["truth"] = -bench.truth(points[:, :2], 5e-3, load, centre)[:, 2]
+        values = bench.values(5e-3, load, centre, np.random.default_rng(1))
+        touches = Touches(bench.inverse, CONTACT_PRESSURE)
+        touches.update(values)
+        if touches.field is not None:
+            pressure[form] = touches.field.below
+    return FieldExample(points, pressure, bench.poses.position, centre)

@@ -23,11 +23,12 @@ from ..plot.field import draw_field, draw_field_study, field_tables
 from ..plot.fingers import draw_fingers
 from ..plot.pads_example import draw_pads, draw_sweep
 from ..plot.style import save
-from ..plot.traction import draw_traction, traction_table
+from ..plot.traction import draw_layer, draw_traction, pads_table, traction_table
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..research.field_study import field_example, field_study
 from ..research.pads_example import planar_calibration, sweep
+from ..research.pads_study import coarse_influence, layer_example, study_pads
 from ..research.paper import experiments
 from ..research.traction_study import MAIN, PITCHES, SHAPED, WRONG, traction_example
 from ..research.traction_study import study as traction_study
@@ -109,6 +110,9 @@ def make_pictures(folder: Path) -> None:
     shaped = traction_study(SHAPED, CONTACT_WIDTHS, cases=6, seed=SEED)
     names_of = {s: f"{s.shape}, {s.cubes}, {1e3 * s.pitch:g} mm" for s in shaped}
     print(traction_table({names_of[s]: errors for s, errors in shaped.items()}))
+    pads = coarse_influence()
+    save(draw_layer(layer_example(pads)), folder / "thin_layer.png")
+    print(pads_table(study_pads(pads, CONTACT_WIDTHS, cases=40, seed=SEED)))
     names = ("pitches", "widths", "error", "position", "force")
     table = {name: getattr(study, name).tolist() for name in names}
     (folder / "field.json").write_text(json.dumps(table) + "\n")
