@@ -6,6 +6,11 @@ between u0 and u (S, its secant). So w is what the stiffer cube alone makes of u
 
     (K + S) w = -(K_cube - K_elastomer) u0        matrices of the cube's place on the right
 
+That holds if the rod's displacement is held. If its force is, the cube drives the rod back by d
+along z (e is one there, and zero along x), and the change of the contact's force sums to zero::
+
+    K w + S (w - d e) = -(K_cube - K_elastomer) u0,        e' S (w - d e) = 0
+
 Pads are linear in u, and hence in u0 in the cube's place. There u0 is a sum of polynomials in
 balance, one to four for each order, after G. V. Kolosov, with z = x + i y and y along the height::
 
@@ -21,10 +26,14 @@ Sources: N. I. Muskhelishvili, Some Basic Problems of the Mathematical Theory of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Literal
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.optimize import newton
 
 from ..core.errors import ElasticError
 from ..core.layout import LAYOUTS
@@ -37,6 +46,8 @@ from .rod import Rod
 from .virtual_bench import Step, VirtualBench
 
 Array = NDArray[np.float64]
+Held = Literal["displacement", "force"]
+"""What of the rod is the same with the cube as without it."""
 
 PARTS = ("shear", "normal", "gradients", "second", "higher")
 """Uniform shear, uniform normal stresses, gradients, second derivatives of stress, the rest."""
@@ -48,6 +59,8 @@ P_SHEAR = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0])
 
 _ORDER = 8
 """Of the polynomials; beyond it 0.2 % of the signal is left."""
+_SAME_DEPTH = 1e-8
+"""Of rods, m; the method of secants is then far closer to the force that is held."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +77,11 @@ def rod_parts(
     places: Sequence[float] = (1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 8e-3),
     pressed: float = 1e-3,
     progress: Progress | None = None,
+    held: Held = "displacement",
 ) -> dict[str, RodParts]:
     """Parts of -v1 + v2 + v3 - v4 by the rod's place along x, m; bottom bonded, no friction.
 
+    pressed: how deep the rod is without the cube, m
     Keys: "rounded rod, strips" and so on, of RADII and PADS.
     """
     bench = VirtualBench(body or Body())
@@ -79,13 +94,33 @@ def rod_parts(
                 done, total = number * len(places) + row, len(RADII) * len(places)
                 progress(done, total, f"{rod} at {1e3 * place:g} mm")
             step = dent(bench.body, Rod(pressed, place, edge_radius=radius))
-            rows.append(split(bench, step, signals))
+            rows.append(split(bench, step, signals, held))
         for pads, parts in zip(PADS, np.moveaxis(np.array(rows), 1, 0), strict=True):
             found[f"{rod}, {pads}"] = RodParts(np.array(places), parts.sum(axis=1), parts)
     return found
 
 
-def split(bench: VirtualBench, step: Step, signals: Sequence[Array]) -> Array:
+def eased(bench: VirtualBench, step: Step) -> Step:
+    """The step with its rod drawn back until its force is that on the body without the cube."""
+    rod = step.rod
+    if rod is None:
+        raise ElasticError("the step has no rod whose force could be held; give it one")
+
+    def at(depth: float) -> Step:
+        return replace(step, rod=replace(rod, pressed=depth))
+
+    @cache
+    def excess(depth: float) -> float:
+        return float(bench.rod_pressure(at(depth))[1].sum() / force - 1)
+
+    force = bench.without_cube().rod_pressure(step)[1].sum()
+    guess = rod.pressed / (1 + excess(rod.pressed))
+    return at(newton(excess, rod.pressed, x1=guess, tol=_SAME_DEPTH))
+
+
+def split(
+    bench: VirtualBench, step: Step, signals: Sequence[Array], held: Held = "displacement"
+) -> Array:
     """(signals, 5) parts of each signal under a step of a linear bench.
 
     signals: (dofs,) weights of the nodal forces on the cube, as bench.pad_weights gives them
@@ -93,14 +128,21 @@ def split(bench: VirtualBench, step: Step, signals: Sequence[Array]) -> Array:
     if bench.finite or step.sliding:
         raise ElasticError("fields superpose on a linear bench whose bottom is bonded; take that")
     empty = bench.without_cube()
-    u, field = bench.solve(step), empty.solve(step)
+    with_cube = eased(bench, step) if held == "force" else step
+    u, field = bench.solve(with_cube), empty.solve(step)
     if u is None or field is None:
         raise ElasticError("the load is too large for one step; press less")
-    matrix = bench.section.tangent(u)
-    if step.rod is not None:
-        matrix = matrix + bench.rod_contact(step.rod).secant(u, field)
     free, inside = bench.free(step), bench.in_cube
-    solver = factors(matrix[free][:, free])
+    matrix = bench.section.tangent(u)[free][:, free]
+    if step.rod is not None and with_cube.rod is not None:
+        up = (bench.section.component == 1).astype(float)
+        back = (step.rod.pressed - with_cube.rod.pressed) / (bench.body.side / 2)
+        springs = bench.rod_contact(step.rod).secant(u - back * up, field)
+        matrix = matrix + springs[free][:, free]
+        if held == "force":
+            push = sp.csr_matrix((springs @ up)[free])
+            matrix = sp.bmat([[matrix, push.T], [push, [[up @ springs @ up]]]])
+    solver = factors(matrix)
     dofs = np.unique(bench.section.basis.element_dofs[:, inside])
     polynomials, part = _polynomials(bench)
     polynomials = polynomials[:, dofs]
@@ -110,7 +152,9 @@ def split(bench: VirtualBench, step: Step, signals: Sequence[Array]) -> Array:
     rows = []
     for weights in signals:
         adjoint = np.zeros_like(u)
-        adjoint[free] = solver.solve(-_forces(bench, weights, ~inside)[free])
+        right = np.zeros(matrix.shape[0])
+        right[: len(free)] = -_forces(bench, weights, ~inside)[free]
+        adjoint[free] = solver.solve(right)[: len(free)]
         response = _forces(empty, weights + adjoint, inside) - _forces(bench, adjoint, inside)
         each = (polynomials @ response[dofs]) * amplitude
         parts = np.bincount(part, each, len(PARTS))
