@@ -14,9 +14,10 @@ from cube_tensor_driver.research import paper
 from cube_tensor_driver.research import virtual_bench as benches
 from cube_tensor_driver.research.layout_study import layout_study
 from cube_tensor_driver.research.material import Material
+from cube_tensor_driver.research.normal_fall import normal_fall
 from cube_tensor_driver.research.paper import dent, plates
 from cube_tensor_driver.research.rod import Rod
-from cube_tensor_driver.research.rod_parts import P_SHEAR, PARTS, split
+from cube_tensor_driver.research.rod_parts import P_SHEAR, PARTS, eased, split
 from cube_tensor_driver.research.virtual_bench import Step, VirtualBench
 
 BODY, NARROW = Body(), Body(width=20e-3)
@@ -185,22 +186,62 @@ def test_a_sliding_bottom_stays_on_average(coarse, finite):
     assert pushed == finite  # linear: the rod has no force along x
 
 
-def bottom_weights(basis):
-    """(dofs,) with weights @ u = the integral of u_x over the bottom, by Simpson's rule."""
+def bottom_weights(basis, along=0):
+    """(dofs,) with weights @ u = the integral of u_x or u_z over the bottom, by Simpson's rule."""
     mesh, weights = basis.mesh, np.zeros(basis.N)
     for facet in mesh.facets_satisfying(
         lambda x: np.abs(x[1] - mesh.p[1].min()) < 1e-9, boundaries_only=True
     ):
         corners = mesh.facets[:, facet]
         length = np.ptp(mesh.p[0, corners])
-        weights[basis.nodal_dofs[0, corners]] += length / 6
-        weights[basis.facet_dofs[0, facet]] += 2 * length / 3
+        weights[basis.nodal_dofs[along, corners]] += length / 6
+        weights[basis.facet_dofs[along, facet]] += 2 * length / 3
     return weights
 
 
 def test_prototype_signs():
     frequency = 100e3 + np.array([[-1.0, -3.0, -1.0, -1.0]])
     assert paper.prototype(frequency) == pytest.approx(np.array([[6.0, -2.0, 2.0]]))
+
+
+def experiment(pads, truth, rotation):
+    frequency = pad_frequency(pads[:, :4], **paper.FOAM)
+    signals = paper.prototype(frequency)
+    steps = np.arange(float(len(pads)))
+    return paper.Experiment("b", steps, pads, frequency, signals, signals, truth, truth, rotation)
+
+
+def test_the_parts_of_a_falling_p_normal_sum_to_its_fall():
+    random = np.random.default_rng(5)
+    made_up = experiment(-1e5 * random.random((4, 8)), *random.random((2, 4, 7)))
+    made_up.pads[1] = -6e4
+    made_up = experiment(made_up.pads, 1e5 * made_up.truth, made_up.rotation[:, 0])
+    parts, mean = normal_fall(made_up), made_up.pads[:, :4].mean(axis=1)
+    assert parts.stress.sum() == pytest.approx(mean[3] - mean[1])
+    assert parts.signal.sum() == pytest.approx(made_up.prototype[3, 0] - made_up.prototype[1, 0])
+
+
+def test_a_body_that_is_turned_as_a_whole_has_parts_that_sum_to_nothing(coarse):
+    """The true s_zz changes and no pad feels it: what turned faces bring makes up for it."""
+    angle = 0.15
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    pressed = plates(NARROW, 1e-3, 1e-3)
+
+    def turned(x):
+        moved = pressed.prescribed(x)
+        return turn @ (x + moved) - x
+
+    steps = [pressed, Step(turned)]
+    with_cube, without = (
+        VirtualBench(NARROW, cube=cube, finite=True, size=2.0).run(steps) for cube in (True, False)
+    )
+    rotation = with_cube.rotation - with_cube.rotation[0]
+    parts = normal_fall(experiment(with_cube.pads, without.state, rotation))
+    assert rotation[1] == pytest.approx(angle, rel=1e-6)
+    size = np.abs(parts.stress).max()
+    assert size > 1e3 and np.abs(parts.stress[:3]).min() > 0.1 * size
+    assert abs(parts.stress[:3].sum()) < 1e-6 * size and abs(parts.stress[3]) < 1e-6 * size
+    assert abs(parts.signal[:4].sum()) < 1e-6 * np.abs(parts.signal).max()
 
 
 def test_a_rod_above_c2_raises_p_shear_only_with_c2_on_the_lower_face(coarse):
@@ -222,6 +263,22 @@ def test_the_parts_under_a_rod_sum_to_the_signal_of_the_bench(coarse):
     none, parts = (split(bench, step, [signal])[0] for step in (middle, beside))
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([beside]).pads[0], rel=1e-6)
     assert np.abs(none).max() < 1e-6 * np.abs(parts).max()
+
+
+def test_the_parts_sum_to_the_signal_of_a_rod_with_the_force_it_has_without_the_cube(coarse):
+    """The force is what the bottom bears."""
+    bench = VirtualBench(Body(width=12e-3), size=2.0)
+    step = dent(bench.body, Rod(1e-3, 1e-3, edge_radius=1e-5))  # sharp: soon solved
+    drawn_back, bottom = eased(bench, step), bottom_weights(bench.section.basis, along=1) > 0
+    signal = P_SHEAR @ bench.pad_weights(bench.layout)
+    parts = split(bench, step, [signal], "force")[0]
+    assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([drawn_back]).pads[0], rel=1e-6)
+    force, without = (
+        body.unbalanced_forces(body.solve(one), one.rod)[bottom].sum()
+        for body, one in ((bench, drawn_back), (bench.without_cube(), step))
+    )
+    assert force == pytest.approx(without, rel=1e-6)
+    assert drawn_back.rod.pressed < 0.8e-3
 
 
 @pytest.mark.parametrize(

@@ -477,7 +477,9 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     monkeypatch.setattr("cube_tensor_driver.research.virtual_bench.CUBE_REFINEMENTS", 0)
     monkeypatch.setattr(
         "cube_tensor_driver.plot.paper.rod_parts",
-        lambda progress: rod_parts.rod_parts(NARROW, places=(2e-3,), progress=progress),
+        lambda progress, places=(2e-3,), held="": (
+            {} if held else rod_parts.rod_parts(NARROW, places=places, progress=progress)
+        ),
     )
     monkeypatch.setattr(
         "cube_tensor_driver.plot.paper.rod_shear",
@@ -501,7 +503,7 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
 def _experiment() -> paper.Experiment:
     step = np.linspace(0, 1, 3)
     rows = [np.outer(step, np.ones(n)) for n in (8, 4, 3, 3, 7, 7)]
-    return paper.Experiment("test", step, *rows)
+    return paper.Experiment("test", step, *rows, rotation=step)
 
 
 def test_every_picture_of_the_paper_is_there_and_shown():
@@ -562,7 +564,13 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
             for name, column in (("b", 1), ("c", 1), ("c", 2))
         ]
         said.append(f"| the {face} face | {' | '.join(signals)} |")
-    for rod in found["rod parts"].values():
+    for name, parts in found["fall of P_normal"].items():
+        first = found[f"{name}, finite"]["prototype"][11][0]
+        stress = [f"{part / 1e3:.1f}" for part in parts["stress"]]
+        percent = [f"{100 * part / first:.2f}" for part in parts["signal"]]
+        said.append(f"{' | '.join(stress)} | | {sum(parts['stress']) / 1e3:.1f} |")
+        said.append(f"{' | '.join(percent)} | {100 * sum(parts['signal']) / first:.2f} |")
+    for rod in [*found["rod parts"].values(), *found["rod parts, held force"].values()]:
         for at, whole, parts in zip(rod["place"], rod["signal"], rod["parts"], strict=True):
             shares = " | ".join(f"{round(100 * part / whole)}" for part in parts)
             said.append(f"| {1e3 * at:g} | {whole / 1e3:.1f} | {shares} |")
@@ -576,6 +584,6 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
         if place:
             numbers = " | ".join(f"{shear / 1e3:.1f}" for shear in shears)
             said.append(f"| {1e3 * place:g} | {numbers} |")
-    assert len(said) == 48
+    assert len(said) == 64
     for words in said:
         assert words in text, words

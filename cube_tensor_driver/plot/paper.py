@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..config.output_files import write_json
 from ..elastic.fem import Progress
+from ..research.normal_fall import NormalFall, normal_fall
 from ..research.paper import Experiment, experiments, figure_4
 from ..research.rod_parts import RodParts, rod_parts
 from ..research.rod_shear import RodShear, rod_shear
@@ -13,11 +14,14 @@ from .deformation import draw_figure_4
 from .experiments import draw_experiment, draw_rod_parts, draw_rod_shear
 from .style import save
 
+NEAR = (1e-3, 2e-3, 3e-3)
+"""Of the rod whose force is held, m: farther away the cube changes the force by less than 20 %."""
 BEGIN_END = {
-    "linear": (0.01, 0.19),
-    "finite": (0.19, 0.70),
-    "rod": (0.70, 0.83),
-    "shear": (0.83, 1.0),
+    "linear": (0.01, 0.17),
+    "finite": (0.17, 0.59),
+    "rod": (0.59, 0.69),
+    "rod, held force": (0.69, 0.87),
+    "shear": (0.87, 1.0),
 }
 """When the parts begin and end, as measured parts of the whole time; before them comes Fig. 4."""
 
@@ -35,10 +39,15 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
             written.append(folder / f"experiment_{number}_{law}.png")
             save(draw_experiment(result, law), written[-1])
             numbers[f"{result.name}, {law}"] = _numbers(result)
+    numbers["fall of P_normal"] = {
+        result.name: _lists(normal_fall(result)) for result in results if result.name[0] == "b"
+    }
     parts = rod_parts(progress=_part(report, "rod"))
     written.append(folder / "rod_parts.png")
     save(draw_rod_parts(parts), written[-1])
     numbers["rod parts"] = {name: _lists(one) for name, one in parts.items()}
+    parts = rod_parts(places=NEAR, held="force", progress=_part(report, "rod, held force"))
+    numbers["rod parts, held force"] = {name: _lists(one) for name, one in parts.items()}
     recovered = rod_shear(progress=_part(report, "shear"))
     written.append(folder / "rod_shear.png")
     save(draw_rod_shear(recovered), written[-1])
@@ -58,10 +67,10 @@ def _part(report: Progress, name: str) -> Progress:
     return report_part
 
 
-def _lists(table: RodParts | RodShear) -> dict[str, object]:
+def _lists(table: NormalFall | RodParts | RodShear) -> dict[str, object]:
     return {name: column.tolist() for name, column in vars(table).items()}
 
 
 def _numbers(result: Experiment) -> dict[str, object]:
-    names = ("displacement", "prototype", "upper", "pads", "recovered", "truth")
+    names = ("displacement", "prototype", "upper", "pads", "recovered", "truth", "rotation")
     return {name: getattr(result, name).tolist() for name in names}

@@ -47,6 +47,7 @@ class Experiment:
     pads: (n, 8) Pa; frequency: (n, 4) Hz of C1 .. C4, with C1 and C2 on the lower face
     prototype: (n, 3) P_normal, P_shear, P_grad, Hz; upper: the same, C1 and C2 on the upper face
     recovered, truth: (n, 7) plane modes in Pa, from all eight pads, and of the body without a cube
+    rotation: (n,) of the cube, rad
     """
 
     name: str
@@ -57,6 +58,7 @@ class Experiment:
     upper: Array
     recovered: Array
     truth: Array
+    rotation: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +150,7 @@ def _experiment(
         upper=prototype(frequency[:, ON_UPPER]),
         recovered=with_cube.pads @ recover.T,
         truth=without.state,
+        rotation=with_cube.rotation,
     )
 
 
