@@ -29,7 +29,7 @@ def arguments(parser: Parser) -> None:
         "--3d",
         dest="space",
         action="store_true",
-        help="compute in space, for 24 pads: takes minutes and up to 6 GB",
+        help="compute in space, for 24 pads: takes minutes and up to 6 GB, with --surface 11 GB",
     )
     parser.add_argument(
         "--surface",
