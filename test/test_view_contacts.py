@@ -18,8 +18,10 @@ from cube_tensor_driver.bags.contact_messages import (
 )
 from cube_tensor_driver.browser import contacts_client
 from cube_tensor_driver.browser.contacts_client import ContactsClient
+from cube_tensor_driver.browser.moment import DEVIATION, Moment, SurfaceField
+from cube_tensor_driver.browser.scene_3d import Colouring
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.core.scene import CubePoses
+from cube_tensor_driver.core.scene import QUANTITIES, CubePoses
 from cube_tensor_driver.elastic.surface import Contact, Surface, patches
 from cube_tensor_driver.msg import SkinContacts
 
@@ -50,7 +52,7 @@ def cloud_of(poses: CubePoses) -> np.ndarray:
     """As the node publishes it: 2 x 2 points on the surface above each cube."""
     points = patches(poses, PITCH / 2, 2).reshape(-1, 3) + np.array([0, 0, DEPTH])
     pressure = 1e3 + 1e5 * points[:, 0] - 2e5 * points[:, 1]
-    return np.column_stack([points, pressure, 0.3 * pressure, np.full(len(points), 70.0)])
+    return np.column_stack([points, pressure, 0.3 * pressure, 70.0 + 0.01 * pressure])
 
 
 def test_field_and_contacts_of_the_node_are_shown_until_they_are_old(poses, monkeypatch):
@@ -76,9 +78,38 @@ def test_field_and_contacts_of_the_node_are_shown_until_they_are_old(poses, monk
     true = 1e3 + 1e5 * x - 2e5 * y
     assert np.abs(field.pressure - true)[inside].max() < 0.05 * 1500
     np.testing.assert_allclose(field.shear, 0.3 * field.pressure, rtol=1e-5)
-    assert field.sigma == 70.0
+    np.testing.assert_allclose(field.sigma, 70.0 + 0.01 * field.pressure, rtol=1e-5)
     monkeypatch.setattr(contacts_client, "OLD_S", -1.0)
     assert client.found(surface) == (None, None)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_deviation_is_a_colour_while_the_node_says_it(poses, known):
+    """On the surface and on the cubes below it, beside the range of the pressure; grey where it is
+    unknown."""
+    surface = Surface(poses, DEPTH)
+    pressure = np.linspace(0.0, 9e3, len(surface.points))
+    sigma = 100.0 + 0.1 * pressure
+    sigma[surface.middle[3]] = np.nan
+    field = SurfaceField(pressure, 0 * pressure, sigma if known else None)
+    values = np.full((16, 15), 5.0)
+    moment = Moment(values, np.zeros(16), np.zeros(16, int), np.zeros(16, int), field, [])
+    colouring = Colouring.of(moment, surface, DEVIATION, 0.0, 0.0)
+    if not known:
+        assert np.isnan(colouring.field).all() and np.isnan(colouring.cubes).all()
+        assert colouring.text(2) == "unknown"
+        return
+    np.testing.assert_array_equal(colouring.field, sigma)
+    np.testing.assert_array_equal(colouring.cubes, sigma[surface.middle])
+    assert colouring.top == 9e3
+    at = surface.middle[2]
+    near = np.linalg.norm(surface.points - poses.position[2], axis=1)
+    assert near[at] == near.min()
+    said = f"{pressure[at] / 1e3:.2f} ± {sigma[at] / 1e3:.2f} kPa"
+    assert colouring.text(2) == f"pressure on the surface {said}"
+    assert colouring.text(3).endswith("± unknown kPa")
+    by_pressure = Colouring.of(moment, surface, QUANTITIES["pressure"], 0.0, 0.0)
+    assert by_pressure.text(2).endswith(f"on the surface {said}")
 
 
 def test_another_point_cloud_is_refused_in_words(poses):

@@ -46,14 +46,15 @@ class ContactsClient:
         if self._between is None or not self._between.fits(surface, places):
             self._between = _Between(surface, places)
         pressure, shear, sigma = self._between.values(self._cloud[:, 3:]).T
-        return Found(contacts, SurfaceField(pressure, shear, float(np.median(sigma))))
+        return Found(contacts, SurfaceField(pressure, shear, sigma))
 
     def _receive_contacts(self, message: SkinContacts) -> None:
         self._contacts, self._contacts_at = decode_contacts(message), time.monotonic()
 
     def _receive_traction(self, message: PointCloud2) -> None:
         cloud = decode_traction(message)
-        self._cloud, self._cloud_at = cloud[np.isfinite(cloud).all(axis=1)], time.monotonic()
+        placed = np.isfinite(cloud[:, :3]).all(axis=1)
+        self._cloud, self._cloud_at = cloud[placed], time.monotonic()
 
 
 class _Between:
@@ -75,6 +76,6 @@ class _Between:
         return surface is self._surface and np.array_equal(places, self._places)
 
     def values(self, values: Array) -> Array:
-        """(points, C) of values (M, C) at the places."""
+        """(points, C) of values (M, C) at the places; NaN next to a place where it is NaN."""
         between: Array = np.einsum("pk,pkc->pc", self._weight, values[self._near])
         return between

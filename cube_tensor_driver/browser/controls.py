@@ -13,6 +13,7 @@ from ..core.modes import COMPONENTS
 from ..core.scene import QUANTITIES, Quantity
 from . import markup
 from .history import History
+from .moment import DEVIATION, SurfaceField
 from .scene_3d import Shown
 
 STEP_S = 0.1
@@ -47,7 +48,8 @@ class ColourControls:
 
     @property
     def quantity(self) -> Quantity:
-        chosen = [one for one in QUANTITIES.values() if one.label == self._quantity.value]
+        offered = (*QUANTITIES.values(), DEVIATION)
+        chosen = [one for one in offered if one.label == self._quantity.value]
         # A browser may send any text.
         return chosen[0] if chosen else next(iter(QUANTITIES.values()))
 
@@ -57,8 +59,11 @@ class ColourControls:
         value = float(self._range.value)
         return value * self.quantity.size if math.isfinite(value) and value > 0 else 0.0
 
-    def offer_observed(self, history: History) -> None:
-        """Offer only what some cube observes."""
+    def offer_known(self, history: History, field: SurfaceField) -> None:
+        """Offer only what some cube observes, and the standard deviation if the field has one.
+
+        Once chosen it stays: the colours do not change their meaning because a node ends.
+        """
         observed = dict(zip(History.COLUMNS, history.observed, strict=True))
         if not any(observed[name] for name in COMPONENTS):
             return
@@ -67,12 +72,17 @@ class ColourControls:
             for name, quantity in QUANTITIES.items()
             if name not in COMPONENTS or observed[name]
         ]
+        if field.sigma is not None or self.quantity is DEVIATION:
+            seen.append(DEVIATION.label)
         if tuple(seen) != tuple(self._quantity.options):
             self._quantity.options = seen
 
-    def write_legend(self, top: float) -> None:
+    def write_legend(self, top: float, field: SurfaceField) -> None:
         """top: of the range in use, SI."""
-        self._legend.content = markup.legend(self.quantity, top)
+        if self.quantity is DEVIATION and field.sigma is None:
+            self._legend.content = markup.no_deviation()
+        else:
+            self._legend.content = markup.legend(self.quantity, top)
 
 
 class ShownControls:

@@ -16,6 +16,8 @@ from ..core.status import STATUS
 from ..elastic.surface import Contact
 from .moment import Moment
 
+Array = NDArray[np.float64]
+
 GREEN, AMBER, RED, BLUE = "#2b8a3e", "#e67700", "#c92a2a", "#1864ab"
 NoteColour = Literal["blue", "green", "red"]
 MOST_ROWS = 20
@@ -82,9 +84,16 @@ def unit(name: str) -> tuple[float, str]:
 def value(quantity: scene.Quantity, shown: float) -> str:
     """A quantity of one cube, SI, with its unit."""
     if np.isnan(shown):
-        return "not observed"
-    rounded = round(shown / quantity.size, 2) + 0.0  # of -0.0, 0.0
-    return f"{quantity.label} {rounded:.2f} {quantity.unit}"
+        return "unknown"
+    return f"{quantity.label} {_hundredths(shown / quantity.size)} {quantity.unit}"
+
+
+def surface_pressure(pressure: float, sigma: float) -> str:
+    """The pressure on the surface, Pa, with its standard deviation; NaN: unknown."""
+    if np.isnan(pressure):
+        return "on the surface unknown"
+    deviation = "unknown" if np.isnan(sigma) else f"{sigma / 1e3:.2f}"
+    return f"on the surface {_hundredths(pressure / 1e3)} ± {deviation} kPa"
 
 
 def clock(seconds: float) -> str:
@@ -132,6 +141,14 @@ def action_line(action: str) -> str:
     return box(escape(action)) if action else ""
 
 
+def no_deviation() -> str:
+    """Instead of the legend of the standard deviation, where there is none."""
+    return box(
+        "Everything is grey: the standard deviation is known only while the node <i>contacts</i> "
+        "runs with <i>method:=inverse</i>."
+    )
+
+
 def legend(quantity: scene.Quantity, top: float) -> str:
     """The bar of colours with its range; top: SI."""
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
@@ -139,15 +156,14 @@ def legend(quantity: scene.Quantity, top: float) -> str:
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
     middle = (LEGEND_STEPS - 1) // 2
     ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in values[::middle])
-    meaning = f"{quantity.label} in {quantity.unit}; grey: not observed"
+    meaning = f"{quantity.label} in {quantity.unit}; grey: unknown"
     bar = _div(BAR_STYLE.format(stops), "")
     return box(bar + _div(TICKS_STYLE, ticks) + _div("text-align:center", meaning))
 
 
-def explanation(bar: float, stress: float, gradient: float, sigma: float) -> str:
+def explanation(bar: float, stress: float, gradient: float, sigma: Array | None) -> str:
     """What is drawn, and how long arrows are. bar: length of the scale bar, m. stress, Pa, and
-    gradient, Pa/m: of arrows as long as the bar. sigma: of the field's pressure, Pa; NaN: it is
-    interpolated."""
+    gradient, Pa/m: of arrows as long as the bar. sigma: of the field, as in SurfaceField."""
     long = f"as long as the bar ({1e3 * bar:g} mm):"
     lines = [
         ("#282c34", f"traction on the upper face, {long} <b>{stress / 1e3:.3g} kPa</b>"),
@@ -162,10 +178,12 @@ def explanation(bar: float, stress: float, gradient: float, sigma: float) -> str
     return box(rows)
 
 
-def _field(sigma: float) -> str:
-    if np.isnan(sigma):
+def _field(sigma: Array | None) -> str:
+    if sigma is None:
         return "field: interpolated between the cubes, at their depth"
-    return f"field: on the surface, from the node <i>contacts</i>, ± {sigma / 1e3:.2g} kPa"
+    known = sigma[np.isfinite(sigma)]
+    typical = f", ±&nbsp;{np.median(known) / 1e3:.2g}&nbsp;kPa" if len(known) else ""
+    return f"field: on the surface, from the node <i>contacts</i>{typical}"
 
 
 def numbers(moment: Moment, cube: int, hertz: float) -> str:
@@ -179,6 +197,11 @@ def numbers(moment: Moment, cube: int, hertz: float) -> str:
     rows.append(("rate", f"{hertz:.0f}", "Hz"))
     rows.append(("state", _state(moment.status[cube], moment.health[cube]), ""))
     return box(_table(rows))
+
+
+def _hundredths(number: float) -> str:
+    """0.00 for -0.001, too."""
+    return f"{round(number, 2) + 0.0:.2f}"
 
 
 def _state(status: int, health: int) -> str:

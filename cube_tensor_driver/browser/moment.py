@@ -8,22 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.defaults import CONTACT_PRESSURE
-from ..core.scene import Newest
+from ..core.scene import QUANTITIES, Newest, Quantity
 from ..elastic.surface import Contact, Surface
 
 Array = NDArray[np.float64]
+
+DEVIATION = Quantity(
+    "standard deviation of pressure",
+    "kPa",
+    1e3,
+    QUANTITIES["pressure"].least,
+    False,
+    lambda values, residual: np.full(len(values), np.nan),
+)
+"""Of the field on the surface; a cube has none of its own."""
 
 
 class SurfaceField(NamedTuple):
     """On the M points of a surface.
 
-    pressure, shear: (M,) Pa. sigma: standard deviation of the pressure, Pa; NaN: interpolated
-    between the cubes, at their depth.
+    pressure, shear: (M,) Pa, NaN where unknown. sigma: (M,) standard deviation of the pressure, Pa;
+    None: interpolated between the cubes, at their depth.
     """
 
     pressure: Array
     shear: Array
-    sigma: float = np.nan
+    sigma: Array | None = None
 
 
 class Found(NamedTuple):

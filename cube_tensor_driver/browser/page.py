@@ -161,8 +161,8 @@ class Page:
     def _write_numbers(self, moment: Moment, rate: NDArray[np.float64], status: PageStatus) -> None:
         history, cube = self._skin.history, self._scene.selected
         self._charts.offer_observed(history)
-        self._colours.offer_observed(history)
-        self._colours.write_legend(self._top)
+        self._colours.offer_known(history, moment.field)
+        self._colours.write_legend(self._top, moment.field)
         scene = self._scene
         self._meaning.content = markup.explanation(
             scene.bar, scene.bar_stress(), scene.bar_gradient(), moment.field.sigma

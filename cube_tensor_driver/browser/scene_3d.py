@@ -20,7 +20,7 @@ from ..core.scene import QUANTITIES, CubePoses, Quantity
 from ..elastic.surface import Contact, Surface
 from . import markup
 from .meshes import CUBE, CUBE_EDGES, NOTHING, Mesh, arrows, hit, ring, rods
-from .moment import Moment
+from .moment import DEVIATION, Moment
 from .surface_layer import SquareLayer
 
 Array = NDArray[np.float64]
@@ -52,31 +52,52 @@ class Colouring(NamedTuple):
     """What colours mean in one picture of a skin with N cubes and M points of its surface.
 
     quantity: what is shown. cubes: (N,) and field: (M,) its values, SI. top: of its range, SI.
+    above: (N, 2) pressure on the surface above each cube, and its standard deviation, Pa; None:
+    the node `contacts` says nothing of it.
     """
 
     quantity: Quantity
     cubes: Array
     field: Array
     top: float
+    above: Array | None
 
     @classmethod
     def of(
         cls, moment: Moment, surface: Surface, quantity: Quantity, wanted: float, before: float
     ) -> Colouring:
         """wanted: top of the range, SI; 0: it follows what there is, and `before`."""
+        pressure, sigma = moment.field.pressure, moment.field.sigma
+        above = None
+        if sigma is not None:
+            above = np.stack([pressure, sigma], axis=1)[surface.middle]
         cubes = quantity.of(moment.values, moment.residual)
+        if quantity is DEVIATION and above is not None:
+            cubes = above[:, 1]
         field = _field(moment, surface, quantity, cubes)
-        top = wanted or scene.automatic(quantity, np.concatenate([cubes, field]), before)
-        return cls(quantity, cubes, field, top)
+        # A deviation is large or small beside the pressure.
+        measured = pressure if quantity is DEVIATION else cubes
+        top = wanted or scene.automatic(quantity, np.concatenate([measured, field]), before)
+        return cls(quantity, cubes, field, top, above)
+
+    def text(self, cube: int) -> str:
+        """What is said of a cube: its value, and the pressure on the surface above it."""
+        value = markup.value(self.quantity, self.cubes[cube])
+        if self.above is None or self.quantity not in (QUANTITIES["pressure"], DEVIATION):
+            return value
+        surface = markup.surface_pressure(*self.above[cube])
+        return f"pressure {surface}" if self.quantity is DEVIATION else f"{value}, {surface}"
 
 
 def _field(moment: Moment, surface: Surface, quantity: Quantity, cubes: Array) -> Array:
-    """(M,) on the points of the surface: the field's if the quantity is pressure or shear,
-    otherwise the value of the nearest cube."""
+    """(M,) on the points of the surface: the field's if it has the quantity, otherwise the value
+    of the nearest cube."""
     if quantity is QUANTITIES["pressure"]:
         return moment.field.pressure
     if quantity is QUANTITIES["shear"]:
         return moment.field.shear
+    if quantity is DEVIATION and moment.field.sigma is not None:
+        return moment.field.sigma
     return cubes[surface.cube]
 
 
@@ -165,8 +186,7 @@ class Scene3D:
         self._gradient.draw(values, moment.residual, visible=shown.gradient)
         self._crosses.draw(values, self._traction.longest, visible=shown.principal)
         self._faults.draw(moment.health)
-        value = colouring.cubes[self.selected]
-        self._chosen.show(self.selected, markup.value(colouring.quantity, value))
+        self._chosen.show(self.selected, colouring.text(self.selected))
         self._label.show(moment.contact)
 
     def bar_stress(self) -> float:
@@ -402,7 +422,7 @@ class FaultCrosses:
 
 
 class ChosenCube:
-    """A ring around the cube whose numbers the page shows, with its name and value."""
+    """A ring around the cube whose numbers the page shows, with its name and a text."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement, names: Sequence[str]) -> None:
         self._names = names
@@ -416,10 +436,10 @@ class ChosenCube:
             "/chosen/label", "", position=(0.0, -radius, 0.0), anchor="top-center"
         )
 
-    def show(self, cube: int, value: str) -> None:
+    def show(self, cube: int, text: str) -> None:
         self._ring.position = self._upper_faces[cube]
         self._ring.wxyz = self._orientations[cube]
-        self._label.text = f"{self._names[cube]}: {value}"
+        self._label.text = f"{self._names[cube]}: {text}"
 
 
 class ContactLabel:

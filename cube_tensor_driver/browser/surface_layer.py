@@ -18,7 +18,7 @@ from .meshes import NOTHING, Mesh
 Array = NDArray[np.floating]
 
 STEPS = 32
-"""Of the scale of colours. The next number is grey: not observed."""
+"""Of the scale of colours. The next number is grey: unknown."""
 _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -32,7 +32,7 @@ def steps_of(quantity: Quantity, shown: Array, top: float) -> NDArray[np.int64]:
 
 
 def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
-    """(STEPS + 1, 3) bytes, sRGB: the colour of each step and of what is not observed."""
+    """(STEPS + 1, 3) bytes, sRGB: the colour of each step and of what is unknown."""
     middle = (np.arange(STEPS) + 0.5) / STEPS
     values = np.append(2 * middle - 1 if quantity.signed else middle, np.nan)
     return np.round(255 * scene.colours(quantity, values, 1.0)).astype(np.uint8)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..core import scene
-from ..core.scene import CubePoses, Quantity
+from ..core.scene import CubePoses
 from ..elastic.surface import Contact, Surface
 from ..plot.style import png_of_pixels
 from . import markup
@@ -125,7 +125,7 @@ class TopView:
         for cube, (name, corners) in enumerate(zip(self._names, self._corners, strict=True)):
             points = " ".join("{:.1f},{:.1f}".format(*self._at(corner)) for corner in corners)
             width = 2.5 if cube == chosen else 0.7
-            title = f"{escape(name)}: {_value(colouring.quantity, colouring.cubes[cube])}"
+            title = escape(f"{name}: {colouring.text(cube)}")
             parts.append(
                 f"<polygon points='{points}' fill='rgb({','.join(map(str, colours[cube]))})' "
                 f"stroke='#212529' stroke-width='{width}'><title>{title}</title></polygon>"
@@ -148,10 +148,6 @@ class TopView:
         halo = "paint-order='stroke' stroke='white' stroke-width='3' font-weight='bold'"
         text = _text(min(max(x, MARGIN + 60), WIDTH - 60), text_y, markup.newtons(contact))
         return "".join(parts) + f"<g {halo}>{text}</g>"
-
-
-def _value(quantity: Quantity, value: float) -> str:
-    return escape(markup.value(quantity, value))
 
 
 def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:

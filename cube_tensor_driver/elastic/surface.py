@@ -60,6 +60,7 @@ class Surface:
     """Points of a skin's surface, `side` × `side` on the patch of each cube, and the field on them.
 
     points: (M, 3) m in the parent frame, in the cubes' plane; cube: (M,) whose patch it is
+    middle: (cubes,) the point nearest to each cube
     spacing: of the points, m; area: of a point, m²
 
     Parameters: depth: from the cubes' centres to the surface, m. gradients: False ignores the
@@ -80,6 +81,7 @@ class Surface:
         self._patches = patches(poses, self.spacing, side)
         self.points = self._patches.reshape(-1, 3)
         self.cube = np.repeat(np.arange(len(poses.position)), side**2)
+        self.middle = np.arange(len(poses.position)) * side**2 + side // 2 * (side + 1)
         self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
         self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
         # (pairs, 2) points next to each other
