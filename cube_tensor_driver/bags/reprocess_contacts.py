@@ -15,7 +15,7 @@ from ..elastic.contact_finder import ContactFinder, ContactSettings, contact_fin
 from .contact_messages import encode_contacts, encode_traction
 from .message_codec import Decoded
 from .read import CONTACTS, TRACTION
-from .skin_info import cube_calibrations, cube_poses, cubes_noise, geometry
+from .skin_info import cube_calibrations, cube_poses, geometry
 from .write import BagWriter, quality
 
 
@@ -52,7 +52,7 @@ class ContactWriter:
         if self._geometry == geometry(info):
             return
         self._finder = contact_finder(
-            self._wanted.settings, cube_poses(info), cubes_noise(info), cube_calibrations(info)
+            self._wanted.settings, cube_poses(info), cube_calibrations(info)
         )
         self._newest = Newest(len(info.cubes))
         self._geometry, self._frame_id = geometry(info), info.header.frame_id

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.yaml import parse_yaml
 from ..core.calibration import Calibration
 from ..core.errors import CalibrationError, ConfigError, MessageError
-from ..core.modes import COMPONENTS
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_quaternion
 
@@ -58,13 +56,6 @@ def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
             f"info of the skin {info.name}: no calibration {error}, which a cube uses"
         ) from None
     return tuple(known[cube.calibration_id] for cube in info.cubes)
-
-
-def cubes_noise(info: Any) -> NDArray[np.float64]:
-    """(cubes, 15, 15) covariance of the components of each cube of an `info`."""
-    n = len(COMPONENTS)
-    by_id = dict(zip(info.calibration_ids, np.reshape(info.covariance, (-1, n, n)), strict=True))
-    return np.array([by_id[cube.calibration_id] for cube in info.cubes])
 
 
 def geometry(info: Any) -> list[object]:

@@ -13,7 +13,7 @@ from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.scene import CubePoses
 from .influence_file import find_influence, read_influence
-from .inverse import SurfaceInverse
+from .inverse import SurfaceInverse, noise_by_pad
 from .layer import Layer
 from .pad_reading import read_pads
 from .surface import Contact, Surface
@@ -68,15 +68,15 @@ class ContactFinder(Protocol):
 
 
 def contact_finder(
-    settings: ContactSettings, poses: CubePoses, noise: Array, calibrations: Sequence[Calibration]
+    settings: ContactSettings, poses: CubePoses, calibrations: Sequence[Calibration]
 ) -> ContactFinder:
-    """noise: (cubes, 15, 15) covariance of the components; calibrations: of the cubes.
+    """calibrations: of the cubes.
 
     ElasticError, ConfigError: nothing to compute with. The method inverse takes seconds to set up.
     """
     if settings.method == INTERPOLATION:
         return _Interpolated(settings, poses)
-    return _Followed(settings, poses, noise, calibrations)
+    return _Followed(settings, poses, calibrations)
 
 
 class _Interpolated:
@@ -95,7 +95,6 @@ class _Followed:
         self,
         settings: ContactSettings,
         poses: CubePoses,
-        noise: Array,
         calibrations: Sequence[Calibration],
     ) -> None:
         layer, depth, reading = settings.layer, settings.depth, None
@@ -103,7 +102,8 @@ class _Followed:
             influence = read_influence(find_influence(settings.influence))
             layer, depth = influence.layer, influence.depth
             reading = read_pads(influence, calibrations)
-        self._inverse = SurfaceInverse.of_cubes(poses, noise, layer, depth, reading=reading)
+        by_pad = noise_by_pad(calibrations)
+        self._inverse = SurfaceInverse.of_cubes(poses, by_pad, layer, depth, reading=reading)
         self._touches = Touches(self._inverse, settings.least)
 
     def update(self, values: Array) -> list[TrackedContact]:

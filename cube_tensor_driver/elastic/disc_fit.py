@@ -6,11 +6,18 @@ ln a are those of Gauss and Newton, with the covariance of what is left as weigh
     y = sum_j (R(c_j, a_j) + sum_k s_jk D_k(c_j, a_j)) f_j + H rest + e
     W = (alpha^2 K + S + N)^-1
 
-K is the prior of kernels.py, N the noise. D moves pressure within a contact and leaves its force
-and place: it makes it longer along x or along a diagonal, and emptier or fuller at its rim. The
-shapes s have the covariance S, see SHAPE. alpha has the greatest evidence, the likelihood with
-forces, places and sizes integrated over their priors: where contacts are like none of these, alpha
-grows, and so do all standard deviations.
+K is the prior of kernels.py. D moves pressure within a contact and leaves its force and place: it
+makes it longer along x or along a diagonal, and emptier or fuller at its rim. The shapes s have the
+covariance S, see SHAPE. alpha has the greatest evidence, the likelihood with forces, places and
+sizes integrated over their priors: where contacts are like none of these, alpha grows, and so do
+all standard deviations.
+
+N is the covariance of the pads' noise and gain errors. A cube whose values y follow from its pads
+by B, in units of their noise (`noise_by_pad`), has::
+
+    N = B diag(1 + GAIN_ERROR^2 u^2) B',     u = B' (B B')^-1 y
+
+u are the least stresses of the pads that make y.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); D. J. C. MacKay, Bayesian
 interpolation, Neural Computation 4 (1992) 415 (evidence).
@@ -18,6 +25,7 @@ interpolation, Neural Computation 4 (1992) 415 (evidence).
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -36,17 +44,20 @@ USUAL_SIZE, SIZE_SPREAD = 0.8, 1.0
 is measured."""
 GREATEST_FORCE = 1e3
 """Prior standard deviation of a force, N: none that matters, so that no force is possible, too."""
-GAIN_ERROR = 0.0125
-"""Of every pad over the rms of its cube's pads. Noise that is the same on all pads has the
-covariance N of a cube's components; so such an error has GAIN_ERROR^2 y' N^-1 y / n times that. The
-pads of which a cube is pressed most have more than the mean: hence more than 0.01."""
+GAIN_ERROR = 0.01
+"""Standard deviation of a pad's gain against what its calibration says."""
+ROUGH_ERROR = 0.1
+"""Of every pad over the rms of its cube's pads, as long as a contact is far from its place: there
+the linear problem is off by more than the gains, for pads that feel little, too."""
 SHAPE = np.array([0.7, 0.7, 1.0])
 """Standard deviation of a contact's shapes. Two balls that touch each other have 1.1 in length, a
 rigid flat punch has 1 in flatness."""
 SHIFT, WIDER = 0.5, 0.2
 """Parts of a contact's radius and of its logarithm by which D moves pressure."""
-COLD, WARM, LOOK = 8, 3, 0
+COLD, WARM, LOOK = 16, 3, 0
 """Steps for a contact that has just begun, for one that goes on, and to see how likely it is."""
+FINE = 6
+"""Of the steps of a contact that has just begun, those that are left for the fine noise."""
 SETTLED = 0.02
 """A step that moves a contact by less, over the depth, and changes its size by a smaller part, is
 the last but one: what follows it is of second order."""
@@ -84,21 +95,29 @@ class Scan:
         known = np.isfinite(values) & inverse.observed[cubes]
         self._known = known.ravel()
         filled = np.where(known, values, 0.0)
-        both_known = known[:, :, None] & known[:, None, :]
-        pads = np.where(both_known, inverse.noise[cubes], 0.0)
-        whole = pads + np.eye(known.shape[1]) * ~known[:, None, :]
-        size = (filled * np.linalg.solve(whole, filled[..., None])[..., 0]).sum(axis=1)
-        size /= np.maximum(known.sum(axis=1), 1)
-        n, width = values.shape
-        one = np.arange(n)
-        blocks = np.zeros((n, width, n, width))
-        blocks[one, :, one, :] = pads * (1 + GAIN_ERROR**2 * size)[:, None, None]
-        noise: Array = blocks.reshape(n * width, -1)
-        both = np.ix_(self._known, self._known)
-        self.y, self.noise = filled.ravel()[self._known], noise[both]
-        self.prior = prior[both]
+        by_pad = np.where(known[:, :, None], inverse.by_pad[cubes], 0.0)
+        of_pad = by_pad.swapaxes(1, 2)
+        whole = by_pad @ of_pad + np.eye(known.shape[1]) * ~known[:, None, :]
+        stress = of_pad @ np.linalg.solve(whole, filled[..., None])
+        self._by_pad, self._square = by_pad, stress**2
+        self.y = filled.ravel()[self._known]
+        self.noise = self._covariance(GAIN_ERROR**2 * self._square)
+        self.prior = prior[np.ix_(self._known, self._known)]
         self.size = len(self.y)
-        self.sees_all = self.size == n * len(COMPONENTS)
+        self.sees_all = self.size == len(values) * len(COMPONENTS)
+
+    @cached_property
+    def rough(self) -> Array:
+        """(D, D) noise with ROUGH_ERROR instead of the gains'."""
+        return self._covariance(ROUGH_ERROR**2 * self._square.mean(axis=1, keepdims=True))
+
+    def _covariance(self, errors: Array) -> Array:
+        """(D, D) of pads with these variances (n, P, 1) beside their noise, over its variance."""
+        own = self._by_pad @ ((1 + errors) * self._by_pad.swapaxes(1, 2))
+        n, width, _ = own.shape
+        blocks = np.zeros((n, width, n, width))
+        blocks[np.arange(n), :, np.arange(n), :] = own
+        return blocks.reshape(n * width, -1)[np.ix_(self._known, self._known)]
 
     def responses(self, middles: Array, size: float) -> Array:
         """(K, D, 3) of contacts with force 1 N at K places (K, 2)."""
@@ -138,6 +157,7 @@ class Fitted(NamedTuple):
 def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> Fitted:
     """Fit contacts, beginning at middles (J, 2) m, sizes (J,) m and alpha, Pa.
 
+    Contacts that have just begun have the rough noise until they settle, or FINE steps are left.
     steps: COLD, WARM or LOOK. The columns of the problem are, per contact, f_x, f_y, f_z, c_x,
     c_y, ln a.
     """
@@ -152,14 +172,14 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
     for axis in range(3):
         prior[axis::6] = GREATEST_FORCE**-2
     forces, before, score = np.zeros((count, 3)), np.inf, np.inf
-    last = False
+    last, rough = False, steps != WARM
     for step in range(steps + 1):
         last |= step == steps
         parts = [_Parts(scan, m, np.exp(a)) for m, a in zip(middles, logs, strict=True)]
         response = np.concatenate([part.response for part in parts], axis=1)
         shapes = [part.shapes @ force for part, force in zip(parts, forces, strict=True)]
         shape = np.concatenate(shapes).T  # (D, 3 contacts)
-        noise = scan.noise + shape @ shape.T
+        noise = (scan.rough if rough else scan.noise) + shape @ shape.T
         factor = _factor(scan, noise, alpha)
         weighted = cho_solve(factor, response)
         forces = np.linalg.lstsq(response.T @ weighted, weighted.T @ scan.y, rcond=None)[0]
@@ -169,7 +189,7 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
             jacobian[:, 6 * j : 6 * j + 3] = part.response
             jacobian[:, 6 * j + 3 : 6 * j + 6] = (part.slopes @ force).T
         residual = scan.y - response @ forces.ravel()
-        if last or (steps == COLD and step % 2 == 0):
+        if last or (steps == COLD and not rough and step % 2 == 0):
             before = alpha
             tried = alpha * _TRIED[steps]
             alpha, score, factor = _best_alpha(scan, noise, jacobian, residual, prior, tried)
@@ -182,7 +202,9 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
         right[5::6] -= (logs - usual) * SIZE_SPREAD**-2
         change = np.linalg.lstsq(normal, right, rcond=None)[0].reshape(count, 6)
         moved = max(np.abs(change[:, 3:5]).max() / depth, np.abs(change[:, 5]).max())
-        last = moved < SETTLED and (steps == WARM or alpha == before)
+        settled = moved < SETTLED and (steps == WARM or rough or alpha == before)
+        last = settled and not rough
+        rough &= not settled and step < steps - FINE
         middles += np.clip(change[:, 3:5], -depth / 2, depth / 2)
         middles = np.clip(middles, start - scan.pitch, start + scan.pitch)
         logs = np.clip(logs + np.clip(change[:, 5], -0.5, 0.5), low, high)

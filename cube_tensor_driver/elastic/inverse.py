@@ -21,6 +21,7 @@ Processes for Machine Learning (2006), 2.2, 5.4 and (leaving out) 5.4.2.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,9 +29,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 
+from ..core.calibration import Calibration
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from ..core.errors import ElasticError
-from ..core.modes import STRESS
+from ..core.modes import COMPONENTS, STRESS
 from ..core.pipeline import Pipeline
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
@@ -109,35 +111,33 @@ class SurfaceInverse:
             rotation=np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes]),
             half_side=np.array([calibration.half_side for calibration in skin.calibrations]),
         )
-        pipeline = Pipeline(skin.calibrations)
-        noise = np.array([pipeline.covariance(cube) for cube in range(len(skin.cubes))])
+        by_pad = noise_by_pad(skin.calibrations)
         layer, reading = Layer(thickness, poisson), None
         if influence is not None:
             layer, depth = influence.layer, influence.depth
             reading = read_pads(influence, skin.calibrations)
-        self._set_up(poses, noise, layer, depth, side, reading)
+        self._set_up(poses, by_pad, layer, depth, side, reading)
 
     @classmethod
     def of_cubes(
         cls,
         poses: CubePoses,
-        noise: Array,
+        by_pad: Array,
         layer: Layer,
         depth: float,
         side: int = 2,
         reading: Reading | None = None,
     ) -> SurfaceInverse:
-        """The same from poses and noise (cubes, 15, 15): the covariance of the components of each
-        cube in Pa and Pa/m, NaN where a component is not observed. reading: how the cubes see; by
-        default as points."""
+        """The same from poses and by_pad (cubes, 15, P), see `noise_by_pad`. reading: how the cubes
+        see; by default as points."""
         inverse = cls.__new__(cls)
-        inverse._set_up(poses, noise, layer, depth, side, reading)
+        inverse._set_up(poses, by_pad, layer, depth, side, reading)
         return inverse
 
     def _set_up(
         self,
         poses: CubePoses,
-        noise: Array,
+        by_pad: Array,
         layer: Layer,
         depth: float,
         side: int,
@@ -156,14 +156,13 @@ class SurfaceInverse:
         self.points = (flat + depth * poses.rotation[:, None, :, 2]).reshape(-1, 3)
         self.cube = np.repeat(np.arange(len(flat)), side**2)
         self._patch = square(self.spacing, side)
-        observed = np.isfinite(noise[:, np.arange(15), np.arange(15)])
+        observed = np.isfinite(by_pad.sum(axis=2))
         self.columns = np.flatnonzero(observed.any(axis=0))
         if not len(self.columns):
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
         self._units = np.where(self.columns < len(STRESS), 1.0, scale)
-        units = np.where(np.arange(15) < len(STRESS), 1.0, scale)
-        scaled = noise * np.outer(units, units)
-        self.noise = scaled[:, self.columns][:, :, self.columns]
+        self.by_pad = by_pad[:, self.columns] * self._units[:, None]
+        self.noise = self.by_pad @ self.by_pad.swapaxes(1, 2)
         self.observed = observed[:, self.columns]
         self._windows = _Windows(self)
         self._known = self.observed
@@ -216,6 +215,18 @@ class SurfaceInverse:
         if not np.array_equal(known, self._known):
             self._known, self._changed = known, self._windows.without(known)
         return np.where(known, scaled, 0.0).astype(np.float32)
+
+
+def noise_by_pad(calibrations: Sequence[Calibration]) -> Array:
+    """(cubes, 15, P) what the standard deviation of each pad's noise makes of each component, Pa
+    and Pa/m: B B' is the covariance of a cube's components. NaN where a component is not observed;
+    0 for pads that a cube does not have."""
+    pipeline = Pipeline(calibrations)
+    by_pad = np.zeros((len(calibrations), len(COMPONENTS), pipeline.n_pads))
+    for cube, calibration in enumerate(calibrations):
+        own = pipeline.matrix(cube) * calibration.noise
+        by_pad[cube, :, : own.shape[1]] = own
+    return by_pad
 
 
 class _Reduced(NamedTuple):

@@ -25,7 +25,7 @@ from ..core.rows import FrequencyRows
 from ..core.tensor import rotation_from_rpy
 from ..elastic import contact
 from ..elastic.influence import Influence
-from ..elastic.inverse import SurfaceInverse
+from ..elastic.inverse import SurfaceInverse, noise_by_pad
 from ..elastic.kernels import Kernels
 from ..elastic.layer import Layer
 from ..elastic.pad_reading import read_pads
@@ -104,12 +104,12 @@ class Bench:
         folder = package_data() / "config" / "calibration"
         self.calibration: Calibration = read_calibration(find_calibration(name, folder))
         self._pipeline = Pipeline([self.calibration] * n)
-        noise = np.tile(self._pipeline.covariance(0), (n, 1, 1))
+        by_pad = noise_by_pad([self.calibration] * n)
         layer, reading = Layer(setting.known_thickness), None
         if influence is not None:
             reading = read_pads(influence, [self.calibration] * n)
         self.inverse = SurfaceInverse.of_cubes(
-            self.poses, noise, layer, setting.depth, side, reading
+            self.poses, by_pad, layer, setting.depth, side, reading
         )
         self.surface = Surface(self.poses, setting.depth, side)
         self.window = np.abs(self.inverse.points[:, :2]).max(axis=1) < WINDOW / 2
@@ -149,9 +149,9 @@ class Bench:
     ) -> Array:
         """(cubes, 15) what the pipeline makes of a load."""
         field = self.truth(self.poses.position[:, :2], width, force, centre)
-        return self.measured(self._pads_in(field), random)
+        return self.measured(self.pads_in(field), random)
 
-    def _pads_in(self, field: Array) -> Array:
+    def pads_in(self, field: Array) -> Array:
         """(cubes, P) pad stresses, Pa, in a field (cubes, 24) in the skin's frame."""
         calibration, turn = self.calibration, self.poses.rotation
         stress = np.einsum("nai,nbj,nab->nij", turn, turn, to_matrix(field[:, :6]))

@@ -12,7 +12,7 @@ from sensor_msgs.msg import PointCloud2
 from cube_tensor_driver.msg import SkinContacts
 
 from ..bags.contact_messages import encode_contacts, encode_traction
-from ..bags.skin_info import cube_calibrations, cubes_noise
+from ..bags.skin_info import cube_calibrations
 from ..core.errors import CubeError
 from ..elastic.contact_finder import INVERSE, ContactFinder, ContactSettings, contact_finder
 from .node import run
@@ -45,11 +45,11 @@ class Contacts(SkinSubscriberNode):
     def set_up(self, skin: FollowedSkin) -> None:
         names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
-        noise, calibrations = cubes_noise(skin.info), cube_calibrations(skin.info)
+        calibrations = cube_calibrations(skin.info)
         self._seen = 0
         self._finder: ContactFinder | None = None
         self._coming: Future[ContactFinder] | None = self._worker.submit(
-            contact_finder, settings, skin.poses, noise, calibrations
+            contact_finder, settings, skin.poses, calibrations
         )
 
     def message(self, skin: FollowedSkin, health: np.ndarray) -> bytes | None:
