@@ -147,6 +147,18 @@ def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact
         assert found.position_uncertainty < 0.3e-3
 
 
+@pytest.mark.parametrize("seed", [2, 9])
+def test_a_force_between_two_likely_ones_is_as_uncertain(seed):
+    """On both sides of the middle between two planar cubes, contacts explain the values alike. Here
+    the likelier one is the wrong one: 0.03 N off, 7 deviations of its fit alone, and 0.4 mm."""
+    bench = Bench(Setting(cubes=CUBES[2]), side=1)
+    force, centre = np.array([0.638, -0.635, -3.0]), np.array([3.8e-3, -0.6e-3])
+    values = bench.values(10e-3, force, centre, np.random.default_rng(seed))
+    (found,) = Touches(bench.inverse, LEAST).update(values)
+    assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
+    assert np.abs(found.position[:2] - centre).max() < 4 * found.position_uncertainty
+
+
 def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their_ids(inverse):
     random, touches = np.random.default_rng(3), Touches(inverse, LEAST)
     first, second = np.array([-4e-3, 1e-3]), np.array([14e-3, 1e-3])

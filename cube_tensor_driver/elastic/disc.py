@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ class Disc:
     id: the same as long as it is followed
     place: (2,) m; size: radius, m; force: (3,) N; alpha: Pa, of what is left around it
     doubt: m^2, variance of the place because it may lie elsewhere, inf before the first fit
+    force_doubt: (3,) N^2, that of the force for the same reason
     asked: Pa, what was left around it when it was asked last whether it is two
     told_apart: from its neighbour, by likelihood (disc_split.py)
     """
@@ -38,6 +39,7 @@ class Disc:
     force: Array
     alpha: float
     doubt: float = np.inf
+    force_doubt: Array = field(default_factory=lambda: np.zeros(3))
     asked: float = 0.0
     told_apart: bool = False
 

@@ -164,7 +164,10 @@ class Touches:
         for j, disc in enumerate(discs):
             self._put(disc, fitted, j, cubes, place, angle)
             load = load_of(scan, fitted, j)
-            load = load._replace(place_variance=load.place_variance + disc.doubt / 2)
+            load = load._replace(
+                place_variance=load.place_variance + disc.doubt / 2,
+                force_variance=load.force_variance + disc.force_doubt,
+            )
             self._contacts[disc.id] = self._tracked(disc.id, load, cubes, place, angle)
 
     def _otherwise(
@@ -194,8 +197,10 @@ class Touches:
                 begin(at + turn @ (corner * away), USUAL_SIZE * self._inverse.depth)
         best = min(tried, key=lambda one: one.score)
         weight = np.exp([(best.score - one.score) / 2 for one in tried])
+        weight /= weight.sum()
         squares = [((one.middles[j] - best.middles[j]) ** 2).sum() for one in tried]
-        doubt = float(weight @ squares / weight.sum())
+        disc.force_doubt = weight @ [(one.forces[j] - best.forces[j]) ** 2 for one in tried]
+        doubt = float(weight @ squares)
         disc.doubt = doubt if doubt > (CERTAIN * self._inverse.pitch) ** 2 else 0.0
         return best
 
