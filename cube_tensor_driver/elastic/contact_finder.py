@@ -13,8 +13,9 @@ from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.scene import CubePoses
 from .influence_file import find_influence, read_influence
-from .inverse import SurfaceInverse, noise_by_pad
+from .inverse import SurfaceInverse
 from .layer import Layer
+from .pad_noise import noise_by_pad
 from .pad_reading import read_pads
 from .surface import Contact, Surface
 from .touches import Touches, TrackedContact
@@ -109,10 +110,8 @@ class _Followed:
     def update(self, values: Array) -> list[TrackedContact]:
         return self._touches.update(values)
 
-    def cloud(self, values: Array) -> Array | None:
+    def cloud(self, values: Array) -> Array:
         field = self._touches.field
-        if field is None:
-            return None
         shear = np.hypot(field.traction[:, 0], field.traction[:, 1])
-        sigma = self._inverse.deviation(values).pressure
+        sigma = self._touches.deviation(values).pressure
         return np.column_stack([self._inverse.points, field.pressure, shear, sigma])

@@ -8,16 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .disc_fit import Parts
 from .inverse import SurfaceInverse, TractionField, square
-from .kernels import hertz_pressure
+from .kernels import REACH, hertz_pressure
+from .layer import FIELD
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 FINER = 8
 """Places along the side of a point's square over which a disc's traction is averaged."""
-_REACH = 12.0
-"""Depths beyond which a contact is not seen."""
+_NEAR = 6.0
+"""Depths beyond which a contact makes no pressure."""
 
 
 @dataclass
@@ -28,6 +30,7 @@ class Disc:
     place: (2,) m; size: radius, m; force: (3,) N; alpha: Pa, of what is left around it
     doubt: m^2, variance of the place because it may lie elsewhere, inf before the first fit
     force_doubt: (3,) N^2, that of the force for the same reason
+    covariance: (9, 9) of force, place, ln size and shapes, see `Fitted.covariance`, and the doubts
     asked: Pa, what was left around it when it was asked last whether it is two
     told_apart: from its neighbour, by likelihood (disc_split.py)
     """
@@ -40,6 +43,7 @@ class Disc:
     alpha: float
     doubt: float = np.inf
     force_doubt: Array = field(default_factory=lambda: np.zeros(3))
+    covariance: Array = field(default_factory=lambda: np.zeros((9, 9)))
     asked: float = 0.0
     told_apart: bool = False
 
@@ -90,11 +94,44 @@ class DiscModel:
             traction[points] += share[:, None] * (turn @ disc.force)
         return rest._replace(traction=traction, below=below)
 
+    def variance(self, discs: list[Disc]) -> Array:
+        """(M, 2) of the pressure on the surface and of that below: what the covariances of the
+        discs make of them."""
+        total = np.zeros((len(self.inverse.points), 2))
+        for disc in discs:
+            self._add_variance(total, disc)
+        return total
+
+    def _add_variance(self, total: Array, disc: Disc) -> None:
+        inverse = self.inverse
+        points, place, turn = self.points_around(disc)
+        # Its shapes reach no farther.
+        touched = np.linalg.norm(place, axis=1) < 2 * disc.size + inverse.spacing
+        within = square(inverse.spacing / FINER, FINER)
+
+        def on_surface(middles: Array, size: float) -> Array:
+            """(K, n, 3) pressure at the n points touched, under 1 N at K places (K, 2)."""
+            from_middle = place[touched][:, None] + within - middles[:, None, None]
+            share = hertz_pressure(np.hypot(from_middle[..., 0], from_middle[..., 1]), size)
+            return np.asarray(-share.mean(axis=2)[..., None] * turn[touched, 2])
+
+        def below(middles: Array, size: float) -> Array:
+            """(K, n, 3) that below all points."""
+            from_middle = (place - middles[:, None]).reshape(-1, 2)
+            pressure = -inverse.kernels.field(from_middle, size)[:, FIELD.index("zz")]
+            return pressure.reshape(len(middles), -1, 3)
+
+        for part, which, responses in ((0, points[touched], on_surface), (1, points, below)):
+            parts = Parts.of(responses, inverse.depth, np.zeros(2), disc.size)
+            slopes = parts.by_parameters(disc.force)
+            own = np.einsum("mp,pq,mq->m", slopes, disc.covariance, slopes)
+            total[which, part] += np.maximum(own, 0)
+
     def points_around(self, disc: Disc) -> tuple[Index, Array, Array]:
         """Points near a contact: which, their places (n, 2) from its middle in its home's frame,
         and rotations (n, 3, 3) from that frame to the point's."""
         inverse = self.inverse
-        reach = _REACH / 2 * inverse.depth
+        reach = _NEAR * inverse.depth
         points = np.sort(self._points.query_ball_point(self.middle(disc), reach))
         points = np.asarray(points, dtype=np.intp)
         rotation = inverse.poses.rotation
@@ -105,7 +142,7 @@ class DiscModel:
     def cubes_around(self, home: int) -> tuple[Index, Array, Array]:
         """Cubes that see contacts of this home: which, places and angles laid flat."""
         inverse = self.inverse
-        reach = _REACH * inverse.depth
+        reach = REACH * inverse.depth
         cubes = np.sort(self._cubes.query_ball_point(inverse.poses.position[home], reach))
         cubes = np.asarray(cubes, dtype=np.intp)
         facing = inverse.poses.rotation[cubes, :, 2] @ inverse.poses.rotation[home, :, 2] > 0.5

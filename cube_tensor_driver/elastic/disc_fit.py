@@ -6,18 +6,11 @@ ln a are those of Gauss and Newton, with the covariance of what is left as weigh
     y = sum_j (R(c_j, a_j) + sum_k s_jk D_k(c_j, a_j)) f_j + H rest + e
     W = (alpha^2 K + S + N)^-1
 
-K is the prior of kernels.py. D moves pressure within a contact and leaves its force and place: it
-makes it longer along x or along a diagonal, and emptier or fuller at its rim. The shapes s have the
-covariance S, see SHAPE. alpha has the greatest evidence, the likelihood with forces, places and
-sizes integrated over their priors: where contacts are like none of these, alpha grows, and so do
-all standard deviations.
-
-N is the covariance of the pads' noise and gain errors. A cube whose values y follow from its pads
-by B, in units of their noise (`noise_by_pad`), has::
-
-    N = B diag(1 + GAIN_ERROR^2 u^2) B',     u = B' (B B')^-1 y
-
-u are the least stresses of the pads that make y.
+K is the prior of kernels.py, N the noise of pad_noise.py. D moves pressure within a contact and
+leaves its force and place: it makes it longer along x or along a diagonal, and emptier or fuller at
+its rim. The shapes s have the covariance S, see SHAPE. alpha has the greatest evidence, the
+likelihood with forces, places and sizes integrated over their priors: where contacts are like none
+of these, alpha grows, and so do all standard deviations.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); D. J. C. MacKay, Bayesian
 interpolation, Neural Computation 4 (1992) 415 (evidence).
@@ -25,6 +18,7 @@ interpolation, Neural Computation 4 (1992) 415 (evidence).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -35,6 +29,7 @@ from scipy.linalg import cho_factor, cho_solve
 from ..core.modes import COMPONENTS
 from .inverse import AMPLITUDE, SurfaceInverse
 from .kernels import SIZES
+from .pad_noise import GAIN_ERROR, pad_stresses
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -44,8 +39,6 @@ USUAL_SIZE, SIZE_SPREAD = 0.8, 1.0
 is measured."""
 GREATEST_FORCE = 1e3
 """Prior standard deviation of a force, N: none that matters, so that no force is possible, too."""
-GAIN_ERROR = 0.01
-"""Standard deviation of a pad's gain against what its calibration says."""
 ROUGH_ERROR = 0.1
 """Of every pad over the rms of its cube's pads, as long as a contact is far from its place: there
 the linear problem is off by more than the gains, for pads that feel little, too."""
@@ -94,13 +87,9 @@ class Scan:
         self.reading = inverse.reading[cubes]
         known = np.isfinite(values) & inverse.observed[cubes]
         self._known = known.ravel()
-        filled = np.where(known, values, 0.0)
-        by_pad = np.where(known[:, :, None], inverse.by_pad[cubes], 0.0)
-        of_pad = by_pad.swapaxes(1, 2)
-        whole = by_pad @ of_pad + np.eye(known.shape[1]) * ~known[:, None, :]
-        stress = of_pad @ np.linalg.solve(whole, filled[..., None])
-        self._by_pad, self._square = by_pad, stress**2
-        self.y = filled.ravel()[self._known]
+        self._by_pad = np.where(known[:, :, None], inverse.by_pad[cubes], 0.0)
+        self._square = pad_stresses(self._by_pad, known, values)[..., None] ** 2
+        self.y = values.ravel()[self._known]
         self.noise = self._covariance(GAIN_ERROR**2 * self._square)
         self.prior = prior[np.ix_(self._known, self._known)]
         self.size = len(self.y)
@@ -137,7 +126,8 @@ class Scan:
 
 class Fitted(NamedTuple):
     """Contacts middles (J, 2), sizes (J,), forces (J, 3), what is left (alpha, factor, weighted
-    rest W r) and the linearised problem: J (D, 6 contacts), J' W J + prior.
+    rest W r) and the linearised problem: J (D, 6 contacts), J' W J + prior, and what their shapes
+    make, D f times SHAPE (D, 3 contacts).
 
     score: -2 ln of the evidence (Laplace), to compare fits of the same values, also with other
         numbers of contacts
@@ -150,8 +140,30 @@ class Fitted(NamedTuple):
     factor: tuple[Array, bool]
     rest: Array
     jacobian: Array
+    shapes: Array
     normal: Array
     score: float
+
+    def covariance(self, j: int) -> Array:
+        """(9, 9) of contact j: force, place, ln a, and its shapes over SHAPE.
+
+        The shapes s are a part of the noise in W; so with M = D f SHAPE and Q = M' W J::
+
+            cov(x) = (J' W J + prior)^-1,   cov(s, x) = -Q cov(x),
+            cov(s) = 1 - M' W M + Q cov(x) Q'
+        """
+        shapes = self.shapes[:, 3 * j : 3 * j + 3]
+        weighted = cho_solve(self.factor, shapes)
+        cross = weighted.T @ self.jacobian
+        inverse = np.linalg.inv(self.normal)
+        both = cross @ inverse
+        own = slice(6 * j, 6 * j + 6)
+        whole = np.empty((9, 9))
+        whole[:6, :6] = inverse[own, own]
+        whole[6:, :6] = -both[:, own]
+        whole[:6, 6:] = whole[6:, :6].T
+        whole[6:, 6:] = np.eye(3) - shapes.T @ weighted + both @ cross.T
+        return whole
 
 
 def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> Fitted:
@@ -175,7 +187,10 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
     last, rough = False, steps != WARM
     for step in range(steps + 1):
         last |= step == steps
-        parts = [_Parts(scan, m, np.exp(a)) for m, a in zip(middles, logs, strict=True)]
+        parts = [
+            Parts.of(scan.responses, depth, m, np.exp(a))
+            for m, a in zip(middles, logs, strict=True)
+        ]
         response = np.concatenate([part.response for part in parts], axis=1)
         shapes = [part.shapes @ force for part, force in zip(parts, forces, strict=True)]
         shape = np.concatenate(shapes).T  # (D, 3 contacts)
@@ -209,33 +224,46 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
         middles = np.clip(middles, start - scan.pitch, start + scan.pitch)
         logs = np.clip(logs + np.clip(change[:, 5], -0.5, 0.5), low, high)
     rest = cho_solve(factor, residual)
-    return Fitted(middles, np.exp(logs), forces, alpha, factor, rest, jacobian, normal, score)
+    return Fitted(
+        middles, np.exp(logs), forces, alpha, factor, rest, jacobian, shape, normal, score
+    )
 
 
-class _Parts:
+class Parts(NamedTuple):
     """What a contact of force 1 N makes, and how that changes with its place and shape.
 
     response: (D, 3); slopes: (3, D, 3) by c_x, c_y and ln a
     shapes: (3, D, 3) D, each times its standard deviation
     """
 
-    def __init__(self, scan: Scan, middle: Array, size: float) -> None:
-        step = scan.kernels.depth / 50
-        here = scan.responses(
-            middle + np.concatenate([step * _STEPS, SHIFT * size * _AROUND]), size
-        )
+    response: Array
+    slopes: Array
+    shapes: Array
+
+    @classmethod
+    def of(
+        cls, responses: Callable[[Array, float], Array], depth: float, middle: Array, size: float
+    ) -> Parts:
+        """responses: (K, D, 3) of places (K, 2) and a radius, as `Scan.responses`."""
+        step = depth / 50
+        here = responses(middle + np.concatenate([step * _STEPS, SHIFT * size * _AROUND]), size)
         narrower, wider = (
-            scan.responses(middle[None], size * np.exp(share))[0] for share in (-WIDER, WIDER)
+            responses(middle[None], size * np.exp(share))[0] for share in (-WIDER, WIDER)
         )
-        self.response = here[0]
-        ahead = here[1:5].reshape(2, 2, *self.response.shape)
+        response = here[0]
+        ahead = here[1:5].reshape(2, 2, *response.shape)
         along = (ahead[:, 0] - ahead[:, 1]) / (2 * step)
-        self.slopes = np.concatenate([along, (wider - narrower)[None] / (2 * WIDER)])
-        axes = here[5:].reshape(4, 2, *self.response.shape).sum(axis=1) / 4
+        slopes = np.concatenate([along, (wider - narrower)[None] / (2 * WIDER)])
+        axes = here[5:].reshape(4, 2, *response.shape).sum(axis=1) / 4
         same_size = (1 - np.exp(-2 * WIDER)) / (np.exp(2 * WIDER) - np.exp(-2 * WIDER))
         mixed = same_size * wider + (1 - same_size) * narrower
-        shapes = np.stack([axes[0] - axes[1], axes[2] - axes[3], self.response - mixed])
-        self.shapes = SHAPE[:, None, None] * shapes
+        shapes = np.stack([axes[0] - axes[1], axes[2] - axes[3], response - mixed])
+        return cls(response, slopes, SHAPE[:, None, None] * shapes)
+
+    def by_parameters(self, force: Array) -> Array:
+        """(D, 9) derivatives of a contact with this force, N, by f, c, ln a and its shapes."""
+        moved = np.concatenate([self.slopes, self.shapes]) @ force
+        return np.concatenate([self.response, moved.T], axis=1)
 
 
 def _factor(scan: Scan, noise: Array, alpha: float) -> tuple[Array, bool]:

@@ -14,14 +14,17 @@ estimate without them is the one with what the others predict in their place::
 
     y_D = -P_DD^-1 P_DR y_R,      covariance + G_D P_DD^-1 G_D'
 
-The prior's size follows the data: with s^2 = y' P y / n, standard deviations are s times those of
-AMPLITUDE, plus what the pads' noise makes. Source: C. E. Rasmussen, C. K. I. Williams, Gaussian
-Processes for Machine Learning (2006), 2.2, 5.4 and (leaving out) 5.4.2.
+The prior's size follows the data. Variances are s^2 times those of AMPLITUDE, plus what noise and
+gain errors of the pads make (their covariance M is in pad_noise.py)::
+
+    s^2 = (y' P y - tr P M) / n,      diag G M G'
+
+Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 2.2, 5.4
+and (leaving out) 5.4.2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,17 +32,16 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 
-from ..core.calibration import Calibration
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from ..core.errors import ElasticError
-from ..core.modes import COMPONENTS, STRESS
-from ..core.pipeline import Pipeline
+from ..core.modes import STRESS
 from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from .cache import cached
 from .influence import Influence
 from .kernels import Kernels, Reading
 from .layer import Layer
+from .pad_noise import GAIN_ERROR, noise_by_pad, pad_stresses
 from .pad_reading import read_pads
 from .surface import patches
 
@@ -162,7 +164,6 @@ class SurfaceInverse:
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
         self._units = np.where(self.columns < len(STRESS), 1.0, scale)
         self.by_pad = by_pad[:, self.columns] * self._units[:, None]
-        self.noise = self.by_pad @ self.by_pad.swapaxes(1, 2)
         self.observed = observed[:, self.columns]
         self._windows = _Windows(self)
         self._known = self.observed
@@ -197,16 +198,26 @@ class SurfaceInverse:
 
     def deviation(self, values: Array) -> FieldDeviation:
         """How far the field of these values may be off. Takes several times as long as `field`."""
-        return self.deviation_of(self.scaled(values))
+        scaled = self.scaled(values)
+        return self.deviation_of(scaled, scaled)
 
-    def deviation_of(self, scaled: Array) -> FieldDeviation:
-        """The same of `scaled` values."""
-        windows, y = self._windows, self._filled(scaled)
-        variance = windows.size(y)[:, None] ** 2 * windows.prior[windows.kind]
+    def deviation_of(self, left: Array, scaled: Array) -> FieldDeviation:
+        """How far the field of what is left of `scaled` values may be off; all of these are on the
+        pads whose gains are not quite known."""
+        windows, y = self._windows, self._filled(left)
+        stresses = pad_stresses(self.by_pad, self._known, scaled)
+        of_pads = (1 + (GAIN_ERROR * stresses) ** 2).astype(np.float32)
+        square, noise = windows.square(y), windows.noise(of_pads)
+        prior = windows.prior[windows.kind]
+        n_known = windows.n_known.copy()
         for row, window in self._changed.items():
-            size = window.size(windows.precision[windows.kind[row]], y[windows.near[row]])
-            variance[row] = size**2 * (windows.prior[windows.kind[row]] + window.variance)
-        variance += windows.noise[windows.kind]
+            near = windows.near[row]
+            square[row] = window.square(windows.precision[windows.kind[row]], y[near])
+            noise[row] = window.by_pad @ of_pads[near].ravel()
+            prior[row] += window.variance
+            n_known[row] = max(window.known, 1)
+        size = np.maximum(square - noise[:, -1], 0) / n_known
+        variance = size[:, None] * prior + noise[:, :-1]
         return FieldDeviation(*np.sqrt(variance).reshape(-1, 2).T)
 
     def _filled(self, scaled: Array) -> Single:
@@ -217,36 +228,26 @@ class SurfaceInverse:
         return np.where(known, scaled, 0.0).astype(np.float32)
 
 
-def noise_by_pad(calibrations: Sequence[Calibration]) -> Array:
-    """(cubes, 15, P) what the standard deviation of each pad's noise makes of each component, Pa
-    and Pa/m: B B' is the covariance of a cube's components. NaN where a component is not observed;
-    0 for pads that a cube does not have."""
-    pipeline = Pipeline(calibrations)
-    by_pad = np.zeros((len(calibrations), len(COMPONENTS), pipeline.n_pads))
-    for cube, calibration in enumerate(calibrations):
-        own = pipeline.matrix(cube) * calibration.noise
-        by_pad[cube, :, : own.shape[1]] = own
-    return by_pad
-
-
 class _Reduced(NamedTuple):
     """A window without some of its values.
 
     gain: (rows, W C), 0 for them; variance: (points x 2) what variances at the size 1 gain
+    by_pad: (points x 2 + 1, W P) as that of `_Windows`
     out: (W C,) which they are; fill: (out, W C) predicts them; known: how many others there are
     """
 
     gain: Single
     variance: Array
+    by_pad: Single
     out: Mask
     fill: Array
     known: int
 
-    def size(self, precision: Single, y: Single) -> float:
-        """s of this window, see `_Windows.size`."""
+    def square(self, precision: Single, y: Single) -> float:
+        """y' P y of this window."""
         filled = y.ravel().astype(float)
         filled[self.out] = self.fill @ filled
-        return float(np.sqrt(max(filled @ (precision @ filled), 0.0) / max(self.known, 1)))
+        return float(filled @ (precision @ filled))
 
 
 class _Windows:
@@ -254,8 +255,10 @@ class _Windows:
 
     near: (cubes, W) cubes of each window; kind: (cubes,) which matrix is its own
     gain: (kinds, rows, W C) float32; precision: P of each kind, float32
-    prior, noise: (kinds, points x 2) variances of pressure and pressure below, at the size 1 and
-    by the noise of the pads
+    prior: (kinds, points x 2) variances of pressure and pressure below, at the size 1
+    by_pad: (kinds, points x 2 + 1, W P) what the variance of each pad's noise makes of these, and
+    of the mean of y' P y
+    n_known: (cubes,) values that a window has when nothing falls out
     """
 
     def __init__(self, inverse: SurfaceInverse) -> None:
@@ -265,7 +268,8 @@ class _Windows:
         middles = np.arange(len(self.near))
         place, angle = _flattened(poses, middles, self.near)
         self._known = inverse.observed[self.near].reshape(len(self.near), -1)
-        noise_kind = _distinct(np.nan_to_num(inverse.noise.reshape(len(middles), -1), nan=-1.0))
+        self._pads = np.nan_to_num(inverse.by_pad)
+        noise_kind = _distinct(np.nan_to_num(inverse.by_pad, nan=-1.0).reshape(len(middles), -1))
         looks = [place.reshape(len(middles), -1), np.cos(angle), np.sin(angle)]
         looks = [np.round(look / _SAME / 10) for look in looks]
         looks += [noise_kind[self.near], inverse.reading[self.near]]
@@ -287,17 +291,17 @@ class _Windows:
         near = self.near[first]
         key: list[Any] = [*inverse.kernels.made_from, inverse.spacing, inverse.side]
         key += [inverse.columns, place[first], angle[first]]
-        key += [inverse.noise[near], inverse.reading[near]]
+        key += [inverse.by_pad[near], inverse.reading[near]]
         solved = cached("windows", key, solve)
         self.gain, self.precision = solved["gain"], solved["precision"]
-        self.prior, self.noise = solved["variance"], solved["noise"]
+        self.prior, self.by_pad = solved["variance"], solved["by_pad"]
         counts = np.bincount(self.kind)
         self._many = [
             (kind, np.flatnonzero(self.kind == kind)) for kind in kinds if counts[kind] > 1
         ]
         self._single = np.flatnonzero(counts[self.kind] == 1)
         self._single_gain = self.gain[self.kind[self._single]]
-        self._n_known = np.maximum(self._known.sum(axis=1), 1)
+        self.n_known = np.maximum(self._known.sum(axis=1), 1)
 
     def product(self, y: Single) -> Single:
         """(cubes, rows) of values y (cubes, C) that are 0 where unknown."""
@@ -310,14 +314,19 @@ class _Windows:
             result[self._single] = (self._single_gain @ single)[:, :, 0]
         return result
 
-    def size(self, y: Single) -> Array:
-        """(cubes,) s: how large the values of each window are against the prior's."""
+    def square(self, y: Single) -> Array:
+        """(cubes,) y' P y of each window."""
         gathered = y[self.near].reshape(len(self.near), -1)
         square = np.empty(len(gathered))
         for kind in np.unique(self.kind):
             rows = np.flatnonzero(self.kind == kind)
             square[rows] = ((gathered[rows] @ self.precision[kind]) * gathered[rows]).sum(axis=1)
-        return np.sqrt(np.maximum(square, 0) / self._n_known)
+        return square
+
+    def noise(self, of_pads: Single) -> Array:
+        """(cubes, points x 2 + 1) by `by_pad`, of_pads (cubes, P): variances over their noise."""
+        gathered = of_pads[self.near].reshape(len(self.near), -1, 1)
+        return np.asarray((self.by_pad[self.kind] @ gathered)[:, :, 0], float)
 
     def without(self, known: Mask) -> dict[int, _Reduced]:
         """The windows that miss values of cubes, known (cubes, C), by the number of their cube."""
@@ -333,8 +342,11 @@ class _Windows:
             gain[:, out] = 0.0
             inside = np.linalg.solve(precision[np.ix_(out, out)], lost.T)
             more = _of_pressure(np.einsum("rd,dr->r", lost, inside))
+            precision += precision[:, out] @ fill
+            precision[:, out] = precision[out] = 0.0
+            by_pad = _by_pad(gain, precision, self._pads[self.near[row]])
             n_known = int(self._known[row].sum() - out.sum())
-            reduced[row] = _Reduced(gain.astype(np.float32), more, out, fill, n_known)
+            reduced[row] = _Reduced(gain.astype(np.float32), more, by_pad, out, fill, n_known)
         return reduced
 
 
@@ -342,22 +354,21 @@ class _Window(NamedTuple):
     gain: Single
     precision: Single
     variance: Array
-    noise: Array
+    by_pad: Single
 
 
 def _solve(inverse: SurfaceInverse, cubes: Index, place: Array, angle: Array) -> _Window:
     """One window of cubes (W,): matrix (rows, W C), P (W C, W C), variances (points x 2) at
-    AMPLITUDE and by the pads' noise."""
+    AMPLITUDE, and `by_pad`, see `_Windows`."""
     kernels, columns = inverse.kernels, inverse.columns
-    noise, reading = inverse.noise[cubes], inverse.reading[cubes]
+    pads, reading = np.nan_to_num(inverse.by_pad[cubes]), inverse.reading[cubes]
     n, size = len(place), len(place) * len(columns)
-    known = np.isfinite(noise[:, np.arange(len(columns)), np.arange(len(columns))]).ravel()
+    known = inverse.observed[cubes].ravel()
     prior = AMPLITUDE**2 * covariance_matrix(kernels, columns, place, angle, reading)
-    total, pads = prior.copy(), np.zeros_like(prior)
-    for cube in range(n):
+    total = prior.copy()
+    for cube, own in enumerate(pads):
         part = slice(cube * len(columns), (cube + 1) * len(columns))
-        pads[part, part] = np.nan_to_num(noise[cube])
-    total += pads
+        total[part, part] += own @ own.T
     total[np.diag_indices(size)] += MODEL_ERROR**2 * np.diag(prior)
     points = inverse._patch
     offset = (place[:, None] - points[None]).reshape(-1, 2)
@@ -372,11 +383,24 @@ def _solve(inverse: SurfaceInverse, cubes: Index, place: Array, angle: Array) ->
     inside = cho_solve(factor, cross.T).T
     own = np.array([*kernels.variance, kernels.pressure_variance])
     variance = AMPLITUDE**2 * np.tile(own, len(points)) - (inside * cross).sum(axis=1)
-    by_noise = np.einsum("ra,ab,rb->r", inside, pads[np.ix_(known, known)], inside, optimize=True)
     gain, precision = np.zeros((len(inside), size), np.float32), np.zeros((size, size), np.float32)
     gain[:, known] = inside
     precision[np.ix_(known, known)] = cho_solve(factor, np.eye(known.sum()))
-    return _Window(gain, precision, np.maximum(_of_pressure(variance), 0), _of_pressure(by_noise))
+    by_pad = _by_pad(gain, precision, pads)
+    return _Window(gain, precision, np.maximum(_of_pressure(variance), 0), by_pad)
+
+
+def _by_pad(gain: Array | Single, precision: Array | Single, pads: Array) -> Single:
+    """(points x 2 + 1, W P) of a window, see `_Windows`. pads: B (W, C, P) of its cubes, 0 where
+    nothing is observed."""
+    n, width, _ = pads.shape
+    rows = gain.reshape(-1, _ROWS, n, width)[:, 2:].reshape(-1, n, width)
+    of_rows = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
+    one = np.arange(n)
+    own = precision.reshape(n, width, n, width)[one, :, one]
+    of_square = np.einsum("wcp,wcd,wdp->wp", pads, own, pads, optimize=True)
+    both = np.concatenate([of_rows, of_square[None]]).reshape(len(rows) + 1, -1)
+    return np.asarray(both, np.float32)
 
 
 def covariance_matrix(
@@ -395,6 +419,19 @@ def covariance_matrix(
     own = np.arange(n)
     matrix[own, :, own] = (table[one == other] + table[one == other].swapaxes(1, 2)) / 2
     return matrix.reshape(n * width, -1)
+
+
+def positive(covariance: Array) -> Array:
+    """The same with so much more variance of each component that all combinations have some. They
+    lack it where cubes are so far apart that `Kernels` counts their covariance as zero."""
+    for share in (1e-6, 1e-3, 1e-2, 1e-1):
+        more = covariance + share * np.diag(np.diag(covariance))
+        try:
+            np.linalg.cholesky(more)
+        except np.linalg.LinAlgError:
+            continue
+        break
+    return more
 
 
 def _of_pressure(rows: Array) -> Array:

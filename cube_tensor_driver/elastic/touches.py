@@ -13,21 +13,29 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from .disc import Disc, DiscModel
 from .disc_choice import beginning, remaining, same
 from .disc_fit import COLD, USUAL_SIZE, WARM, Fitted, Scan, fit
 from .disc_load import Load, load_of
 from .disc_split import split
-from .inverse import AMPLITUDE, SurfaceInverse, TractionField, covariance_matrix
+from .inverse import (
+    AMPLITUDE,
+    FieldDeviation,
+    SurfaceInverse,
+    TractionField,
+    covariance_matrix,
+    positive,
+)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 NEAR = 16
 """Cubes next to a contact that it is computed from."""
-MOST = 10
-"""Contacts at a time."""
+MOST, TOGETHER = 10, 4
+"""Contacts at a time, and of these in one fit, whose time grows with the cube of their number."""
 MUCH_LEFT, WIDE_SIZE = 0.02, 2.5
 """Alpha over AMPLITUDE from which on a contact is fitted once more, beginning with this radius over
 the depth."""
@@ -65,7 +73,7 @@ class TrackedContact(NamedTuple):
 class Touches:
     """Follows the contacts of a skin from scan to scan.
 
-    field: of the newest scan, contacts included; its standard deviation is that of what is left
+    field: of the newest scan, contacts included; 0 before the first
 
     Parameters: inverse: of the skin. least: pressure at the cubes' depth that counts as contact,
     Pa.
@@ -78,7 +86,9 @@ class Touches:
         self._contacts: dict[int, TrackedContact] = {}
         self._next_id = 0
         self._priors: dict[tuple[int, ...], Array] = {}
-        self.field: TractionField | None = None
+        count = len(inverse.points)
+        self.field = TractionField(np.zeros((count, 3)), np.zeros(count))
+        self._left = np.full((len(inverse.poses.position), len(inverse.columns)), np.nan)
 
     def update(self, values: Array) -> list[TrackedContact]:
         """Contacts of the newest values (cubes, 15), NaN where unknown; strongest first.
@@ -91,7 +101,8 @@ class Touches:
         self._discs = remaining(model, self._discs, self._least)
         tried: list[Array] = []
         for _ in range(MOST + 1):
-            rest = self._inverse.field_of(y - model.seen(self._discs))
+            self._left = y - model.seen(self._discs)
+            rest = self._inverse.field_of(self._left)
             below = rest.below + model.below(self._discs)
             self.field = model.with_discs(rest, below, self._discs)
             pair = same(model, self._discs, below)
@@ -105,12 +116,19 @@ class Touches:
                 break
             tried.append(self._inverse.points[start])
             disc = self._new(start)
-            group = self._group(disc)
+            others = self._near(disc, self._discs)
             self._discs.append(disc)
-            self._fit(y, [*group, disc], COLD)
+            self._fit(y, [disc, *others], COLD)
             self._discs = remaining(model, self._discs, self._least)
         contacts = [self._contacts[disc.id] for disc in self._discs if disc.id in self._contacts]
         return sorted(contacts, key=lambda contact: -contact.normal_force)
+
+    def deviation(self, values: Array) -> FieldDeviation:
+        """How far the `field` of these values may be off: by what is left, and by all that is not
+        sure of the contacts."""
+        of_rest = np.stack(self._inverse.deviation_of(self._left, self._inverse.scaled(values)), 1)
+        of_discs = self._model.variance(self._discs)
+        return FieldDeviation(*np.sqrt(of_rest**2 + of_discs).T)
 
     def _new(self, point: int) -> Disc:
         inverse = self._inverse
@@ -122,20 +140,19 @@ class Touches:
         self._next_id += 1
         return Disc(self._next_id - 1, home, offset[:2], size, np.zeros(3), FIRST_ALPHA * AMPLITUDE)
 
-    def _group(self, disc: Disc) -> list[Disc]:
-        """Other contacts that share cubes with this one."""
-        reach, middle = 4 * self._inverse.pitch, self._model.middle(disc)
-        return [o for o in self._discs if np.linalg.norm(self._model.middle(o) - middle) < reach]
+    def _near(self, disc: Disc, others: list[Disc]) -> list[Disc]:
+        """Those of other contacts that share cubes with this one, the nearest first."""
+        middle, reach = self._model.middle(disc), 4 * self._inverse.pitch
+        apart = [float(np.linalg.norm(self._model.middle(other) - middle)) for other in others]
+        return [others[k] for k in np.argsort(apart) if apart[k] < reach]
 
     def _fit(self, y: Array, discs: list[Disc], steps: int) -> None:
         """Fit contacts, those together that share cubes; the others stay as they are."""
         left = list(discs)
         while left:
-            group = [left.pop(0)]
-            for disc in group:  # grows while it is walked
-                near = {id(other) for other in self._group(disc)}
-                group += [other for other in left if id(other) in near]
-                left = [other for other in left if id(other) not in near]
+            first = left.pop(0)
+            group = [first, *self._near(first, left)[: TOGETHER - 1]]
+            left = [disc for disc in left if all(disc is not one for one in group)]
             others = [disc for disc in self._discs if all(disc is not one for one in group)]
             self._fit_group(y - self._model.seen(others), group, steps)
 
@@ -231,6 +248,10 @@ class Touches:
         disc.alpha = fitted.alpha
         disc.place = back[:2, :2] @ (fitted.middles[j] - place[nearest])
         disc.force = back @ fitted.forces[j]
+        # Both shapes that make a contact longer turn twice as fast as it does.
+        turn = block_diag(back, back[:2, :2], 1.0, (back @ back)[:2, :2], 1.0)
+        doubts = np.diag([*disc.force_doubt, *[disc.doubt / 2] * 2, *np.zeros(4)])
+        disc.covariance = turn @ (fitted.covariance(j) + doubts) @ turn.T
 
     def _tracked(
         self, number: int, load: Load, cubes: Index, place: Array, angle: Array
@@ -267,8 +288,10 @@ class Touches:
             if len(self._priors) >= 2 * MOST:
                 self._priors.pop(next(iter(self._priors)))
             inverse = self._inverse
-            self._priors[key] = covariance_matrix(
-                inverse.kernels, inverse.columns, place, angle, inverse.reading[cubes]
+            self._priors[key] = positive(
+                covariance_matrix(
+                    inverse.kernels, inverse.columns, place, angle, inverse.reading[cubes]
+                )
             )
         return self._priors[key]
 

@@ -112,6 +112,5 @@ def layer_example(true: Influence) -> FieldExample:
         values = bench.values(5e-3, load, centre, np.random.default_rng(1))
         touches = Touches(bench.inverse, CONTACT_PRESSURE)
         touches.update(values)
-        if touches.field is not None:
-            pressure[form] = touches.field.below
+        pressure[form] = touches.field.below
     return FieldExample(points, pressure, bench.poses.position, centre)

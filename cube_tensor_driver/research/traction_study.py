@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..config.calibration import find_calibration, read_calibration
 from ..config.package_data import package_data
@@ -25,9 +26,10 @@ from ..core.rows import FrequencyRows
 from ..core.tensor import rotation_from_rpy
 from ..elastic import contact
 from ..elastic.influence import Influence
-from ..elastic.inverse import SurfaceInverse, noise_by_pad
+from ..elastic.inverse import SurfaceInverse
 from ..elastic.kernels import Kernels
 from ..elastic.layer import Layer
+from ..elastic.pad_noise import noise_by_pad
 from ..elastic.pad_reading import read_pads
 from ..elastic.surface import Surface
 from ..elastic.touches import Touches
@@ -44,8 +46,10 @@ GAIN_ERROR = 0.01
 """Standard deviation of a pad's gain against what its calibration says."""
 CASES = 16
 _SIDE = 0.072
-_ORDER = 14
-"""Of the quadrature of a ball: stress at 4 mm below one of 20 mm is within 1e-3 of its peak."""
+_ORDER, _SURFACE_ORDER = 14, 100
+"""Of the quadrature of a ball: stress at 4 mm below one of 20 mm is within 1e-3 of its peak; the
+second one is for the surface itself."""
+PRESSED = 0.1
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,8 @@ class Errors:
     force: rms error of the normal force over the force; place: 95th percentile, m; both of the
         interpolation and of the contacts
     seen: rms of force error and of place error, over what was stated; of interpolation and contacts
+    seen_field: rms of the errors of pressure over their stated deviations, with contacts: at the
+        cubes' depth and on the surface, where it exceeds PRESSED of its peak
     found: part of the loads with exactly one contact
     """
 
@@ -83,6 +89,7 @@ class Errors:
     force: Array
     place: Array
     seen: Array
+    seen_field: Array
     found: float
 
 
@@ -128,19 +135,29 @@ class Bench:
         stress, gradient = contact.field(below, sources, forces, self.setting.poisson)
         return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
 
-    def _load(self, width: float, force: Array, centre: Array) -> tuple[Array, Array]:
+    def surface_truth(self, width: float, force: Array, centre: Array) -> Array:
+        """(M,) pressure on the surface, Pa, as the mean over the square of each point."""
+        inverse = self.inverse
+        sources, forces = self._load(width, force, centre, _SURFACE_ORDER)
+        nearest = cKDTree(inverse.points[:, :2]).query(sources[:, :2])[1]
+        total = np.bincount(nearest, -forces[:, 2], len(inverse.points))
+        return np.asarray(total / inverse.area)
+
+    def _load(
+        self, width: float, force: Array, centre: Array, order: int = _ORDER
+    ) -> tuple[Array, Array]:
         shape, radius = self.setting.shape, width / 2
         if shape == SHAPES[0]:
-            return contact.hertz(radius, force, centre, _ORDER)
+            return contact.hertz(radius, force, centre, order)
         if shape == SHAPES[1]:
-            return flat_punch(radius, force, centre, _ORDER)
+            return flat_punch(radius, force, centre, order)
         if shape == SHAPES[2]:
             radii = np.linspace(0.6, 1.0, 8) * radius
-            parts = [flat_punch(one, force / 8, centre, _ORDER) for one in radii]
+            parts = [flat_punch(one, force / 8, centre, order) for one in radii]
         else:
             apart = radius / 2 * np.array([0.8, 0.6])
             places = (centre - apart, centre + apart)
-            parts = [contact.hertz(radius / 2, force / 2, place, _ORDER) for place in places]
+            parts = [contact.hertz(radius / 2, force / 2, place, order) for place in places]
         sources, forces = zip(*parts, strict=True)
         return np.concatenate(sources), np.concatenate(forces)
 
@@ -181,6 +198,7 @@ class Bench:
         random = np.random.default_rng(seed)
         field, force = np.zeros((cases, 3)), np.full((cases, 2), -1.0)
         place, seen = np.full((cases, 2), WINDOW), np.full((cases, 2, 2), np.nan)
+        seen_field: list[list[Array]] = []
         one = 0
         for case in range(cases):
             load, centre = self.load(random)
@@ -196,8 +214,14 @@ class Bench:
             fields = [
                 self.surface.field(values).pressure,
                 self.inverse.field(values).below,
-                touches.field.below if touches.field is not None else np.zeros(len(self.window)),
+                touches.field.below,
             ]
+            stated = touches.deviation(values)
+            surface = self.surface_truth(width, load, centre)
+            pressed = true > PRESSED * true.max(), surface > PRESSED * surface.max()
+            errors = fields[2][self.window] - true, touches.field.pressure - surface
+            over = errors[0] / stated.below[self.window], errors[1] / stated.pressure
+            seen_field.append([z[where] ** 2 for z, where in zip(over, pressed, strict=True)])
             for k, computed in enumerate(fields):
                 field[case, k] = ((computed[self.window] - true) ** 2).mean() / (true**2).mean()
             for k, contacts in enumerate(found):
@@ -214,6 +238,9 @@ class Bench:
             force=np.sqrt((force**2).mean(axis=0)),
             place=np.percentile(place, 95, axis=0),
             seen=np.sqrt(np.nanmean(seen**2, axis=0)),
+            seen_field=np.array(
+                [np.sqrt(np.concatenate(z).mean()) for z in zip(*seen_field, strict=True)]
+            ),
             found=one / cases,
         )
 
@@ -255,10 +282,9 @@ def traction_example() -> FieldExample:
         "truth": -bench.truth(points[:, :2], width, load, centre)[:, 2],
         METHODS[0]: bench.surface.field(values).pressure,
         METHODS[1]: bench.inverse.field(values).below,
-        "standard deviation": bench.inverse.deviation(values).below,
+        METHODS[2]: touches.field.below,
+        "standard deviation": touches.deviation(values).below,
     }
-    if touches.field is not None:
-        pressure[METHODS[2]] = touches.field.below
     return FieldExample(points, pressure, bench.poses.position, centre)
 
 
