@@ -113,9 +113,10 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
     assert 0.9 * (1 - spread) ** 2 < found[0] and found[-1] < 1.1 * (1 + spread) ** 2
 
 
-@pytest.mark.parametrize("lost", [[], [40, 41]])
-def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it(lost):
-    """A contact that is known takes all values away, and leaves the errors of its pads."""
+@pytest.mark.parametrize(("lost", "limit"), [([], 0.1), ([40, 41], 0.2)])
+def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it(lost, limit):
+    """A contact that is known takes all values away, and leaves the errors of its pads. What is
+    predicted of lost cubes counts as independent of what it is predicted from."""
     bench, random = Bench(Setting(), side=2), np.random.default_rng(3)
     inverse, force = bench.inverse, np.array([0.6, 0.3, -3.0])
     field = bench.truth(bench.poses.position[:, :2], 8e-3, force, np.array([1e-3, 2e-3]))
@@ -129,7 +130,7 @@ def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it
     near = inverse.cube == 40
     for points in (near, ~near):
         seen = np.sqrt((below[:, points] ** 2).mean())
-        assert np.sqrt((stated[points] ** 2).mean()) == pytest.approx(seen, rel=0.1)
+        assert np.sqrt((stated[points] ** 2).mean()) == pytest.approx(seen, rel=limit)
 
 
 def fitted_scan(inverse, values) -> tuple[Scan, Fitted]:

@@ -9,8 +9,8 @@ Every cube has a window of its nearest cubes, which make the points on its patch
 computed once, so that a scan is one product. Windows that look alike share it. On a bent skin a
 window is laid flat: distances from its middle are kept.
 
-Values that are missing (D; R are the others) change a matrix and not what it is made from. The
-estimate without them is the one with what the others predict in their place::
+Values that are missing (D; R are the others around their cube) change no matrix. The estimate
+without them is the one with what the others predict in their place::
 
     y_D = -P_DD^-1 P_DR y_R,      covariance + G_D P_DD^-1 G_D'
 
@@ -50,8 +50,9 @@ Single = NDArray[np.float32]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-WINDOW = 25
-"""Cubes of a window: 5 x 5 of a square grid."""
+WINDOW, INNER = 25, 13
+"""Cubes of a window: 5 x 5 of a square grid; and those next to its middle that tell how large the
+prior is and predict what is missing in the middle: P of all 25 would be most of the memory."""
 AMPLITUDE = 20e3
 """Prior standard deviation of the pressure, Pa: that of a firm touch."""
 MODEL_ERROR = 0.01
@@ -167,7 +168,7 @@ class SurfaceInverse:
         self.observed = observed[:, self.columns]
         self._windows = _Windows(self)
         self._known = self.observed
-        self._changed: dict[int, _Reduced] = {}
+        self._missing = _Missing(self._windows, self.observed, self.observed)
 
     def scaled(self, values: Array) -> Array:
         """(cubes, C) in Pa of values (cubes, 15): only what some cube observes."""
@@ -189,10 +190,7 @@ class SurfaceInverse:
 
     def field_of(self, scaled: Array) -> TractionField:
         """The same of `scaled` values."""
-        y = self._filled(scaled)
-        result = self._windows.product(y)
-        for row, window in self._changed.items():
-            result[row] = window.gain @ y[self._windows.near[row]].ravel()
+        result = self._windows.product(self._filled(scaled))
         rows: Array = result.reshape(len(self.points), _ROWS).astype(np.float64)
         return TractionField(rows[:, :3], rows[:, 3])
 
@@ -206,69 +204,41 @@ class SurfaceInverse:
         pads whose gains are not quite known."""
         windows, y = self._windows, self._filled(left)
         stresses = pad_stresses(self.by_pad, self._known, scaled)
-        of_pads = (1 + (GAIN_ERROR * stresses) ** 2).astype(np.float32)
-        square, noise = windows.square(y), windows.noise(of_pads)
-        prior = windows.prior[windows.kind]
-        n_known = windows.n_known.copy()
-        for row, window in self._changed.items():
-            near = windows.near[row]
-            square[row] = window.square(windows.precision[windows.kind[row]], y[near])
-            noise[row] = window.by_pad @ of_pads[near].ravel()
-            prior[row] += window.variance
-            n_known[row] = max(window.known, 1)
-        size = np.maximum(square - noise[:, -1], 0) / n_known
-        variance = size[:, None] * prior + noise[:, :-1]
+        whole = np.where(self._known.any(axis=1)[:, None], (GAIN_ERROR * stresses) ** 2 + 1, 0)
+        of_pads = whole.astype(np.float32)
+        square = windows.size(y, of_pads, self._known)[:, None]
+        prior = windows.prior[windows.kind] + self._missing.variance
+        variance = square * prior + windows.noise(of_pads) + self._missing.noise(of_pads)
         return FieldDeviation(*np.sqrt(variance).reshape(-1, 2).T)
 
     def _filled(self, scaled: Array) -> Single:
-        """Values (cubes, C), 0 where unknown. What became unknown or known changes windows."""
+        """Values (cubes, C); where they are unknown, what the others predict."""
         known = np.isfinite(scaled) & self.observed
         if not np.array_equal(known, self._known):
-            self._known, self._changed = known, self._windows.without(known)
-        return np.where(known, scaled, 0.0).astype(np.float32)
-
-
-class _Reduced(NamedTuple):
-    """A window without some of its values.
-
-    gain: (rows, W C), 0 for them; variance: (points x 2) what variances at the size 1 gain
-    by_pad: (points x 2 + 1, W P) as that of `_Windows`
-    out: (W C,) which they are; fill: (out, W C) predicts them; known: how many others there are
-    """
-
-    gain: Single
-    variance: Array
-    by_pad: Single
-    out: Mask
-    fill: Array
-    known: int
-
-    def square(self, precision: Single, y: Single) -> float:
-        """y' P y of this window."""
-        filled = y.ravel().astype(float)
-        filled[self.out] = self.fill @ filled
-        return float(filled @ (precision @ filled))
+            self._known = known
+            self._missing = _Missing(self._windows, self.observed, known)
+        y = np.where(known, scaled, 0.0).astype(np.float32)
+        return self._missing.filled(y)
 
 
 class _Windows:
     """The matrices of all windows, each kind of window once.
 
-    near: (cubes, W) cubes of each window; kind: (cubes,) which matrix is its own
-    gain: (kinds, rows, W C) float32; precision: P of each kind, float32
+    near: (cubes, W) cubes of each window, the inner ones first, its own cube the first of all
+    inner: how many these are; kind: (cubes,) which matrix is its own
+    gain: (kinds, rows, W C) float32; precision: (kinds, inner C, inner C) P of the inner cubes
     prior: (kinds, points x 2) variances of pressure and pressure below, at the size 1
-    by_pad: (kinds, points x 2 + 1, W P) what the variance of each pad's noise makes of these, and
-    of the mean of y' P y
-    n_known: (cubes,) values that a window has when nothing falls out
+    by_pad: (kinds, points x 2, W P) what the variance of each pad's noise makes of these
+    of_size: (kinds, inner P) what it makes of the mean of y' P y
     """
 
     def __init__(self, inverse: SurfaceInverse) -> None:
         poses = inverse.poses
-        self._columns = len(inverse.columns)
         self.near = _nearest(poses)
+        self.inner = min(INNER, self.near.shape[1])
         middles = np.arange(len(self.near))
         place, angle = _flattened(poses, middles, self.near)
-        self._known = inverse.observed[self.near].reshape(len(self.near), -1)
-        self._pads = np.nan_to_num(inverse.by_pad)
+        self.pads = np.nan_to_num(inverse.by_pad)
         noise_kind = _distinct(np.nan_to_num(inverse.by_pad, nan=-1.0).reshape(len(middles), -1))
         looks = [place.reshape(len(middles), -1), np.cos(angle), np.sin(angle)]
         looks = [np.round(look / _SAME / 10) for look in looks]
@@ -294,14 +264,13 @@ class _Windows:
         key += [inverse.by_pad[near], inverse.reading[near]]
         solved = cached("windows", key, solve)
         self.gain, self.precision = solved["gain"], solved["precision"]
-        self.prior, self.by_pad = solved["variance"], solved["by_pad"]
+        self.prior = solved["variance"]
+        self.by_pad, self.of_size = solved["by_pad"], solved["of_size"]
         counts = np.bincount(self.kind)
-        self._many = [
-            (kind, np.flatnonzero(self.kind == kind)) for kind in kinds if counts[kind] > 1
-        ]
+        self._rows = [(kind, np.flatnonzero(self.kind == kind)) for kind in kinds]
+        self._many = [(kind, rows) for kind, rows in self._rows if len(rows) > 1]
         self._single = np.flatnonzero(counts[self.kind] == 1)
         self._single_gain = self.gain[self.kind[self._single]]
-        self.n_known = np.maximum(self._known.sum(axis=1), 1)
 
     def product(self, y: Single) -> Single:
         """(cubes, rows) of values y (cubes, C) that are 0 where unknown."""
@@ -314,40 +283,76 @@ class _Windows:
             result[self._single] = (self._single_gain @ single)[:, :, 0]
         return result
 
-    def square(self, y: Single) -> Array:
-        """(cubes,) y' P y of each window."""
-        gathered = y[self.near].reshape(len(self.near), -1)
-        square = np.empty(len(gathered))
-        for kind in np.unique(self.kind):
-            rows = np.flatnonzero(self.kind == kind)
-            square[rows] = ((gathered[rows] @ self.precision[kind]) * gathered[rows]).sum(axis=1)
-        return square
+    def size(self, y: Single, of_pads: Single, known: Mask) -> Array:
+        """(cubes,) s^2 of each window; 1 where nothing is known. of_pads: as in `noise`."""
+        inner = self.near[:, : self.inner]
+        gathered, pads = y[inner].reshape(len(inner), -1), of_pads[inner].reshape(len(inner), -1)
+        square = np.empty(len(inner))
+        for kind, rows in self._rows:
+            own = gathered[rows]
+            square[rows] = ((own @ self.precision[kind]) * own).sum(axis=1)
+            square[rows] -= pads[rows] @ self.of_size[kind]
+        count = known.sum(axis=1)[inner].sum(axis=1)
+        return np.where(count > 0, np.maximum(square, 0) / np.maximum(count, 1), 1.0)
 
     def noise(self, of_pads: Single) -> Array:
-        """(cubes, points x 2 + 1) by `by_pad`, of_pads (cubes, P): variances over their noise."""
-        gathered = of_pads[self.near].reshape(len(self.near), -1, 1)
-        return np.asarray((self.by_pad[self.kind] @ gathered)[:, :, 0], float)
+        """(cubes, points x 2) by `by_pad`, of_pads (cubes, P): variances over their noise."""
+        gathered = of_pads[self.near].reshape(len(self.near), -1)
+        noise = np.empty((len(gathered), self.by_pad.shape[1]))
+        for kind, rows in self._rows:
+            noise[rows] = gathered[rows] @ self.by_pad[kind].T
+        return noise
 
-    def without(self, known: Mask) -> dict[int, _Reduced]:
-        """The windows that miss values of cubes, known (cubes, C), by the number of their cube."""
-        missing = self._known & ~known[self.near].reshape(len(self.near), -1)
-        reduced = {}
-        for row in np.flatnonzero(missing.any(axis=1)).tolist():
-            out, kind = missing[row], self.kind[row]
-            gain, precision = self.gain[kind].astype(float), self.precision[kind].astype(float)
-            fill = -np.linalg.solve(precision[np.ix_(out, out)], precision[out])
+
+class _Missing:
+    """What the inner cubes of a window predict where its own cube misses values.
+
+    variance: (cubes, points x 2) what is added to the variances at the size 1
+
+    Errors of the predictions of several cubes count as independent of each other.
+    """
+
+    def __init__(self, windows: _Windows, observed: Mask, known: Mask) -> None:
+        missing = observed & ~known
+        width = known.shape[1]
+        self.variance = np.zeros((len(known), windows.prior.shape[1]))
+        self._fill: list[tuple[int, Index, Index, Array]] = []
+        self._noise: list[tuple[Index, Array, Index, Array]] = []
+        for cube in np.flatnonzero(missing.any(axis=1)).tolist():
+            near, kind = windows.near[cube, : windows.inner], windows.kind[cube]
+            precision = windows.precision[kind].astype(float)
+            out, own = missing[near].ravel(), np.flatnonzero(missing[cube])
+            # Of the cube's own ones, the first ones of those that are out.
+            some = np.eye(out.sum(), len(own))
+            inside = cho_solve(cho_factor(precision[np.ix_(out, out)]), some)
+            fill = -inside.T @ precision[out]
             fill[:, out] = 0.0
-            lost = gain[:, out]
-            gain += lost @ fill
-            gain[:, out] = 0.0
-            inside = np.linalg.solve(precision[np.ix_(out, out)], lost.T)
-            more = _of_pressure(np.einsum("rd,dr->r", lost, inside))
-            precision += precision[:, out] @ fill
-            precision[:, out] = precision[out] = 0.0
-            by_pad = _by_pad(gain, precision, self._pads[self.near[row]])
-            n_known = int(self._known[row].sum() - out.sum())
-            reduced[row] = _Reduced(gain.astype(np.float32), more, by_pad, out, fill, n_known)
-        return reduced
+            rows, place = np.nonzero(windows.near == cube)
+            columns = place[:, None] * width + own
+            lost = windows.gain[windows.kind[rows][:, None], :, columns].astype(float)
+            lost = _of_pressure(lost)
+            self.variance[rows] += np.einsum("ncr,cd,ndr->nr", lost, inside[: len(own)], lost)
+            if out.all():
+                continue
+            self._fill.append((cube, own, near, fill))
+            pads = windows.pads[near]
+            by_pad = np.einsum("fwc,wcp->fwp", fill.reshape(len(own), len(near), -1), pads)
+            self._noise.append((near, by_pad.reshape(len(own), -1), rows, lost))
+
+    def filled(self, y: Single) -> Single:
+        """Values (cubes, C) that are 0 where they are missing, with what is predicted there."""
+        filled = y.copy()
+        for cube, own, near, fill in self._fill:
+            filled[cube, own] = fill @ y[near].ravel()
+        return filled
+
+    def noise(self, of_pads: Single) -> Array:
+        """(cubes, points x 2) as `_Windows.noise`, by the pads that the predictions are from."""
+        total = np.zeros_like(self.variance)
+        for near, by_pad, rows, lost in self._noise:
+            covariance = (by_pad * of_pads[near].ravel()) @ by_pad.T
+            total[rows] += np.einsum("ncr,cd,ndr->nr", lost, covariance, lost)
+        return total
 
 
 class _Window(NamedTuple):
@@ -355,11 +360,11 @@ class _Window(NamedTuple):
     precision: Single
     variance: Array
     by_pad: Single
+    of_size: Single
 
 
 def _solve(inverse: SurfaceInverse, cubes: Index, place: Array, angle: Array) -> _Window:
-    """One window of cubes (W,): matrix (rows, W C), P (W C, W C), variances (points x 2) at
-    AMPLITUDE, and `by_pad`, see `_Windows`."""
+    """One window of cubes (W,), see `_Windows`."""
     kernels, columns = inverse.kernels, inverse.columns
     pads, reading = np.nan_to_num(inverse.by_pad[cubes]), inverse.reading[cubes]
     n, size = len(place), len(place) * len(columns)
@@ -383,24 +388,27 @@ def _solve(inverse: SurfaceInverse, cubes: Index, place: Array, angle: Array) ->
     inside = cho_solve(factor, cross.T).T
     own = np.array([*kernels.variance, kernels.pressure_variance])
     variance = AMPLITUDE**2 * np.tile(own, len(points)) - (inside * cross).sum(axis=1)
-    gain, precision = np.zeros((len(inside), size), np.float32), np.zeros((size, size), np.float32)
+    gain = np.zeros((len(inside), size), np.float32)
     gain[:, known] = inside
-    precision[np.ix_(known, known)] = cho_solve(factor, np.eye(known.sum()))
-    by_pad = _by_pad(gain, precision, pads)
-    return _Window(gain, precision, np.maximum(_of_pressure(variance), 0), by_pad)
-
-
-def _by_pad(gain: Array | Single, precision: Array | Single, pads: Array) -> Single:
-    """(points x 2 + 1, W P) of a window, see `_Windows`. pads: B (W, C, P) of its cubes, 0 where
-    nothing is observed."""
-    n, width, _ = pads.shape
-    rows = gain.reshape(-1, _ROWS, n, width)[:, 2:].reshape(-1, n, width)
-    of_rows = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
-    one = np.arange(n)
-    own = precision.reshape(n, width, n, width)[one, :, one]
-    of_square = np.einsum("wcp,wcd,wdp->wp", pads, own, pads, optimize=True)
-    both = np.concatenate([of_rows, of_square[None]]).reshape(len(rows) + 1, -1)
-    return np.asarray(both, np.float32)
+    rows = gain.reshape(-1, _ROWS, n, len(columns))[:, 2:].reshape(-1, n, len(columns))
+    by_pad = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
+    inner = min(INNER, n)
+    first = known[: inner * len(columns)]
+    block = np.ix_(first, first)
+    precision = np.zeros((len(first), len(first)))
+    precision[block] = cho_solve(
+        cho_factor(total[: len(first), : len(first)][block]), np.eye(first.sum())
+    )
+    one = np.arange(inner)
+    own = precision.reshape(inner, len(columns), inner, len(columns))[one, :, one]
+    of_size = np.einsum("wcp,wcd,wdp->wp", pads[:inner], own, pads[:inner], optimize=True)
+    return _Window(
+        gain,
+        precision.astype(np.float32),
+        np.maximum(_of_pressure(variance), 0),
+        by_pad.reshape(len(rows), -1).astype(np.float32),
+        of_size.ravel().astype(np.float32),
+    )
 
 
 def covariance_matrix(
@@ -435,8 +443,10 @@ def positive(covariance: Array) -> Array:
 
 
 def _of_pressure(rows: Array) -> Array:
-    """(points x 2) of the rows of a window: those of the pressure and of the pressure below."""
-    return rows.reshape(-1, _ROWS)[:, 2:].ravel()
+    """(..., points x 2) of the rows (..., points x _ROWS) of windows: those of the pressure and of
+    the pressure below."""
+    chosen = rows.reshape(*rows.shape[:-1], -1, _ROWS)[..., 2:]
+    return chosen.reshape(*rows.shape[:-1], -1)
 
 
 def square(spacing: float, side: int) -> Array:
