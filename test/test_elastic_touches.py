@@ -14,8 +14,9 @@ from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotat
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.disc import Disc, DiscModel
 from cube_tensor_driver.elastic.disc_fit import COLD, Fitted, Scan, fit
-from cube_tensor_driver.elastic.inverse import SurfaceInverse, TractionField, covariance_matrix
+from cube_tensor_driver.elastic.inverse import SurfaceInverse, TractionField
 from cube_tensor_driver.elastic.layer import Layer
+from cube_tensor_driver.elastic.prior import covariance_matrix
 from cube_tensor_driver.elastic.touches import Touches
 from cube_tensor_driver.research.traction_study import CUBES, Bench, Setting
 

@@ -28,7 +28,9 @@ _CODE = (
     "kernels.py",
     "disc_tables.py",
     "polygon_tables.py",
-    "inverse.py",
+    "prior.py",
+    "flattened.py",
+    "windows.py",
     "cache.py",
 )
 

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .disc_fit import Parts
-from .inverse import SurfaceInverse, TractionField, square
+from .inverse import SurfaceInverse, TractionField
 from .kernels import REACH, hertz_pressure
 from .layer import FIELD
+from .surface import square
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

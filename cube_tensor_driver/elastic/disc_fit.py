@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from ..core.modes import COMPONENTS
-from .inverse import AMPLITUDE, SurfaceInverse
+from .inverse import SurfaceInverse
 from .kernels import SIZES
 from .pad_noise import GAIN_ERROR, pad_stresses
+from .prior import AMPLITUDE
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

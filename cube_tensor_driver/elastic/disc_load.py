@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
 from .disc_fit import Fitted, Scan
-from .inverse import AMPLITUDE
 from .kernels import LENGTHS, SHEAR
+from .prior import AMPLITUDE
 
 Array = NDArray[np.float64]
 

@@ -217,6 +217,13 @@ def patches(poses: CubePoses, spacing: float, side: int) -> Array:
     return poses.position[:, None] + np.einsum("nij,qj->nqi", poses.rotation, square)
 
 
+def square(spacing: float, side: int) -> Array:
+    """(side^2, 2) m: the points of a patch about its cube, in the order of `patches`."""
+    line = (np.arange(side) - (side - 1) / 2) * spacing
+    x, y = np.meshgrid(line, line)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
 def _weighted_sum(weights: Array, vectors: Array) -> Array:
     """(3,) the sum of weights (...) times vectors (..., 3).
 

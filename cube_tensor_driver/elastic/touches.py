@@ -20,14 +20,8 @@ from .disc_choice import beginning, remaining, same
 from .disc_fit import COLD, USUAL_SIZE, WARM, Fitted, Scan, fit
 from .disc_load import Load, load_of
 from .disc_split import split
-from .inverse import (
-    AMPLITUDE,
-    FieldDeviation,
-    SurfaceInverse,
-    TractionField,
-    covariance_matrix,
-    positive,
-)
+from .inverse import FieldDeviation, SurfaceInverse, TractionField
+from .prior import AMPLITUDE, covariance_matrix, positive
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -1,7 +1,7 @@
 """Shear that is recovered under the paper's rod, by eq. 4, a cube's tensor, points and pads.
 
 The rod presses on the linear bench with a bonded bottom. *Points* and *pads* take the traction t on
-the surface for a Gaussian process, as elastic/inverse.py does, along x alone. What the cube gives
+the surface for a Gaussian process, as elastic/windows.py does, along x alone. What the cube gives
 is y = int H(x) t(x) dx, and the shear at its place, in the body without it, s = int h(x) t(x) dx::
 
     s = h S H' (H S H' + N)^-1 y
@@ -24,11 +24,11 @@ from ..core.layout import LAYOUTS
 from ..core.modes import PLANE
 from ..elastic.body import Body
 from ..elastic.fem import Progress, compute_response
-from ..elastic.inverse import MODEL_ERROR
 from ..elastic.kernels import LENGTHS, SHEAR
 from ..elastic.layer import Layer
 from ..elastic.line_load import line_load
 from ..elastic.reciprocity import compute_influence
+from ..elastic.windows import MODEL_ERROR
 from .paper import dent
 from .rod import Rod
 from .virtual_bench import VirtualBench
