@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from ..research.field_study import FieldExample
 from ..research.pads_study import FORMS
@@ -13,37 +14,46 @@ from ..research.traction_study import METHODS, Errors, Setting
 from .field import VIEW_MM, draw_pressure, relative_rms
 from .style import print_style
 
+Array = NDArray[np.float64]
+
 
 @print_style()
 def draw_traction(example: FieldExample) -> Figure:
-    """One contact: true pressure at the cubes' depth, that of each method, and what the inverse
-    says about its error. The titles tell the rms of the error over the rms of the pressure."""
-    figure = Figure(figsize=(9, 6.2))
-    axes = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
-    names = ("truth", *METHODS, "standard deviation")
-    truth = example.pressure["truth"]
+    """One contact: true pressure at the cubes' depth and that of each method; the error of the last
+    one and the deviation that it states, on a scale of their own. The titles tell the rms of errors
+    over that of the pressure."""
+    figure = Figure(figsize=(9, 5.6), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True, sharey=True)
+    truth, stated = example.pressure["truth"], example.pressure["standard deviation"]
+    errors = {name: np.abs(example.pressure[name] - truth) for name in METHODS}
+    last = errors[METHODS[-1]]
+
+    def share(values: Array) -> str:
+        return f"{100 * np.sqrt((values**2).mean() / (truth**2).mean()):.1f} %"
+
+    maps = {"truth": truth}
+    maps |= {f"{name}: {share(errors[name])}": example.pressure[name] for name in METHODS}
     top = 1e-3 * truth.max()
-    for axis, name in zip(axes, names, strict=False):
-        pressure = example.pressure[name]
+    for axis, (title, pressure) in zip(axes.flat, maps.items(), strict=False):
         image = draw_pressure(axis, example, np.maximum(pressure, 0), top)
-        title = name
-        if name in METHODS:
-            title = f"{name}: {100 * relative_rms(pressure, truth):.0f} %"
-        if name == "standard deviation":
-            stated = np.sqrt((pressure**2).mean() / (truth**2).mean())
-            title = f"stated error (inverse): {100 * stated:.0f} %"
-        limits = (-VIEW_MM, VIEW_MM)
-        axis.set(title=title, aspect="equal", xlim=limits, ylim=limits)
+        axis.set_title(title)
+    label = "pressure at the cubes' depth / kPa\n(contours: 4 kPa apart)"
+    figure.colorbar(image, ax=axes[0], label=label)
+    maps = {f"its error: {share(last)}": last, f"stated: {share(stated)}": stated}
+    top = 1e-3 * max(last.max(), stated.max())
+    for axis, (title, error) in zip(axes[1, 1:], maps.items(), strict=True):
+        image = draw_pressure(axis, example, error, top)
+        axis.set_title(title)
+    figure.colorbar(image, ax=axes[1, 1:], label="error and stated deviation / kPa")
+    limits = (-VIEW_MM, VIEW_MM)
+    for axis in axes.flat:
+        axis.set(aspect="equal", xlim=limits, ylim=limits)
         axis.grid(False)
-    axes[-1].set_visible(False)
-    for axis in axes[2:5]:
+    for axis in axes[1]:
         axis.set_xlabel("$x$ / mm")
-        axis.tick_params(labelbottom=True)
-    for axis in axes[::3]:
+    for axis in axes[:, 0]:
         axis.set_ylabel("$y$ / mm")
-    axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
-    label = "pressure at the cubes' depth / kPa (white contours: 4 kPa apart)"
-    figure.colorbar(image, ax=axes, label=label)
+    axes[0, 0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
     return figure
 
 
@@ -87,10 +97,13 @@ def pads_table(rows: Mapping[tuple[Setting, str], Sequence[Errors]]) -> str:
 
 
 def traction_table(rows: Mapping[str, Sequence[Errors]]) -> str:
-    """Markdown: per row and width the errors of interpolation, inverse, inverse with contacts."""
+    """Markdown: per row and width the errors of interpolation, inverse, inverse with contacts; of
+    the field with contacts, those over the stated deviation at the cubes' depth and on the surface.
+    """
     lines = [
-        "| cubes | width | field | force | place, mm | force seen/stated | place seen/stated |",
-        "|---|---|---|---|---|---|---|",
+        "| cubes | width | field | force | place, mm | force, seen/stated | place, seen/stated "
+        "| field, seen/stated |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, all_widths in rows.items():
         for one in all_widths:
@@ -98,7 +111,8 @@ def traction_table(rows: Mapping[str, Sequence[Errors]]) -> str:
                 " / ".join(f"{value:.3f}" for value in one.field),
                 " / ".join(f"{100 * value:.1f} %" for value in one.force),
                 " / ".join(f"{1e3 * value:.2f}" for value in one.place),
-                *(" / ".join(f"{value:.1f}" for value in column) for column in one.seen.T),
+                *(f"{before:.1f} / {now:.2f}" for before, now in one.seen.T),
+                " / ".join(f"{value:.2f}" for value in one.seen_field),
             ]
             lines.append(f"| {name} | {1e3 * one.width:g} mm | {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -57,8 +57,8 @@ SHAKEN_S = 2.62
 """When the box of the gripper is accelerated most, s."""
 PHOTOGRAPH_S = 120.0
 """How long the browser may take to make its picture."""
-CONTACT_WIDTHS, SEED = [2e-3, 5e-3, 10e-3, 20e-3], 2024
-"""Loads of the traction's tables: widths, m, and a seed that nothing was chosen with."""
+CONTACT_WIDTHS, LOADS, SEED = [2e-3, 5e-3, 10e-3, 20e-3], 100, 7031
+"""Balls of the traction's tables: widths, m, how many, and a seed that nothing was chosen with."""
 COUNTS, RATE, MEASURE_S = [1, 4, 16, 64, 256, 1024, 4096], 100.0, 6.0
 """Cubes, Hz and seconds of the scale plot: most machines can do that."""
 
@@ -103,7 +103,7 @@ def make_pictures(folder: Path) -> None:
     study = field_study()
     save(draw_field_study(study), folder / "field_error.png")
     save(draw_traction(traction_example()), folder / "traction.png")
-    balls = traction_study((*MAIN, *PITCHES), CONTACT_WIDTHS, cases=40, seed=SEED)
+    balls = traction_study((*MAIN, *PITCHES), CONTACT_WIDTHS, LOADS, seed=SEED)
     print(traction_table({f"{s.cubes}, {1e3 * s.pitch:g} mm": e for s, e in balls.items()}))
     settings = traction_study(list(WRONG.values()), [5e-3, 15e-3], cases=6, seed=SEED)
     print(traction_table({name: settings[one] for name, one in WRONG.items()}))
