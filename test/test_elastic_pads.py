@@ -15,12 +15,14 @@ from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.elastic import contact
+from cube_tensor_driver.elastic.contact_finder import ContactSettings, contact_finder
 from cube_tensor_driver.elastic.influence_file import (
     find_influence,
     read_influence,
     write_influence,
 )
 from cube_tensor_driver.elastic.kernels import LENGTHS, SHEAR, Kernels
+from cube_tensor_driver.elastic.pad_noise import noise_by_pad
 from cube_tensor_driver.elastic.pad_reading import read_pads
 from cube_tensor_driver.elastic.touches import Touches
 from cube_tensor_driver.research.pads_study import LayerBench
@@ -118,6 +120,44 @@ def test_a_contact_on_a_thin_layer(influence):
     assert abs(touch.normal_force / 3 - 1) < 0.01
     assert np.abs(touch.force - load).max() < 0.03
     assert abs(forces[0][2] / 3 + 1) > 0.05
+
+
+@pytest.mark.parametrize(("cubes", "calibration"), [(CUBES[0], CUBE), (CUBES[1], PLANAR)])
+def test_pads_that_are_left_out_change_what_a_cube_says_and_the_contact_stays(
+    influence, cubes, calibration
+):
+    """Beside the contact, one or two pads of each cube: a cube without a pad says something else in
+    a thin layer, up to half of the force, and noise counts more."""
+    setting = Setting(cubes=cubes, depth=influence.depth, thickness=11e-3, known_thickness=11e-3)
+    load, centre = np.array([0.6, 0.3, -3.0]), np.array([1e-3, -2e-3])
+    bench, random = LayerBench(setting, influence, side=1), np.random.default_rng(4)
+    settings = ContactSettings(method="inverse", influence="cube_11mm")
+    n = len(bench.poses.position)
+    finder = contact_finder(settings, bench.poses, [calibration] * n)
+    pads, left_out = bench.pads_under(5e-3, load, centre), np.zeros(n, np.uint32)
+    near = np.argsort(np.linalg.norm(bench.poses.position[:, :2] - centre, axis=1))[:4]
+    for bits in (0, [1, 2, 4, 8], [3, 0, 8, 0], 0):
+        left_out[near] = bits
+        values = bench.measured(pads, random, left_out)
+        (touch,) = finder.update(values, left_out)
+        assert abs(touch.normal_force - 3) < min(0.05, 4 * touch.force_uncertainty)
+        assert np.linalg.norm(touch.position[:2] - centre) < 1e-4
+
+
+def test_in_the_field_a_cube_without_a_pad_counts_as_missing(influence):
+    """Matrices are those of all pads. With all pads back it is as before."""
+    setting = Setting(depth=influence.depth, thickness=11e-3, known_thickness=11e-3)
+    bench, random = LayerBench(setting, influence, influence, side=1), np.random.default_rng(5)
+    inverse, n = bench.inverse, len(bench.poses.position)
+    pads = bench.pads_under(5e-3, np.array([0.6, 0.3, -3.0]), np.array([1e-3, -2e-3]))
+    values, pipeline = bench.measured(pads, random), Pipeline([CUBE] * n)
+    cube, lost = np.array([n // 2]), values.copy()
+    lost[cube] = np.nan
+    before, expected = inverse.field(values), inverse.field(lost)
+    inverse.leave_out(cube, noise_by_pad(pipeline, cube, np.array([1], np.uint32)))
+    np.testing.assert_array_equal(inverse.field(values).traction, expected.traction)
+    inverse.leave_out(cube, noise_by_pad(pipeline, cube, np.array([0], np.uint32)))
+    np.testing.assert_array_equal(inverse.field(values).traction, before.traction)
 
 
 def test_influence_functions_of_other_cubes_are_refused(influence):

@@ -86,7 +86,7 @@ class ContactWriter:
         if self._finder is None:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
         values = self._newest.believed(self._newest.health(stamp_ns * 1e-9, STALE_S))
-        contacts = self._finder.update(values)
+        contacts = self._finder.update(values, self._newest.left_out)
         data = encode_contacts(stamp_ns, self._frame_id, contacts)
         self._writer.write(self._contacts, recorded_ns, data)
         cloud = self._finder.cloud(values)

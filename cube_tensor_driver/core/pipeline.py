@@ -267,11 +267,12 @@ class Pipeline:
         bad = np.zeros(len(group), np.int64) if law.bad is None else law.bad.ravel()
         return group, unknown, law.v.reshape(-1, self.n_pads) * self._stiffness[group], bad
 
-    def matrix(self, cube: int) -> np.ndarray:
+    def matrix(self, cube: int, left_out: int = 0) -> np.ndarray:
         """(15, P) one cube's components in Pa and Pa/m from its pads' stresses in Pa; NaN where
-        unobserved."""
+        unobserved, 0 for pads that are left out (bits)."""
         group = int(self._group[cube])
-        return np.asarray(self._estimator(group, 0).matrix * self._scale(group)[:, None])
+        mask = int(left_out) & int(_mask(self._exists[group]))
+        return np.asarray(self._estimator(group, mask).matrix * self._scale(group)[:, None])
 
     def covariance(self, cube: int, left_out: int = 0) -> np.ndarray:
         """(15, 15) of one cube's components from its pads' noise, in Pa and Pa/m; NaN where

@@ -80,6 +80,7 @@ class Newest:
         self.values = np.full((n, len(COMPONENTS)), np.nan)
         self.residual = np.full(n, np.nan)
         self.status = np.zeros(n, np.uint16)
+        self.left_out = np.zeros(n, np.uint32)
         self.arrived = np.full(n, -np.inf)
         self.count = np.zeros(n, np.int64)
         self.strained = np.zeros(n, bool)
@@ -97,6 +98,7 @@ class Newest:
             rows.gradient,
         )
         self.residual[cube], self.status[cube], self.arrived[cube] = rows.residual, rows.status, now
+        self.left_out[cube] = rows.left_out
         self._close_window(now)
         np.add.at(self.count, cube, 1)
         over = rows.status & RESIDUAL != 0

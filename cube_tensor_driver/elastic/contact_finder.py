@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 
 from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
+from ..core.pipeline import Pipeline
 from ..core.scene import CubePoses
 from .influence_file import find_influence, read_influence
 from .inverse import SurfaceInverse
 from .layer import Layer
-from .pad_noise import noise_by_pad
+from .pad_noise import noise_by_pad, noise_of_all_pads
 from .pad_reading import read_pads
 from .surface import Contact, Surface
 from .touches import Touches, TrackedContact
 
 Array = NDArray[np.float64]
+Masks = NDArray[np.uint32]
 
 INTERPOLATION, INVERSE = CONTACT_METHODS
 
@@ -60,8 +62,9 @@ class ContactSettings:
 class ContactFinder(Protocol):
     """Finds the contacts of one skin."""
 
-    def update(self, values: Array) -> list[Contact] | list[TrackedContact]:
-        """Contacts of the newest values (cubes, 15), NaN where unknown; strongest first."""
+    def update(self, values: Array, left_out: Masks) -> list[Contact] | list[TrackedContact]:
+        """Contacts of the newest values (cubes, 15), NaN where unknown; strongest first. left_out:
+        (cubes,) bits of pads that the values are without."""
 
     def cloud(self, values: Array) -> Array | None:
         """(M, 6) the surface after `update` of these values: place in the skin's parent frame, m,
@@ -84,7 +87,7 @@ class _Interpolated:
     def __init__(self, settings: ContactSettings, poses: CubePoses) -> None:
         self._surface, self._least = Surface(poses, settings.depth), settings.least
 
-    def update(self, values: Array) -> list[Contact]:
+    def update(self, values: Array, left_out: Masks) -> list[Contact]:
         return self._surface.contacts(values, self._least)
 
     def cloud(self, values: Array) -> None:
@@ -103,11 +106,18 @@ class _Followed:
             influence = read_influence(find_influence(settings.influence))
             layer, depth = influence.layer, influence.depth
             reading = read_pads(influence, calibrations)
-        by_pad = noise_by_pad(calibrations)
+        by_pad = noise_of_all_pads(calibrations)
+        self._pipeline = Pipeline(calibrations)
+        self._left_out = np.zeros(len(calibrations), np.uint32)
         self._inverse = SurfaceInverse.of_cubes(poses, by_pad, layer, depth, reading=reading)
         self._touches = Touches(self._inverse, settings.least)
 
-    def update(self, values: Array) -> list[TrackedContact]:
+    def update(self, values: Array, left_out: Masks) -> list[TrackedContact]:
+        changed = np.flatnonzero(left_out != self._left_out)
+        if len(changed):
+            by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])
+            self._inverse.leave_out(changed, by_pad)
+            self._left_out = left_out.copy()
         return self._touches.update(values)
 
     def cloud(self, values: Array) -> Array:

@@ -21,7 +21,7 @@ from .influence import Influence
 from .kernels import Kernels, Reading
 from .layer import Layer
 from .missing import Missing
-from .pad_noise import GAIN_ERROR, noise_by_pad, pad_stresses
+from .pad_noise import GAIN_ERROR, noise_of_all_pads, pad_stresses
 from .pad_reading import read_pads
 from .surface import patches
 from .windows import Observed, Windows
@@ -83,7 +83,7 @@ class SurfaceInverse:
             rotation=np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes]),
             half_side=np.array([calibration.half_side for calibration in skin.calibrations]),
         )
-        by_pad = noise_by_pad(skin.calibrations)
+        by_pad = noise_of_all_pads(skin.calibrations)
         layer, reading = Layer(thickness, poisson), None
         if influence is not None:
             layer, depth = influence.layer, influence.depth
@@ -100,8 +100,8 @@ class SurfaceInverse:
         side: int = 2,
         reading: Reading | None = None,
     ) -> SurfaceInverse:
-        """The same from poses and by_pad (cubes, 15, P), see `noise_by_pad`. reading: how the cubes
-        see; by default as points."""
+        """The same from poses and by_pad (cubes, 15, P), see `noise_of_all_pads`. reading: how the
+        cubes see; by default as points."""
         inverse = cls.__new__(cls)
         inverse._set_up(poses, by_pad, layer, depth, side, reading)
         return inverse
@@ -121,7 +121,7 @@ class SurfaceInverse:
         scale = float(np.median(poses.half_side))
         self.kernels = Kernels(layer, depth, scale, reading)
         n = len(poses.position)
-        self.reading = np.zeros(n, np.intp) if reading is None else reading.of_cube
+        self.reading = np.zeros(n, np.intp) if reading is None else reading.of_cube.copy()
         self.spacing = poses.pitch / side
         self.area = self.spacing**2
         flat = patches(poses, self.spacing, side)
@@ -133,8 +133,12 @@ class SurfaceInverse:
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
         self._units = np.where(self.columns < len(STRESS), 1.0, scale)
         self.by_pad = by_pad[:, self.columns] * self._units[:, None]
+        self._all_pads = self.by_pad.copy()
+        self._of_pads = None if reading is None else reading.of_pads
+        self._kind = self.reading.copy()
+        self._differs = np.zeros(n, bool)
         self.observed = observed[:, self.columns]
-        seen = Observed(self.columns, self.observed, self.by_pad, self.reading)
+        seen = Observed(self.columns, self.observed, self._all_pads, self._kind)
         self._windows = Windows(self.kernels, poses, seen, self.spacing, side)
         self._known = self.observed
         self._missing = Missing(self._windows, self.observed, self.observed)
@@ -148,6 +152,22 @@ class SurfaceInverse:
         rad by which each is turned."""
         place, angle = flattened(self.poses, np.array([middle]), cubes[None])
         return place[0], angle[0]
+
+    def leave_out(self, cubes: Index, by_pad: Array) -> None:
+        """From now on these cubes (n,) have other pads, by_pad (n, 15, P) as from `noise_by_pad`.
+
+        Contacts take what such a cube says as it is. The field takes it so where cubes count as
+        points: they say the same without some pads. Where their pads are known it does not, since
+        its matrices are those of all pads: there the cube counts as missing.
+        """
+        self.by_pad[cubes] = by_pad[:, self.columns] * self._units[:, None]
+        if self._of_pads is None:
+            return
+        for cube, own in zip(cubes.tolist(), by_pad, strict=True):
+            said = self._of_pads[self._kind[cube]] @ np.nan_to_num(own).T
+            self.reading[cube] = self.kernels.add_reading(said)
+            here, whole = self.by_pad[cube], self._all_pads[cube]
+            self._differs[cube] = not np.array_equal(here, whole, equal_nan=True)
 
     def field(self, values: Array) -> TractionField:
         """The traction that the values (cubes, 15) tell, NaN where a component is not known.
@@ -182,7 +202,7 @@ class SurfaceInverse:
 
     def _filled(self, scaled: Array) -> Single:
         """Values (cubes, C); where they are unknown, what the others predict."""
-        known = np.isfinite(scaled) & self.observed
+        known = np.isfinite(scaled) & self.observed & ~self._differs[:, None]
         if not np.array_equal(known, self._known):
             self._known = known
             self._missing = Missing(self._windows, self.observed, known)

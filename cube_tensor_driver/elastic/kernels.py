@@ -54,11 +54,13 @@ class Reading(NamedTuple):
     said: (readings, 2 n, 15) COMPONENTS from the real parts and the imaginary parts, in the cube's
     frame, Pa and Pa/m
     of_cube: (cubes,) which of these readings each cube has
+    of_pads: (readings, 2 n, P) what pads see, over their noise; None: cubes count as points
     """
 
     spectra: Spectra
     said: Array
     of_cube: Index
+    of_pads: Array | None = None
 
 
 def read_points(layer: Layer, depth: float, cubes: int) -> Reading:
@@ -89,7 +91,7 @@ class Kernels:
         self.step, self._last = depth / PER_DEPTH, REACH * PER_DEPTH
         # (-1, 0, ...) steps: cubic interpolation needs one more on the left.
         r = np.arange(-1.0, self._last + 3) * self.step
-        spectra, said, _ = reading or at_points
+        spectra, said, *_ = reading or at_points
         bessel = bessel_functions(spectra.k, r)
         self.readings = said * np.where(_GRADIENT, scale, 1.0)
         self._order = spectra.order
@@ -102,6 +104,14 @@ class Kernels:
         self._cross, self._pressure = tables["cross"], tables["pressure"]
         self._even, self._odd = tables["even"], tables["odd"]
         self.pressure_variance = float(tables["own"])
+
+    def add_reading(self, said: Array) -> int:
+        """The number of one more reading (2 n, 15), as those of `Reading`, or of the same one."""
+        own = said * np.where(_GRADIENT, self.scale, 1.0)
+        same = np.flatnonzero((self.readings == own).all(axis=(1, 2)))
+        if not len(same):
+            self.readings = np.concatenate([self.readings, own[None]])
+        return int(same[0]) if len(same) else len(self.readings) - 1
 
     def _discs(self, spectra: Spectra, bessel: Bessel) -> Array:
         """(sizes, places, 3, n) R, Z and T of the discs of SIZES."""

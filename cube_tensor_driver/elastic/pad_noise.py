@@ -20,21 +20,32 @@ from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+Masks = NDArray[np.uint32]
 
 GAIN_ERROR = 0.01
 """Standard deviation of a pad's gain against what its calibration says."""
 
 
-def noise_by_pad(calibrations: Sequence[Calibration]) -> Array:
-    """B (cubes, 15, P): what the standard deviation of each pad's noise makes of each component, Pa
-    and Pa/m. NaN where a component is not observed; 0 for pads that a cube does not have."""
-    pipeline = Pipeline(calibrations)
-    by_pad = np.zeros((len(calibrations), len(COMPONENTS), pipeline.n_pads))
-    for cube, calibration in enumerate(calibrations):
-        own = pipeline.matrix(cube) * calibration.noise
-        by_pad[cube, :, : own.shape[1]] = own
+def noise_by_pad(pipeline: Pipeline, cubes: Index, left_out: Masks) -> Array:
+    """B (n, 15, P) of some cubes: what the standard deviation of each pad's noise makes of each
+    component, Pa and Pa/m.
+
+    left_out: (n,) bits of pads that are left out. NaN where a component is not observed; 0 for pads
+    that are left out or that a cube does not have.
+    """
+    by_pad = np.zeros((len(cubes), len(COMPONENTS), pipeline.n_pads))
+    for row, (cube, mask) in enumerate(zip(cubes.tolist(), left_out.tolist(), strict=True)):
+        own = pipeline.matrix(cube, mask) * pipeline.calibrations[cube].noise
+        by_pad[row, :, : own.shape[1]] = own
     return by_pad
+
+
+def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
+    """The same (cubes, 15, P) of cubes with these calibrations and with all of their pads."""
+    n = len(calibrations)
+    return noise_by_pad(Pipeline(calibrations), np.arange(n), np.zeros(n, np.uint32))
 
 
 def pad_stresses(by_pad: Array, known: Mask, values: Array) -> Array:

@@ -54,8 +54,11 @@ def read_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Read
     spectra, made = _components(influence)
     pipeline = Pipeline(kinds)
     said = [made[:, mine] @ np.nan_to_num(pipeline.matrix(k)).T for k, mine in enumerate(pads)]
+    over_noise = np.zeros((len(kinds), len(made), pipeline.n_pads))
+    for k, (one, mine) in enumerate(zip(kinds, pads, strict=True)):
+        over_noise[k, :, : len(mine)] = made[:, mine] / one.noise
     of_cube = np.array([number[id(one)] for one in calibrations], np.intp)
-    return Reading(spectra, np.stack(said), of_cube)
+    return Reading(spectra, np.stack(said), of_cube, over_noise)
 
 
 def _pads(influence: Influence, calibration: Calibration) -> list[int]:

@@ -277,7 +277,7 @@ class Touches:
 
     def _prior(self, cubes: Index, place: Array, angle: Array) -> Array:
         """(n C, n C) covariance of cubes; those of the last contacts are remembered."""
-        key = tuple(cubes.tolist())
+        key = (*cubes.tolist(), *self._inverse.reading[cubes].tolist())
         if key not in self._priors:
             if len(self._priors) >= 2 * MOST:
                 self._priors.pop(next(iter(self._priors)))

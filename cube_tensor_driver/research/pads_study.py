@@ -55,16 +55,14 @@ class LayerBench(Bench):
         self._true = true
         self._pads = [int(np.argmin(np.abs(given - pad).max(axis=1))) for pad in pads]
 
-    def values(
-        self, width: float, force: Array, centre: Array, random: np.random.Generator
-    ) -> Array:
+    def pads_under(self, width: float, force: Array, centre: Array) -> Array:
         sources, forces = self._load(width, force, centre)
         turn = self.poses.rotation
         apart = np.einsum("nji,nsj->nsi", turn, sources - self.poses.position[:, None])
         seen = self._true.at(apart[..., :2].reshape(-1, 2))[self._pads]
         seen = seen.reshape(-1, len(turn), len(sources), 3)
         local = np.einsum("nji,sj->nsi", turn, forces)
-        return self.measured(np.einsum("pnsi,nsi->np", seen, local), random)
+        return np.asarray(np.einsum("pnsi,nsi->np", seen, local))
 
 
 def coarse_influence() -> Influence:

@@ -29,13 +29,14 @@ from ..elastic.influence import Influence
 from ..elastic.inverse import SurfaceInverse
 from ..elastic.kernels import Kernels
 from ..elastic.layer import Layer
-from ..elastic.pad_noise import noise_by_pad
+from ..elastic.pad_noise import noise_of_all_pads
 from ..elastic.pad_reading import read_pads
 from ..elastic.surface import Surface
 from ..elastic.touches import Touches
 from .field_study import FORCE, FRICTION, WINDOW, FieldExample, flat_skin
 
 Array = NDArray[np.float64]
+Masks = NDArray[np.uint32]
 
 CUBES = ("24-pad", "planar", "planar, crosswise")
 METHODS = ("interpolation", "inverse", "inverse with contacts")
@@ -111,7 +112,7 @@ class Bench:
         folder = package_data() / "config" / "calibration"
         self.calibration: Calibration = read_calibration(find_calibration(name, folder))
         self._pipeline = Pipeline([self.calibration] * n)
-        by_pad = noise_by_pad([self.calibration] * n)
+        by_pad = noise_of_all_pads([self.calibration] * n)
         layer, reading = Layer(setting.known_thickness), None
         if influence is not None:
             reading = read_pads(influence, [self.calibration] * n)
@@ -165,8 +166,11 @@ class Bench:
         self, width: float, force: Array, centre: Array, random: np.random.Generator
     ) -> Array:
         """(cubes, 15) what the pipeline makes of a load."""
-        field = self.truth(self.poses.position[:, :2], width, force, centre)
-        return self.measured(self.pads_in(field), random)
+        return self.measured(self.pads_under(width, force, centre), random)
+
+    def pads_under(self, width: float, force: Array, centre: Array) -> Array:
+        """(cubes, P) pad stresses, Pa, under a load."""
+        return self.pads_in(self.truth(self.poses.position[:, :2], width, force, centre))
 
     def pads_in(self, field: Array) -> Array:
         """(cubes, P) pad stresses, Pa, in a field (cubes, 24) in the skin's frame."""
@@ -177,14 +181,17 @@ class Bench:
         state = calibration.modes.state(stress, calibration.half_side * gradient)
         return np.asarray(state @ calibration.response.T)
 
-    def measured(self, pads: Array, random: np.random.Generator) -> Array:
-        """(cubes, 15) what the pipeline makes of pad stresses (cubes, P), Pa."""
+    def measured(
+        self, pads: Array, random: np.random.Generator, left_out: Masks | None = None
+    ) -> Array:
+        """(cubes, 15) what the pipeline makes of pad stresses (cubes, P), Pa. left_out: (cubes,)
+        bits of pads."""
         calibration = self.calibration
         pads = pads * (1 + self.setting.gain_error * random.standard_normal(pads.shape))
         rest = calibration.rest_frequency
         hertz = pad_frequency(pads, rest, calibration.beta, calibration.modulus)
         hertz *= 1 + FREQUENCY_NOISE * random.standard_normal(hertz.shape)
-        rows = self._pipeline.process(FrequencyRows.of(np.arange(len(hertz)), hertz))
+        rows = self._pipeline.process(FrequencyRows.of(np.arange(len(hertz)), hertz), left_out)
         return np.concatenate([rows.stress, rows.gradient], axis=1)
 
     def load(self, random: np.random.Generator) -> tuple[Array, Array]:

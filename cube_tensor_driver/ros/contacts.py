@@ -58,7 +58,7 @@ class Contacts(SkinSubscriberNode):
             return None
         self._seen = skin.messages
         values, frame_id = skin.newest.believed(health), skin.info.header.frame_id
-        contacts = finder.update(values)
+        contacts = finder.update(values, skin.newest.left_out)
         if self._traction is not None and self._traction_is_wanted():
             cloud = finder.cloud(values)
             if cloud is not None:
