@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from .windows import Windows, of_pressure
 
@@ -43,14 +42,15 @@ class Missing:
             out, own = missing[near].ravel(), np.flatnonzero(missing[cube])
             # Of the cube's own ones, the first ones of those that are out.
             some = np.eye(out.sum(), len(own))
-            inside = cho_solve(cho_factor(precision[np.ix_(out, out)]), some)
+            inside = np.linalg.solve(precision[np.ix_(out, out)], some)
             fill = -inside.T @ precision[out]
             fill[:, out] = 0.0
             rows, place = np.nonzero(windows.near == cube)
             columns = place[:, None] * width + own
             lost = windows.gain[windows.kind[rows][:, None], :, columns].astype(float)
             lost = of_pressure(lost)
-            self.variance[rows] += np.einsum("ncr,cd,ndr->nr", lost, inside[: len(own)], lost)
+            more = np.einsum("ncr,cd,ndr->nr", lost, inside[: len(own)], lost)
+            self.variance[rows] += np.maximum(more, 0)
             if out.all():
                 continue
             self._fill.append((cube, own, near, fill))
