@@ -52,9 +52,8 @@ COLD, WARM, LOOK = 16, 3, 0
 """Steps for a contact that has just begun, for one that goes on, and to see how likely it is."""
 REACH = 1.5
 """Pitches by which a contact moves at most, each way. From the wrong side of a cube to the right
-one it is up to one: a fit that ended there, short of its place, would look as likely as the others,
-for its evidence is that of the linear problem.
-"""
+one it is up to one. A fit that is held up just before its place looks as likely as one that gets
+there, as its evidence is that of the linear problem."""
 FINE = 6
 """Of the steps of a contact that has just begun, those that are left for the fine noise."""
 SETTLED = 0.02
@@ -176,6 +175,8 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
     """Fit contacts, beginning at middles (J, 2) m, sizes (J,) m and alpha, Pa.
 
     Contacts that have just begun have the rough noise until they settle, or FINE steps are left.
+    A step of ln a that takes back more than half of the last one goes half the way: size and
+    fullness look alike, and S is that of the size before, so fits of flat punches swing.
     steps: COLD, WARM or LOOK. The columns of the problem are, per contact, f_x, f_y, f_z, c_x,
     c_y, ln a.
     """
@@ -190,6 +191,7 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
     for axis in range(3):
         prior[axis::6] = GREATEST_FORCE**-2
     forces, before, score = np.zeros((count, 3)), np.inf, np.inf
+    grown = np.zeros(count)
     last, rough = False, steps != WARM
     for step in range(steps + 1):
         last |= step == steps
@@ -223,6 +225,9 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
         right[5::6] -= (logs - usual) * SIZE_SPREAD**-2
         change = np.linalg.lstsq(normal, right, rcond=None)[0].reshape(count, 6)
         moved = max(np.abs(change[:, 3:5]).max() / depth, np.abs(change[:, 5]).max())
+        swings = change[:, 5] * grown < -(grown**2) / 2
+        change[swings, 5] /= 2
+        grown = change[:, 5].copy()
         settled = moved < SETTLED and (steps == WARM or rough or alpha == before)
         last = settled and not rough
         rough &= not settled and step < steps - FINE
