@@ -50,7 +50,7 @@ SHIFT, WIDER = 0.5, 0.2
 """Parts of a contact's radius and of its logarithm by which D moves pressure."""
 COLD, WARM, LOOK = 16, 3, 0
 """Steps for a contact that has just begun, for one that goes on, and to see how likely it is."""
-REACH = 1.5
+FARTHEST = 1.5
 """Pitches by which a contact moves at most, each way. From the wrong side of a cube to the right
 one it is up to one. A fit that is held up just before its place looks as likely as one that gets
 there, as its evidence is that of the linear problem."""
@@ -182,7 +182,7 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
     """
     depth, count = scan.kernels.depth, len(middles)
     middles, logs = middles.copy(), np.log(sizes)
-    start, reach = middles.copy(), REACH * scan.pitch
+    start, farthest = middles.copy(), FARTHEST * scan.pitch
     low, high = np.log(np.array([SIZES[1], SIZES[-3]]) * depth)
     usual = np.log(USUAL_SIZE * depth)
     prior = np.zeros(6 * count)
@@ -232,7 +232,7 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
         last = settled and not rough
         rough &= not settled and step < steps - FINE
         middles += np.clip(change[:, 3:5], -depth / 2, depth / 2)
-        middles = np.clip(middles, start - reach, start + reach)
+        middles = np.clip(middles, start - farthest, start + farthest)
         logs = np.clip(logs + np.clip(change[:, 5], -0.5, 0.5), low, high)
     rest = cho_solve(factor, residual)
     return Fitted(
