@@ -208,7 +208,7 @@ def test_a_contact_that_moves_on_to_a_turned_cube_is_as_unsure_as_one_that_begin
         return np.concatenate([rotate_stress(stress, into_cubes), normal.reshape(-1, 9)], axis=1)
 
     moved, begun = Touches(turned, LEAST), Touches(turned, LEAST)
-    for x in (5.7e-3, 5.9e-3, 6.1e-3):
+    for x in (5.9e-3, 5.98e-3, 5.99e-3, 6.01e-3):
         there = values((x, 2e-3))
         moved.update(there)
     begun.update(there)
