@@ -35,6 +35,8 @@ MUCH_LEFT, WIDE_SIZE = 0.02, 2.5
 the depth."""
 CERTAIN = 0.005
 """Pitches by which a place may be in doubt without that it is asked again where the contact is."""
+ROUND = 4
+"""Cubes next to a contact around which it is looked for, if it has just begun and leaves much."""
 _CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 FIRST_ALPHA = 0.05
 """Alpha over AMPLITUDE from which the fit of a new contact begins."""
@@ -204,8 +206,13 @@ class Touches:
             best = min(tried, key=lambda one: one.score)
             away = np.abs(turn.T @ (best.middles[j] - at))
             away = np.maximum(away, self._inverse.pitch / 4)
-            for corner in _CORNERS:
-                begin(at + turn @ (corner * away), USUAL_SIZE * self._inverse.depth)
+            middles = [at]
+            if best.alpha > limit and np.isinf(disc.doubt):
+                apart = np.linalg.norm(scan.place - best.middles[j], axis=1)
+                middles = list(scan.place[np.argsort(apart)[:ROUND]])
+            for middle in middles:
+                for corner in _CORNERS:
+                    begin(middle + turn @ (corner * away), USUAL_SIZE * self._inverse.depth)
         best = min(tried, key=lambda one: one.score)
         weight = np.exp([(best.score - one.score) / 2 for one in tried])
         weight /= weight.sum()
