@@ -259,6 +259,20 @@ def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact
         assert found.position_uncertainty < 0.3e-3
 
 
+@pytest.mark.parametrize("seed", [5, 17, 88])
+def test_a_contact_midway_between_planar_cubes_is_not_looked_for_beside_another_cube(seed):
+    """Where the field is highest there. A third of the force was found, 14 mm off."""
+    bench, random = (
+        Bench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3)),
+        np.random.default_rng(seed),
+    )
+    centre, angle = np.array([random.uniform(-4e-3, 4e-3), -11.7e-3]), random.uniform(0, 6.28)
+    force = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), -3.0])
+    (found,) = Touches(bench.inverse, LEAST).update(bench.values(2e-3, force, centre, random))
+    assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
+    assert np.linalg.norm(found.position[:2] - centre) < 0.2e-3
+
+
 @pytest.mark.parametrize("seed", [2, 9])
 def test_a_force_between_two_likely_ones_is_as_uncertain(seed):
     """On both sides of the middle between two planar cubes, contacts explain the values alike. Here

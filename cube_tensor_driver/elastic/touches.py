@@ -190,7 +190,8 @@ class Touches:
 
         at, turn: (2,), (2, 2) of the home of contact j. Much that is left may be a wide contact. On
         another side of a cube that does not see all components, a contact looks nearly the same.
-        Both are tried for those that are new or were in doubt.
+        Both are tried for those that are new or were in doubt. Between wide pitches the field may
+        point at the wrong cube: a new one that leaves much is looked for around others, too.
         """
         tried = [fitted]
 
