@@ -75,9 +75,7 @@ class Colouring(NamedTuple):
         if quantity is DEVIATION and above is not None:
             cubes = above[:, 1]
         field = _field(moment, surface, quantity, cubes)
-        # A deviation is large or small beside the pressure.
-        measured = pressure if quantity is DEVIATION else cubes
-        top = wanted or scene.automatic(quantity, np.concatenate([measured, field]), before)
+        top = wanted or scene.automatic(quantity, np.concatenate([cubes, field]), before)
         return cls(quantity, cubes, field, top, above)
 
     def text(self, cube: int) -> str:
