@@ -74,7 +74,7 @@ class ContactFinder(Protocol):
 def contact_finder(
     settings: ContactSettings, poses: CubePoses, calibrations: Sequence[Calibration]
 ) -> ContactFinder:
-    """calibrations: of the cubes.
+    """The finder of these settings for cubes with these poses and calibrations.
 
     ElasticError, ConfigError: nothing to compute with. The method inverse takes seconds to set up.
     """

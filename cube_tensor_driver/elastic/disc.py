@@ -20,7 +20,7 @@ Index = NDArray[np.intp]
 FINER = 8
 """Places along the side of a point's square over which a disc's traction is averaged."""
 _NEAR = 6.0
-"""Depths beyond which a contact makes no pressure."""
+"""Depths beyond which the pressure of a contact counts as zero."""
 
 
 @dataclass

@@ -69,7 +69,7 @@ class TrackedContact(NamedTuple):
 class Touches:
     """Follows the contacts of a skin from scan to scan.
 
-    field: of the newest scan, contacts included; 0 before the first
+    field: traction of the newest scan, contacts included; 0 before the first
 
     Parameters: inverse: of the skin. least: pressure at the cubes' depth that counts as contact,
     Pa.

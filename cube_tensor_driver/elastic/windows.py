@@ -61,6 +61,7 @@ class Observed(NamedTuple):
     reading: Index
 
     def of(self, cubes: Index) -> Observed:
+        """The same of some of the cubes; any shape of numbers of cubes becomes the leading axes."""
         return Observed(self.columns, self.known[cubes], self.by_pad[cubes], self.reading[cubes])
 
 
