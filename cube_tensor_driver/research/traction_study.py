@@ -44,8 +44,8 @@ SHAPES = ("ball", "flat punch", "rounded punch", "two balls")
 """A rounded punch is the mean of flat ones from 0.6 of its radius on. Two balls touch each other,
 and together are as wide as a ball."""
 GAIN_ERROR = 0.01
-"""Standard deviation of a pad's true gain against its calibration; pad_noise.py has what the inverse
-takes it for."""
+"""Standard deviation of a pad's true gain against its calibration; pad_noise.py has what the
+inverse takes it for."""
 CASES = 16
 _SIDE = 0.072
 _ORDER, _SURFACE_ORDER = 14, 100
