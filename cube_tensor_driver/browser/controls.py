@@ -112,13 +112,20 @@ class ReplayControls:
             self._position = gui.add_html("")
             self._slider = gui.add_slider("time / s", 0.0, 1.0, STEP_S, 0.0)
             self._button = gui.add_button("stop the replay")
+        self._drawn = 0.0
         self._button.on_click(lambda _: hold())
 
         @self._slider.on_update
         def _(event: viser.GuiEvent) -> None:
             # Updates that `show` makes have no client.
-            if event.client is not None and math.isfinite(self._slider.value):
-                jump(self._slider.value)
+            if event.client is None:
+                return
+            # A browser may send any number.
+            if not math.isfinite(self._slider.value):
+                self._slider.value = self._drawn  # type: ignore[misc]
+                return
+            jump(self._slider.value)
+            self._drawn = self._slider.value
 
     def show(self, replay: ReplayState | None) -> None:
         """Show where a replay is; None: there is none."""
@@ -127,8 +134,15 @@ class ReplayControls:
         if replay is None:
             return
         self._slider.max = max(round(math.ceil(replay.length / STEP_S) * STEP_S, 1), STEP_S)
-        self._slider.value = round(min(replay.position, self._slider.max), 1)  # type: ignore[misc]
+        self._draw(round(min(replay.position, self._slider.max), 1))
         self._position.content = markup.box(
             f"<b>{markup.clock(replay.position)}</b> of {markup.clock(replay.length)}"
         )
         self._button.label = "go on with the replay" if replay.paused else "stop the replay"
+
+    def _draw(self, position: float) -> None:
+        # Where the user has moved the slider stays until its event has been seen, which comes from
+        # another thread and may come late.
+        if self._slider.value == self._drawn and position != self._drawn:
+            self._drawn = position
+            self._slider.value = position  # type: ignore[misc]

@@ -77,7 +77,7 @@ class Viewer:
         self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
-        self._replay = ReplayClient(self._node, self._services)
+        self._replay = ReplayClient(self._node, self._services, self._status.say)
         self._contacts = ContactsClient(self._node, self._guard)
         self._recorder = BagRecorder(recordings)
         self._links: dict[str, str] = {}

@@ -1,0 +1,160 @@
+"""A jump that a browser asks for is neither overwritten nor forgotten, however late things come."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+pytest.importorskip("viser", reason="needs viser")
+
+from cube_tensor_driver.browser import replay_client
+from cube_tensor_driver.browser.controls import ReplayControls
+from cube_tensor_driver.browser.replay_client import ReplayClient
+from cube_tensor_driver.browser.service_calls import WAIT_S, ServiceCalls
+from cube_tensor_driver.core.scene import STALE_S
+from cube_tensor_driver.msg import ReplayState
+from cube_tensor_driver.srv import SteerReplay
+
+END_S = 3.0
+
+
+class Slider:
+    """viser's: what a browser sends is its value at once, and an event later."""
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+        self.max = 1.0
+
+    def on_update(self, callback) -> None:
+        self.event = lambda: callback(SimpleNamespace(client="browser"))
+
+
+@pytest.fixture
+def page():
+    """Slider and controls of a replay that is held at its end; `jumps` are those asked for."""
+    jumps: list[float] = []
+    slider = Slider(0.0)
+    gui = SimpleNamespace(
+        add_folder=lambda *_, **__: _Folder(),
+        add_html=lambda _: SimpleNamespace(),
+        add_slider=lambda *_: slider,
+        add_button=lambda _: SimpleNamespace(on_click=lambda _: None),
+    )
+    controls = ReplayControls(gui, hold=lambda: None, jump=jumps.append)
+    show(controls, END_S)
+    assert slider.value == END_S
+    return SimpleNamespace(slider=slider, controls=controls, jumps=jumps)
+
+
+class _Folder:
+    visible = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def show(controls: ReplayControls, position: float) -> None:
+    controls.show(SimpleNamespace(position=position, length=END_S, paused=True))
+
+
+def test_a_state_between_a_move_and_its_event_does_not_overwrite_the_move(page):
+    page.slider.value = 0.0
+    show(page.controls, END_S)
+    show(page.controls, END_S - 0.1)
+    page.slider.event()
+    assert page.jumps == [0.0]
+    show(page.controls, 0.5)
+    assert page.slider.value == 0.5
+
+
+def test_no_number_is_put_back(page):
+    page.slider.value = float("nan")
+    page.slider.event()
+    assert page.jumps == [] and page.slider.value == END_S
+    show(page.controls, 0.5)
+    assert page.slider.value == 0.5
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time of the client, s; what is added to `late` passes at once."""
+    here = SimpleNamespace(late=0.0)
+    monkeypatch.setattr(
+        replay_client, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + here.late)
+    )
+    return here
+
+
+@pytest.fixture
+def client(ros):
+    said: list[str] = []
+    say = lambda title, text, colour: said.append(text)  # noqa: E731
+    found = ReplayClient(ros.node, ServiceCalls(say), say)
+    states = ros.node.create_publisher(ReplayState, "player/state", 1)
+
+    def come() -> None:
+        """The replay says where it is."""
+        found.state = None
+        states.publish(ReplayState(position=END_S, length=END_S, paused=True))
+
+    def running() -> bool:
+        if found.state is None:
+            come()
+        return found.state is not None
+
+    return SimpleNamespace(said=said, client=found, is_running=running)
+
+
+def serve(ros) -> list[float]:
+    """A replay that can be steered; the positions it is asked for."""
+    asked: list[float] = []
+
+    def steer(request: SteerReplay.Request, response: SteerReplay.Response):
+        asked.append(request.position)
+        response.success = True
+        return response
+
+    ros.node.create_service(SteerReplay, "player/steer", steer)
+    return asked
+
+
+def test_a_jump_waits_for_a_replay_that_is_silent_or_not_found_yet(ros, client, clock):
+    ros.wait(client.is_running)
+    client.client.jump_to(0.0)
+    assert not client.client.update()
+    clock.late += STALE_S + 0.1
+    client.client.forget_if_silent()
+    assert client.client.state is None and client.client.jumping
+    asked = serve(ros)
+    ros.wait(client.is_running)
+    ros.wait(client.client.update)
+    ros.wait(lambda: asked == [0.0])
+    ros.wait(lambda: not client.client.update() and not client.client.jumping)
+    assert client.said == []
+
+
+def test_a_jump_of_no_replay_is_said(ros, client, clock):
+    client.client.jump_to(0.0)
+    assert not client.client.update() and client.said == []
+    clock.late += WAIT_S + 0.1
+    assert not client.client.update() and not client.client.jumping
+    assert client.said == ["jump: no replay is running"]
+
+
+def test_a_jump_without_an_answer_is_said_and_the_next_one_is_asked_for(ros, client, clock):
+    asked = serve(ros)
+    ros.wait(client.is_running)
+    client.client.jump_to(0.0)
+    ros.wait(client.client.update)
+    client.client.jump_to(1.0)
+    assert not client.client.update()
+    # Nothing is spun: the answer does not come.
+    clock.late += WAIT_S + 0.1
+    assert client.client.update()
+    assert client.said == ["jump: no answer within 10 s"]
+    ros.wait(lambda: asked == [0.0, 1.0])
