@@ -259,20 +259,20 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path, page):
         ros.wait(lambda: heard and position() > 2.9 and GO_ON in buttons(page), 40)
         see(ros, page, lambda text: "paused" in text and f"{N} of {N} cubes" in text)
 
-        def key(one: str) -> None:
-            ros.wait(lambda: sent(one))
+        def key(one: str, wanted: float) -> None:
+            ros.wait(lambda: taken(one, wanted))
 
-        def sent(one: str) -> bool:
-            # The page may draw the slider again at any time, also between these two steps.
+        def taken(one: str, wanted: float) -> bool:
+            # The page may draw the slider again at any time, also between these steps.
             try:
                 slider = page.find_element("css selector", "[role=slider]")
                 page.execute_script("arguments[0].focus()", slider)
                 slider.send_keys(one)
+                return float(slider.get_attribute("aria-valuenow")) == wanted
             except StaleElementReferenceException:
                 return False
-            return True
 
-        key(Keys.HOME)
+        key(Keys.HOME, 0.0)
         ros.wait(lambda: position() < 0.3, 40)
         assert GO_ON in buttons(page)
         count, at = len(heard), position()
@@ -281,9 +281,9 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path, page):
         ros.wait(lambda: STOP in buttons(page), 40)
         press(page, STOP)
         ros.wait(lambda: GO_ON in buttons(page), 40)
-        key(Keys.HOME)
+        key(Keys.HOME, 0.0)
         ros.wait(lambda: position() < 0.3, 40)
-        key(Keys.END)
+        key(Keys.END, 3.0)
         ros.wait(lambda: position() > 2.8, 40)
         ros.wait(lambda: slider_value(page) > 2.8, 40)
         assert f"{N} of {N} cubes" in text(page)
