@@ -93,21 +93,20 @@ def clock(monkeypatch):
 @pytest.fixture
 def client(ros):
     said: list[str] = []
-    say = lambda title, text, colour: said.append(text)  # noqa: E731
-    found = ReplayClient(ros.node, ServiceCalls(say), say)
+
+    def say(title: str, text: str, colour: str) -> None:
+        said.append(text)
+
+    replay = ReplayClient(ros.node, ServiceCalls(say), say)
     states = ros.node.create_publisher(ReplayState, "player/state", 1)
 
-    def come() -> None:
-        """The replay says where it is."""
-        found.state = None
-        states.publish(ReplayState(position=END_S, length=END_S, paused=True))
+    def is_running() -> bool:
+        """The replay says where it is until the client has heard it."""
+        if replay.state is None:
+            states.publish(ReplayState(position=END_S, length=END_S, paused=True))
+        return replay.state is not None
 
-    def running() -> bool:
-        if found.state is None:
-            come()
-        return found.state is not None
-
-    return SimpleNamespace(said=said, client=found, is_running=running)
+    return SimpleNamespace(said=said, replay=replay, is_running=is_running)
 
 
 def serve(ros) -> list[float]:
@@ -125,36 +124,40 @@ def serve(ros) -> list[float]:
 
 def test_a_jump_waits_for_a_replay_that_is_silent_or_not_found_yet(ros, client, clock):
     ros.wait(client.is_running)
-    client.client.jump_to(0.0)
-    assert not client.client.update()
+    client.replay.jump_to(0.0)
+    assert not client.replay.update()
     clock.late += STALE_S + 0.1
-    client.client.forget_if_silent()
-    assert client.client.state is None and client.client.jumping
+    client.replay.forget_if_silent()
+    # Meanwhile the page hides it, as it does all that is silent.
+    assert client.replay.state is None and not client.replay.jumping
     asked = serve(ros)
     ros.wait(client.is_running)
-    ros.wait(client.client.update)
+    assert client.replay.jumping
+    ros.wait(client.replay.update)
     ros.wait(lambda: asked == [0.0])
-    ros.wait(lambda: not client.client.update() and not client.client.jumping)
+    ros.wait(lambda: not client.replay.update() and not client.replay.jumping)
     assert client.said == []
 
 
 def test_a_jump_of_no_replay_is_said(ros, client, clock):
-    client.client.jump_to(0.0)
-    assert not client.client.update() and client.said == []
+    client.replay.jump_to(0.0)
+    assert not client.replay.update() and client.said == []
     clock.late += WAIT_S + 0.1
-    assert not client.client.update() and not client.client.jumping
+    assert not client.replay.update()
     assert client.said == ["jump: no replay is running"]
+    ros.wait(client.is_running)
+    assert not client.replay.jumping
 
 
 def test_a_jump_without_an_answer_is_said_and_the_next_one_is_asked_for(ros, client, clock):
     asked = serve(ros)
     ros.wait(client.is_running)
-    client.client.jump_to(0.0)
-    ros.wait(client.client.update)
-    client.client.jump_to(1.0)
-    assert not client.client.update()
+    client.replay.jump_to(0.0)
+    ros.wait(client.replay.update)
+    client.replay.jump_to(1.0)
+    assert not client.replay.update()
     # Nothing is spun: the answer does not come.
     clock.late += WAIT_S + 0.1
-    assert client.client.update()
+    assert client.replay.update()
     assert client.said == ["jump: no answer within 10 s"]
     ros.wait(lambda: asked == [0.0, 1.0])

@@ -120,12 +120,13 @@ class ReplayControls:
             # Updates that `show` makes have no client.
             if event.client is None:
                 return
+            position = self._slider.value
             # A browser may send any number.
-            if not math.isfinite(self._slider.value):
+            if not math.isfinite(position):
                 self._slider.value = self._drawn  # type: ignore[misc]
                 return
-            jump(self._slider.value)
-            self._drawn = self._slider.value
+            jump(position)
+            self._drawn = position
 
     def show(self, replay: ReplayState | None) -> None:
         """Show where a replay is; None: there is none."""
@@ -141,8 +142,8 @@ class ReplayControls:
         self._button.label = "go on with the replay" if replay.paused else "stop the replay"
 
     def _draw(self, position: float) -> None:
-        # Where the user has moved the slider stays until its event has been seen, which comes from
-        # another thread and may come late.
+        # What the user has set stays until its event has been seen, which comes in another thread
+        # and may be late.
         if self._slider.value == self._drawn and position != self._drawn:
             self._drawn = position
             self._slider.value = position  # type: ignore[misc]

@@ -42,7 +42,7 @@ class ReplayClient:
     @property
     def jumping(self) -> bool:
         """A jump is wanted or under way: `state` is not where the user wants to be."""
-        return self._wanted is not None or self._jump is not None
+        return self.state is not None and (self._wanted is not None or self._jump is not None)
 
     def toggle_hold(self) -> None:
         """Stop, or go on."""
