@@ -19,8 +19,8 @@ from cube_tensor_driver.ros.launching import (
     FromSkin,
     GivenParameters,
     check_arguments,
+    record_skin,
     rviz_file,
-    skin_name,
     switch,
     text,
 )
@@ -46,7 +46,7 @@ def generate_launch_description() -> LaunchDescription:
         switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
         switch("markers", "Publish the skin as a MarkerArray on `markers`."),
         switch("state_publisher", "Publish the cubes' frames (robot_state_publisher)."),
-        switch("record", "Record the skin into a new bag below the current folder (mcap)."),
+        switch("record", "Record the skin with ros2 bag into a new folder here (mcap)."),
         switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
     ]
     autostart = ParameterFile(GivenParameters("autostart"))
@@ -66,7 +66,7 @@ def generate_launch_description() -> LaunchDescription:
             node("composed", driver, composed),
             node("contacts", autostart, IfCondition(given("contacts"))),
             node("markers", autostart, wanted("markers", "rviz")),
-            node("recorder", {"skin": FromSkin(skin_name)}, wanted("record"), respawn=False),
+            OpaqueFunction(function=record_skin, condition=wanted("record")),
             Node(
                 package="robot_state_publisher",
                 executable="robot_state_publisher",
@@ -91,7 +91,7 @@ def wanted(argument: str, other: str | None = None) -> IfCondition:
     return IfCondition(OrSubstitution(given(argument), given(other or argument)))
 
 
-def node(executable: str, parameters: Any, condition: Any, **options: Any) -> Node:
+def node(executable: str, parameters: Any, condition: Any) -> Node:
     """A node of this package. `composed` holds several, which keep their own names."""
     return Node(
         package=PACKAGE,
@@ -102,7 +102,8 @@ def node(executable: str, parameters: Any, condition: Any, **options: Any) -> No
         condition=condition,
         output="screen",
         emulate_tty=True,
-        **{"respawn": given("respawn"), "respawn_delay": RESPAWN_DELAY_S, **options},
+        respawn=given("respawn"),
+        respawn_delay=RESPAWN_DELAY_S,
     )
 
 

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.bags.read import FREQUENCIES, INFO, STRESS, typestore
+from cube_tensor_driver.bags.read import typestore
 from cube_tensor_driver.bags.write import BagWriter, quality
 from cube_tensor_driver.config.calibration import calibration_text
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STUCK
+from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 
 START_NS = 1_700_000_000_000_000_000
 WRENCH = "geometry_msgs/msg/WrenchStamped"

@@ -176,10 +176,10 @@ def decoded(message: object) -> object:
     """`Decoded` rows of a SkinFrequencies or SkinStress as rclpy gives it."""
     from rclpy.serialization import serialize_message
 
-    from cube_tensor_driver.bags import message_codec
+    from cube_tensor_driver.messages import codec
 
     name = "frequency" if hasattr(message, "frequency") else "stress"
-    return getattr(message_codec, f"{name}_codec").decode(serialize_message(message))
+    return getattr(codec, f"{name}_codec").decode(serialize_message(message))
 
 
 class Ros:

@@ -13,10 +13,10 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import FREQUENCIES, STRESS, header, message
 
-from cube_tensor_driver.bags.message_codec import frequency_codec, stress_codec
 from cube_tensor_driver.bags.read import typestore
 from cube_tensor_driver.core.errors import MessageError
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
+from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
 
 CODECS = {FREQUENCIES: frequency_codec, STRESS: stress_codec}
 FRAMES = ("", "a", "skin", "skin_base")

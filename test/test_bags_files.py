@@ -27,8 +27,7 @@ from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
 from cube_tensor_driver.bags.mcap import HEAD, BagReader
-from cube_tensor_driver.bags.message_codec import upgrade_frequencies, upgrade_stress
-from cube_tensor_driver.bags.read import FREQUENCIES, INFO, STRESS, Bag, typestore
+from cube_tensor_driver.bags.read import Bag, typestore
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess import Overrides, ReprocessJob, reconstruct, reprocess
 from cube_tensor_driver.bags.source import open_bag
@@ -43,6 +42,8 @@ from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import PAD_FAULT, Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import STAMP, STUCK
+from cube_tensor_driver.messages.codec import upgrade_frequencies, upgrade_stress
+from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 KEPT = ROOT / "test" / "data" / "bag_v1"

@@ -26,12 +26,13 @@ from rosgraph_msgs.msg import Clock
 from test_bags_files import all_differing_bits, differing_bits, stress
 
 from conftest import ROOT, decoded
-from cube_tensor_driver.bags.read import FREQUENCIES, Bag
+from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess import ReprocessJob, reprocess
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.errors import BagError
+from cube_tensor_driver.messages.types import FREQUENCIES
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import (

@@ -12,8 +12,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, frequencies_of, info_of, loads, make_bag
 
-from cube_tensor_driver.bags.message_codec import frequency_codec
-from cube_tensor_driver.bags.read import FREQUENCIES, INFO, typestore
+from cube_tensor_driver.bags.read import typestore
 from cube_tensor_driver.bags.recorded_reconstruction import RecordedReconstruction
 from cube_tensor_driver.bags.reprocess import reconstruct
 from cube_tensor_driver.bags.source import open_bag
@@ -25,6 +24,8 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import STUCK
+from cube_tensor_driver.messages.codec import frequency_codec
+from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 MESSAGES = 200

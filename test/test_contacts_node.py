@@ -13,13 +13,12 @@ import pytest
 pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
-from cube_tensor_driver.bags.contact_messages import CLOUD
-from cube_tensor_driver.bags.message_codec import frequency_codec, stress_codec
-from cube_tensor_driver.bags.read import FREQUENCIES, INFO, Bag
+from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess import ReprocessJob, reprocess
 from cube_tensor_driver.bags.reprocess_contacts import ContactsOverTime
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
+from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE, POISSONS_RATIO, SURFACE_DEPTH
@@ -30,7 +29,10 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.contact_finder import ContactSettings
-from cube_tensor_driver.elastic.influence_file import find_influence, read_influence
+from cube_tensor_driver.elastic.influence_file import read_influence
+from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
+from cube_tensor_driver.messages.contacts import CLOUD
+from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 
 FRAME = b"skin_base\0"
 FORCE = np.array([0.5, 0.0, -2.0])

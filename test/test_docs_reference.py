@@ -33,7 +33,6 @@ from cube_tensor_driver.ros.parameters import (
     DRIVER,
     MARKERS,
     RECONSTRUCTION,
-    RECORDER,
     Parameter,
 )
 
@@ -45,7 +44,6 @@ NODES = {
     "reconstruction": RECONSTRUCTION,
     "markers": MARKERS,
     "contacts": CONTACTS,
-    "recorder": RECORDER,
 }
 ENTRIES = 900
 """Of an array whose length is free: a multiple of all widths."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.config.layout import shipped_calibration
 from cube_tensor_driver.core.errors import ConfigError, ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -16,11 +17,7 @@ from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.contact_finder import ContactSettings, contact_finder
-from cube_tensor_driver.elastic.influence_file import (
-    find_influence,
-    read_influence,
-    write_influence,
-)
+from cube_tensor_driver.elastic.influence_file import read_influence, write_influence
 from cube_tensor_driver.elastic.kernels import LENGTHS, SHEAR, Kernels
 from cube_tensor_driver.elastic.pad_noise import noise_by_pad
 from cube_tensor_driver.elastic.pad_reading import read_pads

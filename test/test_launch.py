@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
-import itertools
 import os
 import re
 import runpy
@@ -14,6 +13,8 @@ import signal
 import subprocess
 import sys
 import threading
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -21,7 +22,7 @@ import pytest
 
 from conftest import ROOT
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 
@@ -57,7 +58,6 @@ def test_every_executable_of_the_list_is_installed_and_runs_its_module(monkeypat
     every = [
         *skin_processes(SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True),
         *skin_processes(SKIN, composed=True),
-        Process("recorder", "cube_tensor_driver.ros.recording"),
     ]
     for process in every:
         module, name = importlib.import_module(process.module), process.executable
@@ -84,46 +84,126 @@ print(temporary_folder("cube_").is_dir())
     assert list(tmp_path.iterdir()) == []
 
 
-def start_recorder(folder: Path) -> subprocess.Popen[str]:
-    """In the namespace that a launch file gives it."""
-    return subprocess.Popen(
-        [
-            *(sys.executable, "-m", "cube_tensor_driver.ros.recording"),
-            *("--ros-args", "-r", "__ns:=/robot1/hand", "-p", "skin:=palm"),
-        ],
-        cwd=folder,
+BLOCK = """
+import sys
+
+class Undeclared:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {undeclared}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Undeclared())
+"""
+"""A sitecustomize.py that makes modules unimportable."""
+
+
+@pytest.fixture
+def robot(monkeypatch, tmp_path):
+    """Processes that start now import only what package.xml names, as on a robot without pip."""
+    tree = ElementTree.parse(ROOT / "package.xml")
+    declared = {element.text for element in tree.iter() if element.tag == "exec_depend"}
+    by_pip = set(MODULES) - {name for name, key in MODULES.items() if key in declared}
+    (tmp_path / "sitecustomize.py").write_text(BLOCK.format(undeclared=by_pip))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ["PYTHONPATH"]]))
+
+
+MODULES = {
+    "rosbags": "python3-rosbags",
+    "mcap": "python3-mcap",
+    "lz4": "python3-lz4",
+    "zstandard": "python3-zstandard",
+    "pyarrow": "python3-pyarrow",
+    "viser": "python3-viser",
+    "websockets": "python3-websockets",
+    "skfem": "python3-scikit-fem",
+    "mujoco": "python3-mujoco",
+    "distributed": "python3-distributed",
+    "PIL": "python3-pil",
+    "matplotlib": "python3-matplotlib",
+    "rich": "python3-rich",
+    "psutil": "python3-psutil",
+    "scipy": "python3-scipy",
+}
+"""Modules that this environment has, and the rosdep key by which package.xml would name each."""
+
+
+def test_every_node_runs_with_what_package_xml_installs(ros, robot, tmp_path):
+    from sensor_msgs.msg import PointCloud2
+    from visualization_msgs.msg import MarkerArray
+
+    from cube_tensor_driver.msg import SkinContacts
+    from cube_tensor_driver.processes.children import Children
+
+    simulated = SimulatedHubs(tmp_path / "ports")
+    every = skin_processes(SKIN, simulated=simulated, markers=True, contacts=True)
+    heard = [
+        ros.listen(SkinContacts, "contacts"),
+        ros.listen(PointCloud2, "traction"),
+        ros.listen(MarkerArray, "markers"),
+    ]
+    with Children(tmp_path) as children:
+        for process in every:
+            inverse = {"method": "inverse"} if process.executable == "contacts" else {}
+            children.start(replace(process, parameters=process.parameters | inverse))
+        ros.wait(lambda: all(heard), 40.0)
+        children.check()
+
+
+@pytest.mark.usefixtures("domain")
+def test_a_bag_as_config_names_the_missing_library(robot, tmp_path):
+    bag = tmp_path / "run1.mcap"
+    bag.write_bytes(b"")
+    command = [sys.executable, "-m", "cube_tensor_driver.ros.reconstruction"]
+    node = subprocess.Popen(
+        [*command, "--ros-args", "-p", f"config:={bag}"],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
     )
-
-
-def test_the_recorder_records_the_skin_of_its_namespace(ros, tmp_path):
-    from cube_tensor_driver.bags.read import Bag
-    from cube_tensor_driver.msg import SkinFrequencies
-
-    publisher = ros.node.create_publisher(SkinFrequencies, "/robot1/hand/frequencies", 10)
-    recorder = start_recorder(tmp_path)
+    lines = []
+    stop = threading.Timer(30.0, node.kill)
+    stop.start()
     try:
-        ros.wait(publisher.get_subscription_count)
-        published = itertools.count()
-        ros.wait(lambda: publisher.publish(SkinFrequencies()) or next(published) == 5)
-        recorder.send_signal(signal.SIGINT)
-        output, _ = recorder.communicate(timeout=20)
+        for line in node.stdout:
+            lines.append(line)
+            if "pip install" in line:
+                break
     finally:
-        recorder.kill()
-    assert recorder.returncode == 0, output
-    (folder,) = tmp_path.iterdir()
-    assert re.fullmatch(r"robot1_hand_palm_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", folder.name)
-    with Bag(folder) as bag:
-        assert len(list(bag.entries({"/robot1/hand/frequencies"}))) > 0
+        stop.cancel()
+        node.kill()
+        node.communicate()
+    output = "".join(lines)
+    assert "needs the Python package rosbags" in output and "Traceback" not in output
 
 
-@pytest.mark.usefixtures("domain")
-def test_a_recording_that_cannot_be_made_is_an_error():
-    """Nobody can make a folder in /proc, root included."""
-    output, _ = (recorder := start_recorder(Path("/proc"))).communicate(timeout=20)
-    assert recorder.returncode == 1 and "recorder: /proc/robot1_hand_palm" in output, output
+@needs_launch
+def test_the_recording_follows_namespace_and_remaps():
+    """`ros2 bag` gets whole names, long queues, and the reliability that the nodes have."""
+    from launch import LaunchContext
+
+    from cube_tensor_driver.config.yaml import read_yaml
+    from cube_tensor_driver.ros.launching import record_skin
+
+    context = LaunchContext()
+    context.launch_configurations |= {
+        "config": str(SKIN),
+        "namespace": "hand",
+        "ros_namespace": "/robot1",
+        "ros_remaps": [("stress", "touch")],
+        "global_params": [("qos_reliability", "best_effort")],
+    }
+    (action,) = record_skin(context)
+    command = [words[0].perform(context) for words in action.cmd]
+    names = ["frequencies", "touch", "info", "driver/info"]
+    whole = [*(f"/robot1/hand/{name}" for name in names), "/diagnostics"]
+    regex = command[command.index("--regex") + 1]
+    assert [name for name in [*whole, "/frequencies"] if re.search(regex, name)] == whole
+    qualities = read_yaml(Path(command[command.index("--qos-profile-overrides-path") + 1]))
+    assert list(qualities) == ["/robot1/hand/frequencies", "/robot1/hand/touch", *whole[2:]]
+    assert qualities["/robot1/hand/touch"]["reliability"] == "best_effort"
+    assert qualities["/robot1/hand/info"]["durability"] == "transient_local"
+    folder = Path(command[command.index("--output") + 1])
+    assert re.fullmatch(r"robot1_hand_skin_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", folder.name)
 
 
 def declared(name: str) -> dict[str, object]:
@@ -158,7 +238,7 @@ def test_pages_use_arguments_that_launch_files_have():
 
 @needs_launch
 def test_the_launch_file_starts_what_the_demo_starts():
-    """And the recorder, RViz and the publisher of frames."""
+    """And RViz and the publisher of frames. The recorder is made when the launch runs."""
     from launch.actions import ExecuteProcess
     from launch.launch_description_sources import get_launch_description_from_python_launch_file
     from launch_ros.actions import Node
@@ -175,7 +255,6 @@ def test_the_launch_file_starts_what_the_demo_starts():
         *skin_processes(SKIN, composed=True),
     ]
     assert started == {process.executable for process in every} | {
-        "recorder",
         "rviz2",
         "robot_state_publisher",
     }

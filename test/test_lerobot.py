@@ -16,7 +16,7 @@ import pytest
 from bag_maker import START_NS, header, make_bag, message
 from PIL import Image
 
-from cube_tensor_driver.bags.read import INFO, Bag, typestore
+from cube_tensor_driver.bags.read import Bag, typestore
 from cube_tensor_driver.bags.reprocess import ReprocessJob, make_table, reprocess
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
@@ -26,6 +26,7 @@ from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.lerobot.statistics import Statistics
 from cube_tensor_driver.lerobot.windows import TACTILE, Windows
+from cube_tensor_driver.messages.types import INFO
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 FPS = 30

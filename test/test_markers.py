@@ -129,10 +129,10 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from visualization_msgs.msg import Marker, MarkerArray
 
-    from cube_tensor_driver.bags.message_codec import stress_codec
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.pipeline import Pipeline
+    from cube_tensor_driver.messages.codec import stress_codec
     from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process

@@ -22,8 +22,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
-from cube_tensor_driver.bags.read import STRESS, Bag
+from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.messages.types import STRESS
 from cube_tensor_driver.processes.children import ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.simulation.sample_log import SampleLog

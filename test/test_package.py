@@ -31,6 +31,7 @@ FLOORS = [
     ["simulation"],
     ["lerobot"],
     ["bags", "conformance", "research"],
+    ["messages"],
     ["device", "elastic"],
     ["config"],
     ["core"],

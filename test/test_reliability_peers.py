@@ -19,9 +19,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from conftest import free_domain, observer_node
-from cube_tensor_driver.bags.message_codec import frequency_codec
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes

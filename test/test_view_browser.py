@@ -34,12 +34,12 @@ from selenium.webdriver.common.keys import Keys
 from websockets.sync.client import connect
 
 from conftest import ROOT, end
-from cube_tensor_driver.bags.message_codec import frequency_codec
 from cube_tensor_driver.browser.page import LEFT_WIDTH
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process

@@ -8,14 +8,7 @@ import pytest
 pytest.importorskip("viser", reason="needs viser: pip install viser")
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import PointCloud2
 
-from cube_tensor_driver.bags.contact_messages import (
-    decode_traction,
-    encode_contacts,
-    encode_traction,
-)
 from cube_tensor_driver.browser import contacts_client
 from cube_tensor_driver.browser.contacts_client import ContactsClient
 from cube_tensor_driver.browser.moment import DEVIATION, Moment, SurfaceField
@@ -23,7 +16,12 @@ from cube_tensor_driver.browser.scene_3d import Colouring
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.scene import QUANTITIES, CubePoses
 from cube_tensor_driver.elastic.surface import Contact, Surface, patches
-from cube_tensor_driver.msg import SkinContacts
+from cube_tensor_driver.messages.contacts import (
+    contacts_message,
+    decode_traction,
+    traction_message,
+)
+from cube_tensor_driver.ros.messages import make_message
 
 DEPTH, PITCH = 0.004, 0.01
 
@@ -62,12 +60,8 @@ def test_field_and_contacts_of_the_node_are_shown_until_they_are_old(poses, monk
     assert client.found(surface) == (None, None)
     cloud = np.vstack([np.full(6, np.nan), cloud_of(poses)])
     contact = Contact(np.ones(3), np.array([0, 0, 1.0]), np.arange(3.0), 2.0, 0.5, 1e-5, 1e-4, 0.1)
-    node.callbacks["contacts"](
-        deserialize_message(encode_contacts(5, "skin_base", [contact]), SkinContacts)
-    )
-    node.callbacks["traction"](
-        deserialize_message(encode_traction(5, "skin_base", cloud), PointCloud2)
-    )
+    node.callbacks["contacts"](contacts_message(make_message, 5, "skin_base", [contact]))
+    node.callbacks["traction"](traction_message(make_message, 5, "skin_base", cloud))
     (shown,), field = client.found(surface)
     for name, value in contact._asdict().items():
         np.testing.assert_array_equal(getattr(shown, name), value)
@@ -112,8 +106,7 @@ def test_the_deviation_is_a_colour_while_the_node_says_it(poses, known):
 
 
 def test_another_point_cloud_is_refused_in_words(poses):
-    data = encode_traction(5, "skin_base", cloud_of(poses))
-    message = deserialize_message(data, PointCloud2)
+    message = traction_message(make_message, 5, "skin_base", cloud_of(poses))
     message.fields = message.fields[:3]
     with pytest.raises(BagError, match="has the fields x, y, z; those of the topic traction are"):
         decode_traction(message)

@@ -31,12 +31,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from cube_tensor_driver.bags.message_codec import stress_codec
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
+from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process

@@ -17,8 +17,8 @@ from ..core.fit import traction_loads
 from ..core.layout import Layout
 from ..core.modes import COMPONENTS, STRESS
 from ..core.symmetry import default_modes
-from .message_codec import SECOND
-from .read import STRESS as BATCH_TYPE
+from ..messages.codec import SECOND
+from ..messages.types import STRESS as BATCH_TYPE
 from .read import Bag
 from .source import open_bag
 

@@ -20,8 +20,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from ..config.package_data import package_data
 from ..core.errors import BagError, CubeError, MessageError
 from ..core.rows import FrequencyRows, StressRows
-from .mcap import BagReader
-from .message_codec import (
+from ..messages.codec import (
     SHAPE_AT,
     Decoded,
     MessageCodec,
@@ -30,14 +29,10 @@ from .message_codec import (
     stress_codec,
     stress_codec_1,
 )
+from ..messages.types import FREQUENCIES, PACKAGE, STRESS
+from .mcap import BagReader
 from .rosbags_storage import Sqlite3Error, Typestore, ZstdError
 
-PACKAGE = "cube_tensor_driver"
-FREQUENCIES, STRESS, INFO = (
-    f"{PACKAGE}/msg/{name}" for name in ("SkinFrequencies", "SkinStress", "SkinInfo")
-)
-CONTACTS = f"{PACKAGE}/msg/SkinContacts"
-TRACTION = "sensor_msgs/msg/PointCloud2"
 VERSIONS = (1, 2, 3)
 """Versions of SkinInfo that this package reads."""
 TOGETHER, TOGETHER_BYTES = 64, 1 << 19
@@ -107,6 +102,16 @@ def typestore() -> Typestore:
         types |= get_types_from_msg(path.read_text(), f"{PACKAGE}/msg/{path.stem}")
     store.register(types)
     return store
+
+
+def make_message(kind: str, **fields: Any) -> Any:
+    """A message of the bag library from its type and its fields."""
+    return typestore().types[kind](**fields)
+
+
+def serialise(message: Any) -> bytes:
+    """The bytes (CDR) of a message that `make_message` made, or that was read from a bag."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
 class Entry(NamedTuple):

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from ..core.reconstructor import Verdicts
 from ..core.rows import FrequencyRows
 from ..core.status import WORDS
-from .message_codec import SECOND
-from .read import STRESS, Bag
+from ..messages.codec import SECOND
+from ..messages.types import STRESS
+from .read import Bag
 
 AHEAD_NS = SECOND
 """How far stress is read ahead of frequencies: messages may stand in a bag a little out of

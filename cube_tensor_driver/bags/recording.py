@@ -15,10 +15,10 @@ from ..core.errors import BagError, MessageError
 from ..core.reconstructor import Verdicts
 from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
-from .message_codec import SECOND
+from ..messages.codec import SECOND
+from ..messages.skin_info import cube_calibrations
 from .read import Bag, damage
 from .recorded_verdicts import VerdictReader
-from .skin_info import cube_calibrations
 
 
 @dataclass(frozen=True, eq=False)

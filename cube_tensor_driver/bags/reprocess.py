@@ -23,9 +23,10 @@ from ..core.errors import BagError, CalibrationError, CubeError
 from ..core.pipeline import Pipeline
 from ..core.reconstructor import Reconstructor
 from ..core.rows import StressRows
+from ..messages.codec import stress_codec
+from ..messages.types import FREQUENCIES, INFO, STRESS
 from .mcap import HEAD
-from .message_codec import stress_codec
-from .read import FREQUENCIES, INFO, STRESS, VERSIONS, Bag, typestore
+from .read import VERSIONS, Bag, serialise
 from .recording import Settings, stamp_ns
 from .reprocess_contacts import ContactsOverTime, ContactWriter
 from .source import BagSource, Segment
@@ -147,7 +148,7 @@ def _write_bag(
             infos = list(_infos(source.recording.infos, settings))
             for info in infos:
                 inside_ns = max(bag.start_ns, min(bag.end_ns, stamp_ns(info)))
-                data = bytes(typestore().serialize_cdr(info, INFO))
+                data = serialise(info)
                 writer.write(f"{skin}info", inside_ns, data)
             touched = None if contacts is None else ContactWriter(writer, skin, contacts)
             for segment, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):

@@ -12,10 +12,11 @@ from ..core.errors import BagError
 from ..core.rows import StressRows
 from ..core.scene import STALE_S, Newest
 from ..elastic.contact_finder import ContactFinder, ContactSettings, contact_finder
-from .contact_messages import encode_contacts, encode_traction
-from .message_codec import Decoded
-from .read import CONTACTS, TRACTION
-from .skin_info import cube_calibrations, cube_poses, geometry
+from ..messages.codec import Decoded
+from ..messages.contacts import contacts_message, traction_message
+from ..messages.skin_info import cube_calibrations, cube_poses, geometry
+from ..messages.types import CONTACTS, TRACTION
+from .read import make_message, serialise
 from .write import BagWriter, quality
 
 
@@ -87,9 +88,9 @@ class ContactWriter:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
         values = self._newest.believed(self._newest.health(stamp_ns * 1e-9, STALE_S))
         contacts = self._finder.update(values, self._newest.left_out)
-        data = encode_contacts(stamp_ns, self._frame_id, contacts)
-        self._writer.write(self._contacts, recorded_ns, data)
+        message = contacts_message(make_message, stamp_ns, self._frame_id, contacts)
+        self._writer.write(self._contacts, recorded_ns, serialise(message))
         cloud = self._finder.cloud(values)
         if cloud is not None:
-            data = encode_traction(stamp_ns, self._frame_id, cloud)
-            self._writer.write(self._traction, recorded_ns, data)
+            message = traction_message(make_message, stamp_ns, self._frame_id, cloud)
+            self._writer.write(self._traction, recorded_ns, serialise(message))

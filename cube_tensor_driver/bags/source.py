@@ -14,8 +14,9 @@ from ..config.skin import Skin
 from ..core.errors import BagError
 from ..core.pattern import count_repeats
 from ..core.rows import FrequencyRows
-from .message_codec import Decoded
-from .read import FREQUENCIES, Bag
+from ..messages.codec import Decoded
+from ..messages.types import FREQUENCIES
+from .read import Bag
 from .recording import Recording
 
 

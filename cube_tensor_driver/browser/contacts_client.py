@@ -12,8 +12,8 @@ from sensor_msgs.msg import PointCloud2
 
 from cube_tensor_driver.msg import SkinContacts
 
-from ..bags.contact_messages import decode_contacts, decode_traction
 from ..elastic.surface import Contact, Surface
+from ..messages.contacts import decode_contacts, decode_traction
 from ..ros.guard import CallbackGuard
 from .moment import Found, SurfaceField
 

@@ -90,8 +90,8 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
     """The browser view as a child, if wanted. BagError: it would have nothing to show."""
     import tempfile
 
-    from ..bags.read import PACKAGE
     from ..core.errors import BagError
+    from ..messages.types import PACKAGE
     from ..processes.children import Children
     from ..processes.skin_processes import Process
 

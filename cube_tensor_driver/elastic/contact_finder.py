@@ -9,11 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.influence import find_influence
 from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.pipeline import Pipeline
 from ..core.scene import CubePoses
-from .influence_file import find_influence, read_influence
+from .influence_file import read_influence
 from .inverse import SurfaceInverse
 from .layer import Layer
 from .pad_noise import noise_by_pad, noise_of_all_pads

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..config.atomic_write import atomic_write
 from ..config.input_files import read_bounded
-from ..config.package_data import package_data
 from ..core.errors import ConfigError, CubeError
 from ..core.layout import Layout
 from .influence import Influence
@@ -23,31 +22,6 @@ STEPS = 30_000
 """The greatest value is so many of the steps that values are rounded to: ten times finer than the
 finite elements they come from."""
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile)
-
-
-def find_influence(name: str) -> Path:
-    """The file of influence functions that `name` means: a shipped one, or a path.
-
-    Raises ConfigError if there is neither, and lists the shipped ones.
-    """
-    shipped = package_data() / "config" / "influence"
-    for path in (shipped / f"{name}.npz", Path(name)):
-        if path.is_file():
-            return path
-    names = ", ".join(sorted(path.stem for path in shipped.glob("*.npz")))
-    raise ConfigError(
-        f"no influence functions {name!r}; name a file that ./cube fem --surface --3d made, or one "
-        f"of the shipped: {names}"
-    )
-
-
-def influence_problem(name: str) -> str:
-    """Why `find_influence` finds nothing, in words; empty if it does."""
-    try:
-        find_influence(name)
-    except ConfigError as error:
-        return str(error)
-    return ""
 
 
 def write_influence(path: Path, influence: Influence, made_by: str) -> None:

@@ -9,9 +9,9 @@ from typing import Generic
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bags.message_codec import AnyRows
 from ..config.skin import Skin
 from ..core.rows import FrequencyRows, StressRows
+from ..messages.codec import AnyRows
 
 
 @dataclass(frozen=True)

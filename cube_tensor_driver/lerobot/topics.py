@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
-from ..bags.read import PACKAGE, Bag
+from ..bags.read import Bag
 from ..core.errors import BagError
+from ..messages.types import PACKAGE
 from .frames import SECOND, Frames
 
 JOINTS = "sensor_msgs/msg/JointState"

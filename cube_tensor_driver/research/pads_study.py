@@ -12,11 +12,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..config.influence import find_influence
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.layout import LAYOUTS
 from ..elastic.body import Body
 from ..elastic.influence import Influence
-from ..elastic.influence_file import find_influence, read_influence
+from ..elastic.influence_file import read_influence
 from ..elastic.reciprocity import compute_influence
 from ..elastic.touches import Touches
 from .field_study import FORCE, FRICTION, FieldExample

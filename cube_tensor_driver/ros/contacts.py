@@ -11,10 +11,11 @@ from sensor_msgs.msg import PointCloud2
 
 from cube_tensor_driver.msg import SkinContacts
 
-from ..bags.contact_messages import encode_contacts, encode_traction
-from ..bags.skin_info import cube_calibrations
 from ..core.errors import CubeError
 from ..elastic.contact_finder import INVERSE, ContactFinder, ContactSettings, contact_finder
+from ..messages.contacts import contacts_message, traction_message
+from ..messages.skin_info import cube_calibrations
+from .messages import make_message
 from .node import run
 from .parameters import CONTACTS
 from .skin_subscriber import FollowedSkin, SkinSubscriberNode
@@ -52,7 +53,7 @@ class Contacts(SkinSubscriberNode):
             contact_finder, settings, skin.poses, calibrations
         )
 
-    def message(self, skin: FollowedSkin, health: np.ndarray) -> bytes | None:
+    def message(self, skin: FollowedSkin, health: np.ndarray) -> SkinContacts | None:
         finder = self._ready()
         if finder is None or skin.messages == self._seen:
             return None
@@ -62,8 +63,10 @@ class Contacts(SkinSubscriberNode):
         if self._traction is not None and self._traction_is_wanted():
             cloud = finder.cloud(values)
             if cloud is not None:
-                self._traction.publish(encode_traction(skin.stamp_ns, frame_id, cloud))
-        return encode_contacts(skin.stamp_ns, frame_id, contacts)
+                self._traction.publish(
+                    traction_message(make_message, skin.stamp_ns, frame_id, cloud)
+                )
+        return contacts_message(make_message, skin.stamp_ns, frame_id, contacts)
 
     def _ready(self) -> ContactFinder | None:
         """None while it is being set up, or if it could not be: that is logged once."""

@@ -9,8 +9,8 @@ from rclpy.qos import QoSProfile
 
 from cube_tensor_driver.msg import SkinFrequencies
 
-from ..bags.message_codec import MessageBuffer, frequency_codec
 from ..core.rows import FrequencyRows
+from ..messages.codec import MessageBuffer, frequency_codec
 from .compat import on_matched
 from .node import BUFFERS_KEPT
 

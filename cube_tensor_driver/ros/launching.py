@@ -8,20 +8,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import Action, LaunchContext, Substitution
-from launch.actions import DeclareLaunchArgument, SetLaunchConfiguration
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, SetLaunchConfiguration
 from launch.substitutions import LaunchConfiguration
+from launch_ros.utilities.namespace_utils import make_namespace_absolute, prefix_namespace
 
 from ..config.load_script import read_script
 from ..config.package_data import package_data
 from ..config.port import port_problem
 from ..config.rviz import rviz_view
 from ..config.skin import Skin, read_skin
-from ..config.yaml import write_yaml
+from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 from ..processes.temporary import temporary_folder
 from .parameters import DRIVER
@@ -31,7 +33,12 @@ SINGLE, DEMO, DEMO_LOAD = (
     _CONFIG / name for name in ("cube.yaml", "skin_demo.yaml", "load_demo.yaml")
 )
 SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
-NEEDS = {"rviz": ("rviz2", "robot_state_publisher"), "state_publisher": ("robot_state_publisher",)}
+RECORD_QOS = _CONFIG / "record_qos.yaml"
+NEEDS = {
+    "rviz": ("rviz2", "robot_state_publisher"),
+    "state_publisher": ("robot_state_publisher",),
+    "record": ("ros2bag", "rosbag2_storage_mcap"),
+}
 """The ROS packages beyond our own that an argument needs."""
 
 
@@ -88,10 +95,6 @@ class GivenParameters(Substitution):
         return str(path)
 
 
-def skin_name(skin: Skin) -> str:
-    return skin.name
-
-
 def parent_frame(skin: Skin) -> str:
     return skin.parent_frame
 
@@ -101,6 +104,44 @@ def rviz_file(skin: Skin) -> str:
     path = temporary_folder("cube_rviz_") / "skin.rviz"
     write_yaml(path, rviz_view(skin))
     return str(path)
+
+
+def record_skin(context: LaunchContext) -> list[Action]:
+    """Start `ros2 bag record` for the skin's topics, as its nodes name them.
+
+    A namespace, remaps and the parameter `qos_reliability` that the including launch file sets
+    around the skin are applied here, because `ros2 bag` is no action of launch_ros.
+    """
+    surroundings = context.launch_configurations
+    namespace = make_namespace_absolute(
+        prefix_namespace(surroundings.get("ros_namespace", ""), _given(context, "namespace"))
+    )
+    remaps = dict(surroundings.get("ros_remaps", []))
+    parameters = [one for one in surroundings.get("global_params", []) if isinstance(one, tuple)]
+    reliability = dict(parameters).get("qos_reliability", "reliable")
+
+    qualities = {}
+    for topic, quality in read_yaml(RECORD_QOS).items():
+        name = topic if topic == "/diagnostics" else topic.removeprefix("/")
+        name = remaps.get(name, name)
+        full_name = name if name.startswith("/") else f"{(namespace or '').rstrip('/')}/{name}"
+        is_batch = topic in ("/frequencies", "/stress")
+        qualities[full_name] = quality | ({"reliability": reliability} if is_batch else {})
+    overrides = temporary_folder("cube_record_") / "qos.yaml"
+    write_yaml(overrides, qualities)
+
+    skin = read_skin(Path(_given(context, "config")))
+    parts = [
+        *(namespace or "").strip("/").split("/"),
+        skin.name,
+        f"{datetime.now():%Y_%m_%d-%H_%M_%S}",
+    ]
+    folder = Path("_".join(part for part in parts if part)).absolute()
+    command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(folder)]
+    command += ["--qos-profile-overrides-path", str(overrides)]
+    # The option --topics does not exist in Humble, --regex does everywhere.
+    command += ["--regex", f"^({'|'.join(qualities)})$"]
+    return [ExecuteProcess(cmd=command, name="recorder", output="screen")]
 
 
 def check_arguments(context: LaunchContext) -> list[Action]:

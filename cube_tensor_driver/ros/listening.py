@@ -15,13 +15,12 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from cube_tensor_driver.msg import SkinInfo, SkinStress, StressTensorStamped
 
-from ..bags.message_codec import stress_codec
 from ..core.errors import CubeError, MessageError
 from ..core.rows import StressRows
+from ..messages.codec import stress_codec
 from ..terminal.echo import Reading
 from .asking import STEP_S, discover, domain_text, spin
-from .messages import to_ns
-from .recorder import message_class
+from .messages import message_class, to_ns
 from .recording import resolve_topics
 from .session import node_session, on_stop_signal
 

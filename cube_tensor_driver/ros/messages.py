@@ -1,10 +1,11 @@
 """Messages of rclpy that are made or read one by one: info, single tensors and wrenches, times.
 
-The batch messages go through `bags/message_codec.py`, as serialised bytes.
+The batch messages go through `messages/codec.py`, as serialised bytes.
 """
 
 from __future__ import annotations
 
+import importlib
 from array import array
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -18,12 +19,35 @@ from std_msgs.msg import Header
 
 from cube_tensor_driver.msg import CubeInfo, SkinInfo, StressTensor, StressTensorStamped
 
-from ..bags.message_codec import SECOND
 from ..config.calibration import calibration_text
 from ..config.skin import Skin
+from ..core.errors import BagError
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
 from ..core.tensor import quaternion_from_rpy
+from ..messages.codec import SECOND
+
+
+def message_class(topic: str, msgtype: str) -> Any:
+    """The message class of pkg/msg/Name. BagError: not installed."""
+    package, _, name = msgtype.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        raise BagError(
+            f"{topic}: the messages of {package} are not installed here; "
+            "source the workspace that has them"
+        ) from None
+
+
+def make_message(kind: str, **fields: Any) -> Any:
+    """A message of rclpy from its type and its fields, whose arrays may be numpy's."""
+    arrays = {
+        name: packed(value.dtype.char, value)
+        for name, value in fields.items()
+        if isinstance(value, np.ndarray)
+    }
+    return message_class("make_message", kind)(**fields | arrays)
 
 
 def to_time(stamp_ns: int) -> Time:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from ..config.influence import influence_problem
 from ..config.port import port_problem
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.scene import QUANTITIES
-from ..elastic.influence_file import influence_problem
 
 
 class Parameter(NamedTuple):
@@ -169,7 +169,6 @@ CONTACTS = (
         problem=influence_problem,
     ),
 )
-RECORDER = (Parameter("skin", "skin", "Name of the skin, for the name of the bag's folder."),)
 ECHO = (
     AUTOSTART,
     Parameter("cubes", 64, "Rows of a message."),

@@ -12,11 +12,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from ..bags.message_codec import upgrade_frequencies, upgrade_stress
-from ..bags.read import FREQUENCIES, PACKAGE, STRESS, Bag, Entry
+from ..bags.read import Bag, Entry
 from ..core.errors import BagError
-from .messages import SECOND
-from .recorder import DEPTH, message_class
+from ..messages.codec import upgrade_frequencies, upgrade_stress
+from ..messages.types import FREQUENCIES, PACKAGE, STRESS
+from .messages import SECOND, message_class
+from .recorder import DEPTH
 
 CLOCK_S = 0.01
 """The clock is published at least so often in real time, and before every message."""

@@ -9,11 +9,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo
 
-from ..bags.message_codec import frequency_codec
 from ..config.skin import read_skin
 from ..core.errors import CubeError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows
+from ..messages.codec import frequency_codec
 from .compat import with_number
 from .diagnostics import Diagnostics
 from .lost_messages import LostMessages

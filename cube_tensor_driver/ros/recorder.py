@@ -3,7 +3,6 @@ a separate thread writes them."""
 
 from __future__ import annotations
 
-import importlib
 import threading
 import time
 from collections import deque
@@ -16,6 +15,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..bags.write import BagWriter, quality
 from ..core.errors import BagError
+from .messages import message_class
 
 DEPTH = 2000
 WRITE_S = 0.05
@@ -138,15 +138,3 @@ class Recorder:
             topic, time_ns, data = self._waiting.popleft()
             self._bag.write(topic, time_ns, data)
             self._written_bytes += len(data)
-
-
-def message_class(topic: str, msgtype: str) -> Any:
-    """The message class of pkg/msg/Name. BagError: not installed."""
-    package, _, name = msgtype.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError):
-        raise BagError(
-            f"{topic}: the messages of {package} are not installed here; "
-            "source the workspace that has them"
-        ) from None

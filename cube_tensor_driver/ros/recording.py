@@ -1,30 +1,23 @@
-"""Recording from the first message to a complete bag: as a command, and as the node `recorder`."""
+"""Recording from the first message to a complete bag."""
 
 from __future__ import annotations
 
 import os
 import shutil
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
 from ..bags.repair import repair
 from ..bags.write import BagWriter
-from ..core.errors import BagError, ConfigError, CubeError
-from ..processes.skin_processes import RECORDED
-from .parameters import RECORDER
+from ..core.errors import BagError, ConfigError
 from .recorder import Recorder
 from .session import node_session, on_stop_signal
 
-MISSING_S = 10.0
-"""The node warns of topics that nobody offers after so long."""
 FIND_S, SPIN_S, SHOW_S = 0.2, 0.05, 1.0
 """How often topics are looked for, how long a spin lasts, how often `show` is called."""
 
@@ -133,63 +126,3 @@ def _close(recorder: Recorder, folder: Path) -> None:
         except BagError as worse:
             raise BagError(f"{error}\n{worse}") from None
         raise BagError(f"{error}. The {done.messages} messages written before are valid") from None
-
-
-class _Log:
-    """What the node `recorder` says while it records: each thing once."""
-
-    def __init__(self, node: Node) -> None:
-        self._log = node.get_logger()
-        self._said: set[str] = set()
-
-    def show(self, recorder: Recorder, seconds: float) -> None:
-        for reason in recorder.refused.values():
-            self._warn(f"not recorded: {reason}")
-        if recorder.dropped:
-            self._warn("the disk is too slow: messages are dropped")
-        if recorder.missing and seconds > MISSING_S:
-            self._warn(
-                f"nobody offers {', '.join(recorder.missing)}: nothing of it is recorded yet"
-            )
-
-    def _warn(self, text: str) -> None:
-        if text not in self._said:
-            self._said.add(text)
-            self._log.warning(text)
-
-
-def new_folder(node: Node, skin: str) -> Path:
-    """Below the current folder, named [namespace_]skin_date-time."""
-    parts = [part for part in node.get_namespace().split("/") if part]
-    return Path("_".join([*parts, skin, f"{datetime.now():%Y_%m_%d-%H_%M_%S}"])).absolute()
-
-
-def main() -> int:
-    """The node `recorder`: records the skin in whose namespace it is, until a signal.
-
-    Returns the exit code: 1 if there is no recording, or messages are missing from it.
-    """
-    stop = stop_event()
-    try:
-        with node_session("recorder") as (node, executor):
-            for parameter in RECORDER:
-                node.declare_parameter(parameter.name, parameter.default)
-            bag = BagWriter(new_folder(node, node.get_parameter("skin").value), "mcap", 0, 0.0)
-            node.get_logger().info(f"recording into {bag.folder}")
-            names = resolve_topics(node, RECORDED)
-            show = _Log(node).show
-            recorder = fill(bag, node, executor, names, stop=stop, duration=None, show=show)
-            node.get_logger().info(f"{bag.folder}: {bag.messages} messages")
-    except (ParameterException, CubeError) as error:
-        print(f"recorder: {error}", file=sys.stderr)
-        return 1
-    if recorder.dropped:
-        print(
-            f"recorder: the disk is too slow: {recorder.dropped} messages dropped", file=sys.stderr
-        )
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -16,10 +16,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from cube_tensor_driver.msg import SkinInfo, SkinStress
 
-from ..bags.message_codec import stress_codec
-from ..bags.skin_info import cube_poses, geometry
 from ..core.errors import CubeError, MessageError
 from ..core.scene import STALE_S, CubePoses, Newest
+from ..messages.codec import stress_codec
+from ..messages.skin_info import cube_poses, geometry
 from .guard import CallbackGuard
 from .node import CubeNode
 from .parameters import Parameter

@@ -9,10 +9,10 @@ from rclpy.qos import QoSProfile
 
 from cube_tensor_driver.msg import SkinStress
 
-from ..bags.message_codec import stress_codec
 from ..config.skin import Skin
 from ..core.reconstructor import Reconstructor
 from ..core.rows import StressRows
+from ..messages.codec import stress_codec
 from .cube_topics import CubeTopics
 from .force_cloud import ForceCloud
 from .node import BUFFERS_KEPT

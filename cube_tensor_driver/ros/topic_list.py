@@ -12,7 +12,7 @@ from rclpy.node import Node
 from ..core.errors import BagError, CubeError
 from .asking import SETTLE_S, discover_all, domain_text, spin
 from .listening import profile_of
-from .recorder import message_class
+from .messages import message_class
 from .session import node_session
 
 COUNT_S = 1.0

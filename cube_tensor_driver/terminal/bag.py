@@ -10,10 +10,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ..bags.read import FREQUENCIES, Bag
+from ..bags.read import Bag
 from ..bags.recording import skin_infos
 from ..bags.summary import cube_summaries, last_diagnostics
 from ..core.errors import BagError
+from ..messages.types import FREQUENCIES
 
 
 def show_bag(path: Path) -> None:

@@ -19,7 +19,6 @@ from rich.progress import Progress
 
 from cube_tensor_driver.msg import SkinStress
 
-from ..bags.message_codec import stress_codec
 from ..config.grid import grid
 from ..config.skin import read_skin
 from ..config.yaml import write_yaml
@@ -28,6 +27,7 @@ from ..core.errors import CubeError
 from ..core.oscillator import pad_frequency
 from ..core.pipeline import Pipeline
 from ..core.rows import FrequencyRows
+from ..messages.codec import stress_codec
 from ..plot.scale import draw_scale
 from ..plot.style import save
 from ..processes.children import Children

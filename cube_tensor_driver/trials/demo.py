@@ -15,7 +15,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
-from ..bags.message_codec import frequency_codec, stress_codec
 from ..config.grid import grid
 from ..config.load_script import read_script
 from ..config.output_files import write_json
@@ -23,6 +22,7 @@ from ..config.package_data import package_data
 from ..config.skin import Skin, read_skin
 from ..config.yaml import write_yaml
 from ..core.errors import ConfigError, CubeError, MessageError
+from ..messages.codec import frequency_codec, stress_codec
 from ..plot.skin_force import draw_forces
 from ..plot.style import save
 from ..processes.children import Children

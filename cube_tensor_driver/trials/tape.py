@@ -17,11 +17,11 @@ from rclpy.serialization import deserialize_message
 
 from cube_tensor_driver.msg import StressTensorStamped
 
-from ..bags.message_codec import AnyRows, MessageCodec
 from ..config.skin import Skin
 from ..core.errors import MessageError
 from ..core.rows import concatenate
 from ..judge.record import CubeMessages, Received
+from ..messages.codec import AnyRows, MessageCodec
 from ..ros.messages import to_ns
 
 TOGETHER = 500

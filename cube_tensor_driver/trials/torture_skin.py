@@ -19,13 +19,13 @@ from rclpy.node import Node
 
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 
-from ..bags.message_codec import frequency_codec, stress_codec
 from ..config.grid import grid
 from ..config.skin import Skin, read_skin
 from ..config.yaml import write_yaml
 from ..core.errors import CubeError
 from ..judge.expected import load_tables
 from ..judge.record import Deed, Record
+from ..messages.codec import frequency_codec, stress_codec
 from ..processes.children import Children
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..ros.messages import to_ns

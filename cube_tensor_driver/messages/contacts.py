@@ -1,8 +1,12 @@
-"""Messages of contacts, made alike by the node `contacts` and by reprocessing."""
+"""Messages of contacts, made alike by the node `contacts` and by reprocessing.
+
+The caller passes the function that makes a message: of rclpy's classes in a node, of the bag
+library's in reprocessing. So a robot needs no bag library for its contacts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +15,13 @@ from numpy.typing import NDArray
 from ..core.errors import BagError
 from ..elastic.surface import Contact
 from ..elastic.touches import TrackedContact
-from .message_codec import SECOND
-from .read import CONTACTS, TRACTION, typestore
+from .codec import SECOND
+from .types import CONTACTS, TRACTION
 
 Array = NDArray[np.float64]
+MakeMessage = Callable[..., Any]
+"""Makes a message from its type, such as geometry_msgs/msg/Point, and its fields by name. Fields
+with numbers are numpy arrays."""
 
 CLOUD = ("x", "y", "z", "pressure", "shear", "sigma")
 """Of the points of `traction`, each a float32: m in the skin's parent frame, Pa on the surface, and
@@ -25,31 +32,34 @@ _FLOAT32 = 7
 """`FLOAT32` of PointField."""
 
 
-def encode_contacts(
-    stamp_ns: int, frame_id: str, contacts: Sequence[Contact] | Sequence[TrackedContact]
-) -> bytes:
-    """A serialised SkinContacts."""
+def contacts_message(
+    make: MakeMessage,
+    stamp_ns: int,
+    frame_id: str,
+    contacts: Sequence[Contact] | Sequence[TrackedContact],
+) -> Any:
+    """A SkinContacts."""
     tracked = [one for one in contacts if isinstance(one, TrackedContact)]
     fields: dict[str, Any] = {name: _column(contacts, name) for name in _NUMBERS}
     fields |= {name: _column(tracked, name) for name in _TRACKED}
     fields["id"] = np.array([one.id for one in tracked], np.uint32)
-    fields["position"] = [_xyz("Point", one.position) for one in contacts]
-    fields["normal"] = [_xyz("Vector3", one.normal) for one in contacts]
-    fields["force"] = [_xyz("Vector3", one.force) for one in contacts]
-    return _encode(CONTACTS, header=_header(stamp_ns, frame_id), **fields)
+    fields["position"] = [_xyz(make, "Point", one.position) for one in contacts]
+    fields["normal"] = [_xyz(make, "Vector3", one.normal) for one in contacts]
+    fields["force"] = [_xyz(make, "Vector3", one.force) for one in contacts]
+    return make(CONTACTS, header=_header(make, stamp_ns, frame_id), **fields)
 
 
-def encode_traction(stamp_ns: int, frame_id: str, cloud: Array) -> bytes:
-    """A serialised PointCloud2 of a `ContactFinder.cloud` (M, 6)."""
+def traction_message(make: MakeMessage, stamp_ns: int, frame_id: str, cloud: Array) -> Any:
+    """A PointCloud2 of a `ContactFinder.cloud` (M, 6)."""
     data = cloud.astype("<f4")
     step = data.itemsize * len(CLOUD)
     fields = [
-        _message("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=_FLOAT32, count=1)
+        make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=_FLOAT32, count=1)
         for k, name in enumerate(CLOUD)
     ]
-    return _encode(
+    return make(
         TRACTION,
-        header=_header(stamp_ns, frame_id),
+        header=_header(make, stamp_ns, frame_id),
         height=1,
         width=len(data),
         fields=fields,
@@ -91,20 +101,12 @@ def _column(contacts: Sequence[Any], name: str) -> Array:
     return np.array([getattr(one, name) for one in contacts], float)
 
 
-def _header(stamp_ns: int, frame_id: str) -> Any:
+def _header(make: MakeMessage, stamp_ns: int, frame_id: str) -> Any:
     seconds, rest = divmod(stamp_ns, SECOND)
-    stamp = _message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
-    return _message("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
-def _xyz(kind: str, vector: Array) -> Any:
+def _xyz(make: MakeMessage, kind: str, vector: Array) -> Any:
     x, y, z = vector.tolist()
-    return _message(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
-
-
-def _message(kind: str, **fields: Any) -> Any:
-    return typestore().types[kind](**fields)
-
-
-def _encode(kind: str, **fields: Any) -> bytes:
-    return bytes(typestore().serialize_cdr(_message(kind, **fields), kind))
+    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
