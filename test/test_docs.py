@@ -236,7 +236,7 @@ def test_programs_of_a_page_run(name):
     import numpy as np
 
     from cube_tensor_driver.core.calibration import illustrative
-    from cube_tensor_driver.core.scene import CubePoses
+    from cube_tensor_driver.core.poses import CubePoses
 
     cube = types.SimpleNamespace(xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0))
     there = {

@@ -8,7 +8,7 @@ import pytest
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
-from cube_tensor_driver.core.scene import CubePoses
+from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.inverse import SurfaceInverse

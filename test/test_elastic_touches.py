@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import cho_solve
 
 from cube_tensor_driver.core.modes import STRESS, to_matrix
-from cube_tensor_driver.core.scene import CubePoses
+from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.disc import Disc, DiscModel

@@ -12,7 +12,7 @@ from cube_tensor_driver.core.defaults import (
     SURFACE_DEPTH,
 )
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.scene import CubePoses
+from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.elastic.surface import Surface

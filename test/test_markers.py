@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.core import scene
+from cube_tensor_driver.core.newest import DOUBTFUL, FAULTY, FINE, STALE, Newest
+from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
-from cube_tensor_driver.core.scene import QUANTITIES, CubePoses, Newest
+from cube_tensor_driver.core.scene import QUANTITIES
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL
 from cube_tensor_driver.core.tensor import rotation_from_quaternion, rotation_from_rpy
 
@@ -83,16 +85,16 @@ def test_health_says_doubtful_no_tensor_and_stale():
     newest.update(rows(values[:1], PAD_FAULT, cube=np.array([1])), 10.5)
     newest.update(rows(values[:1], INVALID | PAD_FAULT, cube=np.array([2])), 10.5)
     assert newest.health(10.6, 1.0).tolist() == [
-        scene.FINE,
-        scene.DOUBTFUL,
-        scene.FAULTY,
-        scene.STALE,
+        FINE,
+        DOUBTFUL,
+        FAULTY,
+        STALE,
     ]
     assert newest.health(11.2, 1.0).tolist() == [
-        scene.STALE,
-        scene.DOUBTFUL,
-        scene.FAULTY,
-        scene.STALE,
+        STALE,
+        DOUBTFUL,
+        FAULTY,
+        STALE,
     ]
     believed = newest.believed(newest.health(10.6, 1.0))
     assert np.isnan(believed).all(axis=1).tolist() == [False, False, True, True]
@@ -115,14 +117,14 @@ def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
             rows(np.zeros((n, 15)), random.binomial(1, chance) * RESIDUAL, cube=np.arange(n)), now
         )
         health = newest.health(now, 1.0)
-        assert (np.delete(health, 7) == scene.FINE).all()
+        assert (np.delete(health, 7) == FINE).all()
         if not (2 < now < 3 or 4 < now < 5):
-            assert health[7] == (scene.DOUBTFUL if 3 <= now <= 4 else scene.FINE), now
+            assert health[7] == (DOUBTFUL if 3 <= now <= 4 else FINE), now
     newest.update(
         rows(np.zeros((n, 15)), np.full(n, PAD_FAULT), cube=np.arange(n)), -100.0
     )  # a bag plays again
     newest.update(rows(np.zeros((n, 15)), cube=np.arange(n)), -99.0)
-    assert (newest.health(-99.0, 1.0) == scene.FINE).all()
+    assert (newest.health(-99.0, 1.0) == FINE).all()
 
 
 def test_markers_node_draws_what_comes(ros, tmp_path):

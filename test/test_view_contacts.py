@@ -14,7 +14,8 @@ from cube_tensor_driver.browser.contacts_client import ContactsClient
 from cube_tensor_driver.browser.moment import DEVIATION, Moment, SurfaceField
 from cube_tensor_driver.browser.scene_3d import Colouring
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.core.scene import QUANTITIES, CubePoses
+from cube_tensor_driver.core.poses import CubePoses
+from cube_tensor_driver.core.scene import QUANTITIES
 from cube_tensor_driver.elastic.surface import Contact, Surface, patches
 from cube_tensor_driver.messages.contacts import (
     contacts_message,

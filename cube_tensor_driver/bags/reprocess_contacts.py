@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import BagError
+from ..core.newest import STALE_S, Newest
 from ..core.rows import StressRows
-from ..core.scene import STALE_S, Newest
 from ..elastic.contact_finder import ContactFinder, ContactSettings, contact_finder
 from ..messages.codec import Decoded
 from ..messages.contacts import contacts_message, traction_message

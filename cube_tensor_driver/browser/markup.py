@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core import scene
 from ..core.modes import COMPONENTS
+from ..core.newest import FAULTY, HEALTH
 from ..core.status import STATUS
 from ..elastic.surface import Contact
 from .moment import Moment
@@ -116,7 +117,7 @@ def headline(
     recording: bool,
 ) -> str:
     """The first line: does it run, how many cubes, how fast, how hard it is pressed."""
-    live = int(np.count_nonzero(health < scene.FAULTY))
+    live = int(np.count_nonzero(health < FAULTY))
     if paused:
         dot, word = BLUE, "paused"
     elif live == len(health):
@@ -206,16 +207,16 @@ def _hundredths(number: float) -> str:
 
 def _state(status: int, health: int) -> str:
     words = [name.lower().replace("_", " ") for name, bit in STATUS.items() if status & bit]
-    return ", ".join(words) or scene.HEALTH[health]
+    return ", ".join(words) or HEALTH[health]
 
 
 def conditions(names: list[str], health: NDArray[np.integer], links: list[str]) -> str:
     """The state of the links, how many cubes are in which state, and which are not fine."""
     counts = ", ".join(
-        f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(scene.HEALTH)
+        f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(HEALTH)
     )
     not_fine = np.flatnonzero(health)[:MOST_ROWS].tolist()
-    rows = [(names[cube], scene.HEALTH[health[cube]], "") for cube in not_fine]
+    rows = [(names[cube], HEALTH[health[cube]], "") for cube in not_fine]
     lines = "".join(f"<div>{escape(line)}</div>" for line in [*links, counts])
     return box(lines + _table(rows))
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.defaults import CONTACT_PRESSURE
-from ..core.scene import QUANTITIES, Newest, Quantity
+from ..core.newest import Newest
+from ..core.scene import QUANTITIES, Quantity
 from ..elastic.surface import Contact, Surface
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from ..elastic.surface import Surface
 from . import markup
 from .charts import Charts

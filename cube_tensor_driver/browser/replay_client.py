@@ -12,7 +12,7 @@ from rclpy.task import Future
 from cube_tensor_driver.msg import ReplayState
 from cube_tensor_driver.srv import SteerReplay
 
-from ..core.scene import STALE_S
+from ..core.newest import STALE_S
 from .markup import NoteColour
 from .service_calls import WAIT_S, ServiceCalls
 

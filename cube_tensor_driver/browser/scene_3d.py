@@ -16,7 +16,9 @@ import viser
 from numpy.typing import NDArray
 
 from ..core import scene
-from ..core.scene import QUANTITIES, CubePoses, Quantity
+from ..core.newest import DOUBTFUL, FAULTY, STALE
+from ..core.poses import CubePoses, quaternions
+from ..core.scene import QUANTITIES, Quantity
 from ..elastic.surface import Contact, Surface
 from . import markup
 from .meshes import CUBE, CUBE_EDGES, NOTHING, Mesh, arrows, hit, ring, rods
@@ -42,7 +44,7 @@ AMBIENT, DIRECT = 2.4, 1.7
 """Intensities of the lights with which colours look as in the legend."""
 DARK, BLUE, EDGE = (40, 44, 52), (25, 105, 210), (110, 114, 122)
 PULL, PUSH = (210, 40, 40), (40, 80, 220)
-FAULT_COLOURS = {scene.DOUBTFUL: (230, 130, 0), scene.FAULTY: (215, 25, 25), scene.STALE: DARK}
+FAULT_COLOURS = {DOUBTFUL: (230, 130, 0), FAULTY: (215, 25, 25), STALE: DARK}
 CROSS_HEIGHT = 0.75
 """Of the middle of principal crosses above the cubes' centres, in pitches: outside the cubes."""
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
@@ -261,7 +263,7 @@ class Cubes:
         self._solid = api.add_batched_meshes_simple(
             "/cubes",
             *CUBE,
-            scene.quaternions(poses.rotation),
+            quaternions(poses.rotation),
             poses.position,
             batched_scales=poses.half_side,
             batched_colors=np.full((len(poses.position), 3), 200, np.uint8),
@@ -425,7 +427,7 @@ class ChosenCube:
     def __init__(self, api: viser.SceneApi, placement: Placement, names: Sequence[str]) -> None:
         self._names = names
         self._upper_faces = _above(placement, 1.1)
-        self._orientations = scene.quaternions(placement.poses.rotation)
+        self._orientations = quaternions(placement.poses.rotation)
         radius = 0.6 * placement.pitch + 0.01 * placement.arrow
         self._ring = _add_mesh(api, "chosen", DARK)
         _set_mesh(self._ring, ring(radius, THIN + 0.005 * placement.arrow))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..core import scene
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from ..elastic.surface import Contact, Surface
 from ..plot.style import png_of_pixels
 from . import markup

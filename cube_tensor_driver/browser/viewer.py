@@ -27,7 +27,7 @@ from std_srvs.srv import Trigger
 from cube_tensor_driver.srv import Tare
 
 from ..core.errors import ConfigError
-from ..core.scene import STALE_S
+from ..core.newest import STALE_S
 from ..ros.compat import make_executor
 from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros

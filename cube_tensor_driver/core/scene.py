@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from .diagnosis import still_strained
 from .modes import COMPONENTS, STRESS
-from .rows import StressRows
-from .statistics import WINDOW_S
-from .status import INVALID, RESIDUAL
-from .tensor import principal_stresses, quaternion_from_rotation
+from .newest import FINE
+from .poses import CubePoses
+from .tensor import principal_stresses
 
 # ColorBrewer's YlOrRd, and RdBu reversed. Both are light at zero, and their lightness changes
 # monotonically away from it: they can be read in grey, and a skin at rest is seen.
@@ -31,98 +28,10 @@ GREY, RED, ORANGE, WHITE = (
     (0.95, 0.95, 0.95),
 )
 
-FINE, DOUBTFUL, FAULTY, STALE = range(4)
-HEALTH = ("ok", "doubtful", "no tensor", "stale")
-"""Words of `Newest.health`. doubtful: a status bit is set, RESIDUAL in many rows; no tensor:
-INVALID; stale: no row came lately."""
 MARK = np.array([GREY, ORANGE, RED, WHITE])
 """Colour of the cross over a cube by its health; a fine cube has none."""
-STALE_S = 1.0
-"""A cube is stale when no row of it has come for so long."""
 FALL = 0.98
 """What an automatic range keeps of its top from one picture to the next."""
-
-
-class CubePoses(NamedTuple):
-    """Where cubes are: position (N, 3) m, rotation (N, 3, 3) cube to parent, half_side (N,) m."""
-
-    position: np.ndarray
-    rotation: np.ndarray
-    half_side: np.ndarray
-
-    @property
-    def pitch(self) -> float:
-        """Typical distance of neighbours in m, at least a cube's side: the measure of all that is
-        drawn."""
-        side = 2.0 * float(np.median(self.half_side))
-        if len(self.position) < 2:
-            return 3.0 * side
-        square = (self.position**2).sum(axis=1)
-        apart = square[:, None] + square - 2 * self.position @ self.position.T
-        np.fill_diagonal(apart, np.inf)
-        return max(side, float(np.sqrt(max(0.0, np.median(apart.min(axis=1))))))
-
-
-def quaternions(rotation: np.ndarray) -> np.ndarray:
-    """(N, 4) w, x, y, z of rotations (N, 3, 3). It loops: call it once per skin, not per
-    picture."""
-    return np.array([np.roll(quaternion_from_rotation(matrix), 1) for matrix in rotation])
-
-
-class Newest:
-    """The newest row of each of n cubes and when it came. Time is what the caller counts, in s.
-
-    strained: (n,) bool, many rows with a residual above its limit, as `Health` has it; noise alone
-    is above it in one row of a thousand, on a large skin in every picture.
-    """
-
-    def __init__(self, n: int) -> None:
-        self.values = np.full((n, len(COMPONENTS)), np.nan)
-        self.residual = np.full(n, np.nan)
-        self.status = np.zeros(n, np.uint16)
-        self.left_out = np.zeros(n, np.uint32)
-        self.arrived = np.full(n, -np.inf)
-        self.count = np.zeros(n, np.int64)
-        self.strained = np.zeros(n, bool)
-        self._window = -np.inf, np.zeros(n, np.int64)  # when it began, and `count` then
-        self._over = np.zeros(n, np.int64)  # rows of the window with RESIDUAL
-
-    def update(self, rows: StressRows, now: float) -> None:
-        """Keep rows, of several rows of a cube the last. Rows of unknown cubes are ignored."""
-        known = rows.cube < len(self.status)
-        if not known.all():
-            rows = rows.select(known)
-        cube = rows.cube
-        self.values[cube, : len(STRESS)], self.values[cube, len(STRESS) :] = (
-            rows.stress,
-            rows.gradient,
-        )
-        self.residual[cube], self.status[cube], self.arrived[cube] = rows.residual, rows.status, now
-        self.left_out[cube] = rows.left_out
-        self._close_window(now)
-        np.add.at(self.count, cube, 1)
-        over = rows.status & RESIDUAL != 0
-        if over.any():
-            np.add.at(self._over, cube[over], 1)
-
-    def health(self, now: float, stale: float) -> np.ndarray:
-        """(N,) FINE, DOUBTFUL, FAULTY or STALE; stale after so many s without a row."""
-        health = np.where(self.strained | (self.status & ~np.uint16(RESIDUAL) != 0), DOUBTFUL, FINE)
-        health[self.status & INVALID != 0] = FAULTY
-        health[now - self.arrived > stale] = STALE
-        return health
-
-    def believed(self, health: np.ndarray) -> np.ndarray:
-        """(N, 15) the values, NaN where the health is FAULTY or STALE."""
-        return np.where((health < FAULTY)[:, None], self.values, np.nan)
-
-    def _close_window(self, now: float) -> None:
-        """Where it is over, or time fell back."""
-        begun, count = self._window
-        if 0 <= now - begun < WINDOW_S:
-            return
-        self.strained = still_strained(self.strained, self._over, self.count - count)
-        self._window, self._over[:] = (now, self.count.copy()), 0
 
 
 @dataclass(frozen=True)

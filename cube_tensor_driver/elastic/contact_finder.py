@@ -13,7 +13,7 @@ from ..config.influence import find_influence
 from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.pipeline import Pipeline
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from .influence_file import read_influence
 from .inverse import SurfaceInverse
 from .layer import Layer

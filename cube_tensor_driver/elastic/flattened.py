@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from ..core.errors import ElasticError
 from ..core.modes import STRESS
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
 from .flattened import flattened
 from .influence import Influence

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from .interpolation import Interpolation
 
 Array = NDArray[np.float64]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from .cache import cached
 from .flattened import flattened
 from .kernels import Kernels

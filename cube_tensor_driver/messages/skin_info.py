@@ -9,7 +9,7 @@ import numpy as np
 from ..config.yaml import parse_yaml
 from ..core.calibration import Calibration
 from ..core.errors import CalibrationError, ConfigError, MessageError
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_quaternion
 
 

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..core.modes import STRESS
+from ..core.poses import CubePoses
 from ..core.rows import StressRows
-from ..core.scene import CubePoses
 from ..elastic.surface import Surface
 from .style import print_style
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.defaults import CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.modes import COMPONENTS
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from ..elastic import contact
 from ..elastic.surface import Surface
 

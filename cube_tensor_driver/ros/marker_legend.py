@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from visualization_msgs.msg import Marker
 
 from ..core import scene
+from ..core.newest import FINE, HEALTH
+from ..core.poses import CubePoses
 from .marker_shapes import (
     GRADIENT,
     GRADIENT_LENGTH,
@@ -53,7 +55,7 @@ class LegendPlace(NamedTuple):
     z: float
 
     @classmethod
-    def beside(cls, poses: scene.CubePoses) -> LegendPlace:
+    def beside(cls, poses: CubePoses) -> LegendPlace:
         pitch = poses.pitch
         low, high = poses.position.min(axis=0), poses.position.max(axis=0)
         width = max(high[0] - low[0], 4 * pitch)
@@ -140,9 +142,9 @@ def legend_text(quantity: scene.Quantity, top: float, health: NDArray[np.integer
     low = -high if quantity.signed else 0
     label, unit = quantity.label.translate(PLAIN_LETTERS), quantity.unit.replace("σ", "sigma")
     states = []
-    for state, word in enumerate(scene.HEALTH):
+    for state, word in enumerate(HEALTH):
         count = np.count_nonzero(health == state)
-        if count or state == scene.FINE:
+        if count or state == FINE:
             states.append(f"{count} {word}")
     return f"{label}: {low:.3g} to {high:.3g} {unit}; {', '.join(states)}"
 

@@ -13,6 +13,7 @@ from cube_tensor_driver.msg import SkinContacts
 
 from ..core import scene
 from ..core.errors import ConfigError
+from ..core.poses import CubePoses, quaternions
 from .marker_contacts import ContactMarkers, contact_markers
 from .marker_legend import Legend, LegendPlace, legend_markers
 from .marker_shapes import (
@@ -120,9 +121,7 @@ class Canvas:
     data: the message. Each marker has its name as namespace.
     """
 
-    def __init__(
-        self, frame_id: str, poses: scene.CubePoses, *, crosses: bool, signed: bool
-    ) -> None:
+    def __init__(self, frame_id: str, poses: CubePoses, *, crosses: bool, signed: bool) -> None:
         """crosses: whether principal stresses are drawn; signed: whether colours lie about zero."""
         self._poses = poses
         self._pitch = poses.pitch
@@ -185,7 +184,7 @@ class Canvas:
     def _cube_markers(self, frame_id: str, rotations: NDArray[np.float64]) -> list[Marker]:
         """One for each orientation, because all boxes of a CUBE_LIST are parallel."""
         markers = []
-        for group, (w, x, y, z) in enumerate(scene.quaternions(rotations).tolist()):
+        for group, (w, x, y, z) in enumerate(quaternions(rotations).tolist()):
             members = self._groups[group]
             half_side = float(self._poses.half_side[members].max())
             made = marker(frame_id, f"cubes {group}", Marker.CUBE_LIST)

@@ -17,7 +17,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from cube_tensor_driver.msg import SkinInfo, SkinStress
 
 from ..core.errors import CubeError, MessageError
-from ..core.scene import STALE_S, CubePoses, Newest
+from ..core.newest import STALE_S, Newest
+from ..core.poses import CubePoses
 from ..messages.codec import stress_codec
 from ..messages.skin_info import cube_poses, geometry
 from .guard import CallbackGuard

@@ -14,7 +14,7 @@ from ..config.load_script import Action, Indenter, Script, between, read_script
 from ..config.package_data import package_data
 from ..config.skin import Skin
 from ..core.errors import ConfigError
-from ..core.scene import CubePoses
+from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..elastic import contact
 from .spline import CubicSpline

@@ -35,9 +35,9 @@ from numpy.typing import NDArray
 from ..config.skin import Skin, SkinCube
 from ..core.defaults import POISSONS_RATIO, YOUNGS_MODULUS
 from ..core.errors import ConfigError
+from ..core.poses import CubePoses
 from ..core.reconstructor import Reconstructor
 from ..core.rows import FrequencyRows, StressRows
-from ..core.scene import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..elastic.disc_tables import DiscTables
 from ..elastic.layer import Layer
