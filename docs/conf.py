@@ -1,12 +1,20 @@
-"""Sphinx settings: ./cube docs builds the pages, every warning an error."""
+"""Sphinx settings: ./cube docs builds the pages, and every warning is an error.
+
+The tables of message fields and of parameters are generated from the code. A page asks for one
+with a comment, `<!-- table: SkinStress -->` or `<!-- table: parameters -->`, which GitHub does not
+show.
+"""
 
 import re
+from pathlib import Path
 
 from pygments.lexers.special import TextLexer
 
+from cube_tensor_driver.ros.parameters import CONTACTS, DRIVER, MARKERS, RECONSTRUCTION
+
 project = "cube_tensor_driver"
 author = "the cube_tensor_driver authors"
-extensions = ["myst_parser", "sphinx.ext.autodoc"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_static_path = ["static"]
 html_css_files = ["lines.css"]
@@ -17,77 +25,101 @@ autodoc_preserve_defaults = True
 autodoc_typehints = "description"
 autodoc_type_aliases = {"NDArray": "NDArray"}
 autodoc_typehints_description_target = "documented_params"
+napoleon_use_ivar = True
+# Docstrings that are not in Google style are shown as they are, although docutils warns of them.
+suppress_warnings = ["docutils"]
 default_role = "py:obj"
 exclude_patterns = ["_build"]
 
-ENTRY = re.compile(r"([a-z]\w*(?:, \w+)*): (.*)")
-"""`name: text` at the beginning of a paragraph, or right after another such line."""
-ERROR = re.compile(r"([A-Z]\w*Error): (.*)")
-MARKUP = re.compile(r"(`[^`]*`|``[^`]*``)|([*|\\]|_\b(?!\w))")
-"""What reStructuredText would read as markup: quoted words stay, all else is escaped."""
+ROOT = Path(__file__).parent.parent
+NODES = {
+    "driver": DRIVER,
+    "reconstruction": RECONSTRUCTION,
+    "markers": MARKERS,
+    "contacts": CONTACTS,
+}
+PAGE_NAME = re.compile(r"\[([a-z_]+\.md)\]\((?=\1[)#])")
+"""Text of a link that is the file name of a page. The HTML page shows its title instead."""
+TABLE = re.compile(r"<!-- table: (\w+) -->")
 
 
-PAGE = re.compile(r"\[([a-z_]+\.md)\]\((?=\1[)#])")
-"""The begin of a link whose text is the page's file name, for those who read the files."""
+def markdown_table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def plain(line: str) -> str:
-    return MARKUP.sub(lambda found: found[1] or "\\" + found[2], line)
+def interface_tables(path: Path) -> str:
+    """Describe a .msg or .srv file: its introduction, its constants and its fields.
 
-
-def restructured(lines: list[str], field: str) -> list[str]:
-    """A docstring in plain text as reStructuredText.
-
-    `name: text` becomes a field, a name with `Error` what is raised, and what is indented after a
-    blank line stays as it stands: an equation or a program.
+    A comment belongs to the field below it, and before an empty line to the whole file.
     """
-    done: list[str] = []
-    kind = "text"  # of the paragraph that a line may go on: text, entry, error or literal
-    for line in lines:
-        entry, error = ENTRY.fullmatch(line), ERROR.fullmatch(line)
-        begins = not done or not done[-1]
-        if not line:
-            done.append("")
-        elif line.startswith(" "):
-            if begins and kind != "literal":
-                done += ["::", ""]
-                kind = "literal"
-            done.append(line if kind == "literal" else plain(line))
-        elif error or (entry and (begins or kind in ("entry", "error"))):
-            if not begins and kind not in ("entry", "error"):
-                done.append("")
-            if error:
-                kind = "error"
-                done.append(f":raises {error[1]}: {plain(error[2])}")
-            else:
-                kind = "entry"
-                done += [f":{field} {name}: {plain(entry[2])}" for name in entry[1].split(", ")]
-        elif not begins and (kind == "error" or (kind == "entry" and line[0].islower())):
-            done.append("    " + plain(line))
+    introduction: list[str] = []
+    constants: list[list[str]] = []
+    fields: list[list[str]] = []
+    comment: list[str] = []
+    part = "request" if path.suffix == ".srv" else ""
+
+    for line in path.read_text().splitlines():
+        definition, _, text = line.partition("#")
+        if line.startswith("#"):
+            comment.append(text.strip())
+        elif line == "---":
+            part = "response"
+        elif not line:
+            introduction += comment
+            comment = []
+        elif "=" in definition:
+            name, value = definition.split()[1].split("=")
+            constants.append([f"`{name}`", value, text.strip()])
+            introduction += comment
+            comment = []
         else:
-            if not begins and kind in ("entry", "error"):
-                done.append("")
-            kind = "text"
-            done.append(plain(line))
-    return done
+            kind, name = definition.split()
+            fields.append([f"`{name}`", f"`{kind}`", " ".join(comment)])
+            fields[-1][1:1] = [part] if part else []
+            comment = []
+
+    tables = [" ".join(introduction)]
+    head = ["field", "in", "type", "meaning"] if part else ["field", "type", "meaning"]
+    tables.append(markdown_table(head, fields))
+    if constants:
+        tables.append(markdown_table(["constant", "value", "meaning"], constants))
+    return "\n\n".join(tables)
+
+
+def parameter_table() -> str:
+    """List the parameters of all nodes. A parameter that several nodes share has one row."""
+    users: dict = {}
+    for node, parameters in NODES.items():
+        for parameter in parameters:
+            users.setdefault(parameter, []).append(f"`{node}`")
+
+    rows = []
+    for parameter, nodes in users.items():
+        default = f"`{parameter.default}`" if parameter.default != "" else "empty"
+        allowed = parameter.choices or {bool: "true, false"}.get(type(parameter.default), "text")
+        if parameter.span:
+            low, high = parameter.span
+            allowed = f"{parameter.least or low:.12g} to {high:.12g}"
+            allowed = f"0, {allowed}" if parameter.least else allowed
+        live = "yes" if parameter.live else "no"
+        name, text = f"`{parameter.name}`", parameter.description
+        rows.append([name, ", ".join(nodes), default.lower(), allowed, live, text])
+    return markdown_table(["parameter", "node", "default", "allowed", "live", "meaning"], rows)
+
+
+def generated_table(name: str) -> str:
+    if name == "parameters":
+        return parameter_table()
+    [path] = [*ROOT.glob(f"msg/{name}.msg"), *ROOT.glob(f"srv/{name}.srv")]
+    return interface_tables(path)
 
 
 def setup(app) -> None:
-    """The blocks of protocol.md are bytes for a test; docstrings are plain text; a link shows the
-    title of its page."""
-    for name in ("frame", "wire"):
+    def prepare_page(app, page: str, source: list[str]) -> None:
+        text = PAGE_NAME.sub("[](", source[0])
+        source[0] = TABLE.sub(lambda found: generated_table(found[1]), text)
+
+    for name in ("frame", "wire"):  # the blocks of protocol.md, which tests read as bytes
         app.add_lexer(name, TextLexer)
-
-    def text(app, what, name, obj, options, lines: list[str]) -> None:
-        lines[:] = restructured(lines, "ivar" if what == "class" else "param")
-
-    def skip(app, what, name, obj, skip, options) -> bool | None:
-        # Python's own words about the field of a tuple; the class describes its fields.
-        return True if str(obj.__doc__).startswith("Alias for field") else None
-
-    def titles(app, docname: str, source: list[str]) -> None:
-        source[0] = PAGE.sub("[](", source[0])
-
-    app.connect("source-read", titles)
-    app.connect("autodoc-process-docstring", text)
-    app.connect("autodoc-skip-member", skip)
+    app.connect("source-read", prepare_page)

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 
+import cube_tensor_driver as ctd
 from conftest import ROOT, end
 
 PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
@@ -166,10 +167,12 @@ def test_documentation_builds_without_a_warning(tmp_path):
     # A link shows the title of its page, not its file name.
     links = set(re.findall(r"\]\((\w+\.md)", (ROOT / "docs" / "start.md").read_text()))
     assert links and not [one for one in links if one in (tmp_path / "start.txt").read_text()]
+    # The public names, and the tables that are generated from the code.
     api = (tmp_path / "api.txt").read_text()
-    # What docstrings say in lists are fields: parameters with their types, errors, attributes.
-    assert "* **rate** (*float** | **None*) -- samples per second to" in api
-    assert "**BagError** -- no bag" in api and "* **frequency** -- (N, P) Hz" in api
+    assert all(f"cube_tensor_driver.{name}" in api for name in ctd.__all__)
+    messages = (tmp_path / "messages.txt").read_text()
+    assert '"left_out"' in messages and '"PAD_DRIFT"' in messages and "table:" not in messages
+    assert '"tare_folder"' in (tmp_path / "parameters.txt").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,4 @@
-"""Every Python block of docs/python.md and docs/api.md runs, in the order of the page, and so does
-README's example."""
+"""Every Python block of docs/python.md runs in order, and so does the example of the README."""
 
 from __future__ import annotations
 
@@ -102,21 +101,6 @@ def test_blocks_of_the_page_run_in_their_order(folder, hubs, monkeypatch):
     assert there["table"].num_rows == len(simulated)
     assert (folder / "c05.png").stat().st_size > 1000
     assert (folder / "stress.parquet").is_file()
-
-
-def test_blocks_of_the_reference_run_and_find_what_was_put_in(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    make_bag(folder / "run1", folder / "skin.yaml", 20)
-    page = ROOT / "docs" / "api.md"
-    there: dict = {"__name__": "page"}
-    for block in blocks(page, "python"):
-        exec(compile(block, page, "exec"), there)
-    true = there["calibration"].coefficients
-    found = there["found"].coefficients
-    assert all(abs(found[name] - true[name]) < 0.01 for name in true)
-    assert there["decoder"].counters.frames == 1 and not there["mistakes"]
-    with ctd.open_bag(folder / "copy") as copy:
-        assert sum(len(rows) for rows in copy) == 20 * len(copy.skin.cubes)
 
 
 def test_example_of_the_readme_runs(folder, hubs):

@@ -1,4 +1,4 @@
-"""docs/messages.md, docs/parameters.md and docs/troubleshooting.md against the package."""
+"""docs/messages.md, docs/troubleshooting.md and computed numbers of pages against the package."""
 
 from __future__ import annotations
 
@@ -28,25 +28,11 @@ from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.elastic import contact
 from cube_tensor_driver.research.pads_example import planar_calibration
-from cube_tensor_driver.ros.parameters import (
-    CONTACTS,
-    DRIVER,
-    MARKERS,
-    RECONSTRUCTION,
-    Parameter,
-)
 
 PAGE = ROOT / "docs" / "messages.md"
 INTERFACES = sorted([*ROOT.glob("msg/*.msg"), *ROOT.glob("srv/*.srv")])
-PARAMETERS = ROOT / "docs" / "parameters.md"
-NODES = {
-    "driver": DRIVER,
-    "reconstruction": RECONSTRUCTION,
-    "markers": MARKERS,
-    "contacts": CONTACTS,
-}
 ENTRIES = 900
-"""Of an array whose length is free: a multiple of all widths."""
+"""Length of the arrays in a filled message: a multiple of all row widths."""
 RCLCPP = """
 #pragma once
 #include <cstdio>
@@ -71,21 +57,8 @@ inline void shutdown() {}
 """What the page's program calls of rclcpp, for a machine without it."""
 
 
-def table(page: Path, heading: str) -> list[list[str]]:
-    """The rows of the first table below a heading, without its head."""
-    section = page.read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
-    lines = section[section.index("|---") :].split("\n\n")[0].splitlines()[1:]
-    return [re.split(r"\s*\|\s*", line)[1:-1] for line in lines]
-
-
-def fields(path: Path) -> list[tuple[str, str]]:
-    """Name and type of each field of a message, or of a service's request and answer."""
-    lines = (line.split("#")[0].split() for line in path.read_text().splitlines())
-    return [(words[1], words[0]) for words in lines if len(words) == 2 and "=" not in words[1]]
-
-
 def filled(kind: Any) -> Any:
-    """A message with something in each of its arrays."""
+    """Return a message with entries in each of its arrays."""
     message = kind()
     for name, of in kind.get_fields_and_field_types().items():
         array = re.fullmatch(r"sequence<(?:(\w+)/)?(\w+)>", of)
@@ -97,63 +70,25 @@ def filled(kind: Any) -> Any:
     return message
 
 
-def parameter_table() -> list[str]:
-    """The parameters of all nodes as a table. What several nodes share has one line."""
-    nodes: dict[Parameter, list[str]] = {}
-    for node, parameters in NODES.items():
-        for parameter in parameters:
-            nodes.setdefault(parameter, []).append(f"`{node}`")
-    lines = [
-        "| parameter | node | default | allowed | live | what it sets |",
-        "|---|---|---|---|---|---|",
-    ]
-    for each, of in nodes.items():
-        default = f"`{each.default}`" if each.default != "" else "empty"
-        allowed = each.choices or {bool: "true, false"}.get(type(each.default), "text")
-        if each.span:
-            low, high = (np.format_float_positional(limit, trim="-") for limit in each.span)
-            allowed = f"0, {each.least:g} to {high}" if each.least else f"{low} to {high}"
-        live = "yes" if each.live else "no"
-        shown = ["`" + each.name + "`", ", ".join(of), default.lower(), allowed, live]
-        lines.append(f"| {' | '.join(shown)} | {each.description} |")
-    return lines
-
-
 @pytest.mark.parametrize("path", INTERFACES, ids=lambda path: path.stem)
-def test_table_of_a_message_has_its_fields(path):
-    rows = table(PAGE, path.stem)
-    assert [(row[0].strip("`"), row[1].split(",")[0]) for row in rows] == fields(path)
-    assert all(len(row) == 4 and all(row) for row in rows)
+def test_every_field_of_a_message_has_a_comment_of_whole_sentences(path):
+    lines = path.read_text().splitlines()
+    for before, line in zip(["", *lines], lines, strict=False):
+        if line and line != "---" and "=" not in line and not line.startswith("#"):
+            assert re.search(r"^# .*\.$", before), f"{path.name}: {line}"
 
 
-def test_examples_of_the_tables_read_a_message():
+def test_examples_of_the_page_read_messages():
     messages = importlib.import_module("cube_tensor_driver.msg")
-    services = importlib.import_module("cube_tensor_driver.srv")
-    there = {"np": np, "row": 1, "cube": 0, "pad": 2, "info": filled(messages.SkinInfo)}
-    there |= {"SkinInfo": messages.SkinInfo, "SkinStress": messages.SkinStress}
-    for path in INTERFACES:
-        if path.suffix == ".srv":
-            kind = getattr(services, path.stem)
-            there |= {"request": filled(kind.Request), "response": filled(kind.Response)}
-        elif path.stem == "StressTensor":
-            there["message"] = filled(messages.StressTensorStamped)
-        else:
-            there["message"] = filled(getattr(messages, path.stem))
-        if path.stem == "SkinFrequencies":
-            there["message"].n_pads = 3
-        if path.stem == "ReplayState":
-            there["message"].length = 1.0
-        for name, _, _, example in table(PAGE, path.stem):
-            of = name.strip("`")
-            assert of in example, f"{path.stem}.{of}: {example} reads another field"
-            eval(example.strip("`"), there)
-
-
-def test_status_bits_of_the_page_are_those_of_the_message():
-    text = (ROOT / "msg" / "SkinStress.msg").read_text()
-    defined = dict(re.findall(r"^uint16 (\w+)=(\d+)", text, re.MULTILINE))
-    shown = dict(re.findall(r"^\| `(\w+)` \| (\d+) \|", PAGE.read_text(), re.MULTILINE))
-    assert shown == defined
+    frequencies = filled(messages.SkinFrequencies)
+    frequencies.n_pads = 3
+    there = {"np": np, "row": 1, "pad": 2, "info": filled(messages.SkinInfo)}
+    introduction = PAGE.read_text().split("\n## ")[0]
+    examples = re.findall(r"^ {4}(\w+ = .*)", introduction, re.MULTILINE)
+    assert len(examples) == 7
+    for example in examples:
+        message = frequencies if "n_pads" in example else filled(messages.SkinStress)
+        exec(example, there | {"message": message})
 
 
 @pytest.mark.parametrize("rows", [ctd.FrequencyRows, ctd.StressRows])
@@ -190,11 +125,6 @@ def test_program_in_cpp_fits_the_messages(tmp_path):
         [*command, *includes, "listen.cpp"], cwd=tmp_path, text=True, capture_output=True
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_table_of_parameters_is_that_of_the_nodes():
-    [section] = re.findall(r"(?s)\n(\| parameter .*?)\n\n", PARAMETERS.read_text())
-    assert section.splitlines() == parameter_table()
 
 
 def test_quoted_messages_are_those_of_the_package():
