@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from .core.reconstructor import Reconstructor
     from .core.rows import FrequencyRows, StressRows
     from .device.live import open_links
-    from .elastic.inverse import SurfaceInverse
     from .simulation.source import simulate
+    from .touch.inverse import SurfaceInverse
 
 __all__ = [
     "CubeError",
@@ -53,7 +53,7 @@ _HOMES = {
     "FrequencyRows": ".core.rows",
     "Reconstructor": ".core.reconstructor",
     "StressRows": ".core.rows",
-    "SurfaceInverse": ".elastic.inverse",
+    "SurfaceInverse": ".touch.inverse",
     "open_bag": ".bags.source",
     "open_links": ".device.live",
     "read_skin": ".config.skin",

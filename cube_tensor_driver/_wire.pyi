@@ -1,4 +1,4 @@
-"""The wire in C: native/python_wire.c. device/native.py says whether it is there."""
+"""The wire in C: native/python_wire.c. device/wire/native.py says whether it is there."""
 
 from collections.abc import Callable
 from typing import Any
@@ -33,7 +33,7 @@ def place_rows(samples: list[bytes], stamps_ns: list[int], n_pads: int, memory: 
     """
 
 class Follower:
-    """The usual samples of a link: native/cube_follow.h, for device/follower.py."""
+    """The usual samples of a link: native/cube_follow.h, for device/scans/follower.py."""
 
     def lend(self, *values: float) -> None:
         """Those of `LentSteps` and of `LentLine`."""

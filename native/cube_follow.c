@@ -3,15 +3,15 @@
 
 #include <math.h>
 
-/* As in device/clock_step.py, */
+/* As in device/clock/step.py, */
 #define STEP_US 4000.0
 #define SLACK 1e-3
 #define QUIET_US 2.0
 #define MEMORY_US 50000.0
 #define SMOOTHING 64
-/* in device/clock_line.py, */
+/* in device/clock/line.py, */
 #define JITTER_SMOOTHING 64
-/* and in device/clock.py. */
+/* and in device/clock/clock.py. */
 #define MAX_DELAY_NS INT64_C(60000000000)
 
 #define MAX_DEVICE_US (INT64_C(1) << 50)

@@ -2,7 +2,7 @@
  * the line of its hub's clock allows.
  *
  * They change running values alone. Whatever is decided about a link is decided in Python
- * (device/sequence.py, clock_step.py and clock.py), which lends these values and takes them back.
+ * (device/scans/sequence.py, clock_step.py and clock.py), which lends these values and takes them back.
  * The arithmetic is Python's, to the last bit. */
 #ifndef CUBE_FOLLOW_H
 #define CUBE_FOLLOW_H

@@ -1,4 +1,4 @@
-/* The Python module cube_tensor_driver._wire: cube_wire.h for cube_tensor_driver/device/native.py.
+/* The Python module cube_tensor_driver._wire: cube_wire.h for cube_tensor_driver/device/wire/native.py.
  *
  * Plain C API of Python, limited to the stable ABI of 3.10: one build serves all later versions.
  * The functions and their contracts for Python stand in cube_tensor_driver/_wire.pyi. What makes no

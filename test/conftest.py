@@ -10,6 +10,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -26,6 +27,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parents[1]
+# Tests share cases with those of other folders.
+sys.path += [str(folder) for folder in (ROOT / "test").iterdir() if folder.is_dir()]
 # Domains up to 101 leave the ports of the system alone.
 _domains = itertools.cycle(range(1, 101))
 

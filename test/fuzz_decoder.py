@@ -15,10 +15,10 @@ import zlib
 import atheris
 
 with atheris.instrument_imports(include=["cube_tensor_driver.device"]):
-    from cube_tensor_driver.device import cobs
-    from cube_tensor_driver.device.decoder import Decoder
-    from cube_tensor_driver.device.protocol import Sample, Stats, encode
-    from cube_tensor_driver.device.sequence import Account
+    from cube_tensor_driver.device.scans.sequence import Account
+    from cube_tensor_driver.device.wire import cobs
+    from cube_tensor_driver.device.wire.decoder import Decoder
+    from cube_tensor_driver.device.wire.protocol import Sample, Stats, encode
 
 
 def sound(part: bytes, any_type: bool) -> bytes:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.device.decoder import Decoder
-from cube_tensor_driver.device.protocol import Command, Hello, Request, Sample, encode
+from cube_tensor_driver.device.wire.decoder import Decoder
+from cube_tensor_driver.device.wire.protocol import Command, Hello, Request, Sample, encode
 
 SINGLE = package_data() / "config" / "cube.yaml"
 """The skin of one cube with 8 pads, on the link hub0."""

@@ -19,43 +19,50 @@ import pytest
 from conftest import ROOT
 
 PACKAGE = ROOT / "cube_tensor_driver"
-# A folder may import those below it in this list, never one above or beside it.
 FLOORS = [
     ["cli"],
-    ["trials"],
+    ["demo"],
     ["browser"],
     ["ros"],
-    ["plot", "terminal"],
-    ["processes"],
-    ["judge"],
-    ["simulation"],
-    ["lerobot"],
-    ["bags", "conformance", "research"],
+    ["views"],
+    ["calibrate", "lerobot"],
+    ["bags", "simulation"],
     ["messages"],
-    ["device", "elastic"],
-    ["config"],
+    ["touch"],
+    ["device", "mechanics"],
+    ["config", "processes"],
     ["core"],
 ]
-# Each heavy library in as few folders as it needs.
+"""Folders of the driver. One may import those below it in this list, none above or beside it."""
+PRODUCTS = {
+    "cube_tensor_driver": set(),
+    "cube_tensor_design": {"cube_tensor_driver"},
+    "cube_tensor_hub": {"cube_tensor_driver"},
+    "workshop": {"cube_tensor_driver", "cube_tensor_design", "cube_tensor_hub"},
+}
+"""Package -> the other packages of the repository that it may import."""
 HOMES = {
-    "rclpy": {"ros", "browser", "trials"},
+    "rclpy": {"ros", "browser", "demo", "workshop"},
     "serial": {"device"},
     "yaml": {"config"},
     "jsonschema": {"config"},
-    "rich": {"terminal", "trials"},
-    "matplotlib": {"plot"},
+    "rich": {"views", "cube_tensor_design", "cube_tensor_hub", "workshop"},
+    "psutil": {"demo", "workshop"},
+    "matplotlib": {"views", "browser", "cube_tensor_design", "workshop"},
+    "scipy": {"mechanics", "touch", "browser", "cube_tensor_design"},
     "rosbags": {"bags", "lerobot"},
     "mcap": {"bags"},
     "pyarrow": {"bags", "lerobot"},
     "PIL": {"lerobot"},
     "zarr": {"bags"},
     "distributed": {"bags"},
-    "skfem": {"elastic", "research"},
+    "skfem": {"cube_tensor_design"},
     "transforms3d": {"core"},
     "launch": {"ros"},
     "viser": {"browser"},
     "mujoco": {"simulation"},
 }
+"""Each heavy library -> the few folders of the driver, and the other packages, that import it."""
 
 
 def python(script: str, folder: Path = ROOT, **environment: str) -> str:
@@ -87,18 +94,25 @@ def imports(path: Path) -> set[str]:
 
 
 def all_imports() -> Iterator[tuple[str, str, Path]]:
-    """(folder, what is imported, file) of every import of the package."""
-    for path in PACKAGE.rglob("*.py"):
-        for module in imports(path):
-            yield path.relative_to(PACKAGE).parts[0], module, path
+    """(folder of the driver or other package, what is imported, file) of every import."""
+    for package in PRODUCTS:
+        for path in (ROOT / package).rglob("*.py"):
+            parts = path.relative_to(ROOT).parts
+            room = parts[1] if package == PACKAGE.name else package
+            for module in imports(path):
+                yield room, module, path
 
 
 def test_imports_point_one_way():
     floor = {name: number for number, names in enumerate(FLOORS) for name in names}
     assert set(floor) == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
     for room, module, path in all_imports():
-        other = module.removeprefix(f"{PACKAGE.name}.").split(".")[0]
-        if room in floor and other in floor and module.startswith(PACKAGE.name) and other != room:
+        top, _, rest = module.partition(".")
+        package = path.relative_to(ROOT).parts[0]
+        if top in PRODUCTS and top != package:
+            assert top in PRODUCTS[package], f"{path} imports {module}"
+        other = rest.split(".")[0]
+        if top == package == PACKAGE.name and room in floor and other in floor and other != room:
             assert floor[other] > floor[room], f"{path} imports {module}"
 
 
@@ -114,8 +128,8 @@ def test_core_needs_numpy_and_nothing_else():
 import importlib, pkgutil, sys
 import numpy, transforms3d.euler, cube_tensor_driver.core as core
 before = set(sys.modules)
-for module in pkgutil.iter_modules(core.__path__):
-    importlib.import_module(f"{core.__name__}.{module.name}")
+for module in pkgutil.walk_packages(core.__path__, f"{core.__name__}."):
+    importlib.import_module(module.name)
 tops = {name.split(".")[0] for name in set(sys.modules) - before}
 print(*tops - sys.stdlib_module_names)
 """
@@ -172,7 +186,7 @@ def test_every_dependency_is_declared_and_pinned():
         by_pip += extra
     of_pip = {re.match(r"[a-z0-9-]+", requirement)[0] for requirement in by_pip}
     used = {module.split(".")[0] for _, module, _ in all_imports()}
-    for module in used - sys.stdlib_module_names - {"cube_tensor_driver"} - of_ros:
+    for module in used - sys.stdlib_module_names - set(PRODUCTS) - of_ros:
         wheel = WHEELS.get(module, module)
         key = KEYS.get(wheel, f"python3-{wheel}")
         if wheel not in NOT_PINNED:
@@ -189,7 +203,7 @@ from cube_tensor_driver.config.skin import read_skin
 print(cube_tensor_driver.__file__)
 print(package_data())
 print(len(read_skin(package_data() / "config" / "skin_demo.yaml").cubes))
-from cube_tensor_driver.device.native import wire
+from cube_tensor_driver.device.wire.native import wire
 print(wire and wire.__file__)
 """
 
@@ -201,7 +215,7 @@ def test_installed_by_colcon_it_has_module_and_messages(tmp_path):
         path for path in sys.path if path and Path(path).resolve() not in (ROOT, ROOT / "test")
     ]
     script = (
-        "import cube_tensor_driver.ros.driver\n"
+        "import cube_tensor_driver.ros.nodes.driver\n"
         "from cube_tensor_driver.msg import SkinStress, StressTensorStamped\n"
         "from cube_tensor_driver.srv import Tare\n"
     )
@@ -238,7 +252,7 @@ def installed_by_pip(tmp_path: Path, **variables: str) -> Path:
     source.mkdir()
     for name in ("pyproject.toml", "package.xml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    for name in (PACKAGE.name, "native", *DATA):
+    for name in (PACKAGE.name, "cube_tensor_design", "cube_tensor_hub", "native", *DATA):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
     pip += ["--no-compile", "--no-build-isolation", "--disable-pip-version-check"]

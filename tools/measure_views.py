@@ -190,7 +190,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
         stack.enter_context(SkinSender(node, skin))
         children = stack.enter_context(Children(folder))
         for topic in counters:
-            children.start(Process(topic, f"cube_tensor_driver.ros.{topic}"))
+            children.start(Process(topic, f"cube_tensor_driver.ros.nodes.{topic}"))
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
         url = children.wait_for_line("view", "http://", START_S).split()[0]
         pictures = PictureCounter(url)

@@ -1,4 +1,1 @@
-"""Recordings: rosbag2 folders read, written, repaired and reprocessed without rosbag2.
-
-The codec of the batch messages is here too, because nodes and bags share it. ROS is not imported.
-"""
+"""Recordings: rosbag2 folders read, written and repaired without rosbag2. ROS is not imported."""

@@ -3,7 +3,7 @@
 `mcap.py` and `write.py` derive from them, to read and write whole chunks instead of single
 messages. A new version of rosbags may change them without saying so. Therefore pyproject.toml pins
 rosbags to a range, nothing else is imported from its inner modules, and
-`test/test_bags_rosbags_storage.py` holds what is used of each class.
+`test/bags/test_bags_rosbags_storage.py` holds what is used of each class.
 """
 
 from rosbags.rosbag2.reader import DirectoryReader

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from ..core.modes import COMPONENTS, STRESS
-from ..plot.live import draw_lines
-from ..plot.style import png, symbol
+from ..views.figures.style import png, symbol
 from . import markup
 from .history import History
+from .plot_colours import draw_lines
 
 Array = NDArray[np.float64]
 

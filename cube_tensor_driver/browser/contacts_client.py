@@ -10,11 +10,10 @@ from rclpy.node import Node
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 
-from cube_tensor_driver.msg import SkinContacts
-
-from ..elastic.surface import Contact, Surface
 from ..messages.contacts import decode_contacts, decode_traction
+from ..msg import SkinContacts
 from ..ros.guard import CallbackGuard
+from ..touch.surface import Contact, Surface
 from .moment import Found, SurfaceField
 
 Array = NDArray[np.float64]

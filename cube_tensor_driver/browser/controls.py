@@ -10,7 +10,7 @@ from typing import Protocol
 import viser
 
 from ..core.modes import COMPONENTS
-from ..core.scene import QUANTITIES, Quantity
+from ..views.scene import QUANTITIES, Quantity
 from . import markup
 from .history import History
 from .moment import DEVIATION, SurfaceField

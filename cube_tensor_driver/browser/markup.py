@@ -10,11 +10,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import scene
 from ..core.modes import COMPONENTS
 from ..core.newest import FAULTY, HEALTH
 from ..core.status import STATUS
-from ..elastic.surface import Contact
+from ..touch.surface import Contact
+from ..views import scene
 from .moment import Moment
 
 Array = NDArray[np.float64]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.newest import Newest
-from ..core.scene import QUANTITIES, Quantity
-from ..elastic.surface import Contact, Surface
+from ..touch.surface import Contact, Surface
+from ..views.scene import QUANTITIES, Quantity
 
 Array = NDArray[np.float64]
 
@@ -47,8 +47,8 @@ class Found(NamedTuple):
 class Moment(NamedTuple):
     """The rows of N cubes at one instant, and what follows from them.
 
-    values: (N, 15) as in core/scene.py, NaN where a cube has no tensor. residual: (N,). health:
-    (N,) as in core/scene.py. status: (N,) bits. field: on the points of the surface. contacts:
+    values: (N, 15) as in views/scene.py, NaN where a cube has no tensor. residual: (N,). health:
+    (N,) as in views/scene.py. status: (N,) bits. field: on the points of the surface. contacts:
     strongest first.
     """
 

@@ -13,7 +13,7 @@ import viser
 from numpy.typing import NDArray
 
 from ..core.poses import CubePoses
-from ..elastic.surface import Surface
+from ..touch.surface import Surface
 from . import markup
 from .charts import Charts
 from .controls import ColourControls, ReplayControls, ReplayState, ShownControls

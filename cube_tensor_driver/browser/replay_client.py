@@ -9,10 +9,9 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.task import Future
 
-from cube_tensor_driver.msg import ReplayState
-from cube_tensor_driver.srv import SteerReplay
-
 from ..core.newest import STALE_S
+from ..msg import ReplayState
+from ..srv import SteerReplay
 from .markup import NoteColour
 from .service_calls import WAIT_S, ServiceCalls
 

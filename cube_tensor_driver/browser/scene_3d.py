@@ -15,11 +15,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from ..core import scene
 from ..core.newest import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
-from ..core.scene import QUANTITIES, Quantity
-from ..elastic.surface import Contact, Surface
+from ..touch.surface import Contact, Surface
+from ..views import scene
+from ..views.scene import QUANTITIES, Quantity
 from . import markup
 from .meshes import CUBE, CUBE_EDGES, NOTHING, Mesh, arrows, hit, ring, rods
 from .moment import DEVIATION, Moment

@@ -11,8 +11,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from ..core import scene
-from ..core.scene import Quantity
+from ..views import scene
+from ..views.scene import Quantity
 from .meshes import NOTHING, Mesh
 
 Array = NDArray[np.floating]

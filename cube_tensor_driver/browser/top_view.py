@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..core import scene
 from ..core.poses import CubePoses
-from ..elastic.surface import Contact, Surface
-from ..plot.style import png_of_pixels
+from ..touch.surface import Contact, Surface
+from ..views import scene
+from ..views.figures.style import png_of_pixels
 from . import markup
 from .scene_3d import Colouring, round_down
 

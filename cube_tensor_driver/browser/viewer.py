@@ -24,14 +24,13 @@ import viser
 from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
-from cube_tensor_driver.srv import Tare
-
 from ..core.errors import ConfigError
 from ..core.newest import STALE_S
 from ..ros.compat import make_executor
 from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros
 from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
+from ..srv import Tare
 from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S

@@ -21,7 +21,7 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     if options.what == "info":
-        from ..terminal.bag import show_bag
+        from ..views.terminal.bag import show_bag
 
         show_bag(options.bag)
         return 0
@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
 def repair_bag(bag: Path) -> int:
     """Make a bag readable and print what was lost."""
     from ..bags.repair import REST, repair
-    from ..terminal.output import warn
+    from ..views.terminal.output import warn
 
     done = repair(bag)
     print(f"{bag}: {done.messages} messages can be read")

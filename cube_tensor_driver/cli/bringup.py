@@ -10,12 +10,12 @@ from .parser import Parser, sample_rate
 if TYPE_CHECKING:
     import numpy as np
 
+    from ..calibrate.pad_order import Explanation
+    from ..calibrate.pad_rest import PadsAtRest
+    from ..calibrate.press import Press
     from ..config.skin import Skin
-    from ..core.pad_order import Explanation
-    from ..core.pad_rest import PadsAtRest
-    from ..core.press import Press
     from ..device.live import LinkSource
-    from ..terminal.bringup import BringupScreen
+    from ..views.terminal.bringup import BringupScreen
 
 REST_S = 5.0
 """How long pads rest before the presses: their noise and drift are from this time."""
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
     from ..device.live import open_links
-    from ..terminal.bringup import BringupScreen
+    from ..views.terminal.bringup import BringupScreen
 
     if options.output.exists():
         raise ConfigError(f"-o {options.output}: the file is there; remove it, or name another one")
@@ -93,7 +93,7 @@ def first_skin(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
     from ..config.skin import check_skin_data
     from ..core.errors import ConfigError, CubeError
     from ..core.layout import LAYOUTS
-    from ..device.search import Port, ask_ports
+    from ..device.links.search import Port, ask_ports
 
     port = Port(options.port)
     ask_ports([port])
@@ -136,8 +136,8 @@ def watch_rest(source: LinkSource, screen: BringupScreen) -> PadsAtRest:
     """The pads while nothing touches them, for REST_S."""
     import numpy as np
 
-    from ..core.pad_rest import LEAST_SAMPLES, pads_at_rest
-    from ..device.averages import scans
+    from ..calibrate.pad_rest import LEAST_SAMPLES, pads_at_rest
+    from ..device.scans.averages import scans
 
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     shown = 0.0
@@ -163,11 +163,11 @@ def press_cubes(
     """Ask for presses beside each cube that has working pads; what they say, by cube."""
     import numpy as np
 
+    from ..calibrate.pad_order import cube_turns, explain_presses
+    from ..calibrate.press import PressWatch
+    from ..calibrate.side_press import SIDES, side_presses
     from ..core.oscillator import pad_stress
-    from ..core.pad_order import cube_turns, explain_presses
-    from ..core.press import PressWatch
-    from ..device.averages import averages
-    from ..elastic.side_press import SIDES, side_presses
+    from ..device.scans.averages import averages
 
     cubes = source.skin.cubes
     calibration = cubes[0].calibration

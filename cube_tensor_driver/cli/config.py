@@ -68,7 +68,7 @@ def write_grid(options: argparse.Namespace) -> int:
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
-    from ..terminal.output import working
+    from ..views.terminal.output import working
 
     if options.output.exists():
         raise ConfigError(f"-o {options.output}: the file is there; remove it, or name another one")
@@ -110,8 +110,8 @@ def check_file(path: Path) -> int:
     """Print what is wrong with a skin file and return 1, or print what the file holds."""
     from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin
-    from ..device.line_load import line_doubts
-    from ..terminal.output import working
+    from ..device.links.line_load import line_doubts
+    from ..views.terminal.output import working
 
     with working(f"checking {path}"):
         skin, mistakes = check_skin(path)

@@ -73,7 +73,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..trials.demo import run_demo
+    from ..demo.demo import run_demo
 
     duration = options.duration
     if duration is None and (options.headless or options.json or options.figure):

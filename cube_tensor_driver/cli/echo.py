@@ -18,8 +18,8 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Until Ctrl-C, or until the reader of a pipe has enough: neither is an error."""
     from ..config.yaml import to_yaml
-    from ..ros.listening import listen
-    from ..terminal.echo import Reading, message_json, reading_json, reading_line
+    from ..ros.commands.listening import listen
+    from ..views.terminal.echo import Reading, message_json, reading_json, reading_line
 
     try:
         for items in listen(options.topic, options.once):

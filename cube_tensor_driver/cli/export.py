@@ -66,11 +66,11 @@ def _add_common(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """1 if a table could not be made. CubeError: nothing was begun."""
-    from ..bags.reprocess_all import RECIPE
+    from ..bags.reprocess.all_bags import RECIPE
     from ..lerobot.choices import Choices
     from ..lerobot.export import check_empty, export_lerobot
-    from ..terminal.exporting import say_exported
-    from ..terminal.output import progress_bar
+    from ..views.terminal.exporting import say_exported
+    from ..views.terminal.output import progress_bar
 
     if options.what in TABLES:
         if not (options.output / RECIPE).exists():  # an export that was interrupted goes on

@@ -11,7 +11,7 @@ from .parser import Parser, positive, uid
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..core.fit import Fit
+    from ..calibrate.fit import Fit
 
 
 def arguments(parser: Parser) -> None:
@@ -66,22 +66,22 @@ def run(options: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from ..bags.read import is_bag
+    from ..calibrate.fit import fit, measured_stress
+    from ..calibrate.load_table import read_loads, unloaded
     from ..config.calibration import find_calibration, read_calibration, write_calibration
     from ..config.layout import named_layout, shipped_calibration
-    from ..config.load_table import read_loads, unloaded
     from ..config.output_files import write_json
     from ..core.errors import ConfigError
-    from ..core.fit import fit, measured_stress
     from ..core.symmetry import find_structure
-    from ..plot.calibration import draw_fit
-    from ..plot.style import save
-    from ..terminal.fit import show_fit
+    from ..views.figures.calibration import draw_fit
+    from ..views.figures.style import save
+    from ..views.terminal.fit import show_fit
 
     layout = named_layout(options.layout)
     base = shipped_calibration(layout)
     rest: np.ndarray | None
     if options.reference is not None:
-        from ..bags.loads import bag_loads
+        from ..calibrate.recorded_loads import bag_loads
 
         loads, base = bag_loads(
             options.loads, options.cube, options.reference, layout, options.area

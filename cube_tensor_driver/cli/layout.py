@@ -36,9 +36,9 @@ def run(options: argparse.Namespace) -> int:
     from ..core.estimator import summary
     from ..core.response import generic_response
     from ..core.symmetry import find_structure, largest_symmetry
-    from ..plot.calibration import draw_layout
-    from ..plot.style import save
-    from ..terminal.layout import show_layout
+    from ..views.figures.calibration import draw_layout
+    from ..views.figures.style import save
+    from ..views.terminal.layout import show_layout
 
     layout = named_layout(options.name)
     calibration = shipped_calibration(layout)

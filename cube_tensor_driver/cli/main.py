@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .parser import Parser, check_outputs, columns, nearest, sentence
-from .table import COMMANDS, GROUPS
+from .table import COMMANDS, GROUPS, PACKAGES
 
 PROGRAM = "./cube"
 
@@ -71,7 +71,15 @@ def command_parser(name: str) -> Parser:
         kind = "option" if name.startswith("-") else "command"
         close = nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
         Parser(prog=PROGRAM).error(f"unknown {kind} {name}; {close}")
-    module = importlib.import_module(f".{name}", __package__)
+    package = PACKAGES.get(name, __package__.partition(".")[0])
+    try:
+        module = importlib.import_module(f"{package}.cli.{name}")
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        Parser(prog=PROGRAM).error(
+            f"the command {name} is not part of the driver: run it as ./cube {name} in a checkout"
+        )
     parser = Parser(prog=f"{PROGRAM} {name}", description=sentence(COMMANDS[name]))
     module.arguments(parser)
     parser.set_defaults(run=module.run)

@@ -161,7 +161,7 @@ def check_outputs(options: argparse.Namespace) -> None:
             pictures.append(value)
     check_outputs(files)
     if pictures:
-        from ..plot.style import check_picture
+        from ..views.figures.style import check_picture
 
         for picture in pictures:
             check_picture(picture)

@@ -30,8 +30,8 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ..bags.source import open_bag
-    from ..plot.style import save
-    from ..plot.time_series import cube_series, draw_series
+    from ..views.figures.style import save
+    from ..views.figures.time_series import cube_series, draw_series
 
     with open_bag(options.bag) as source:
         series = cube_series(source, options.cube, options.start, options.end)

@@ -17,7 +17,7 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """1 if there is no serial port, else 0."""
     from ..core.errors import CubeError
-    from ..device.search import ask_ports, find_ports
+    from ..device.links.search import ask_ports, find_ports
 
     ports = find_ports()
     if not ports:

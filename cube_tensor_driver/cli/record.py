@@ -48,9 +48,9 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """1 if messages were dropped, else 0."""
-    from ..ros.recorder import Recorder
-    from ..ros.recording import record
-    from ..terminal.recording import RecordingStatus
+    from ..ros.commands.recorder import Recorder
+    from ..ros.commands.recording import record
+    from ..views.terminal.recording import RecordingStatus
 
     status = RecordingStatus(options.output)
 

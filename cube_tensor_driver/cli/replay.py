@@ -14,7 +14,7 @@ from .parser import Parser, not_negative, positive
 if TYPE_CHECKING:
     from ..bags.read import Bag
     from ..processes.children import Children
-    from ..ros.player import Player
+    from ..ros.commands.player import Player
 
 START_S = 30.0
 """How long the browser view may take to start."""
@@ -50,8 +50,8 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ..bags.read import Bag
-    from ..ros.replaying import replay
-    from ..terminal.replaying import ReplayBar, pressed_key, single_keys
+    from ..ros.commands.replaying import replay
+    from ..views.terminal.replaying import ReplayBar, pressed_key, single_keys
 
     with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as keys:
         length = (bag.end_ns - bag.start_ns) * 1e-9

@@ -11,8 +11,8 @@ from ..core.defaults import CONTACT_METHODS
 from .parser import Parser, count, number
 
 if TYPE_CHECKING:
-    from ..bags.reprocess import Overrides
-    from ..bags.reprocess_contacts import ContactsOverTime
+    from ..bags.reprocess.contacts import ContactsOverTime
+    from ..bags.reprocess.job import Overrides
 
 
 def arguments(parser: Parser) -> None:
@@ -73,7 +73,7 @@ def add_overrides(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """1 if a bag could not be reprocessed. CubeError: nothing was begun."""
-    from ..bags.reprocess_all import (
+    from ..bags.reprocess.all_bags import (
         make_jobs,
         remove_without_results,
         reprocess_all,
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
         workers,
         write_recipe,
     )
-    from ..terminal.reprocessing import ReprocessingReport
+    from ..views.terminal.reprocessing import ReprocessingReport
 
     overrides, contacts = overrides_of(options), contacts_of(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
 
 def overrides_of(options: argparse.Namespace) -> Overrides:
     """ConfigError: options that contradict each other, or files that are wrong."""
-    from ..bags.reprocess import Overrides
+    from ..bags.reprocess.job import Overrides
     from ..config.calibration import find_calibration, read_calibration
     from ..config.skin import read_skin
     from ..core.errors import ConfigError
@@ -122,10 +122,10 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
 
 def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
     """ConfigError: a method or value that the node `contacts` would not take; or a table."""
-    from ..bags.reprocess_contacts import ContactsOverTime
+    from ..bags.reprocess.contacts import ContactsOverTime
     from ..core.errors import ConfigError
-    from ..elastic.contact_finder import ContactSettings
     from ..ros.parameters import CONTACTS
+    from ..touch.contact_finder import ContactSettings
 
     if options.contacts is None:
         return None

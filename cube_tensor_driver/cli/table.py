@@ -51,4 +51,19 @@ GROUPS = {
 }
 """Heading -> command -> one line of help, in the order in which a user needs them."""
 
+PACKAGES = {
+    "fem": "cube_tensor_design",
+    "study": "cube_tensor_design",
+    "paper": "cube_tensor_design",
+    "check": "cube_tensor_hub",
+    "firmware": "cube_tensor_hub",
+    "bench": "workshop",
+    "torture": "workshop",
+    "pictures": "workshop",
+    "test": "workshop",
+    "lint": "workshop",
+    "docs": "workshop",
+}
+"""Command -> package of its module, for commands that are not part of the driver."""
+
 COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .diagnosis import still_strained
+from .health.diagnosis import still_strained
+from .health.statistics import WINDOW_S
 from .modes import COMPONENTS, STRESS
 from .rows import StressRows
-from .statistics import WINDOW_S
 from .status import INVALID, RESIDUAL
 
 FINE, DOUBTFUL, FAULTY, STALE = range(4)

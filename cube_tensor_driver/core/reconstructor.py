@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .calibration import Calibration
-from .drift import DriftTracker
 from .errors import TareError
-from .health import Health
+from .health.drift import DriftTracker
+from .health.health import Health
+from .health.tare import measure_rest
 from .pipeline import Pipeline
 from .rows import FrequencyRows, StressRows
-from .tare import measure_rest
 
 
 class Verdicts(NamedTuple):

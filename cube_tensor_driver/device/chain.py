@@ -17,18 +17,18 @@ from dataclasses import dataclass, field
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
 from ..core.status import STAMP
-from .clock import ClockMap
-from .cube_table import CubeAddress
-from .follower import Follower
-from .host_clock import HostClockWatch
-from .link import Link, LinkConfig, LinkState
-from .link_log import LinkLog, Log
-from .native import SLOWER, wire
-from .protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
-from .reader import LinkFrames, Reader
-from .row_account import RowAccount, RowCounts
-from .scan import MakeRows, ScanBuilder, empty_rows
-from .sequence import Account, Arrival
+from .clock.clock import ClockMap
+from .clock.host import HostClockWatch
+from .links.link import Link, LinkConfig, LinkState
+from .links.link_log import LinkLog, Log
+from .links.reader import LinkFrames, Reader
+from .scans.cube_table import CubeAddress
+from .scans.follower import Follower
+from .scans.row_account import RowAccount, RowCounts
+from .scans.scan import MakeRows, ScanBuilder, empty_rows
+from .scans.sequence import Account, Arrival
+from .wire.native import SLOWER, wire
+from .wire.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
 
 MAX_SCANS = 4
 """Scans in one callback at most, or one more than were asked for. Many scans wait after a pause;

@@ -13,8 +13,8 @@ from ..config.skin import Skin
 from ..core.errors import ConfigError
 from ..core.rows import FrequencyRows
 from .chain import LiveLinks
-from .cube_table import CubeAddress
-from .link import LinkConfig
+from .links.link import LinkConfig
+from .scans.cube_table import CubeAddress
 
 QUEUE_S = 2.0
 """A consumer that is further behind loses the oldest rows."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ..bags.reprocess import AS_RECORDED, Overrides
+from ..bags.reprocess.job import AS_RECORDED, Overrides
 
 
 @dataclass(frozen=True)

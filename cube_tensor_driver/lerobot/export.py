@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..bags.read import Bag
-from ..bags.reprocess import reconstruct, settings_with
+from ..bags.reprocess.job import reconstruct, settings_with
 from ..bags.source import open_bag
 from ..config.skin import Skin
 from ..core.errors import BagError

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import BagError
-from ..elastic.surface import Contact
-from ..elastic.touches import TrackedContact
+from ..touch.surface import Contact
+from ..touch.tracker.touches import TrackedContact
 from .codec import SECOND
 from .types import CONTACTS, TRACTION
 

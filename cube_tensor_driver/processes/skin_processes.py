@@ -105,4 +105,4 @@ def skin_processes(
 
 
 def _node(name: str, parameters: dict[str, Value]) -> Process:
-    return Process(name, f"cube_tensor_driver.ros.{name}", parameters=dict(parameters))
+    return Process(name, f"cube_tensor_driver.ros.nodes.{name}", parameters=dict(parameters))

@@ -112,7 +112,7 @@ def record_skin(context: LaunchContext) -> list[Action]:
     A namespace, remaps and the parameter `qos_reliability` that the including launch file sets
     around the skin are applied here, because `ros2 bag` is no action of launch_ros.
     """
-    surroundings = context.launch_configurations
+    surroundings: dict[str, Any] = context.launch_configurations
     namespace = make_namespace_absolute(
         prefix_namespace(surroundings.get("ros_namespace", ""), _given(context, "namespace"))
     )

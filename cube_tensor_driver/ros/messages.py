@@ -17,8 +17,6 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, WrenchStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from cube_tensor_driver.msg import CubeInfo, SkinInfo, StressTensor, StressTensorStamped
-
 from ..config.calibration import calibration_text
 from ..config.skin import Skin
 from ..core.errors import BagError
@@ -26,6 +24,7 @@ from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
 from ..core.tensor import quaternion_from_rpy
 from ..messages.codec import SECOND
+from ..msg import CubeInfo, SkinInfo, StressTensor, StressTensorStamped
 
 
 def message_class(topic: str, msgtype: str) -> Any:

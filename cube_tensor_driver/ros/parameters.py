@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ..config.influence import influence_problem
 from ..config.port import port_problem
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
-from ..core.scene import QUANTITIES
+from ..views.scene import QUANTITIES
 
 
 class Parameter(NamedTuple):

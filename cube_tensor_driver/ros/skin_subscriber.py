@@ -14,13 +14,12 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from cube_tensor_driver.msg import SkinInfo, SkinStress
-
 from ..core.errors import CubeError, MessageError
 from ..core.newest import STALE_S, Newest
 from ..core.poses import CubePoses
 from ..messages.codec import stress_codec
 from ..messages.skin_info import cube_poses, geometry
+from ..msg import SkinInfo, SkinStress
 from .guard import CallbackGuard
 from .node import CubeNode
 from .parameters import Parameter

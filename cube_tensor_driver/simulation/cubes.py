@@ -14,7 +14,7 @@ from ..core.calibration import Calibration
 from ..core.errors import ConfigError
 from ..core.modes import COMPONENTS, to_matrix
 from ..core.oscillator import pad_frequency, stress_slope
-from ..device.protocol import NOT_MEASURED
+from ..device.wire.protocol import NOT_MEASURED
 from .imperfections import Imperfections, PadBehaviour
 from .sample_log import ABSENT
 

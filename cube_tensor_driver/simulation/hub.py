@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.decoder import PythonDecoder
-from ..device.protocol import (
+from ..device.wire.decoder import PythonDecoder
+from ..device.wire.protocol import (
     TEMPERATURE_UNKNOWN,
     VERSION,
     Ack,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.protocol import TEMPERATURE_UNKNOWN, VERSION
+from ..device.wire.protocol import TEMPERATURE_UNKNOWN, VERSION
 from .faults import FRAME_FAULTS, MOMENTARY_FAULTS, PAD_FAULTS, Fault, HubSize, check_target
 from .hub import SimulatedHub
 from .line import Line

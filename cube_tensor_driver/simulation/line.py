@@ -10,7 +10,7 @@ import tty
 from pathlib import Path
 
 from ..core.errors import ConfigError
-from ..device.tcp import parse_url
+from ..device.links.tcp import parse_url
 
 OUT_LIMIT = 1 << 16
 """Bytes that wait for the line at most: the hub drops and counts what it samples beyond."""

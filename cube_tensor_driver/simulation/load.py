@@ -16,7 +16,7 @@ from ..config.skin import Skin
 from ..core.errors import ConfigError
 from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
-from ..elastic import contact
+from ..mechanics import contact
 from .spline import CubicSpline
 
 Array = NDArray[np.float64]

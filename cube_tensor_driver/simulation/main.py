@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _load(skin: Skin, options: argparse.Namespace) -> AnyLoad:
     """What acts on the skin. CubeError: it cannot be used."""
     if options.mujoco:
-        from .mujoco_scene import MujocoLoad  # the elastic tables and MuJoCo take long to load
+        from .mujoco.scene import MujocoLoad
 
         return MujocoLoad(options.mujoco, skin)
     return Load(skin, read_script(options.load) if options.load else default_script())

@@ -6,8 +6,8 @@ from __future__ import annotations
 import struct
 import zlib
 
-from ..device import cobs
-from ..device.protocol import Sample, encode
+from ..device.wire import cobs
+from ..device.wire.protocol import Sample, encode
 
 _HEAD = 24
 """Bytes of a SAMPLE before its frequencies; the last one is spare and 0."""

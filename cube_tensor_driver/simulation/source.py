@@ -14,7 +14,7 @@ from ..config.load_script import read_script
 from ..config.skin import Skin
 from ..core.errors import ConfigError
 from ..core.rows import FrequencyRows
-from ..device.protocol import NOT_MEASURED
+from ..device.wire.protocol import NOT_MEASURED
 from .cubes import hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
 from .imperfections import Imperfections

@@ -1,7 +1,7 @@
 /* Windows and captures of a board without oscillators.
  *
  * What timers would capture comes over UART1: the hub asks for each window, and whoever plays the
- * oscillators (cube_tensor_driver/simulation/captures.py) answers with the edges that the counter
+ * oscillators (cube_tensor_hub/captures.py) answers with the edges that the counter
  * would have seen. On a board with pads, a file that reads its timers takes the place of this one.
  *
  *     question   number u32, middle of the window in us u64, CRC-32 u32

@@ -1,0 +1,4 @@
+"""Design of a cube: finite elements, studies of layouts, and the source paper's experiments.
+
+It computes what a driver needs (response matrices, influence functions), and runs without it.
+"""

@@ -1,0 +1,29 @@
+"""./cube paper: all pictures and numbers of docs/paper.md but those of the study."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cube_tensor_driver.cli.parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_output(
+        "--out",
+        kind="folder",
+        default=Path("paper"),
+        help="folder to write to (default: %(default)s)",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from cube_tensor_driver.views.terminal.output import progress_bar
+
+    from ..figures.paper import save_paper
+
+    with progress_bar() as report:
+        written = save_paper(options.out, report)
+    names = ", ".join(path.name for path in written)
+    print(f"wrote {names} into {options.out}")
+    return 0

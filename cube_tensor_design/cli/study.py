@@ -1,0 +1,36 @@
+"""./cube study: from which contact width on each layout can be trusted."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cube_tensor_driver.cli.parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_json()
+    parser.add_output(
+        "--figure",
+        kind="picture",
+        default=Path("study.png"),
+        help="picture to write (default: %(default)s)",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from cube_tensor_driver.config.output_files import write_json
+    from cube_tensor_driver.views.figures.style import save
+    from cube_tensor_driver.views.terminal.output import progress_bar
+
+    from ..figures.trust import draw_trust
+    from ..studies.layout_study import layout_study
+    from ..terminal.study import show_study
+
+    with progress_bar() as report:
+        result = layout_study(progress=report)
+    show_study(result)
+    save(draw_trust(result), options.figure)
+    if options.json is not None:
+        write_json(options.json, result.to_dict())
+    return 0

@@ -1,0 +1,1 @@
+"""Finite elements of one cube in its elastomer."""

@@ -1,0 +1,1 @@
+"""Pictures of finite elements and studies, drawn by matplotlib."""

@@ -1,0 +1,1 @@
+"""Studies: where each layout and each field can be trusted."""

@@ -1,0 +1,1 @@
+"""Stress and contacts computed again from the recorded frequencies of bags."""

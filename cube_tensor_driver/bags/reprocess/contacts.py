@@ -1,0 +1,96 @@
+"""Contacts and the surface's traction out of the stress of a bag: a sink beside its writer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import BagError
+from ...core.newest import STALE_S, Newest
+from ...core.rows import StressRows
+from ...messages.codec import Decoded
+from ...messages.contacts import contacts_message, traction_message
+from ...messages.skin_info import cube_calibrations, cube_poses, geometry
+from ...messages.types import CONTACTS, TRACTION
+from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
+from ..read import make_message, serialise
+from ..write import BagWriter, quality
+
+
+@dataclass(frozen=True)
+class ContactsOverTime:
+    """settings: how contacts are found; rate: messages per second at most."""
+
+    settings: ContactSettings
+    rate: float
+
+
+class ContactWriter:
+    """Writes `contacts` and `traction` of one skin into a bag, as the node publishes them.
+
+    Parameters: topics: what the skin's topics begin with.
+    """
+
+    def __init__(self, writer: BagWriter, topics: str, wanted: ContactsOverTime) -> None:
+        self._writer, self._wanted = writer, wanted
+        self._period_ns = 1e9 / wanted.rate
+        self._contacts, self._traction = f"{topics}contacts", f"{topics}traction"
+        writer.add_topic(self._contacts, CONTACTS, [quality()])
+        writer.add_topic(self._traction, TRACTION, [quality(depth=2)])
+        self._geometry: list[object] | None = None
+        self._finder: ContactFinder | None = None
+        self._frame_id = ""
+        self._last_ns: int | None = None
+
+    def set_up(self, info: Any) -> None:
+        """For the rows that follow. As in the node, contacts go on where cubes stay in place.
+
+        CubeError: no contacts can be computed on such a skin.
+        """
+        if self._geometry == geometry(info):
+            return
+        self._finder = contact_finder(
+            self._wanted.settings, cube_poses(info), cube_calibrations(info)
+        )
+        self._newest = Newest(len(info.cubes))
+        self._geometry, self._frame_id = geometry(info), info.header.frame_id
+
+    def write(
+        self, stress: StressRows, messages: Decoded[Any], recorded_ns: NDArray[np.int64]
+    ) -> None:
+        """What M messages of stress say, written when each of them was recorded."""
+        rows = len(stress) // len(messages)
+        begin = 0
+        for number, stamp_ns in enumerate(messages.stamp_ns.tolist()):
+            if not self._is_due(stamp_ns):
+                continue
+            end = (number + 1) * rows
+            self._newest.update(stress.select(slice(begin, end)), stamp_ns * 1e-9)
+            begin = end
+            self._write(stamp_ns, int(recorded_ns[number]))
+        if begin < len(stress):
+            last_ns = int(messages.stamp_ns[-1])
+            self._newest.update(stress.select(slice(begin, len(stress))), last_ns * 1e-9)
+
+    def _is_due(self, stamp_ns: int) -> bool:
+        """Whether a period has passed, or time fell back."""
+        last = self._last_ns
+        if last is not None and 0 <= stamp_ns - last < self._period_ns:
+            return False
+        self._last_ns = stamp_ns
+        return True
+
+    def _write(self, stamp_ns: int, recorded_ns: int) -> None:
+        if self._finder is None:
+            raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
+        values = self._newest.believed(self._newest.health(stamp_ns * 1e-9, STALE_S))
+        contacts = self._finder.update(values, self._newest.left_out)
+        message = contacts_message(make_message, stamp_ns, self._frame_id, contacts)
+        self._writer.write(self._contacts, recorded_ns, serialise(message))
+        cloud = self._finder.cloud(values)
+        if cloud is not None:
+            message = traction_message(make_message, stamp_ns, self._frame_id, cloud)
+            self._writer.write(self._traction, recorded_ns, serialise(message))

@@ -1,0 +1,1 @@
+"""The demo: a simulated skin in real processes, measured against what was sent."""

@@ -1,0 +1,1 @@
+"""The clock of a hub, mapped to the clock of the host."""

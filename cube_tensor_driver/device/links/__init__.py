@@ -1,0 +1,1 @@
+"""Serial ports and TCP connections: opened, read, and the conversation with the hub behind each."""

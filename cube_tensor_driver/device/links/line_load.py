@@ -1,0 +1,35 @@
+"""Whether the serial line of a link can carry what its cubes send."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ...config.port import TCP
+from ...config.skin import Skin
+from ..wire.protocol import sample_bytes
+
+BITS_PER_BYTE = 10
+"""On the line: a start bit, eight data bits, a stop bit."""
+WITHOUT_BAUD = (TCP, "/dev/ttyACM")
+"""What ports begin with that have no baud rate: TCP, and USB devices that are no serial adapter."""
+
+
+def line_doubts(skin: Skin) -> Iterator[str]:
+    """One line for each link whose cubes send more at the skin's rate than its baud rate allows.
+
+    Nothing is said of a skin that leaves the rate to the hubs.
+    """
+    if skin.rate is None:
+        return
+    for link in skin.links:
+        cubes = [cube for cube in skin.cubes if cube.link == link.name]
+        if not cubes or link.port.startswith(WITHOUT_BAUD):
+            continue
+        wanted = sample_bytes(len(cubes), cubes[0].calibration.layout.n_pads) * skin.rate
+        carried = link.baud / BITS_PER_BYTE
+        if wanted > carried:
+            yield (
+                f"links: {link.name!r}: {len(cubes)} of the cubes at {skin.rate:g} Hz send "
+                f"{wanted:.0f} bytes per second, {link.baud} baud carry {carried:.0f}: "
+                "raise baud, lower rate, or use more links"
+            )

@@ -1,0 +1,339 @@
+"""One thread that reads all links: it opens and reopens them, decodes, and calls back once per
+wake-up.
+
+No link waits for another: ports are read and TCP connections are made without blocking, and bytes
+that a link does not take stay in a bounded buffer of its own. What is said on a link is in
+`session.py`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import selectors
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+from ...core.errors import LinkError
+from ..wire.protocol import Command, Frame, Request, encode
+from .intake import take_in
+from .link import Link, LinkConfig, LinkState
+from .session import TICK_S, Session
+
+GATHER_PERIODS = 0.2
+GATHER_S = 1e-3
+"""Hubs sample together, but their bytes come one after the other. The reader waits for the other
+hubs for this part of the sample period, and at most for this time. So all come in one callback."""
+GATHER_STEP_S = 2e-4
+"""While it waits it looks at this interval, instead of waking up for each hub. Arrival times may be
+later than true by that."""
+NO_WAIT_S = 5e-5
+"""If waiting for data took less than this, data was there already."""
+DRAIN_S = 0.05
+"""How long closing waits for the last requests to leave the serial ports."""
+CLOSE_S = 1.5
+"""How long closing waits for the thread to end."""
+
+
+class LinkRead(NamedTuple):
+    """What one read of a link gave: index of the link, time of arrival in ns, frames or error."""
+
+    link: int
+    arrival_ns: int
+    result: list[Frame] | LinkError
+
+
+class LinkFrames(NamedTuple):
+    """Frames that one read of a link completed: index of the link, time of arrival in ns.
+
+    asked_ns: when the question was sent that a TIME among the frames answers
+    """
+
+    link: int
+    arrival_ns: int
+    frames: list[Frame]
+    asked_ns: int = 0
+
+
+OnFrames = Callable[[list[LinkFrames]], None]
+OnState = Callable[[int, LinkState, LinkError | None], None]
+
+_log = logging.getLogger(__name__)
+
+
+class Reader:
+    """Reads all links in one thread.
+
+    on_frames: called once per wake-up with a list of `LinkFrames`, in order of arrival per link.
+    on_state: called with (link index, LinkState, LinkError or None) when the state of a link, or
+    the reason why it waits, changes.
+    Both run in the reader's thread and must return soon. If they raise, the error is logged and the
+    reader goes on.
+    clock_ns: the clock of arrival times. It is read after the bytes, so that no arrival is earlier
+    than true.
+    period_us: sample period to set on every hub; None leaves the hub's own.
+    on_end: called last of all in the reader's thread, however it ends.
+
+    failure: the error that ended the thread; None while it runs and after `close`.
+    callback_errors: how often a callback raised.
+    """
+
+    def __init__(
+        self,
+        links: Sequence[LinkConfig],
+        on_frames: OnFrames,
+        on_state: OnState,
+        clock_ns: Callable[[], int] = time.time_ns,
+        period_us: int | None = None,
+        on_end: Callable[[], None] = lambda: None,
+    ) -> None:
+        """LinkError `bad_port`: a port that can never be opened."""
+        self.links = [Link(config) for config in links]
+        self.callback_errors = 0
+        self.failure: Exception | None = None
+        self._sessions = [
+            Session(link, period_us, clock_ns, partial(self._call, on_state, i))
+            for i, link in enumerate(self.links)
+        ]
+        self._selector = selectors.DefaultSelector()
+        self._on_frames = on_frames
+        self._on_end = on_end
+        self._clock_ns = clock_ns
+        self._requests: deque[tuple[int, Request]] = deque()
+        self._stopping = False
+        self._thread: threading.Thread | None = None
+        self._wake_lock = threading.Lock()
+        self._wake_write = -1
+
+    def start(self) -> None:
+        """Begin. LinkError `closed`: it was started before; a reader runs once."""
+        if self._thread is not None:
+            raise LinkError("a reader starts once: make a new Reader", "closed")
+        wake_read, self._wake_write = os.pipe()
+        os.set_blocking(wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._thread = threading.Thread(
+            target=self._run, args=(wake_read,), name="cube reader", daemon=True
+        )
+        self._thread.start()
+
+    def send(self, link: int, request: Request) -> None:
+        """Send a request, from any thread.
+
+        Start, stop and set period are remembered and sent again after each reopening, so they may
+        be given while the link is down. LinkError `closed`: any other request while it is down.
+        """
+        target = self.links[link]
+        remembered = request.request in (Command.START, Command.STOP, Command.SET_PERIOD)
+        if not remembered and not target.is_open:
+            raise LinkError(
+                f"link {target.config.name!r} is {target.state.value}: wait until it opens",
+                "closed",
+            )
+        self._requests.append((link, request))
+        self._wake()
+
+    def forget_questions(self) -> None:
+        """Deliver no answer to what was asked until now; to be called by `on_frames`."""
+        for session in self._sessions:
+            session.asked_ns = None
+
+    def close(self) -> None:
+        """Stop the hubs, close all links and end the thread, within CLOSE_S. Safe to call twice."""
+        self._stopping = True
+        self._wake()
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(CLOSE_S)
+            if thread.is_alive():
+                _log.error(
+                    "the reader did not end within %.1f s: a port hangs in the kernel", CLOSE_S
+                )
+
+    def _wake(self) -> None:
+        # The lock keeps a late send from writing to a number that the closed pipe has given back.
+        with self._wake_lock:
+            if self._wake_write >= 0:
+                with contextlib.suppress(BlockingIOError):
+                    os.write(self._wake_write, b"\0")
+
+    def _run(self, wake_read: int) -> None:
+        try:
+            self._selector.register(wake_read, selectors.EVENT_READ, None)
+            self._loop(wake_read)
+        except Exception as error:  # noqa: BLE001  (a thread that ends unseen would look like silent hubs)
+            self.failure = error
+            _log.exception("the thread that reads the links has ended")
+        finally:
+            try:
+                self._close_all(wake_read)
+            finally:
+                self._on_end()
+
+    def _loop(self, wake_read: int) -> None:
+        tick_at = 0.0
+        while not self._stopping:
+            now = time.monotonic()
+            ready = self._selector.select(max(0.0, tick_at - now))
+            awake_at = time.monotonic()
+            reads = self._read_ready(ready, wake_read)
+            # If data was there already, this thread is late and does not wait for more.
+            if reads and awake_at - now > NO_WAIT_S:
+                while time.monotonic() - awake_at < self._gather_time(reads):
+                    time.sleep(GATHER_STEP_S)
+                    reads += self._read_ready(self._selector.select(0), wake_read)
+            received, failed = self._handle_reads(reads)
+            if received:
+                self._call(self._on_frames, received)
+            # Only after its frames were delivered: they would make the link look alive again.
+            for i, error in failed.items():
+                self._drop(i, error)
+            if self._requests:
+                self._send_requests()
+            now = time.monotonic()
+            if now >= tick_at:
+                tick_at = now + TICK_S
+                for i in range(len(self.links)):
+                    self._tick(i, now)
+
+    def _read_ready(
+        self, ready: list[tuple[selectors.SelectorKey, int]], wake_read: int
+    ) -> list[LinkRead]:
+        """Read and decode all links that are ready, and send what waits to be sent."""
+        reads: list[LinkRead] = []
+        readable: list[int] = []
+        for key, events in ready:
+            if key.data is None:
+                os.read(wake_read, 4096)
+                continue
+            if events & selectors.EVENT_WRITE:
+                try:
+                    self.links[key.data].flush()
+                    self._watch(key.data)
+                except LinkError as error:
+                    reads.append(LinkRead(key.data, 0, error))
+                    continue
+            if events & selectors.EVENT_READ:
+                readable.append(key.data)
+        if readable:
+            links = [self.links[i] for i in readable]
+            arrival_ns, results = take_in(links, self._clock_ns)
+            for i, result in zip(readable, results, strict=True):
+                if result is not None:
+                    reads.append(LinkRead(i, arrival_ns, result))
+        return reads
+
+    def _handle_reads(self, reads: list[LinkRead]) -> tuple[list[LinkFrames], dict[int, LinkError]]:
+        """The frames to deliver, and the links to close, each with the reason.
+
+        All reads of a wake-up are handled in one go, because after each wait Python's code and data
+        have left the processor's caches.
+        """
+        received: list[LinkFrames] = []
+        failed: dict[int, LinkError] = {}
+        now = time.monotonic()
+        for i, arrival_ns, result in reads:
+            if i in failed:
+                continue
+            if isinstance(result, LinkError):
+                failed[i] = result
+                continue
+            frames: list[Frame] = []
+            session = self._sessions[i]
+            session.last_byte = now
+            asked_ns = session.asked_ns or 0
+            try:
+                for frame in result:
+                    if session.take(frame):
+                        frames.append(frame)
+                if session.link.unsent:
+                    self._watch(i)
+            except LinkError as error:
+                failed[i] = error
+            if frames:
+                received.append(LinkFrames(i, arrival_ns, frames, asked_ns))
+        return received, failed
+
+    def _gather_time(self, reads: list[LinkRead]) -> float:
+        """How long to wait for links that deliver but have not come yet, s."""
+        came = {i for i, _, result in reads if isinstance(result, list) and result}
+        if len(came) in (0, len(self.links)):
+            return 0.0
+        periods_us = [
+            session.actual_us
+            for i, session in enumerate(self._sessions)
+            if i not in came and session.is_delivering
+        ]
+        if not periods_us:
+            return 0.0
+        return min(GATHER_PERIODS * 1e-6 * min(periods_us), GATHER_S)
+
+    def _send_requests(self) -> None:
+        while self._requests:
+            i, request = self._requests.popleft()
+            try:
+                self._sessions[i].send(request)
+                self._watch(i)
+            except LinkError as error:
+                self._drop(i, error)
+
+    def _tick(self, i: int, now: float) -> None:
+        """Look at the timers of one link."""
+        session = self._sessions[i]
+        try:
+            if session.link.is_open:
+                session.look(now)
+            elif session.open(now):
+                self._selector.register(session.link, selectors.EVENT_READ, i)
+                session.begin()
+            self._watch(i)
+        except LinkError as error:
+            self._drop(i, error)
+
+    def _drop(self, i: int, error: LinkError) -> None:
+        """Close a link that failed; it is tried again later."""
+        link = self.links[i]
+        if link.is_open:
+            link.lost += 1
+            self._selector.unregister(link)
+        self._sessions[i].close(error)
+
+    def _watch(self, i: int) -> None:
+        """Wake up for writing only while bytes wait to be sent."""
+        link = self.links[i]
+        if not link.is_open:
+            return
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if link.unsent else 0)
+        if self._selector.get_key(link).events != events:
+            self._selector.modify(link, events, i)
+
+    def _call(self, callback: Callable[..., None], *arguments: object) -> None:
+        try:
+            callback(*arguments)
+        except Exception:  # noqa: BLE001  (whatever a callback raises, the links go on)
+            self.callback_errors += 1
+            # Not all of them: at 1 kHz they would fill the log.
+            if self.callback_errors in (1, 10, 100, 1000, 10_000):
+                _log.exception("callback failed (%d so far); reading goes on", self.callback_errors)
+
+    def _close_all(self, wake_read: int) -> None:
+        for link in self.links:
+            if link.is_open:
+                with contextlib.suppress(LinkError):
+                    link.write(encode(Request(Command.STOP)))
+        until = time.monotonic() + DRAIN_S
+        while any(link.draining() for link in self.links) and time.monotonic() < until:
+            time.sleep(0.002)
+        for session in self._sessions:
+            session.link.close()
+            session.set_state(LinkState.CLOSED)
+        self._selector.close()
+        with self._wake_lock:
+            os.close(wake_read)
+            os.close(self._wake_write)
+            self._wake_write = -1

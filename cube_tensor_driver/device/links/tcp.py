@@ -1,0 +1,127 @@
+"""Makes a TCP connection without ever blocking the caller.
+
+The ``socket://`` of pyserial blocks for up to 5 s while it looks up the name and connects. That
+would hold up all other links of the reader's thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import threading
+import time
+from typing import Any
+
+from ...config.port import port_problem, tcp_address
+from ...core.errors import LinkError
+
+CONNECT_TIMEOUT_S = 2.0
+"""For each address of the host. A host that is switched off does not answer at all."""
+
+
+def parse_url(url: str) -> tuple[str, int]:
+    """Host and port of ``socket://host:port``, IPv6 hosts in brackets. LinkError `bad_port`."""
+    address = tcp_address(url)
+    if address is None:
+        raise LinkError(port_problem(url), "bad_port")
+    return address
+
+
+class Connecting:
+    """One attempt to connect; call `poll` until it gives the socket.
+
+    A name is looked up in a thread of its own, because the system's resolver can block for half a
+    minute and cannot be cancelled. Numeric hosts need no thread.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._host, self._port = parse_url(url)
+        self._addresses: list[Any] | None = None
+        self._socket: socket.socket | None = None
+        self._deadline = 0.0
+        self._error: LinkError | None = None
+        try:
+            self._addresses = self._look_up(socket.AI_NUMERICHOST)
+        except socket.gaierror:
+            threading.Thread(
+                target=self._resolve, name=f"resolve {self._host}", daemon=True
+            ).start()
+
+    def poll(self) -> socket.socket | None:
+        """The connected, non-blocking socket; None while the attempt is under way.
+
+        LinkError: no address answers.
+        """
+        if self._addresses is None:
+            if self._error:
+                raise self._error
+            return None
+        while True:
+            if self._socket is None:
+                if not self._addresses:
+                    raise self._error or LinkError(
+                        f"{self._url}: {self._host} has no address", "unresolved"
+                    )
+                self._start(self._addresses.pop(0))
+            if self._socket is not None:
+                code = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+                if code:
+                    self._fail(code)
+                elif self._connected():
+                    connected, self._socket = self._socket, None
+                    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    return connected
+                elif time.monotonic() > self._deadline:
+                    self._fail(errno.ETIMEDOUT)
+                else:
+                    return None
+
+    def close(self) -> None:
+        """Give up. Safe to call twice."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _look_up(self, flags: int) -> list[Any]:
+        return list(
+            socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=flags)
+        )
+
+    def _resolve(self) -> None:
+        try:
+            self._addresses = self._look_up(0)
+        except (OSError, UnicodeError) as error:
+            self._error = LinkError(
+                f"{self._url}: cannot find the host {self._host!r} ({error}): "
+                "correct the name, use its number, or check the network",
+                "unresolved",
+            )
+
+    def _start(self, address: Any) -> None:
+        family, kind, protocol, _, target = address
+        try:
+            self._socket = socket.socket(family, kind | socket.SOCK_NONBLOCK, protocol)
+            self._deadline = time.monotonic() + CONNECT_TIMEOUT_S
+            code = self._socket.connect_ex(target)
+        except OSError as error:
+            code = error.errno or errno.EIO
+        if code not in (0, errno.EINPROGRESS):
+            self._fail(code)
+
+    def _connected(self) -> bool:
+        with contextlib.suppress(OSError):
+            return self._socket is not None and bool(self._socket.getpeername())
+        return False
+
+    def _fail(self, code: int) -> None:
+        self.close()
+        if code == errno.ECONNREFUSED:
+            kind, fix = "refused", "start the bridge there or correct the port"
+        elif code == errno.ETIMEDOUT:
+            kind, fix = "no_answer", "switch the bridge on, or check the address and the network"
+        else:
+            kind, fix = "unreachable", "check the address and the network"
+        self._error = LinkError(f"{self._url}: {os.strerror(code)}: {fix}", kind)

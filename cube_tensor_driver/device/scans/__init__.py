@@ -1,0 +1,1 @@
+"""Samples of all links, counted and put together into scans."""

@@ -1,0 +1,1 @@
+"""The wire protocol: bytes to frames and frames to bytes. No I/O and no clock."""

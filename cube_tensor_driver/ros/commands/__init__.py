@@ -1,0 +1,1 @@
+"""What commands do in the ROS graph: record, replay, listen, tare, list topics, set parameters."""

@@ -1,0 +1,64 @@
+"""Diagnostics of the driver: of all rows, and of each link."""
+
+from __future__ import annotations
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from ...device.chain import LinkReport, LiveLinks
+from ...device.links.link import LinkState
+from ...device.scans.row_account import RowCounts
+from .updater import make_status
+
+LEVELS = {
+    LinkState.OPEN: DiagnosticStatus.OK,
+    LinkState.WAITING: DiagnosticStatus.ERROR,
+    LinkState.SILENT: DiagnosticStatus.STALE,
+    LinkState.CLOSED: DiagnosticStatus.WARN,
+}
+
+
+class LinkStatuses:
+    """Makes the driver's diagnostics, once a second."""
+
+    def __init__(self, skin_name: str) -> None:
+        self._skin_name = skin_name
+        self._before = RowCounts()
+
+    def __call__(self, links: LiveLinks, with_links: bool) -> list[DiagnosticStatus]:
+        """The status of all rows, and of each link if with_links."""
+        counts = links.row_counts()
+        statuses = [_rows_status(self._skin_name, counts, self._before)]
+        self._before = counts
+        if with_links:
+            statuses += [_link_status(report) for report in links.report()]
+        return statuses
+
+
+def _rows_status(skin_name: str, counts: RowCounts, before: RowCounts) -> DiagnosticStatus:
+    level, text = DiagnosticStatus.OK, ""
+    if counts.unaccounted:
+        level = DiagnosticStatus.ERROR
+        text = f"{counts.unaccounted} rows are lost in the driver: please report it"
+    elif counts.lost > before.lost:
+        level = DiagnosticStatus.ERROR
+        text = f"{counts.lost - before.lost} rows lost by an error: {counts.lost_reason}"
+    values = {
+        "rows published": counts.delivered,
+        "rows per second": counts.delivered - before.delivered,
+        "rows of unknown cubes": counts.unknown_cube,
+        "rows with another number of pads": counts.wrong_pads,
+        "rows that came twice": counts.duplicate,
+        "rows lost by errors": counts.lost,
+        "rows unaccounted": counts.unaccounted,
+    }
+    return make_status("rows", skin_name, level, text, values)
+
+
+def _link_status(report: LinkReport) -> DiagnosticStatus:
+    """How one link is doing. The level is that of its worst state since the last report."""
+    levels = [LEVELS[state] for state in (report.state, *report.past_states)]
+    if report.notes:
+        levels.append(DiagnosticStatus.WARN)
+    uid = "" if report.hub_uid is None else f"{report.hub_uid:#x}"
+    text = "; ".join(report.notes) or report.state.value
+    return make_status(f"link {report.name}", uid, max(levels), text, report.values)

@@ -1,0 +1,1 @@
+"""Shapes for RViz and Foxglove, which the node `markers` publishes."""

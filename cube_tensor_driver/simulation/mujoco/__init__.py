@@ -1,0 +1,1 @@
+"""Skins on bodies of a MuJoCo model."""

@@ -1,1 +1,0 @@
-"""Whole skins in real processes, measured against what was sent: demo, torture, bench."""

@@ -1,0 +1,1 @@
+"""Pictures as files. A function takes results and returns a figure of matplotlib."""

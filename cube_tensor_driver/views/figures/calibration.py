@@ -1,0 +1,113 @@
+"""Pictures of a cube's pads and of the fit of its calibration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
+
+from ...calibrate.fit import Fit
+from ...core.layout import Layout
+from .style import MARKERS, print_style
+
+_VIEW = np.array([0.75, -1.0, 0.75])
+"""Direction from the cube to the viewer."""
+_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+
+
+@print_style()
+def draw_layout(layout: Layout) -> Figure:
+    """The cube with its pads: those towards the viewer filled, those behind as an outline."""
+    figure = Figure(figsize=(5, 4.6))
+    axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
+    _draw_edges(axes)
+    for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):
+        _draw_pad(axes, name, centre, normal, layout.pad_size)
+    elevation = np.degrees(np.arctan2(_VIEW[2], np.hypot(*_VIEW[:2])))
+    azimuth = np.degrees(np.arctan2(_VIEW[1], _VIEW[0]))
+    axes.view_init(elev=elevation, azim=azimuth)
+    axes.set(
+        xlabel="$x$ / $d_0$",
+        ylabel="$y$ / $d_0$",
+        zlabel="$z$ / $d_0$ (out of the skin)",
+        title=f"layout {layout.name} ($d_0$: half side; dashed: pads behind)",
+    )
+    axes.set_box_aspect((1, 1, 1))
+    for set_ticks in (axes.set_xticks, axes.set_yticks, axes.set_zticks):
+        set_ticks([-1, 0, 1])
+    return figure
+
+
+def _draw_edges(axes: Any) -> None:
+    """The edges of the cube; those that end in its hidden corner are dotted."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    hidden = -np.sign(_VIEW)
+    for i, a in enumerate(corners):
+        for b in corners[i + 1 :]:
+            if np.count_nonzero(a != b) != 1:
+                continue
+            behind = np.array_equal(a, hidden) or np.array_equal(b, hidden)
+            color, dash = ("0.6", ":") if behind else ("0.2", "-")
+            axes.plot(*np.stack([a, b], axis=1), color=color, ls=dash, lw=1)
+
+
+def _draw_pad(
+    axes: Any, name: str, centre: NDArray[np.float64], normal: NDArray[np.float64], size: float
+) -> None:
+    u, w = np.eye(3)[np.flatnonzero(normal == 0)] * size / 2
+    outline = np.array([centre + a * u + b * w for a, b in _SQUARE])
+    front = normal @ _VIEW > 0
+    color, dash, order = ("C0", "-", 3) if front else ("0.55", "--", 1)
+    axes.plot(*outline.T, color=color, lw=1.2, ls=dash, zorder=order)
+    if front:
+        axes.add_collection3d(Poly3DCollection([outline], facecolor="C0", alpha=0.25, zorder=2))
+    axes.text(
+        *(centre + 0.02 * normal),
+        name,
+        ha="center",
+        va="center",
+        fontsize=7,
+        color="black" if front else "0.45",
+        zorder=4,
+    )
+
+
+@print_style()
+def draw_fit(fit: Fit, measured: NDArray[np.float64]) -> Figure:
+    """Measured over fitted pad stresses, and their differences; outliers are crossed.
+
+    measured: (N, P) Pa, the readings that were fitted
+    """
+    figure = Figure(figsize=(8, 4))
+    left, right = figure.subplots(1, 2)
+    pads = fit.structure.layout.pads
+    for pad, name in enumerate(pads):
+        keep = ~fit.outliers[:, pad]
+        x, y = fit.fitted[keep, pad] * 1e-3, measured[keep, pad] * 1e-3
+        style: dict[str, Any] = {
+            "marker": MARKERS[pad % len(MARKERS)],
+            "color": str(0.7 * pad / max(1, len(pads) - 1)),
+            "ls": "",
+            "ms": 4,
+            "mfc": "none",
+        }
+        left.plot(x, y, label=name, **style)
+        right.plot(x, (y - x) * 1e3, **style)
+    out = fit.outliers
+    if out.any():
+        fitted, read = fit.fitted[out] * 1e-3, measured[out] * 1e-3
+        left.plot(fitted, read, "x", color="C3", ms=7, label="outlier")
+    ends = np.array([np.nanmin(fit.fitted), np.nanmax(fit.fitted)]) * 1e-3
+    left.plot(ends, ends, color="0.5", lw=0.8, zorder=0)
+    left.set(xlabel="fitted pad stress / kPa", ylabel="measured pad stress / kPa")
+    left.legend(fontsize=7, ncol=2 if len(pads) <= 12 else 3)
+    right.axhline(0, color="0.5", lw=0.8)
+    right.set(xlabel="fitted pad stress / kPa", ylabel="measured − fitted / Pa")
+    right.set_title(
+        f"scatter {fit.scale:.2f} × stated noise, held-out error {100 * fit.held_out:.2g} %",
+        fontsize=9,
+    )
+    return figure

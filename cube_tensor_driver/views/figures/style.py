@@ -1,0 +1,116 @@
+"""How every picture looks: for print, readable in grey, with no display needed.
+
+matplotlib's global settings stay as they are. A drawing function has the decorator
+`@print_style()`, makes a `Figure` of its own and returns it; `save` writes it.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+
+from ...config.atomic_write import atomic_write
+from ...core.errors import ConfigError
+
+SETTINGS: Any = {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.color": "0.85",
+    "grid.linewidth": 0.5,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 200,
+}
+MARKERS = "osD^v<>pP*hX"
+
+SIGNED_COLOURS = "cividis"
+"""Colour map of signed values. Its lightness grows all the way, unlike that of red to blue."""
+
+# The same colour never comes with the same marker and dashes: curves differ in grey, too.
+_CURVE_COLOURS = (
+    "black",
+    "tab:red",
+    "tab:blue",
+    "tab:orange",
+    "tab:green",
+    "tab:purple",
+    "tab:brown",
+    "0.5",
+)
+_CURVE_MARKERS = "os^Dv<>p"
+_CURVE_DASHES = ("-", "--", "-.", ":")
+
+
+@contextmanager
+def print_style() -> Iterator[None]:
+    """matplotlib's settings for a picture, as a context or as a decorator."""
+    with matplotlib.rc_context(SETTINGS):
+        yield
+
+
+def symbol(component: str) -> str:
+    """A component or mode in mathematical type: zz, zz_x for its derivative along x, xy_y-zx_z."""
+    if "-" in component:
+        return " − ".join(symbol(part) for part in component.split("-"))
+    stress, _, direction = component.partition("_")
+    if not direction:
+        return rf"$\sigma_{{{stress}}}$"
+    return rf"$\partial\sigma_{{{stress}}}/\partial {direction}$"
+
+
+def curve_style(number: int) -> dict[str, Any]:
+    """Colour, marker and dashes of a panel's curve of this number."""
+    count = len(_CURVE_COLOURS)
+    dashes = (number + number // count) % len(_CURVE_DASHES)
+    return {
+        "color": _CURVE_COLOURS[number % count],
+        "marker": _CURVE_MARKERS[number % count],
+        "linestyle": _CURVE_DASHES[dashes],
+        "markersize": 4,
+        "markerfacecolor": "none",
+        "linewidth": 1.2,
+    }
+
+
+@print_style()
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure, completely or not at all. The suffix tells the format, none means PNG.
+
+    Raises ConfigError when the format is unknown or the file cannot be written.
+    """
+    check_picture(path)
+    with atomic_write(path) as partial:
+        figure.savefig(partial, format=path.suffix[1:] or "png")
+
+
+@print_style()
+def png(figure: Figure) -> bytes:
+    """A figure as the content of a PNG file."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()
+
+
+def png_of_pixels(pixels: NDArray[np.uint8]) -> bytes:
+    """Pixels (rows, columns, 4) as the content of a PNG file."""
+    content = io.BytesIO()
+    imsave(content, pixels, format="png")
+    return content.getvalue()
+
+
+def check_picture(path: Path) -> None:
+    """Raise ConfigError when the suffix is no picture format that matplotlib can write."""
+    formats = FigureCanvasAgg.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in formats:
+        raise ConfigError(
+            f"{path}: {path.suffix!r} is no format of a picture; take one of {', '.join(formats)}"
+        )

@@ -1,0 +1,1 @@
+"""What commands show in a terminal: tables of results, progress, the live table of a skin."""

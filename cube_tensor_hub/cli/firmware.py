@@ -1,0 +1,98 @@
+"""./cube firmware build, run, test: hubs in C."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cube_tensor_driver.cli import ROOT
+from cube_tensor_driver.cli.parser import Parser
+
+if TYPE_CHECKING:
+    from cube_tensor_driver.config.skin import Skin
+    from cube_tensor_driver.simulation.cubes import HubCubes
+
+OUT = ROOT / ".cube" / "firmware"
+SOURCE = ROOT / "firmware"
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_subcommand("build", "compile the hubs in C, and print how large one is")
+    run = parser.add_subcommand("run", "run the hub of a microcontroller in QEMU, under a load")
+    run.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="skin file of 4 cubes of 8 pads on one TCP link, at whose port the hub appears "
+        "(default: skin_firmware.yaml of the package)",
+    )
+    run.add_argument(
+        "--load", type=Path, metavar="FILE", help="load script (default: an indenter that wanders)"
+    )
+    parser.add_subcommand("test", "run the tests of the firmware")
+
+
+def run(options: argparse.Namespace) -> int:
+    return {"build": build_all, "run": run_emulated, "test": run_tests}[options.what](options)
+
+
+def build_all(options: argparse.Namespace) -> int:
+    """FirmwareError: a compiler is not there; what is before it is built."""
+    from ..firmware import build
+
+    build(SOURCE, OUT, "posix")
+    print(f"{OUT / 'cube_hub'}: hubs as a process of this machine")
+    said = build(SOURCE, OUT, "an386")
+    print(f"{OUT / 'hub.elf'}: a hub of 4 cubes of 8 pads for MPS2-AN386")
+    print(said.splitlines()[-1])
+    return 0
+
+
+def run_emulated(options: argparse.Namespace) -> int:
+    """Until Ctrl-C."""
+    from cube_tensor_driver.config.load_script import read_script
+    from cube_tensor_driver.device.links.tcp import parse_url
+    from cube_tensor_driver.simulation.load import Load, default_script
+
+    from ..captures import Oscillators
+    from ..firmware import Emulator, build, need
+
+    need("the emulated hub", "make", "arm-none-eabi-gcc", "qemu-system-arm")
+    skin, hub = skin_of_hub(options.config)
+    script = default_script() if options.load is None else read_script(options.load)
+    build(SOURCE, OUT, "an386")
+    pads = Oscillators(hub, Load(skin, script))
+    with Emulator(OUT / "hub.elf", parse_url(hub.link.port)) as emulator:
+        print(f"the hub is at {emulator.port}, under a load; Ctrl-C ends it", flush=True)
+        server = threading.Thread(target=pads.serve, args=(emulator.pads,), daemon=True)
+        server.start()
+        server.join()
+        emulator.check()
+    return 0
+
+
+def skin_of_hub(path: Path | None) -> tuple[Skin, HubCubes]:
+    """The skin whose pads the emulated hub reads, and its cubes. CubeError: they do not fit."""
+    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.skin import read_skin
+    from cube_tensor_driver.core.errors import ConfigError
+    from cube_tensor_driver.simulation.cubes import hub_cubes
+
+    skin = read_skin(path or package_data() / "config" / "skin_firmware.yaml")
+    hubs = hub_cubes(skin)
+    sizes = [(len(hub.members), hub.cubes.n_pads) for hub in hubs]
+    if sizes != [(4, 8)]:
+        raise ConfigError(
+            f"{path}: hubs with (cubes, pads) {sizes}; the emulated hub has 4 cubes of 8 pads"
+        )
+    return skin, hubs[0]
+
+
+def run_tests(options: argparse.Namespace) -> int:
+    """Run the tests of the firmware; the exit code is that of pytest."""
+    command = [sys.executable, "-m", "pytest", "test/hub/test_firmware.py", "-rs"]
+    return subprocess.run(command, cwd=ROOT, check=False).returncode

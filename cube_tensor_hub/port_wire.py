@@ -1,0 +1,69 @@
+"""A hub on a port of this machine, or on TCP."""
+
+from __future__ import annotations
+
+import select
+import time
+
+from cube_tensor_driver.config.port import TCP
+from cube_tensor_driver.core.errors import LinkError
+from cube_tensor_driver.device.links.link import Link, LinkConfig
+
+TRY_AGAIN_S = 0.01
+BACK_S = 5.0
+"""A board on USB that restarts when its port is opened is away for some seconds."""
+
+
+class PortWire:
+    """The `Wire` of a `Link`. A context manager: the port is open inside.
+
+    LinkError, also on entering: the port cannot be opened, or was lost.
+    """
+
+    def __init__(self, port: str, baud: int) -> None:
+        self._link = Link(LinkConfig("hub", port, baud))
+        self.port = port
+        self.is_tcp = port.startswith(TCP)
+
+    def __enter__(self) -> PortWire:
+        self._open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._link.close()
+
+    def now(self) -> float:
+        return time.monotonic()
+
+    def send(self, data: bytes) -> None:
+        self._link.write(data)
+
+    def listen(self, seconds: float) -> bytes:
+        until = self.now() + seconds
+        while (left := until - self.now()) > 0:
+            waiting = [self._link.fileno()] if self._link.unsent else []
+            readable, writable, _ = select.select([self._link.fileno()], waiting, [], left)
+            if writable:
+                self._link.flush()
+            if readable:
+                return self._link.read()
+        return b""
+
+    def ignore(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    def reopen(self, seconds: float) -> None:
+        self._link.close()
+        time.sleep(seconds)
+        until = self.now() + BACK_S
+        while not self._link.is_open:
+            try:
+                self._open()
+            except LinkError:
+                if self.now() > until:
+                    raise
+                time.sleep(TRY_AGAIN_S)
+
+    def _open(self) -> None:
+        while not self._link.open():
+            time.sleep(TRY_AGAIN_S)

@@ -1,0 +1,81 @@
+"""Rules of frames: F1 to F5."""
+
+from __future__ import annotations
+
+from cube_tensor_driver.device.wire.protocol import Hello, Request, Sample
+
+from ..conversation import AFTER_DAMAGE, AFTER_WRONG_WAY, DAMAGED
+from ..transcript import Transcript
+from ..verdict import ANY_FRAME, Verdict, failed, not_tried, passed, rule
+
+OVERFULL = ("unread", "gone")
+"""Steps in which S9 judges what is damaged."""
+
+
+@rule("F1", "A sender puts a zero before and behind each frame.", needs=(ANY_FRAME,))
+def zeros_around(talk: Transcript) -> Verdict:
+    opened = [heard.opened for heard in talk.heard() if heard.opened is not None]
+    if not opened:
+        return not_tried("no two frames came one behind the other")
+    missing = opened.count(False)
+    if missing:
+        return failed(f"{missing} of {len(opened)} frames have no zero of their own before them")
+    return passed(f"all of {len(opened)} frames")
+
+
+@rule(
+    "F2",
+    "A receiver counts each run that is no frame, as above, and continues with the next. It never "
+    "answers it",
+    needs=(ANY_FRAME,),
+)
+def goes_on_behind_damage(talk: Transcript) -> Verdict:
+    step = talk.steps["damaged"]
+    answered = [DAMAGED[ack.request] for ack in step.acks if ack.request in DAMAGED]
+    if answered:
+        return failed(f"the hub answered a request {answered[0]}")
+    if step.ack(AFTER_DAMAGE) is None:
+        return failed("no answer to a sound request behind noise and damaged requests")
+    return passed(f"no answer to noise and to a request {', '.join(DAMAGED.values())}")
+
+
+@rule("F3", "A frame that goes the wrong way, or that nobody waits for, is ignored.", (ANY_FRAME,))
+def ignores_the_wrong_way(talk: Transcript) -> Verdict:
+    step = talk.steps["wrong way"]
+    if step.ack(AFTER_WRONG_WAY) is None:
+        return failed("no answer to a request behind frames that only hubs send")
+    if len(step.acks) > 1:
+        others = [ack for ack in step.acks if ack.request != AFTER_WRONG_WAY]
+        return failed(f"the hub answered a frame that only hubs send: {(others or step.acks)[0]}")
+    return passed("HELLO, SAMPLE, STATS, TIME and ACK are not answered")
+
+
+@rule("F4", "Flags and spare bytes are sent as 0", needs=(ANY_FRAME,))
+def flags_are_0(talk: Transcript) -> Verdict:
+    flags = [hello.flags for hello in talk.frames(Hello) if hello.flags]
+    if flags:
+        return failed(f"flags of HELLO are 0x{flags[0]:02x}")
+    spare = [sample.spare for sample in talk.frames(Sample) if any(sample.spare)]
+    if spare:
+        return failed(f"spare bytes of SAMPLE are {spare[0].hex(' ')}")
+    return passed("flags of HELLO and spare bytes of SAMPLE are 0")
+
+
+@rule(
+    "F5",
+    "Each run of bytes between two zeros of a sender is a frame of this page that goes its way.",
+)
+def nothing_but_frames(talk: Transcript) -> Verdict:
+    steps = [step for step in talk.steps.values() if step.name not in OVERFULL]
+    damaged = sum(step.damaged for step in steps)
+    if damaged:
+        kinds = ", ".join(f"{name} {count}" for name, count in talk.damage.items())
+        other = "" if talk.other_version is None else f"; version {talk.other_version}"
+        return failed(f"{damaged} runs of bytes are no frame ({kinds}{other})")
+    wrong_way = [heard for step in steps for heard in step.heard if type(heard.frame) is Request]
+    if wrong_way:
+        return failed(f"the hub sent {len(wrong_way)} frames of type REQUEST")
+    frames = sum(len(step.heard) for step in steps)
+    if not frames:
+        return not_tried("nothing came")
+    return passed(f"all of {frames} runs")

@@ -1,0 +1,116 @@
+"""Rules of HELLO: H1 to H5."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+from statistics import mode
+
+from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample
+
+from ..transcript import Heard, Step, Transcript
+from ..verdict import Verdict, failed, not_tried, passed, rule
+
+BEHIND_S = 0.3
+"""A HELLO that comes later is that of the second."""
+
+
+def once_a_second(heard: list[Heard], name: str, what: str) -> str:
+    """What is wrong with frames that should come once a second, "" if nothing is."""
+    if len(heard) < 3:
+        return f"{len(heard)} {name} {what} in a time in which 3 were due"
+    gaps = [after.at_s - before.at_s for before, after in pairwise(heard)]
+    mean = sum(gaps) / len(gaps)
+    if not 0.9 < mean < 1.1 or max(gaps) > 1.6:
+        return f"{name} {what} every {mean:.2f} s, at most {max(gaps):.2f} s apart"
+    return ""
+
+
+def frames_per_sample(talk: Transcript) -> int:
+    """Of how many frames most samples are."""
+    frames = Counter(sample.sequence for sample in talk.frames(Sample))
+    return mode(frames.values())
+
+
+def of_kind(talk: Transcript, kind: type, *names: str) -> list[Heard]:
+    return [heard for heard in talk.heard(*names) if isinstance(heard.frame, kind)]
+
+
+def hello_is_behind_ack(step: Step) -> bool:
+    """Also if there was no ACK of request 1, which R1 judges."""
+    acks_s = [
+        heard.at_s
+        for heard in step.heard
+        if isinstance(heard.frame, Ack) and heard.frame.request == Command.HELLO
+    ]
+    hellos_s = [heard.at_s for heard in step.heard if isinstance(heard.frame, Hello)]
+    return not acks_s or any(0 <= hello_s - acks_s[0] < BEHIND_S for hello_s in hellos_s)
+
+
+@rule(
+    "H1",
+    "A hub sends HELLO after power-up, behind the ACK of request 1, and once a second.",
+)
+def hello_comes(talk: Transcript) -> Verdict:
+    if not talk.first_bytes and not talk.is_tcp:
+        return not_tried("nothing came: see L2")
+    if not any(talk.heard()):
+        return failed("no HELLO came, and no other frame")
+    if not all(map(hello_is_behind_ack, talk.steps.values())):
+        return failed(f"no HELLO within {BEHIND_S:g} s behind the ACK of request 1")
+    for name, what in (("quiet", "while stopped"), ("start", "while started")):
+        wrong = once_a_second(of_kind(talk, Hello, name), "HELLO", what)
+        if wrong:
+            return failed(wrong)
+    return passed("behind the ACK of request 1, and once a second, stopped and started")
+
+
+@rule("H2", "All other uids of a hub differ", needs=(Hello,))
+def uids_differ(talk: Transcript) -> Verdict:
+    hellos = talk.frames(Hello)
+    hubs = list(dict.fromkeys(hello.hub_uid for hello in hellos))
+    if len(hubs) > 1:
+        return failed(f"the hub's uid changed from 0x{hubs[0]:x} to 0x{hubs[1]:x}")
+    uids = [uid for uid in hellos[-1].cube_uids.tolist() if uid]
+    twice = [uid for uid in set(uids) if uids.count(uid) > 1]
+    if twice:
+        places = [at for at, uid in enumerate(hellos[-1].cube_uids.tolist()) if uid == twice[0]]
+        return failed(f"cubes {' and '.join(map(str, places))} both have uid 0x{twice[0]:x}")
+    without = hellos[-1].n_cubes - len(uids)
+    text = f"hub 0x{hubs[0]:x}, {len(uids)} cubes with different uids"
+    return passed(text + (f", {without} without one" if without else ""))
+
+
+@rule("H3", "A hub has 1 to 32 pads per cube", needs=(Hello,))
+def pads_fit_the_mask(talk: Transcript) -> Verdict:
+    for hello in talk.frames(Hello):
+        if hello.n_cubes and not 1 <= hello.n_pads <= 32:
+            return failed(f"HELLO says {hello.n_pads} pads per cube")
+    return passed(f"{hello.n_cubes} cubes of {hello.n_pads} pads")
+
+
+@rule(
+    "H4",
+    "Cubes, pads and their order may change between two HELLOs, not between a HELLO and a SAMPLE "
+    "behind it.",
+    needs=(Hello, Sample),
+)
+def cubes_stay(talk: Transcript) -> Verdict:
+    """Cubes beyond those of HELLO, and pads, are S5's."""
+    frames = frames_per_sample(talk)
+    hello, last = 0, None
+    for heard in talk.heard(*talk.first_visit):
+        if isinstance(heard.frame, Hello):
+            if heard.frame.n_cubes != hello:
+                hello, last = heard.frame.n_cubes, None
+        elif isinstance(heard.frame, Sample) and frames == 1:
+            cubes = heard.frame.n_cubes
+            if last is not None and cubes != last:
+                return failed(f"samples had {last} cubes, then {cubes}, and no HELLO said so")
+            last = cubes
+    return passed("the cubes of the samples are the same from HELLO to HELLO")
+
+
+@rule("H5", "The pads of a cube are in the order of its layout")
+def order_of_pads(talk: Transcript) -> Verdict:
+    return not_tried("bytes do not show it: press on one pad after the other, docs/build.md")

@@ -1,0 +1,279 @@
+"""Rules of SAMPLE and STATS: S1 to S9.
+
+Samples are counted until the port is closed: what the host's kernel holds then is lost.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import groupby, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cube_tensor_driver.device.clock.line import MAX_DRIFT
+from cube_tensor_driver.device.wire.protocol import Hello, Sample, Stats
+
+from ..conversation import UNREAD_S
+from ..transcript import Transcript
+from ..verdict import Verdict, failed, not_tried, passed, rule
+from .hello import frames_per_sample, of_kind, once_a_second
+
+HALF = 1 << 31
+STANDSTILL_S, WAITS = 2.5, 0.1
+"""Between two STATS, and of the samples that are due: a hub on a busy machine is not so slow."""
+UPTIME_S = 5.0
+"""By so much device time and uptime may differ: both count from power-up."""
+
+
+def forward(later: int, earlier: int) -> int:
+    """By how much a number that wraps at 2^32 grew; negative if it went back."""
+    return (later - earlier + HALF) % (1 << 32) - HALF
+
+
+def first_frames(samples: list[Sample]) -> list[Sample]:
+    """One frame of each sample."""
+    later = [b for a, b in pairwise(samples) if b.sequence != a.sequence]
+    return [*samples[:1], *later]
+
+
+def periods_us(samples: list[Sample]) -> NDArray[np.float64]:
+    """Device time per number from sample to sample, µs."""
+    gaps = [
+        (after.device_us - before.device_us) / forward(after.sequence, before.sequence)
+        for before, after in pairwise(first_frames(samples))
+        if forward(after.sequence, before.sequence) > 0
+    ]
+    return np.array(gaps)
+
+
+@rule(
+    "S1",
+    "Samples are numbered from 0 at power-up, one for each that is taken, also while nobody "
+    "listens. START, STOP and a new period do not change the numbers.",
+    needs=(Sample,),
+)
+def numbers_go_on(talk: Transcript) -> Verdict:
+    """Of the first frame of each sample; S3 judges the others."""
+    begin = min(sample.first_cube for sample in talk.frames(Sample))
+    samples = [
+        (name, sample)
+        for name in talk.first_visit
+        for sample in talk.frames(Sample, name)
+        if sample.first_cube == begin
+    ]
+    for (before, last), (name, sample) in pairwise(samples):
+        where = f"in the step '{name}'" if name == before else f"from '{before}' to '{name}'"
+        if forward(sample.sequence, last.sequence) <= 0:
+            return failed(f"number {sample.sequence} came after {last.sequence}, {where}")
+    first, last = samples[0][1], samples[-1][1]
+    stats = talk.frames(Stats, "opened", "hello", "stop", "quiet")
+    if stats and stats[-1].taken == 0 and first.sequence != 0:
+        return failed(f"the first sample since power-up has number {first.sequence}")
+    return passed(f"numbers {first.sequence} to {last.sequence} over START, STOP, new periods")
+
+
+@rule(
+    "S2",
+    "Device time is that of the middle of the measurement, in µs since power-up. It never goes "
+    "back while the hub runs",
+    needs=(Sample,),
+)
+def device_time_runs(talk: Transcript) -> Verdict:
+    samples = first_frames(talk.frames(Sample, *talk.first_visit))
+    for before, after in pairwise(samples):
+        if forward(after.sequence, before.sequence) > 0 and after.device_us <= before.device_us:
+            return failed(
+                f"device time goes from {before.device_us} µs of sample {before.sequence} to "
+                f"{after.device_us} µs of sample {after.sequence}"
+            )
+    stats = talk.frames(Stats, *talk.first_visit)
+    device_s = 1e-6 * samples[-1].device_us
+    if stats and abs(device_s - 1e-3 * stats[-1].uptime_ms) > UPTIME_S:
+        uptime_s = 1e-3 * stats[-1].uptime_ms
+        return failed(f"device time is {device_s:.3f} s, the uptime in STATS {uptime_s:.3f} s")
+    flow = of_kind(talk, Sample, "start")
+    if len(flow) < 20:
+        return not_tried(f"{len(flow)} samples came in the step 'start', 20 are needed")
+    host_us = np.array([1e6 * heard.at_s for heard in flow])
+    device_us = np.array([float(sample.device_us) for sample in talk.frames(Sample, "start")])
+    drift, unsure, jitter = drift_of(host_us - host_us[0], device_us - device_us[0])
+    text = f"{1e6 * drift:+.0f} ± {1e6 * unsure:.0f} ppm against the host, jitter {jitter:.0f} µs"
+    if abs(drift) - unsure > MAX_DRIFT:
+        return failed(f"device time runs {text}")
+    return passed(f"never back, {text}")
+
+
+def drift_of(host: NDArray[np.float64], device: NDArray[np.float64]) -> tuple[float, float, float]:
+    """(relative drift, how unsure it is, median delay above the smallest in the unit of time).
+
+    Delay is never negative, so the earliest arrivals of both halves tell the clock. That they are
+    late too makes it unsure.
+    """
+    delay = host - device
+    half = len(delay) // 2
+    early, late = int(np.argmin(delay[:half])), half + int(np.argmin(delay[half:]))
+    apart = float(host[late] - host[early])
+    drift = float(delay[early] - delay[late]) / apart
+    above = delay + drift * host
+    jitter = float(np.median(above) - above.min())
+    return drift, 2 * (jitter + 1) / apart, jitter
+
+
+@rule(
+    "S3",
+    "A sample that does not fit one frame takes several, sent one behind the other, always split "
+    "at the same cubes. All have the same number and device time.",
+    needs=(Sample,),
+)
+def frames_of_a_sample(talk: Transcript) -> Verdict:
+    samples = talk.frames(Sample, *talk.first_visit)
+    if len({sample.first_cube for sample in samples}) == 1:
+        return not_tried("each sample of this hub fits one frame")
+    groups = [list(group) for _, group in groupby(samples, key=lambda sample: sample.sequence)]
+    seen: set[int] = set()
+    for group in groups:
+        times = sorted({sample.device_us for sample in group})
+        if len(times) > 1:
+            return failed(f"frames of sample {group[0].sequence} have device times {times} µs")
+        if group[0].sequence in seen and group[0].first_cube:
+            return failed(f"between frames of sample {group[0].sequence} came one of another")
+        seen.add(group[0].sequence)
+    n_frames = max(map(len, groups))
+    splits = sorted(
+        {
+            tuple((sample.first_cube, sample.n_cubes) for sample in group)
+            for group in groups
+            if len(group) == n_frames
+        }
+    )
+    if len(splits) > 1:
+        return failed(f"one sample is split into (first cube, cubes) {splits[0]}, one {splits[1]}")
+    return passed(f"{n_frames} frames for each of {len(groups)} samples")
+
+
+@rule(
+    "S4",
+    "A hub that must drop drops all frames of a sample and counts 1.",
+    needs=(Sample, Stats),
+)
+def drops_are_counted(talk: Transcript) -> Verdict:
+    """All numbers that are missing before a STATS are in its count. It may count more, behind the
+    last number that came, until it has dropped nothing for a second."""
+    names = talk.first_visit
+    base = talk.frames(Stats, *names)[0].dropped
+    frames = Counter(sample.sequence for sample in talk.frames(Sample, *names))
+    n_frames = frames_per_sample(talk)
+    missing, counted = 0, 0
+    previous: int | None = None
+    for heard in talk.heard(*names):
+        if isinstance(heard.frame, Sample) and heard.frame.sequence != previous:
+            number = heard.frame.sequence
+            step = 1 if previous is None else forward(number, previous)
+            if step < 0:
+                return not_tried("the numbers go back: see S1")
+            missing += max(0, step - 1) + (frames[number] < n_frames)
+            previous = number
+        elif isinstance(heard.frame, Stats):
+            before, counted = counted, heard.frame.dropped - base & 0xFFFFFFFF
+            if counted < missing or before == counted > missing:
+                return failed(f"{missing} numbers are missing, STATS counts {counted} as dropped")
+    if counted:
+        return passed(f"{len(frames)} samples came; {counted} were dropped, all are counted")
+    return passed(f"{len(frames)} samples came, none is missing and none counts as dropped")
+
+
+@rule("S5", "n_pads is that of HELLO.", needs=(Hello, Sample))
+def samples_fit_hello(talk: Transcript) -> Verdict:
+    hello: Hello | None = None
+    for heard in talk.heard():
+        if isinstance(heard.frame, Hello):
+            hello = heard.frame
+        elif isinstance(heard.frame, Sample) and hello is not None:
+            sample = heard.frame
+            if sample.n_pads != hello.n_pads:
+                return failed(f"SAMPLE has {sample.n_pads} pads, HELLO says {hello.n_pads}")
+            last = sample.first_cube + sample.n_cubes
+            if last > hello.n_cubes:
+                return failed(f"SAMPLE has cubes up to {last - 1}, HELLO says {hello.n_cubes}")
+    return passed("pads and cubes of the samples are those of HELLO")
+
+
+@rule("S6", "A frequency of 0 means not measured.", needs=(Sample,))
+def pads_that_are_not_measured(talk: Transcript) -> Verdict:
+    return not_tried("bytes do not show it: stop one oscillator, docs/build.md")
+
+
+@rule(
+    "S7",
+    "*Samples taken* of STATS is the number of the next sample, so 0 before the first one, and "
+    "wraps with it. STATS goes out behind the frames of the samples that it counts.",
+    needs=(Sample, Stats),
+)
+def taken_is_the_next_number(talk: Transcript) -> Verdict:
+    """Between the numbers of the samples before and behind it, which mostly leaves one."""
+    waiting: list[Stats] = []
+    expected: int | None = None  # the number behind that of the last sample
+    n_compared = 0
+    for heard in talk.heard(*talk.first_visit):
+        if isinstance(heard.frame, Stats):
+            waiting.append(heard.frame)
+        elif isinstance(heard.frame, Sample):
+            number = heard.frame.sequence
+            least = number if expected is None else expected
+            for stats in waiting:
+                is_early = expected is not None and forward(stats.taken, least) < 0
+                if forward(number, least) >= 0 and (is_early or forward(number, stats.taken) < 0):
+                    last = "none" if expected is None else str((expected - 1) & 0xFFFFFFFF)
+                    return failed(
+                        f"STATS says {stats.taken} taken, the sample before it is {last}, the "
+                        f"one behind it {number}"
+                    )
+            n_compared += len(waiting)
+            waiting = []
+            expected = (number + 1) & 0xFFFFFFFF
+    return passed(f"{n_compared} STATS fit the samples before and behind them")
+
+
+@rule("S8", "A hub sends STATS once a second, started or not.", needs=(Hello,))
+def stats_come(talk: Transcript) -> Verdict:
+    for name, what in (("quiet", "while stopped"), ("start", "while started")):
+        wrong = once_a_second(of_kind(talk, Stats, name), "STATS", what)
+        if wrong:
+            return failed(wrong)
+    return passed("stopped and started")
+
+
+@rule(
+    "S9",
+    "A full transmit buffer never makes a hub wait: it drops whole frames.",
+    needs=(Sample, Stats),
+)
+def full_buffer(talk: Transcript) -> Verdict:
+    step = talk.steps["unread"]
+    if sum(other.damaged for other in talk.steps.values()) > step.damaged:
+        return not_tried("frames are damaged in any case: see F5")
+    if step.damaged:
+        return failed(f"{step.damaged} damaged frames after {UNREAD_S:g} s without reading")
+    read = talk.first_visit[: talk.first_visit.index("unread")]
+    before = talk.frames(Stats, *read)[-1]
+    stats = [before, *talk.frames(Stats, "unread", "period again")]
+    dropped = forward(stats[-1].dropped, before.dropped)
+    if dropped:
+        return passed(f"{dropped} whole samples dropped in {UNREAD_S:g} s without reading")
+    due_ms = before.uptime_ms + 1e3 * UNREAD_S
+    if stats[-1].uptime_ms < due_ms:
+        return failed(f"no STATS any more after {UNREAD_S:g} s without reading")
+    gaps = periods_us(talk.frames(Sample, "fast"))
+    rate = 1e6 / float(np.median(gaps)) if len(gaps) else 0.0
+    for one, other in pairwise(stats):
+        seconds = 1e-3 * (other.uptime_ms - one.uptime_ms)
+        if seconds > STANDSTILL_S:
+            return failed(f"no STATS for {seconds:.1f} s while nobody read: the hub waited")
+        taken = forward(other.taken, one.taken)
+        if other.uptime_ms <= due_ms and taken < WAITS * seconds * rate:
+            return failed(
+                f"while nobody read, {taken} samples were taken in {seconds:.1f} s at {rate:.0f} "
+                "Hz, and none counts as dropped: the hub waited"
+            )
+    return not_tried(f"the line took all that came in {UNREAD_S:g} s without reading")

@@ -1,0 +1,425 @@
+"""Recording and replaying in real processes."""
+
+from __future__ import annotations
+
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from bag_maker import START_NS, make_bag
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from test_bags_files import all_differing_bits, differing_bits, stress
+
+from conftest import ROOT, decoded
+from cube_tensor_driver.bags.read import Bag
+from cube_tensor_driver.bags.repair import repair
+from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
+from cube_tensor_driver.cli.main import main
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.core.errors import BagError
+from cube_tensor_driver.messages.types import FREQUENCIES
+from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.ros.messages import to_ns
+from cube_tensor_driver.ros.node import queue
+from cube_tensor_driver.simulation.inject import inject
+
+SKIN = package_data() / "config" / "skin_demo.yaml"
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MADE_ANEW = ("--exclude-topics", "/stress")
+needs_ros2_bag = pytest.mark.skipif(
+    find_spec("ros2bag") is None, reason="needs ros2 bag, which the wheels lack"
+)
+
+
+_started: list[subprocess.Popen] = []
+
+
+@pytest.fixture(autouse=True)
+def nothing_left() -> Iterator[None]:
+    """A test that fails leaves no recorder behind, which others would hear."""
+    yield
+    while _started:
+        process = _started.pop()
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+def cube(*arguments: object) -> subprocess.Popen:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cube_tensor_driver.cli", *map(str, arguments)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    _started.append(process)
+    return process
+
+
+def ros2_bag(*arguments: object) -> subprocess.Popen:
+    return subprocess.Popen(
+        ["ros2", "bag", *map(str, arguments), "--disable-keyboard-controls"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def end(process: subprocess.Popen, number: int = signal.SIGINT) -> str:
+    process.send_signal(number)
+    return process.communicate(timeout=20)[1]
+
+
+def grown(folder: Path, size: int) -> bool:
+    """Whether the storage files of a folder hold so many bytes."""
+    files = [path for path in folder.glob("**/*") if path.name.endswith((".mcap", ".db3"))]
+    return sum(path.stat().st_size for path in files) > size
+
+
+def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
+    """What a bag holds of frequencies; of one that is being written, what a repaired copy of it
+    does."""
+    if copy is not None:
+        shutil.rmtree(copy, ignore_errors=True)
+        try:
+            shutil.copytree(bag, copy)
+            repair(copy)
+        except (OSError, BagError):  # nothing there yet
+            return []
+        bag = copy
+    with Bag(bag) as opened:
+        if "/frequencies" not in opened.topics(FREQUENCIES):
+            return []
+        return [
+            int(stamp)
+            for messages, _ in opened.frequencies("/frequencies")
+            for stamp in messages.stamp_ns
+        ]
+
+
+@pytest.fixture(scope="module")
+def bag_of_a_second(tmp_path_factory) -> Path:
+    return make_bag(tmp_path_factory.mktemp("bags") / "bag", SKIN, messages=100)
+
+
+@pytest.fixture
+def own_signals() -> Iterator[None]:
+    """A command that runs in this process leaves no signal handler behind."""
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    handlers = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, handlers, strict=True):
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def running(ros, tmp_path):
+    """A simulated skin of sixteen cubes, and a tester that listens."""
+    with Children(tmp_path) as children:
+        for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
+            children.start(process)
+        ros.heard = ros.listen(SkinStress, "stress", 1000)
+        ros.wait(lambda: ros.heard)
+        yield ros
+        children.check()
+
+
+@pytest.mark.alone
+def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
+    """Nothing lost against what another subscriber hears; and the pipeline gives the nodes' own
+    bits again.
+
+    Also of a pad that was found stuck before the recording began, which the frequencies alone say
+    half a second later.
+    """
+    path = tmp_path / "bag"
+    inject(tmp_path / "ports", ["kind=stuck", "link=hub1", "cube=2", "pad=6", "seconds=60"])
+    running.wait(lambda: running.heard[-1].left_out[-6:].count(1 << 6))
+    heard = running.listen(SkinFrequencies, "frequencies", 1000)
+    running.wait(lambda: heard)
+    recorder, other = (
+        cube("record", "-o", path),
+        cube("record", "-o", tmp_path / "other", "--storage", "sqlite3"),
+    )
+    # The one that starts later has to have recorded for a while, too.
+    running.wait(lambda: grown(path, 800_000) and grown(tmp_path / "other", 400_000))
+    output = end(recorder)
+    assert "/frequencies" in end(other) and other.returncode == 0
+    assert recorder.returncode == 0 and "/frequencies" in output, output
+    with Bag(path) as bag:
+        assert {info.sender for info in bag.infos("/info")} == {"reconstruction"}
+        assert all(cube.uid for cube in bag.infos("/info")[-1].cubes)
+        recorded = [
+            int(stamp)
+            for messages, _ in bag.frequencies("/frequencies")
+            for stamp in messages.stamp_ns
+        ]
+        qos = {
+            one.topic: one.ext.offered_qos_profiles[0].durability.name for one in bag.connections
+        }
+    assert qos["/info"] == "TRANSIENT_LOCAL" and qos["/frequencies"] == "VOLATILE"
+    running.wait(lambda: to_ns(heard[-1].header.stamp) >= recorded[-1])
+    stamps = [to_ns(message.header.stamp) for message in heard]
+    first, last = stamps.index(recorded[0]), stamps.index(recorded[-1])
+    assert recorded == stamps[first : last + 1] and len(recorded) > 50
+    assert len(set(recorded) & set(frequency_stamps(tmp_path / "other"))) > 50
+    reprocess(ReprocessJob(path, tmp_path / "out", "bag"))
+    live, again = stress(path), stress(tmp_path / "out")
+    common = live.keys() & again.keys()
+    assert len(common) > 50
+    assert all_differing_bits({k: live[k] for k in common}, {k: again[k] for k in common}) == 0
+    assert all(again[k].left_out[again[k].cube == 10].all() for k in common)
+
+
+@needs_ros2_bag
+def test_ros2_bag_records_what_is_published(running, tmp_path):
+    """As docs/bags.md says. The bag has the info from before, every scan, and gives the same bits
+    again."""
+    path = tmp_path / "bag"
+    overrides = package_data() / "config" / "record_qos.yaml"
+    options = ["--storage", "mcap", "-o", path, "--qos-profile-overrides-path", overrides]
+    options += ["--topics", "/frequencies", "/stress", "/info"]
+    heard = running.listen(SkinFrequencies, "frequencies", 1000)
+    running.wait(lambda: heard)
+    recorder = ros2_bag("record", *options)
+    running.wait(lambda: len(running.node.get_subscriptions_info_by_topic("/frequencies")) == 3)
+    begun = len(heard)
+    running.wait(lambda: len(heard) > begun + 100)
+    end(recorder)
+    recorded = frequency_stamps(path)
+    stamps = [to_ns(message.header.stamp) for message in heard]
+    assert (
+        recorded == stamps[stamps.index(recorded[0]) : stamps.index(recorded[-1]) + 1]
+        and len(recorded) > 50
+    )
+    with Bag(path) as bag:
+        assert {info.sender for info in bag.infos("/info")} == {"reconstruction"}
+        assert all(cube.uid for cube in bag.infos("/info")[-1].cubes)
+    reprocess(ReprocessJob(path, tmp_path / "out", "bag"))
+    live, again = stress(path), stress(tmp_path / "out")
+    common = live.keys() & again.keys()
+    assert len(common) > 50
+    assert all_differing_bits({k: live[k] for k in common}, {k: again[k] for k in common}) == 0
+
+
+def test_killed_recordings_lose_less_than_a_second(running, tmp_path):
+    heard = running.listen(SkinFrequencies, "frequencies", 1000)
+    running.wait(lambda: heard)
+    for number in range(2):
+        path = tmp_path / f"killed{number}"
+        recorder = cube("record", "-o", path)
+        running.wait(lambda path=path: len(frequency_stamps(path, tmp_path / "copy")) > 100)
+        recorder.kill()
+        killed_ns = time.time_ns()  # stamps are of this clock
+        recorder.communicate(timeout=10)
+        with pytest.raises(BagError, match="repair"):
+            Bag(path)
+        assert repair(path).messages > 0
+        stamps = frequency_stamps(path)
+        assert killed_ns - stamps[-1] < 1_000_000_000
+        # and what is there is whole
+        running.wait(lambda stamps=stamps: to_ns(heard[-1].header.stamp) >= stamps[-1])
+        published = [to_ns(message.header.stamp) for message in heard]
+        assert stamps == published[published.index(stamps[0]) : published.index(stamps[-1]) + 1]
+
+
+def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, monkeypatch):
+    from cube_tensor_driver.ros.commands import recording
+
+    now = [100.0]
+    recorder = SimpleNamespace(error=None, counts={"/stress": 0})
+    recorder.find_topics = recorder.close = lambda: None
+
+    def spin_once(timeout_sec: float) -> None:
+        now[0] += timeout_sec
+        recorder.counts["/stress"] += now[0] >= 103.0  # found late
+
+    monkeypatch.setattr(recording, "Recorder", lambda *_: recorder)
+    monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    bag = SimpleNamespace(folder=tmp_path, messages=1)
+    executor = SimpleNamespace(spin_once=spin_once)
+    stop, show = threading.Event(), lambda *_: None
+    recording.fill(bag, None, executor, [], stop=stop, duration=5.0, show=show)
+    assert now[0] == pytest.approx(108.0, abs=2 * recording.SPIN_S)
+
+
+def test_record_says_what_is_wrong(domain, tmp_path):
+    (tmp_path / "there").mkdir()
+    recorder = cube("record", "-o", tmp_path / "there")
+    _, errors = recorder.communicate(timeout=30)
+    assert recorder.returncode == 1 and "is there already" in errors and "Traceback" not in errors
+    recorder = cube("record", "-o", tmp_path / "bag", "--topics", "nothing", "--duration", "0.5")
+    _, errors = recorder.communicate(timeout=30)
+    assert recorder.returncode == 1 and "Traceback" not in errors
+    assert f"nobody offers /nothing in DDS domain {domain}; start the skin" in errors
+    assert not (tmp_path / "bag").exists()
+    recorder = cube("record", "-o", tmp_path / "bag", "--topics", "bad topic!")
+    _, errors = recorder.communicate(timeout=30)
+    assert recorder.returncode == 1 and errors.count("\n") == 1
+    assert "topic 'bad topic!', allowed: letters" in errors
+    assert not (tmp_path / "bag").exists()
+
+
+@pytest.mark.parametrize("number", ["abc", "500", "-1"])
+@pytest.mark.parametrize("words", ["record -o {}", "view", "replay {}", "demo --headless"])
+def test_a_domain_that_is_none_is_one_line(
+    bag_of_a_second, own_signals, monkeypatch, capsys, words, number
+):
+    monkeypatch.setenv("ROS_DOMAIN_ID", number)
+    there, new = bag_of_a_second, bag_of_a_second.with_name("new")
+    command = words.format(there if words.startswith("replay") else new).split()
+    assert main(command) == 1
+    assert capsys.readouterr().err == (
+        f"cube: ROS_DOMAIN_ID is {number!r}, allowed: 0 to 232; set it or unset it\n"
+    )
+    assert not new.exists()
+
+
+def test_a_node_in_a_domain_that_is_none_ends_with_one_line(domain, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
+    command = [sys.executable, "-m", "cube_tensor_driver.ros.nodes.driver"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "cube_tensor_driver: ROS_DOMAIN_ID is 'abc', allowed: 0 to 232; set it or unset it\n"
+    )
+
+
+def reconstruction(children: Children, config: Path) -> None:
+    children.start(
+        Process(
+            "reconstruction",
+            "cube_tensor_driver.ros.nodes.reconstruction",
+            parameters={"config": str(config), "use_sim_time": True},
+        )
+    )
+
+
+def stuck(k: int) -> np.ndarray:
+    """A pad of cube 5 that was found stuck before the recording began, until message 60."""
+    return np.where(np.arange(16) == 5, 1 << 3, 0) * (k < 60)
+
+
+@pytest.mark.parametrize(
+    ("config", "command"),
+    [
+        ("skin", "replay"),
+        ("bag", "replay"),
+        pytest.param("bag", "ros2 bag play", marks=needs_ros2_bag),
+    ],
+)
+def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, command):
+    """To the bit, stamps included, also the second time round after the jump back.
+
+    With the bag as configuration also where the skin was tared in the middle, and a pad known to be
+    bad.
+    """
+    made = {"left_out": stuck, "tare": (90, 1.001)} if config == "bag" else {}
+    path = make_bag(tmp_path / "bag", SKIN, 150, **made)
+    batches = ros.listen(SkinStress, "stress", queue(None))
+    infos = ros.listen(SkinInfo, "info", LATCHED)
+    clock = ros.listen(
+        Clock, "/clock", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    with Children(tmp_path) as children:
+        reconstruction(children, path if config == "bag" else SKIN)
+        ros.wait(lambda: len(infos) == 1)
+        options = (path, "--clock", "--loop", "--rate", "2")
+        player = (
+            cube("replay", *options)
+            if command == "replay"
+            else ros2_bag("play", *options, *MADE_ANEW)
+        )
+
+        def twice_round() -> bool:
+            """Two beginnings and a jump back seen; how much of the first round is heard is up to
+            discovery."""
+            begun = [message for message in batches if to_ns(message.header.stamp) == START_NS]
+            now = [to_ns(message.clock) for message in clock]
+            return len(begun) >= 2 and len(infos) > 1 and min(np.diff(now), default=0) < 0
+
+        ros.wait(twice_round)
+        assert "Traceback" not in end(player)
+        assert player.returncode == 0
+        children.check()
+    recorded = stress(path)
+    for message in batches:
+        rows = decoded(message).rows
+        assert differing_bits(rows, recorded[to_ns(message.header.stamp)]) == 0
+    now = [to_ns(message.clock) for message in clock]
+    assert min(np.diff(now)) < -1_000_000_000  # the jump back
+    assert all(START_NS <= one <= START_NS + 1_500_000_000 for one in now)
+
+
+def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
+    """Keys through a terminal of its own."""
+    path = make_bag(tmp_path / "bag", SKIN, 300)
+    raw = ros.listen(SkinFrequencies, "frequencies", queue(None))
+    infos = ros.listen(SkinInfo, "info", LATCHED)
+    near, far = pty.openpty()
+    player = subprocess.Popen(
+        [sys.executable, "-m", "cube_tensor_driver.cli", "replay", str(path), "--start", "1"],
+        cwd=ROOT,
+        stdin=far,
+        stdout=far,
+        stderr=far,
+    )
+    os.close(far)
+    os.set_blocking(near, False)
+    try:
+        ros.wait(lambda: len(raw) > 10)
+        assert [int(one.sequence[0]) for one in raw[:10]] == list(range(100, 110)) and len(
+            infos
+        ) == 1
+        os.write(near, b" ")
+        held: list[int] = []
+
+        def still() -> bool:
+            held.append(len(raw))
+            return len(held) > 4 and len(set(held[-4:])) == 1
+
+        ros.wait(still)
+        before = len(raw)
+        os.write(near, b"s")
+        ros.wait(lambda: len(raw) > before)
+        ros.wait(still)
+        assert len(raw) == before + 1
+        os.write(near, b"q")
+        assert player.wait(timeout=10) == 0
+    finally:
+        player.kill()
+        player.wait()
+        os.close(near)
+
+
+def test_types_of_the_bag_are_offered_as_they_were(ros, tmp_path):
+    path = make_bag(tmp_path / "bag", SKIN, 50)
+    player = cube("replay", path, "--stress")
+    ros.wait(
+        lambda: (
+            {name for name, _ in ros.node.get_topic_names_and_types()}
+            >= {"/stress", "/info", "/force"}
+        )
+    )
+    offered = ros.node.get_publishers_info_by_topic("/info")[0]
+    assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert ros.node.get_publishers_info_by_topic("/frequencies")[0].topic_type == FREQUENCIES
+    assert player.communicate(timeout=20) and player.returncode == 0

@@ -1,0 +1,81 @@
+"""Messages that are gone for good are counted, also those that DDS drops without a word."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import UInt32
+
+from cube_tensor_driver.ros.compat import make_executor, with_number
+from cube_tensor_driver.ros.diagnostics.lost_messages import LostMessages
+
+DEPTH = 10
+
+
+@pytest.mark.parametrize("executor", [SingleThreadedExecutor, make_executor])
+def test_what_a_late_subscriber_loses_is_counted(ros, executor):
+    """Its queue holds DEPTH messages. What another publisher sends,
+    also before the two met, is no loss."""
+    lost, came = LostMessages(), []
+
+    def take(message, number):
+        lost.came(number)
+        came.append(message.data)
+
+    node = rclpy.create_node("late")
+    node.create_subscription(
+        UInt32, "late", with_number(take), DEPTH, event_callbacks=lost.new_subscription()
+    )
+    spinner = executor()
+    spinner.add_node(node)
+    publisher = ros.node.create_publisher(UInt32, "late", 1000)
+
+    numbers = itertools.count()
+
+    def publish(count, publisher):
+        for _ in range(count):
+            last = next(numbers)
+            publisher.publish(UInt32(data=last))
+        return last
+
+    def receive(last):
+        until = time.monotonic() + 20
+        while not came or came[-1] != last:
+            assert time.monotonic() < until
+            spinner.spin_once(timeout_sec=0.05)
+
+    try:
+        ros.wait(publisher.get_subscription_count)
+        receive(publish(1, publisher))
+        receive(publish(50, publisher))
+        assert len(came) == 1 + DEPTH and lost.count == 50 - DEPTH
+        other = ros.node.create_publisher(UInt32, "late", 1000)
+        publish(5, other)
+        ros.wait(other.get_subscription_count)
+        for _ in range(4):
+            publish(3, other)
+            receive(publish(2, publisher))
+        ros.node.destroy_publisher(publisher)
+        receive(publish(3, other))
+        assert lost.count == 50 - DEPTH
+    finally:
+        spinner.shutdown()
+        node.destroy_node()
+
+
+def test_a_publisher_that_begins_again_is_no_loss():
+    lost = LostMessages()
+    for number in (5, 6, 7, 1, 2, 3, 6, 7, 8, 11, 12):
+        lost.came(number)
+    assert lost.count == 4
+    lost.new_subscription()
+    for number in (40, 41, 44, 45):
+        lost.came(number)
+    assert lost.count == 6

@@ -1,0 +1,314 @@
+"""The picture of a skin: its geometry against cases computed by hand, its message as other nodes
+read it."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from cube_tensor_driver.core.newest import DOUBTFUL, FAULTY, FINE, STALE, Newest
+from cube_tensor_driver.core.poses import CubePoses
+from cube_tensor_driver.core.rows import StressRows
+from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL
+from cube_tensor_driver.core.tensor import rotation_from_quaternion, rotation_from_rpy
+from cube_tensor_driver.views import scene
+from cube_tensor_driver.views.scene import QUANTITIES
+
+
+def places(n: int = 3, turn: np.ndarray | None = None) -> CubePoses:
+    position = np.stack([0.01 * np.arange(n), np.zeros(n), np.zeros(n)], axis=1)
+    return CubePoses(
+        position, np.tile(np.eye(3) if turn is None else turn, (n, 1, 1)), np.full(n, 0.002)
+    )
+
+
+def rows(values: np.ndarray, status: object = 0, cube: object = None) -> StressRows:
+    cubes = np.arange(len(values)) if cube is None else cube
+    return StressRows.of(cubes, values[:, :6], values[:, 6:], residual=1.0, status=status)
+
+
+def test_traction_pushes_to_the_face_and_pulls_away_from_it():
+    values = np.full((2, 15), np.nan)
+    values[0, 2], values[1, 2] = -1e3, 2e3
+    (pushed, pulled) = scene.traction_arrows(places(2), values, 1e-5)
+    np.testing.assert_allclose(pushed, [[0, 0, 0.012], [0, 0, 0.002]])
+    np.testing.assert_allclose(pulled, [[0.01, 0, 0.002], [0.01, 0, 0.022]])
+
+
+def test_arrows_turn_with_their_cube():
+    values = np.zeros((1, 15))
+    values[0, 2:5] = -1e3, 300, 500
+    values[0, 12:14] = 2e5, -1e5
+    turn = rotation_from_rpy(0.4, 0.9, -2.0)
+    for draw, length in ((scene.traction_arrows, 1e-5), (scene.gradient_arrows, 1e-8)):
+        straight, turned = draw(places(1), values, length), draw(places(1, turn), values, length)
+        np.testing.assert_allclose(turned, straight @ turn.T, atol=1e-15)
+    # pressure −σzz grows against the gradient of σzz
+    tail, tip = scene.gradient_arrows(places(1), values, 1e-8)[0]
+    np.testing.assert_allclose(tip - tail, [-2e-3, 1e-3, 0], atol=1e-15)
+
+
+def test_principal_cross_of_pure_shear_lies_at_45_degrees():
+    values = np.full((1, 15), np.nan)
+    values[0, [0, 2, 4]] = 0, 0, 1e3
+    lines, pulls = scene.principal_crosses(places(1), values, 1e-5)
+    assert pulls[0].tolist() == [True, False, False]
+    along = lines[0, 0, 1] - lines[0, 0, 0]
+    np.testing.assert_allclose(np.abs(along), np.array([1, 0, 1]) * 0.01 / np.sqrt(2), atol=1e-9)
+
+
+def test_colours_are_the_table_s_ends_grey_where_unknown_and_monotonous_in_lightness():
+    quantity = QUANTITIES["pressure"]
+    shown = scene.colours(quantity, np.array([-5.0, 0, 10, 99, np.nan]), 10.0)
+    zero, top = np.array([0xFF, 0xFF, 0xCC]) / 255, np.array([0x80, 0x00, 0x26]) / 255
+    np.testing.assert_allclose(shown, [zero, zero, top, top, scene.GREY])
+    lightness = scene.colours(quantity, np.linspace(0, 10, 50), 10.0) @ [0.299, 0.587, 0.114]
+    assert (np.diff(lightness) < 0).all()
+    signed = scene.colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ [0.299, 0.587, 0.114]
+    assert signed[1] > 2 * max(signed[0], signed[2])
+
+
+def test_automatic_range_rises_at_once_and_falls_slowly():
+    quantity = QUANTITIES["pressure"]
+    top = scene.automatic(quantity, np.array([np.nan, 9e3, -2e3]))
+    assert top == 9e3
+    assert scene.automatic(quantity, np.array([1.0]), top) == pytest.approx(9e3 * scene.FALL)
+    assert scene.automatic(quantity, np.array([np.nan])) == quantity.least
+
+
+def test_health_says_doubtful_no_tensor_and_stale():
+    newest = Newest(4)
+    values = np.zeros((3, 15))
+    newest.update(rows(np.zeros((4, 15)), cube=np.array([0, 1, 2, 9])), 10.0)  # cube 9 is not ours
+    newest.update(rows(values[:1], PAD_FAULT, cube=np.array([1])), 10.5)
+    newest.update(rows(values[:1], INVALID | PAD_FAULT, cube=np.array([2])), 10.5)
+    assert newest.health(10.6, 1.0).tolist() == [
+        FINE,
+        DOUBTFUL,
+        FAULTY,
+        STALE,
+    ]
+    assert newest.health(11.2, 1.0).tolist() == [
+        STALE,
+        DOUBTFUL,
+        FAULTY,
+        STALE,
+    ]
+    believed = newest.believed(newest.health(10.6, 1.0))
+    assert np.isnan(believed).all(axis=1).tolist() == [False, False, True, True]
+    crosses = scene.fault_crosses(places(4), newest.health(10.6, 1.0))
+    assert (np.ptp(crosses[0], axis=1) == 0).all() and (
+        np.ptp(crosses[1:], axis=2).max(axis=(1, 2)) > 0.004
+    ).all()
+
+
+def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
+    """Of 400 cubes at 50 Hz, one row in a hundred has a residual above its limit. Of cube 7, from
+    2 s to 4 s, nearly all rows have. It is shown after one window of such rows, and hidden after
+    one without them."""
+    n, random = 400, np.random.default_rng(4)
+    newest = Newest(n)
+    for step in range(300):
+        now, chance = step / 50, np.full(n, 0.01)
+        chance[7] = 0.9 if 2 <= now < 4 else 0.01
+        newest.update(
+            rows(np.zeros((n, 15)), random.binomial(1, chance) * RESIDUAL, cube=np.arange(n)), now
+        )
+        health = newest.health(now, 1.0)
+        assert (np.delete(health, 7) == FINE).all()
+        if not (2 < now < 3 or 4 < now < 5):
+            assert health[7] == (DOUBTFUL if 3 <= now <= 4 else FINE), now
+    newest.update(
+        rows(np.zeros((n, 15)), np.full(n, PAD_FAULT), cube=np.arange(n)), -100.0
+    )  # a bag plays again
+    newest.update(rows(np.zeros((n, 15)), cube=np.arange(n)), -99.0)
+    assert (newest.health(-99.0, 1.0) == FINE).all()
+
+
+def test_markers_node_draws_what_comes(ros, tmp_path):
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.skin import read_skin
+    from cube_tensor_driver.core.pipeline import Pipeline
+    from cube_tensor_driver.messages.codec import stress_codec
+    from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
+    from cube_tensor_driver.processes.children import Children
+    from cube_tensor_driver.processes.skin_processes import Process
+    from cube_tensor_driver.ros.messages import info_message
+
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    n, pressed, silent = len(skin.cubes), 6, 15
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    info = ros.node.create_publisher(SkinInfo, "info", latched)
+    info.publish(
+        info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns())
+    )
+    publisher = ros.node.create_publisher(SkinStress, "stress", 10)
+    pictures, contacts = ros.listen(MarkerArray, "markers"), ros.listen(SkinContacts, "contacts")
+    values = np.full((n, 15), np.nan)
+    values[:, [0, 2, 4, 12]] = 0
+    values[pressed, [2, 4]] = -20e3, 4e3
+
+    def sent() -> None:
+        made = rows(values)
+        made.stamp_ns[:] = time.time_ns()
+        chosen = made.select(np.arange(n) != silent)
+        publisher.publish(stress_codec.encode(chosen, b"skin_base\0"))
+
+    def drawn() -> bool:
+        sent()
+        return bool(
+            contacts
+            and contacts[-1].position
+            and pictures
+            and "20 kPa" in pictures[-1].markers[-1].text
+            and any(one.ns == "contact 0" and one.color.a == 1 for one in pictures[-1].markers)
+        )
+
+    with Children(tmp_path) as children:
+        for name, given in (("markers", {"crosses": True}), ("contacts", {})):
+            children.start(Process(name, f"cube_tensor_driver.ros.nodes.{name}", parameters=given))
+        ros.wait(drawn)
+        children.check()
+
+    markers = {marker.ns: marker for marker in pictures[-1].markers}
+    assert len(pictures[-1].markers) <= 24
+    assert all(
+        marker.header.frame_id == "skin_base" and marker.action == Marker.ADD
+        for marker in markers.values()
+    )
+    cubes = markers["cubes 0"]
+    assert cubes.type == Marker.CUBE_LIST and len(cubes.points) == len(cubes.colors) == n
+    # RViz 2 shades a box's −z face least among those that one sees from above: the boxes stand on
+    # their heads.
+    q = cubes.pose.orientation
+    turn = rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
+    np.testing.assert_allclose(turn, np.diag([-1, 1, -1]), atol=1e-12)
+    points = np.array([[p.x, p.y, p.z] for p in cubes.points]) @ turn.T
+    upper_faces = np.array([cube.xyz for cube in skin.cubes])
+    upper_faces[:, 2] += skin.cubes[0].calibration.half_side
+    # A plate covers the upper face: the cube of the robot model is seen below it.
+    assert (np.abs(points - upper_faces) <= [1e-12, 1e-12, cubes.scale.z / 2]).all()
+    assert cubes.scale.z < 0.2 * cubes.scale.x
+    bar = np.array([[p.x, p.y, p.z] for p in markers["legend bar"].points]) * np.diag(turn)
+    assert (
+        markers["legend bar"].pose.orientation == q
+        and (np.diff(bar[:, 0]) > 0).all()
+        and not bar[:, 2].any()
+    )
+    colours = np.array([[c.r, c.g, c.b, c.a] for c in cubes.colors])
+    np.testing.assert_allclose(colours[pressed], [0x80 / 255, 0x00 / 255, 0x26 / 255, 1], atol=1e-6)
+    np.testing.assert_allclose(colours[silent, :3], scene.GREY, atol=1e-6)
+    traction = np.array([[p.x, p.y, p.z] for p in markers["traction"].points]).reshape(n, 3, 2, 3)
+    shaft = traction[pressed, 0, 1] - traction[pressed, 0, 0]
+    np.testing.assert_allclose(
+        shaft / np.linalg.norm(shaft), np.array([1, 0, -5]) / np.sqrt(26), atol=1e-6
+    )
+    assert not np.ptp(np.delete(traction, pressed, 0), axis=2).any()
+    faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
+    assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
+    assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
+    numbers = [float(markers[f"legend number {k}"].text) for k in range(3)]
+    assert numbers == [0, 10, 20]
+    # Arrows are to the scale of the legend's.
+    assert markers["traction scale"].text == "traction 20.0 kPa"
+    sample = np.array([[p.x, p.y, p.z] for p in markers["traction arrow"].points])
+    assert np.linalg.norm(shaft) / np.linalg.norm(sample[1] - sample[0]) == pytest.approx(
+        np.hypot(20, 4) / 20
+    )
+    # RViz 2 makes blanks over a metre wide where scale.x does not say, and first looks for the text
+    # without it
+    assert not markers["legend"].text[0].isspace() and not markers["legend"].text[-1].isspace()
+    assert 0.4 < markers["legend"].scale.x / markers["legend"].scale.z < 0.8
+    # RViz sets a second line 1 cm lower and knows no letter that takes two bytes
+    assert "\n" not in markers["legend"].text and markers["legend"].text.isascii()
+
+    contact = contacts[-1]
+    assert contact.header.frame_id == "skin_base" and len(contact.position) == 1
+    assert contact.normal_force[0] > 0 and contact.force[0].z < 0 < contact.force[0].x
+    label, other = markers["contact 0"], markers["contact 1"]
+    assert label.text == f"{contact.normal_force[0]:.2f} N, shear {contact.shear_force[0]:.2f} N"
+    assert label.color.a == 1 and other.color.a < 0.01
+    at = label.pose.position
+    assert (at.x, at.y) == pytest.approx((contact.position[0].x, contact.position[0].y))
+    rings = np.array([[p.x, p.y, p.z] for p in markers["contacts"].points]).reshape(8, -1, 3)
+    radius = np.linalg.norm(rings[0] - rings[0].mean(axis=0), axis=1)
+    np.testing.assert_allclose(np.pi * radius**2, contact.area[0], rtol=1e-6)
+    assert not np.ptp(rings[1:], axis=1).any()
+
+
+@pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "a name of many letters"])
+def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
+    """Lengths of texts decide about the alignment of all that follows."""
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from geometry_msgs.msg import Point
+    from rclpy.serialization import deserialize_message
+    from std_msgs.msg import ColorRGBA
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    from cube_tensor_driver.ros.markers.serialised import SerialisedMarkers
+
+    lines = Marker(ns=name, points=[Point()] * 5, colors=[ColorRGBA()] * 5)
+    text = Marker(ns=f"{name}'s legend", text=" " * 7)
+    text.header.frame_id = name
+    empty = Marker(ns=f"{name}, empty")
+    made = SerialisedMarkers([lines, text, empty, Marker(ns="last", points=[Point()] * 2)])
+    random = np.random.default_rng(len(name))
+    points, colours, last = random.random((5, 3)), random.random((5, 4)), random.random((2, 3))
+    made[name].points[:] = points
+    made[name].colours[:] = colours
+    made["last"].points[:] = last
+    made[f"{name}'s legend"].text[:] = np.frombuffer(b"7 bytes", np.uint8)
+
+    read = {one.ns: one for one in deserialize_message(bytes(made.data), MarkerArray).markers}
+    assert list(read) == [name, f"{name}'s legend", f"{name}, empty", "last"]
+    assert [[p.x, p.y, p.z] for p in read[name].points] == points.tolist()
+    assert [[p.x, p.y, p.z] for p in read["last"].points] == last.tolist()
+    np.testing.assert_allclose([[c.r, c.g, c.b, c.a] for c in read[name].colors], colours, 1e-6)
+    assert read[f"{name}'s legend"].text == "7 bytes" and "nobody" not in made
+
+
+def test_rods_lie_around_their_lines_with_the_radii_asked_for():
+    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
+    from cube_tensor_driver.browser.meshes import SIDES, rods
+
+    lines = np.random.default_rng(3).normal(size=(7, 2, 3))
+    lines[0, 1] = lines[0, 0] + [0, 0, 2.0]  # along an axis
+    vertices, faces = rods(lines, 0.2, 0.05)
+    rings = vertices.reshape(7, 2, SIDES, 3)
+    np.testing.assert_allclose(rings.mean(axis=2), lines, atol=1e-12)
+    way = lines[:, 1] - lines[:, 0]
+    from_axis = rings - lines[:, :, None]
+    np.testing.assert_allclose(np.einsum("nask,nk->nas", from_axis, way), 0, atol=1e-12)
+    radii = np.linalg.norm(from_axis, axis=3)
+    np.testing.assert_allclose(radii, np.broadcast_to([[[0.2], [0.05]]], radii.shape))
+    # every face lies on one rod and touches both of its ends; every vertex has three
+    assert (faces // (2 * SIDES) == np.repeat(np.arange(7), 2 * SIDES)[:, None]).all()
+    assert {len(set(end)) for end in (faces // SIDES % 2).tolist()} == {2}
+    assert (np.bincount(faces.ravel()) == 3).all()
+    # nothing to draw is a shape that is not seen
+    vertices, faces = rods(np.zeros((0, 2, 3)), 0.2)
+    assert np.ptp(vertices, axis=0).max() == 0 and faces.max() < len(vertices)
+
+
+def test_a_click_finds_the_cube_in_front():
+    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
+    from cube_tensor_driver.browser.meshes import hit
+
+    around = 2 * np.pi * np.arange(24) / 24
+    ring = np.stack([0 * around, np.cos(around), np.sin(around)], axis=1)
+    pitch = 2 * np.sin(np.pi / 24)
+    for cube in range(24):
+        aside = 0.1 * pitch * np.array([1.0, 0, 0])
+        assert hit(ring, pitch, 5 * ring[cube] + aside, -2 * ring[cube]) == cube
+    assert hit(ring, pitch, np.array([1.01 * pitch, 5, 0]), np.array([0, -1.0, 0])) is None
+    flat = np.stack(
+        [*(a.ravel() for a in np.meshgrid(np.arange(6.0), np.arange(5.0))), np.zeros(30)], axis=1
+    )
+    eye = np.array([2.5, -8, 6.0])  # as the page looks at a skin
+    for cube in range(30):
+        assert hit(flat, 1.0, eye, flat[cube] + [0.2, -0.2, 0] - eye) == cube

@@ -1,0 +1,180 @@
+"""Traction on the surface from all cubes, against contacts that other methods computed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from curved_skin import cylinder_stress, flat_error
+
+from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.errors import ElasticError
+from cube_tensor_driver.core.modes import COMPONENTS, STRESS
+from cube_tensor_driver.core.poses import CubePoses
+from cube_tensor_driver.core.tensor import rotation_from_rpy
+from cube_tensor_driver.mechanics import contact
+from cube_tensor_driver.mechanics.layer import Layer
+from cube_tensor_driver.touch.inverse import SurfaceInverse
+from cube_tensor_driver.touch.surface import Surface
+
+DEPTH, PITCH, COUNT = 5e-3, 8e-3, 7
+ACROSS = [k for k, name in enumerate(COMPONENTS) if "y" in name]
+
+
+def grid(rotation=None) -> CubePoses:
+    line = (np.arange(COUNT) - COUNT // 2) * PITCH
+    x, y = np.meshgrid(line, line)
+    position = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    turns = np.tile(np.eye(3), (COUNT**2, 1, 1)) if rotation is None else rotation
+    return CubePoses(position, turns, np.full(COUNT**2, 2e-3))
+
+
+def pads_noise() -> np.ndarray:
+    """(cubes, 15, 15) 3 Pa, a pad for each component."""
+    sd = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
+    return np.tile(np.diag(sd), (COUNT**2, 1, 1))
+
+
+def ball(points: np.ndarray, width: float, centre, force=(0.6, 0.3, -3.0)) -> np.ndarray:
+    """(N, 15) below a ball of this contact width, by Boussinesq's and Cerruti's point forces."""
+    below = np.column_stack([points[:, :2], np.full(len(points), -DEPTH)])
+    stress, gradient = contact.field(below, *contact.hertz(width / 2, force, centre, 12), 0.48)
+    return np.concatenate([stress, gradient[:, :3].reshape(len(points), 9)], axis=1)
+
+
+def noisy(values: np.ndarray, seed: int = 1) -> np.ndarray:
+    """With the noise of the pads, and 1 % of each component."""
+    sd = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
+    error = np.random.default_rng(seed).standard_normal(values.shape)
+    return values + error * np.hypot(sd, 0.01 * values)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+@pytest.fixture(scope="module")
+def inverse():
+    return SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(), DEPTH, side=4)
+
+
+@pytest.mark.parametrize(("width", "limit"), [(5e-3, 0.06), (10e-3, 0.03)])
+def test_the_field_at_the_cubes_depth_is_the_true_one(inverse, width, limit):
+    """And far nearer to it than what interpolation between the cubes gives."""
+    centre = np.array([0.3, 0.4]) * PITCH
+    values = noisy(ball(inverse.poses.position, width, centre))
+    middle = np.abs(inverse.points[:, :2]).max(axis=1) < 0.02
+    truth = -ball(inverse.points, width, centre)[middle, 2]
+    field = inverse.field(values)
+    interpolated = Surface(inverse.poses, DEPTH, 4).field(values).pressure[middle]
+    size = np.sqrt((truth**2).mean())
+    error, before = (
+        np.sqrt(((one - truth) ** 2).mean()) / size for one in (field.below[middle], interpolated)
+    )
+    assert error < limit and error < before / 2
+    # one contact is one draw: the stated deviation is right within a factor of two and a half
+    stated = np.sqrt((inverse.deviation(values).below[middle] ** 2).mean()) / size
+    assert stated / 2.5 < error < 2.5 * stated
+
+
+def test_the_traction_carries_the_load(inverse):
+    centre, force = np.array([0.002, -0.001]), np.array([0.6, 0.3, -3.0])
+    field = inverse.field(noisy(ball(inverse.poses.position, 10e-3, centre, force)))
+    found = field.traction.sum(axis=0) * inverse.area
+    np.testing.assert_allclose(found, force, atol=0.05 * np.linalg.norm(force))
+    pressing = field.pressure
+    middle = pressing @ inverse.points[:, :2] / pressing.sum()
+    np.testing.assert_allclose(middle, centre, atol=0.4e-3)
+    assert pressing.max() < 1.2 * 1.5 * 3 / (np.pi * 5e-3**2)
+
+
+def test_values_that_are_missing_are_those_of_a_skin_without_them(inverse):
+    """Cubes fall out, and pads of one: as good and as sure as matrices that are set up anew, which
+    see what is missing from all cubes of each window, not from those next to it alone."""
+    values = noisy(ball(inverse.poses.position, 10e-3, np.zeros(2)))
+    whole, before = inverse.field(values), inverse.deviation(values)
+    lost = values.copy()
+    lost[[17, 24]], lost[30, ACROSS] = np.nan, np.nan
+    field = inverse.field(lost)
+    noise = pads_noise()
+    noise[[17, 24]] = np.nan
+    noise[30, ACROSS] = np.nan
+    anew = SurfaceInverse.of_cubes(grid(), noise, Layer(), DEPTH, side=4)
+    expected, stated = anew.field(lost), inverse.deviation(lost)
+    truth = -ball(inverse.points, 10e-3, np.zeros(2))[:, 2]
+    assert rms(field.below - truth) < 1.2 * rms(expected.below - truth)
+    assert rms(stated.below) == pytest.approx(rms(anew.deviation(lost).below), rel=0.2)
+    there = inverse.cube == 24
+    assert (stated.below[there] > before.below[there]).all()
+    again = inverse.field(values)
+    np.testing.assert_array_equal(again.traction, whole.traction)
+    unknown = np.full_like(values, np.nan)
+    assert np.abs(inverse.field(unknown).traction).max() == 0
+    assert np.isfinite(inverse.deviation(unknown).pressure).all()
+
+
+def test_cubes_that_are_turned_see_the_same_traction(inverse):
+    """Each by an angle of its own about z, and the whole skin somewhere else in space.
+
+    Not exactly the same: turned cubes observe other parts of the shear's gradient.
+    """
+    random = np.random.default_rng(4)
+    angle = random.uniform(-3, 3, COUNT**2)
+    turns = np.array([rotation_from_rpy(0, 0, a) for a in angle])
+    values = ball(grid().position, 10e-3, np.array([0.001, 0.002]))
+    below = np.column_stack([grid().position[:, :2], np.full(COUNT**2, -DEPTH)])
+    load = contact.hertz(5e-3, (0.6, 0.3, -3.0), (0.001, 0.002), 12)
+    stress, gradient = contact.field(below, *load, 0.48)
+    matrix = stress[:, [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
+    slopes = gradient[:, [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
+    matrix = np.einsum("nai,nbj,nab->nij", turns, turns, matrix)
+    slopes = np.einsum("nai,nbj,nck,nabc->nijk", turns, turns, turns, slopes)
+    turned = np.concatenate(
+        [
+            np.stack(
+                [matrix[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))], 1
+            ),
+            np.stack([slopes[:, i, i, k] for i in range(3) for k in range(3)], 1),
+        ],
+        axis=1,
+    )
+    away = rotation_from_rpy(0.7, -1.1, 2.0)
+    poses = CubePoses(grid().position @ away.T + [1, 2, 3], away @ turns, grid().half_side)
+    straight = inverse.field(values)
+    field = SurfaceInverse.of_cubes(poses, pads_noise(), Layer(), DEPTH, side=1).field(turned)
+    one = SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(), DEPTH, side=1).field(values)
+    peak = np.abs(straight.traction).max()
+    in_parent = np.einsum("nij,nj->ni", turns, field.traction)
+    np.testing.assert_allclose(in_parent, one.traction, atol=0.03 * peak)
+    np.testing.assert_allclose(field.below, one.below, atol=0.01 * peak)
+
+
+def test_a_skin_that_observes_nothing_and_a_patch_without_points():
+    with pytest.raises(ElasticError, match="no cube"):
+        SurfaceInverse.of_cubes(grid(), pads_noise() * np.nan, Layer(), DEPTH)
+    with pytest.raises(ElasticError, match="at least 1"):
+        SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(), DEPTH, side=0)
+    with pytest.raises(ElasticError, match="between 0 and"):
+        SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(3e-3), DEPTH)
+
+
+def test_a_curved_skin_laid_flat_is_off_by_half_its_depth_over_its_radius():
+    """On a cylinder: its surface is free of traction, and the error goes as 1 / radius."""
+    angle = np.linspace(0.1, np.pi - 0.1, 20)
+    outward = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    traction = np.einsum("nij,nj->ni", cylinder_stress(0.045 * outward, 0.045), outward)
+    assert np.abs(traction).max() < 1e-9 * 2 / np.pi / 0.045
+    forearm = flat_error(0.045, DEPTH, 12.6e-3)
+    assert forearm == pytest.approx(DEPTH / (2 * 0.045), rel=0.1)
+    assert flat_error(0.45, DEPTH, 12.6e-3) == pytest.approx(forearm / 10, rel=0.05)
+
+
+def test_it_is_made_of_a_skin_as_read_from_its_file():
+    from types import SimpleNamespace as Skin
+
+    places = grid().position[:6]
+    cubes = [Skin(xyz=tuple(place), rpy=(0.0, 0.0, 0.0)) for place in places]
+    calibrations = [illustrative("planar")] * 6
+    inverse = SurfaceInverse(Skin(cubes=cubes, calibrations=calibrations), depth=DEPTH)
+    values = np.full((6, 15), np.nan)
+    assert np.isfinite(inverse.field(values).traction).all()
+    assert len(inverse.columns) == 7

@@ -1,0 +1,99 @@
+"""A short torture: the whole chain in real processes under a mix of faults, judged to the last
+sample and bit; and mutations of it that the judge must find."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from conftest import ROOT
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+
+from cube_tensor_driver.processes import domain
+from workshop.torture.mutations import MUTATIONS
+from workshop.torture.torture import LIMITS, failures
+
+
+def run(tmp_path, *arguments, seconds):
+    """What `./cube torture` writes with these arguments, and what it says."""
+    path = tmp_path / "torture.json"
+    command = [sys.executable, "-m", "cube_tensor_driver.cli", "torture", "--json", str(path)]
+    process = subprocess.Popen(
+        [*command, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=ROOT,
+    )
+    try:
+        output, _ = process.communicate(timeout=seconds)
+    finally:
+        process.kill()
+    assert path.exists(), output
+    return json.loads(path.read_text()), output
+
+
+@pytest.mark.alone
+@pytest.mark.campaign
+def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(tmp_path, effort):
+    duration = 10 * effort
+    result, output = run(tmp_path, "--duration", str(duration), "--seed", "1", seconds=150 * effort)
+    # In 10 s one stall of a busy machine is a tenth of the stamps: only longer runs judge the tail.
+    tail = {"stamp_error_p90_ms", "stamp_error_p99_ms"} if effort == 1 else set()
+    assert set(failures(result)) <= tail, output
+    assert result["samples_sent"] > 32 * 300 * duration and result["counted"] > 0
+    assert result["faults_to_flag"] >= 3 and result["deeds"]["tare"] and result["cube_messages"]
+
+
+@pytest.mark.alone
+@pytest.mark.campaign
+def test_mutations_are_caught(tmp_path, effort):
+    if effort == 1:
+        pytest.skip("half an hour: ./cube test -m campaign")
+    result, output = run(tmp_path, "--mutate", "all", "--seed", "1", seconds=7200)
+    assert [name for name, found in result["mutations"].items() if not found["caught"]] == [], (
+        output
+    )
+
+
+def test_each_mutation_can_be_put_into_a_process():
+    """Into one of its own: what they wrap or replace is there."""
+    code = (
+        "from workshop.torture.mutations import MUTATIONS\n"
+        "for mutation in MUTATIONS.values(): mutation.patch()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert len(MUTATIONS) >= 30 and {m.node for m in MUTATIONS.values()} == {
+        "driver",
+        "reconstruction",
+    }
+
+
+def test_a_torture_has_a_domain_of_its_own(monkeypatch):
+    """Where another skin ran in its domain, it ended with an IndexError."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    with domain.own_domain() as one, domain.own_domain() as other:
+        assert os.environ["ROS_DOMAIN_ID"] == str(other)
+        assert len({42, one, other}) == 3
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+            # The first participant of the domain that would come next (DDSI-RTPS 9.6.2).
+            participant.bind(("", 7400 + 250 * (other - 1) + 10))
+            with domain.own_domain() as third:
+                assert third < other - 1
+    assert os.environ["ROS_DOMAIN_ID"] == "42"
+
+
+def test_limits_of_the_figures():
+    good = dict.fromkeys(LIMITS, 0)
+    assert failures(good) == []
+    assert failures({**good, "lost": 1, "stamp_error_p50_ms": 0.8}) == [
+        "lost",
+        "stamp_error_p50_ms",
+    ]
+    assert failures({**good, "rss_slope_mb_per_min": None}) == []

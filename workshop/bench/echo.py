@@ -1,0 +1,89 @@
+"""What a benchmark compares with: bare rclpy that publishes and echoes messages of a skin's sizes.
+
+`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress. They have the
+executor, the quality of service and the flat arrays of the real nodes, but compute nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from std_msgs.msg import Header
+
+from cube_tensor_driver.msg import SkinFrequencies, SkinStress
+from cube_tensor_driver.ros.messages import packed
+from cube_tensor_driver.ros.node import CubeNode, queue, run
+from cube_tensor_driver.ros.parameters import ECHO
+
+PADS, STRESS, GRADIENT = 8, 6, 9
+
+
+class BareSource(CubeNode):
+    """Publishes `frequencies` of so many cubes at a rate, with a timer."""
+
+    def __init__(self) -> None:
+        super().__init__("source", ECHO)
+
+    def configure(self) -> None:
+        n, rate = int(self.value("cubes")), float(self.value("rate"))
+        self._publisher = self.create_lifecycle_publisher(
+            SkinFrequencies, "frequencies", queue(rate)
+        )
+        self._cube = np.arange(n, dtype=np.uint16)
+        self._zeros = np.zeros(n, np.uint32)
+        self._frequency = np.full((n, PADS), 1e5, np.float32)
+        self._temperature = np.full(n, np.nan, np.float32)
+        self._timer = self.create_timer(1.0 / rate, self._publish)
+
+    def _publish(self) -> None:
+        message = SkinFrequencies(
+            header=Header(frame_id="skin"),
+            cube=packed("H", self._cube),
+            sequence=packed("I", self._zeros),
+            time_offset=packed("i", self._zeros),
+            n_pads=PADS,
+            frequency=packed("f", self._frequency),
+            temperature=packed("f", self._temperature),
+            pad_fault=packed("I", self._zeros),
+            status=packed("H", self._zeros),
+        )
+        self._publisher.publish(message)
+
+
+class BareEcho(CubeNode):
+    """Answers each `frequencies` with a `stress` of as many rows, which are all zero."""
+
+    def __init__(self) -> None:
+        super().__init__("echo", ECHO)
+
+    def configure(self) -> None:
+        n, quality = int(self.value("cubes")), queue(float(self.value("rate")))
+        self._publisher = self.create_lifecycle_publisher(SkinStress, "stress", quality)
+        self._zeros = np.zeros((n, GRADIENT), np.float32)
+        self._subscription = self.create_subscription(
+            SkinFrequencies, "frequencies", self._answer, quality
+        )
+
+    def _answer(self, message: SkinFrequencies) -> None:
+        zeros = self._zeros
+        answer = SkinStress(
+            cube=message.cube,
+            sequence=message.sequence,
+            time_offset=message.time_offset,
+            stress=packed("f", zeros[:, :STRESS]),
+            gradient=packed("f", zeros),
+            residual=packed("f", zeros[:, 0]),
+            status=packed("H", zeros[:, 0]),
+            observed=packed("H", zeros[:, 0]),
+            left_out=packed("I", zeros[:, 0]),
+        )
+        self._publisher.publish(answer)
+
+
+def main() -> None:
+    run(lambda: [BareSource() if "source" in sys.argv else BareEcho()])
+
+
+if __name__ == "__main__":
+    main()

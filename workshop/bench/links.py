@@ -1,0 +1,116 @@
+"""./cube bench links: from the bytes of hubs to arrays, without DDS and without reconstruction."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.errors import CubeError
+from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.demo.running import report
+from cube_tensor_driver.device.chain import LiveLinks
+from cube_tensor_driver.device.live import cube_addresses, link_configs
+from cube_tensor_driver.device.scans.scan import empty_rows
+
+from .hubs_in_c import HubLoad
+
+PITCH = 0.012
+FIRST_S, SETTLE_S, END_S, STEP_S = 10.0, 2.0, 2.0, 0.05
+"""s: until the first rows at most; until it is measured; for the hubs to end; between two looks."""
+
+
+def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | None = None) -> int:
+    """Measure what reading takes of a core, with hubs in C (firmware/) as the load.
+
+    cubes: or a few more, because all hubs have as many. rate: samples per second. duration: s.
+    `lost`: rows that the hubs took and that did not become rows here. CubeError: the hubs cannot
+    be built, or no rows came.
+    """
+    load = HubLoad.of(cubes)
+    cubes = load.cubes
+    with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
+        folder = Path(name)
+        program = load.build(folder / "firmware")
+        path = folder / "skin.yaml"
+        write_yaml(path, grid(nx=cubes, ny=1, pitch=PITCH, links=load.hubs, rate=rate))
+        skin = read_skin(path)
+        delivered = 0
+
+        def on_rows(rows: FrequencyRows) -> None:
+            nonlocal delivered
+            delivered += len(rows)
+
+        with _hubs(program, folder, load, rate):
+            links = LiveLinks(
+                link_configs(skin, port_directory=folder),
+                cube_addresses(skin),
+                on_rows,
+                rate=rate,
+                # As a node does, which fills the same messages again and again.
+                make_rows=lru_cache(maxsize=8)(empty_rows),
+            )
+            links.start()
+            try:
+                _wait(lambda: delivered > 0)
+                time.sleep(SETTLE_S)
+                before, lost = (time.monotonic(), _cpu_s(), delivered), _lost(links)
+                time.sleep(duration)
+                after, lost = (time.monotonic(), _cpu_s(), delivered), _lost(links) - lost
+            finally:
+                links.close()
+    seconds, cpu_s, rows = (end - begin for begin, end in zip(before, after, strict=True))
+    result = {
+        "cubes": cubes,
+        "rate_hz": rate,
+        "duration_s": duration,
+        "rows": rows,
+        "rows_expected": round(rate * seconds) * cubes,
+        "lost": lost * load.cubes_per_hub,
+        "cpu_percent": round(100 * cpu_s / seconds, 1),
+        "cpu_us_per_scan": round(1e6 * cpu_s * cubes / max(rows, 1), 1),
+    }
+    report(result, json_path)
+    return 0
+
+
+@contextmanager
+def _hubs(program: str, folder: Path, load: HubLoad, rate: float) -> Iterator[None]:
+    """Hubs on pseudo-terminals in the folder, for the length of a block."""
+    command = [program, *load.arguments(folder, rate)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        _wait(lambda: len(list(folder.glob("hub*"))) == load.hubs)
+        yield
+    finally:
+        process.terminate()
+        process.wait(END_S)
+
+
+def _wait(done: Callable[[], bool]) -> None:
+    """CubeError: it does not happen within FIRST_S."""
+    until = time.monotonic() + FIRST_S
+    while not done():
+        if time.monotonic() > until:
+            raise CubeError(f"the hubs gave nothing within {FIRST_S:g} s")
+        time.sleep(STEP_S)
+
+
+def _lost(links: LiveLinks) -> int:
+    """Samples that the hubs took and that did not arrive, until now."""
+    names = ("lost_on_the_way", "dropped_in_hub")
+    return sum(int(str(report.values[name])) for report in links.report() for name in names)
+
+
+def _cpu_s() -> float:
+    """Processor time of this process."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime

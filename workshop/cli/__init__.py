@@ -1,0 +1,1 @@
+"""The commands bench, torture, pictures, test, lint and docs."""

@@ -1,0 +1,25 @@
+"""./cube pictures: the pictures of the documentation, drawn again so that they stay true."""
+
+from __future__ import annotations
+
+import argparse
+
+from cube_tensor_driver.cli import ROOT
+from cube_tensor_driver.cli.parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_output(
+        "-o",
+        "--output",
+        kind="folder",
+        default=ROOT / "docs" / "pictures",
+        help="folder to write to (default: docs/pictures)",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..pictures.draw import make_pictures
+
+    make_pictures(options.output)
+    return 0

@@ -1,0 +1,30 @@
+"""./cube test: the test suite."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import sys
+
+from cube_tensor_driver.cli import ROOT
+from cube_tensor_driver.cli.parser import Parser
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_words(
+        "words", "ARGUMENT", "arguments of pytest, as in -k name; ./cube exec pytest --help"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """The whole suite on all processors, or what the words say, in one process."""
+    words = options.words
+    if not words:
+        words = ["test"]
+        if importlib.util.find_spec("xdist") is not None:
+            # Half of the time a test waits for processes it started.
+            workers = 2 * len(os.sched_getaffinity(0))
+            words += ["-n", str(workers), "--dist", "loadgroup"]
+    os.chdir(ROOT)
+    os.execv(sys.executable, [sys.executable, "-m", "pytest", *words])

@@ -1,0 +1,39 @@
+"""./cube torture: real processes under all faults, checked against the simulator's log."""
+
+from __future__ import annotations
+
+import argparse
+
+from cube_tensor_driver.cli.parser import Parser, positive, whole_number
+
+
+def arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "--duration",
+        type=positive,
+        default=60.0,
+        metavar="S",
+        help="how long faults are injected, s (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="N",
+        help="seed of the random mix (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--mutate",
+        metavar="NAME",
+        help="put a fault into the driver or the reconstruction that must be found; all: one after "
+        "the other, each in a short torture of its own",
+    )
+    parser.add_json()
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..torture.torture import run_mutations, run_torture
+
+    if options.mutate is not None:
+        return run_mutations(options.mutate, seed=options.seed, json_path=options.json)
+    return run_torture(duration=options.duration, seed=options.seed, json_path=options.json)
