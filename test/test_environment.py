@@ -25,10 +25,9 @@ from cube_tensor_driver.config.yaml import write_yaml
 sys.path.insert(0, str(ROOT / "tools"))
 import environment
 
-CLI = ROOT / "cube_tensor_driver" / "cli"
 MODULES = [
     path
-    for path in CLI.glob("*.py")
+    for path in ROOT.glob("*/cli/*.py")
     if path.stem not in ("__init__", "__main__", "main", "parser", "table")
 ]
 CAPTURED = {"capture_output": True, "text": True, "check": False}

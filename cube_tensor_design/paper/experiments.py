@@ -1,10 +1,10 @@
 """The source paper's section 3 (Fig. 4) and section 4 (Figs. 7 and 8) on the virtual bench.
 
 Numbers only; `figures/experiments.py` and `figures/deformation.py` draw them. The paper does not
-say on which faces the prototype's pads C1 .. C4 are. Here C1 and C2 are on the lower face: then P_shear and
-P_grad grow in its experiments as they do in the paper. With C1 and C2 on the upper face P_shear has
-the other sign, and nothing else changes. The paper does not give the modulus of the pads' foam:
-FOAM is ours, stiff enough that no pad is crushed at 27 % compression.
+say on which faces the prototype's pads C1 .. C4 are. Here C1 and C2 are on the lower face: then
+P_shear and P_grad grow in its experiments as they do in the paper. With C1 and C2 on the upper face
+P_shear has the other sign, and nothing else changes. The paper does not give the modulus of the
+pads' foam: FOAM is ours, stiff enough that no pad is crushed at 27 % compression.
 """
 
 from __future__ import annotations

@@ -116,9 +116,10 @@ def record_skin(context: LaunchContext) -> list[Action]:
     namespace = make_namespace_absolute(
         prefix_namespace(surroundings.get("ros_namespace", ""), _given(context, "namespace"))
     )
-    remaps = dict(surroundings.get("ros_remaps", []))
-    parameters = [one for one in surroundings.get("global_params", []) if isinstance(one, tuple)]
-    reliability = dict(parameters).get("qos_reliability", "reliable")
+    remaps: dict[str, str] = dict(surroundings.get("ros_remaps") or [])
+    given = [pair for pair in surroundings.get("global_params", []) if isinstance(pair, tuple)]
+    parameters: dict[str, str] = dict(given)
+    reliability = parameters.get("qos_reliability", "reliable")
 
     qualities = {}
     for topic, quality in read_yaml(RECORD_QOS).items():

@@ -306,7 +306,7 @@ def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, paramete
     command = [
         sys.executable,
         "-m",
-        f"cube_tensor_driver.ros.{executable}",
+        f"cube_tensor_driver.ros.nodes.{executable}",
         "--ros-args",
         *ros_arguments(parameters),
     ]

@@ -25,6 +25,7 @@ from cube_tensor_design.paper import experiments as paper
 from cube_tensor_design.paper import rod_parts, rod_shear
 from cube_tensor_design.studies.layout_study import LayoutStudy
 from cube_tensor_driver.cli import main as cli
+from cube_tensor_driver.cli.table import PACKAGES
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -295,7 +296,8 @@ def test_every_output_is_asked_about_before_any_work(
     monkeypatch, capsys, tmp_path, arguments, words
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(f"cube_tensor_driver.cli.{arguments.split()[0]}.run", work)
+    command = arguments.split()[0]
+    monkeypatch.setattr(f"{PACKAGES.get(command, 'cube_tensor_driver')}.cli.{command}.run", work)
     refused(capsys, arguments, words)
     assert not list(tmp_path.iterdir())
 

@@ -191,7 +191,7 @@ def test_without_the_module_all_works_in_python() -> None:
     script = """
 import sys
 sys.modules["cube_tensor_driver._wire"] = None
-from cube_tensor_driver.device import cobs, native
+from cube_tensor_driver.device.wire import cobs, native
 from cube_tensor_driver.device.wire.decoder import Decoder, PythonDecoder
 from cube_tensor_driver.device.wire.protocol import Stats, encode
 assert native.wire is None and Decoder is PythonDecoder

@@ -18,9 +18,11 @@ PROGRAM = """
 import importlib, pathlib, pkgutil, sys
 import matplotlib
 before = matplotlib.rcParams.copy()
-from cube_tensor_driver import plot
-for module in pkgutil.iter_modules(plot.__path__):
-    importlib.import_module(f"{plot.__name__}.{module.name}")
+from cube_tensor_design import figures as design
+from cube_tensor_driver.views import figures
+for package in (figures, design):
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"{package.__name__}.{module.name}")
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.views.figures.calibration import draw_layout
 from cube_tensor_driver.views.figures.style import save
