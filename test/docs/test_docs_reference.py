@@ -23,11 +23,11 @@ from test_docs_python import blocks
 
 import cube_tensor_driver as ctd
 from conftest import ROOT
+from cube_tensor_design.studies.pads_example import planar_calibration
 from cube_tensor_driver.core.defaults import FOAM_MODULUS, FREQUENCY_NOISE, POISSONS_RATIO
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_design.studies.pads_example import planar_calibration
 
 PAGE = ROOT / "docs" / "messages.md"
 INTERFACES = sorted([*ROOT.glob("msg/*.msg"), *ROOT.glob("srv/*.srv")])
