@@ -12,9 +12,8 @@ Source: S. P. Timoshenko, J. N. Goodier, Theory of Elasticity (1951), 33 (half p
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cube_tensor_driver.core.arrays import Array
 
 
 def flat_error(radius: float, depth: float, pitch: float, cubes: int = 2) -> float:

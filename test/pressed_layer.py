@@ -15,12 +15,10 @@ from typing import Any
 
 import numpy as np
 import skfem
-from numpy.typing import NDArray
 from skfem.helpers import ddot, sym_grad
 
 from cube_tensor_design.fem.solid import lame
-
-Array = NDArray[np.float64]
+from cube_tensor_driver.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

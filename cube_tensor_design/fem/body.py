@@ -8,15 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 import skfem
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import HALF_SIDE, POISSONS_RATIO, YOUNGS_MODULUS
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import Layout
 
 from .mesh import block, sections
-
-Array = NDArray[np.float64]
 
 
 class BrickSizes(NamedTuple):

@@ -16,6 +16,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, REST_FREQUENCY
 from cube_tensor_driver.core.errors import ElasticError
@@ -28,7 +29,6 @@ from .body import Body, check_pads, field_axes, make_mesh
 from .memory import check_memory
 from .solid import Parity, Solid, lame
 
-Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 """progress(done, total, what)"""
 

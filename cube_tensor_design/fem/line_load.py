@@ -8,12 +8,10 @@ The transfer functions T(k) of layer.py, for waves along x, of both ways::
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
-
-Array = NDArray[np.float64]
 
 _WAVES = 4000
 _GREATEST = 30.0

@@ -15,7 +15,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cube_tensor_driver.core.arrays import Array
 
 _NEAR = 1.5
 """What the cube adds to the stress has decayed at this distance from its faces, d0."""

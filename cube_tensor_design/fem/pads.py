@@ -17,9 +17,8 @@ Mech. Eng. 2 (1973) 123 (consistent fluxes); the treatment of the corner is ours
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cube_tensor_driver.core.arrays import Array
 
 
 def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: float) -> Array:

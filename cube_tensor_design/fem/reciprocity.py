@@ -17,8 +17,8 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.mechanics.influence import Influence
@@ -28,8 +28,6 @@ from .body import Body, check_pads, make_mesh
 from .fem import make_solid, pad_weights, sees
 from .memory import check_memory
 from .solid import Solid
-
-Array = NDArray[np.float64]
 
 
 def compute_influence(

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from skfem.helpers import ddot, dot, sym_grad, trace
 
+from cube_tensor_driver.core.arrays import Array
+
 from .pads import face_weights, interval_weights
 
-Array = NDArray[np.float64]
 Parity = tuple[int, ...]
 
 _SAME = 1e-13

@@ -9,14 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.tri import Triangulation
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style, symbol
 
 from ..paper.virtual_bench import Deformation
-
-Array = NDArray[np.float64]
 
 _FIGURE_4_TITLES = {
     "zx": r"(a) shear alone: $\sigma_{zx}$ = 10 kPa",

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.views.figures.style import print_style
 
 from ..studies.field_study import SKIN_KINDS, FieldExample, FieldStudy
-
-Array = NDArray[np.float64]
 
 VIEW_MM = 22.0
 """The example is drawn from minus to plus this."""

@@ -6,16 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.views.figures.style import print_style
 
 from ..studies.field_study import FieldExample
 from ..studies.pads_study import FORMS
 from ..studies.traction_study import METHODS, Errors, Setting
 from .field import VIEW_MM, draw_pressure, relative_rms
-
-Array = NDArray[np.float64]
 
 
 @print_style()

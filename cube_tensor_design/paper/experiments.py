@@ -15,8 +15,8 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import BETA, REST_FREQUENCY
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
@@ -27,8 +27,6 @@ from ..fem.body import Body
 from ..fem.fem import Progress, Response, compute_response
 from .rod import Rod
 from .virtual_bench import Deformation, Step, VirtualBench
-
-Array = NDArray[np.float64]
 
 FOAM = {"rest_frequency": REST_FREQUENCY, "beta": BETA, "modulus": 3e6}
 MODE_AMPLITUDE = 1e4

@@ -16,9 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cube_tensor_driver.core.arrays import Array
 
 _ONE = np.eye(2)
 

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
-Array = NDArray[np.float64]
+from cube_tensor_driver.core.arrays import Array
 
 _TOLERANCE = 1e-9
 """Of the correction, over the largest displacement."""

@@ -16,13 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.oscillator import pad_frequency
 
 from .experiments import FOAM, Experiment, prototype
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

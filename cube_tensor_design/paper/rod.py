@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import skfem
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cube_tensor_driver.core.arrays import Array
 
 _STIFFNESS = 300.0
 """k over Young's modulus, per d0: a pressure of three times E pushes in by a hundredth of d0."""

@@ -35,6 +35,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.optimize import newton
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 
@@ -46,7 +47,6 @@ from .newton import factors
 from .rod import Rod
 from .virtual_bench import Step, VirtualBench
 
-Array = NDArray[np.float64]
 Held = Literal["displacement", "force"]
 """What of the rod is the same with the cube as without it."""
 

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import PLANE
@@ -33,8 +33,6 @@ from ..fem.reciprocity import compute_influence
 from .experiments import dent
 from .rod import Rod
 from .virtual_bench import VirtualBench
-
-Array = NDArray[np.float64]
 
 _STEP = 1e-4
 """Of the grid on the surface, m."""

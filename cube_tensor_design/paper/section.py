@@ -13,10 +13,10 @@ import scipy.sparse as sp
 import skfem
 from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
+
 from .material import Material, determinant
 from .newton import Balance
-
-Array = NDArray[np.float64]
 
 
 class Section:

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 import skfem
 from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
 
@@ -29,8 +30,6 @@ from .material import Material
 from .newton import Balance, Constraints, factors, find_balance
 from .rod import Rod, RodContact
 from .section import Section
-
-Array = NDArray[np.float64]
 
 CUBE_REFINEMENTS = 2
 """How often the triangles that touch the cube are cut in four.

@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.touch.surface import Surface
-
-Array = NDArray[np.float64]
 
 SKIN_KINDS = ("values alone", "values and gradients", "planar cubes")
 _UNSEEN_BY_PLANAR = [k for k, name in enumerate(COMPONENTS) if "y" in name]

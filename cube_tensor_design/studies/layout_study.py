@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import POISSONS_RATIO
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.estimator import make_estimator
@@ -29,8 +29,6 @@ from cube_tensor_driver.mechanics import contact
 from ..fem.body import Body, make_mesh
 from ..fem.fem import Progress, linear_response, make_solid, pad_stresses
 from ..fem.memory import check_memory
-
-Array = NDArray[np.float64]
 
 TRUSTED_ERROR = 0.2
 """A component can be trusted while its error is at most this part of its range."""

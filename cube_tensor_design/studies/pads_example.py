@@ -9,17 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.mechanics import contact
-
-Array = NDArray[np.float64]
 
 LOAD = -10e3
 """Stress of each simple load, Pa."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cube_tensor_driver.config.influence import find_influence
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.mechanics.influence import Influence
@@ -23,8 +23,6 @@ from ..fem.body import Body
 from ..fem.reciprocity import compute_influence
 from .field_study import FORCE, FRICTION, FieldExample
 from .traction_study import CUBES, Bench, Errors, Setting
-
-Array = NDArray[np.float64]
 
 FORMS = ("points", "pads")
 BODY = Body(width=80e-3, depth=80e-3, cube_young=np.inf, ground=True)

@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import PLANE
@@ -35,7 +35,6 @@ from ..fem.fem import compute_response
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 WIDTHS = (2e-3, 5e-3, 10e-3, 20e-3)

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cube_tensor_driver.config.calibration import find_calibration, read_calibration
 from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.core.arrays import Array, PadMasks
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import CONTACT_PRESSURE, FREQUENCY_NOISE, POISSONS_RATIO
 from cube_tensor_driver.core.modes import to_matrix
@@ -35,9 +35,6 @@ from cube_tensor_driver.touch.surface import Surface
 from cube_tensor_driver.touch.tracker.touches import Touches
 
 from .field_study import FORCE, FRICTION, WINDOW, FieldExample, flat_skin
-
-Array = NDArray[np.float64]
-Masks = NDArray[np.uint32]
 
 CUBES = ("24-pad", "planar", "planar, crosswise")
 METHODS = ("interpolation", "inverse", "inverse with contacts")
@@ -184,7 +181,7 @@ class Bench:
         return np.asarray(state @ calibration.response.T)
 
     def measured(
-        self, pads: Array, random: np.random.Generator, left_out: Masks | None = None
+        self, pads: Array, random: np.random.Generator, left_out: PadMasks | None = None
     ) -> Array:
         """(cubes, 15) what the pipeline makes of pad stresses (cubes, P), Pa. left_out: (cubes,)
         bits of pads."""

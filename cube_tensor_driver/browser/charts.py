@@ -9,16 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 from viser import uplot
 
+from ..core.arrays import Array
 from ..core.modes import COMPONENTS, STRESS
 from ..views.figures.style import png, symbol
 from . import markup
 from .history import History
 from .plot_colours import draw_lines
-
-Array = NDArray[np.float64]
 
 HISTORY_S = 10.0
 TIME_SCALE = uplot.Scale(time=False, auto=False, range=(-HISTORY_S, 0.0))

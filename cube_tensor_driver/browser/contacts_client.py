@@ -5,18 +5,16 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 
+from ..core.arrays import Array
 from ..messages.contacts import decode_contacts, decode_traction
 from ..msg import SkinContacts
 from ..ros.guard import CallbackGuard
 from ..touch.surface import Contact, Surface
 from .moment import Found, SurfaceField
-
-Array = NDArray[np.float64]
 
 NEIGHBOURS = 4
 """Points of `traction` between which it is interpolated."""

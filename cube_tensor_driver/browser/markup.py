@@ -10,14 +10,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.modes import COMPONENTS
 from ..core.newest import FAULTY, HEALTH
 from ..core.status import STATUS
 from ..touch.surface import Contact
 from ..views import scene
 from .moment import Moment
-
-Array = NDArray[np.float64]
 
 GREEN, AMBER, RED, BLUE = "#2b8a3e", "#e67700", "#c92a2a", "#1864ab"
 NoteColour = Literal["blue", "green", "red"]

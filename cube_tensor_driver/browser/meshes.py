@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ..core.arrays import Array
+
 Mesh = tuple[NDArray[Any], NDArray[Any]]
 """Vertices (V, 3) and faces (F, 3), each three indices of vertices."""
 

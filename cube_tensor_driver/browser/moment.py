@@ -7,12 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.newest import Newest
 from ..touch.surface import Contact, Surface
 from ..views.scene import QUANTITIES, Quantity
-
-Array = NDArray[np.float64]
 
 DEVIATION = Quantity(
     "standard deviation of pressure",

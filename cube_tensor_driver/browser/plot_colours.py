@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..views.figures.style import curve_style, print_style
-
-Array = NDArray[np.float64]
 
 
 @print_style()

@@ -15,6 +15,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.newest import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
@@ -25,7 +26,6 @@ from .meshes import CUBE, CUBE_EDGES, NOTHING, Mesh, arrows, hit, ring, rods
 from .moment import DEVIATION, Moment
 from .surface_layer import SquareLayer
 
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 SPAN = 2.0

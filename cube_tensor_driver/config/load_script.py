@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH, YOUNGS_MODULUS
 from ..core.errors import ConfigError
 from .schema import NAME, TRIPLE, Schema, list_of, mapping, real
 from .yaml import read_yaml
 
-Array = NDArray[np.float64]
 MOST_TAPS = 1000
 SLIP_TOLERANCE = 1e-9
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config.skin import Skin
+from ..core.arrays import Array
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.errors import MessageError
 from ..core.estimator import make_estimator
@@ -20,7 +21,6 @@ from ..simulation.sample_log import SampleLog
 from ..touch.surface import Contact, Surface
 from .verification import Arrivals, Comparison, compare, percentile
 
-Array = NDArray[np.float64]
 TIMES_COMPARED = 500
 """Times at most whose tensors are compared with the load: each costs a contact problem."""
 RANGE_TIMES = 100

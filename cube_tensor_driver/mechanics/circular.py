@@ -14,10 +14,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.modes import STRESS
 from .layer import FIELD
-
-Array = NDArray[np.float64]
 
 
 def _circular() -> tuple[NDArray[np.complex128], NDArray[np.int64]]:

@@ -22,11 +22,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..core.arrays import Array
 from ..core.errors import ElasticError
-
-Array = NDArray[np.float64]
 
 _ORDER_PER_RADIUS = 5.5
 """Order of a Hertz contact over its radius in depths, measured (`hertz_order`)."""

@@ -9,13 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.arrays import Array
 from .cache import cached
 from .circular import summed
 from .kernels import PER_DEPTH, REACH, disc_spectrum
 from .layer import Layer
 from .spectra import bessel_functions, layer_spectra
-
-Array = NDArray[np.float64]
 
 SIZES = np.geomspace(0.1, 5.0, 23)
 """Radii of the discs in the tables over the depth; others are rounded, by 10 % at most."""

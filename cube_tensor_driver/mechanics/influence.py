@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
+from ..core.arrays import Array
 from ..core.layout import Layout
 from .layer import Layer
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

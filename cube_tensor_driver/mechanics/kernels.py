@@ -21,14 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import Array, Index
 from ..core.modes import COMPONENTS, STRESS
 from .cache import cached
 from .circular import BACK, CIRCULAR, ORDERS
 from .layer import FIELD, Layer
 from .spectra import Bessel, Spectra, bessel_functions, layer_spectra
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 LENGTHS = (0.2, 0.8)
 """Of the prior over the depth: near the pair that explained contacts of 2 to 20 mm best, in a half

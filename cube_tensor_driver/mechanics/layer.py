@@ -23,14 +23,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array, Complex
 from ..core.defaults import POISSONS_RATIO
 from ..core.errors import ElasticError
 from ..core.modes import STRESS
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 FIELD = STRESS + tuple(f"{name}_{axis}" for name in STRESS for axis in "xyz")
 """What `Layer.transfer` gives: six stresses, then the three derivatives of each of them."""

@@ -23,14 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from ..core.arrays import Array, Complex
 from .cache import cached
 from .circular import ORDERS, summed
 from .kernels import PER_DEPTH, REACH
 from .layer import Layer
 from .spectra import bessel_functions, layer_spectra
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 STEP = 1 / 16
 """Of asinh(d) and of asinh(t / sqrt(1 + d^2)) in the tables, with lengths over the depth."""

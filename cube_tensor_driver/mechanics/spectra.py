@@ -29,10 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import jv
 
+from ..core.arrays import Array
 from .circular import CIRCULAR, ORDERS
 from .layer import Layer
 
-Array = NDArray[np.float64]
 Bessel = Callable[[int], Array]
 
 GREATEST = 25.0

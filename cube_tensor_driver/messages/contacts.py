@@ -10,15 +10,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.errors import BagError
 from ..touch.surface import Contact
 from ..touch.tracker.touches import TrackedContact
 from .codec import SECOND
 from .types import CONTACTS, TRACTION
 
-Array = NDArray[np.float64]
 MakeMessage = Callable[..., Any]
 """Makes a message from its type, such as geometry_msgs/msg/Point, and its fields by name. Fields
 with numbers are numpy arrays."""

@@ -15,13 +15,12 @@ import threading
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..config.skin import Skin
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from .simulator import Simulator
-
-Array = NDArray[np.float64]
 
 
 class BackgroundHubs:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from ..config.load_script import Action, Indenter, Script, between, read_script
 from ..config.package_data import package_data
 from ..config.skin import Skin
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..mechanics import contact
 from .spline import CubicSpline
 
-Array = NDArray[np.float64]
 SLOW = 1e-3
 """Speed at which friction has reached 0.7 of its full size, m/s: so it changes direction smoothly
 where a slide does."""

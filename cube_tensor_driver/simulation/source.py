@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.load_script import read_script
 from ..config.skin import Skin
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from ..core.rows import FrequencyRows
 from ..device.wire.protocol import NOT_MEASURED
@@ -20,8 +20,6 @@ from .hub import PERIOD_LIMITS_US, SimulatedHub
 from .imperfections import Imperfections
 from .load import AnyLoad, Load, LoadMemory, default_script
 from .sample_log import SEQUENCE_RANGE
-
-Array = NDArray[np.float64]
 
 
 def simulate(

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.influence import find_influence
+from ..core.arrays import Array, PadMasks
 from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.pipeline import Pipeline
@@ -21,9 +21,6 @@ from .pad_noise import noise_by_pad, noise_of_all_pads
 from .pad_reading import read_pads
 from .surface import Contact, Surface
 from .tracker.touches import Touches, TrackedContact
-
-Array = NDArray[np.float64]
-Masks = NDArray[np.uint32]
 
 INTERPOLATION, INVERSE = CONTACT_METHODS
 
@@ -63,7 +60,7 @@ class ContactSettings:
 class ContactFinder(Protocol):
     """Finds the contacts of one skin."""
 
-    def update(self, values: Array, left_out: Masks) -> list[Contact] | list[TrackedContact]:
+    def update(self, values: Array, left_out: PadMasks) -> list[Contact] | list[TrackedContact]:
         """Contacts of the newest values (cubes, 15), NaN where unknown; strongest first. left_out:
         (cubes,) bits of pads that the values are without."""
 
@@ -88,7 +85,7 @@ class _Interpolated:
     def __init__(self, settings: ContactSettings, poses: CubePoses) -> None:
         self._surface, self._least = Surface(poses, settings.depth), settings.least
 
-    def update(self, values: Array, left_out: Masks) -> list[Contact]:
+    def update(self, values: Array, left_out: PadMasks) -> list[Contact]:
         return self._surface.contacts(values, self._least)
 
     def cloud(self, values: Array) -> None:
@@ -113,7 +110,7 @@ class _Followed:
         self._inverse = SurfaceInverse.of_cubes(poses, by_pad, layer, depth, reading=reading)
         self._touches = Touches(self._inverse, settings.least)
 
-    def update(self, values: Array, left_out: Masks) -> list[TrackedContact]:
+    def update(self, values: Array, left_out: PadMasks) -> list[TrackedContact]:
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
             by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])

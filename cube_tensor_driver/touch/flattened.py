@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array, Index
 from ..core.poses import CubePoses
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 def flattened(poses: CubePoses, middles: Index, near: Index) -> tuple[Array, Array]:

@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from ..core.arrays import Array, Mask
 from ..core.poses import CubePoses
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 NEIGHBOURS = 9
 """Nearest cubes, the own one included, that make the points of a cube's patch."""

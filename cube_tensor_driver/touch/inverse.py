@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array, Index, Single
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from ..core.errors import ElasticError
 from ..core.modes import STRESS
@@ -25,11 +25,6 @@ from .pad_noise import GAIN_ERROR, noise_of_all_pads, pad_stresses
 from .pad_reading import read_pads
 from .surface import patches
 from .windows import Observed, Windows
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 class TractionField(NamedTuple):

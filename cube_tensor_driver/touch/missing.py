@@ -12,14 +12,9 @@ Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learn
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array, Index, Mask, Single
 from .windows import Windows, of_pressure
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 class Missing:

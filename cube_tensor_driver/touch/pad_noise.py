@@ -13,22 +13,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array, Index, Mask, PadMasks
 from ..core.calibration import Calibration
 from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-Masks = NDArray[np.uint32]
 
 GAIN_ERROR = 0.01
 """Standard deviation of a pad's gain against what its calibration says."""
 
 
-def noise_by_pad(pipeline: Pipeline, cubes: Index, left_out: Masks) -> Array:
+def noise_by_pad(pipeline: Pipeline, cubes: Index, left_out: PadMasks) -> Array:
     """B (n, 15, P) of some cubes: what the standard deviation of each pad's noise makes of each
     component, Pa and Pa/m.
 

@@ -20,16 +20,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.errors import ElasticError
 from ..core.pipeline import Pipeline
 from ..mechanics.influence import Influence
 from ..mechanics.kernels import Reading
 from ..mechanics.spectra import Spectra, bessel_functions, waves
-
-Array = NDArray[np.float64]
 
 ANGLES = 32
 """Directions from force to cube that the Fourier series is made from."""

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import Array, Index
 from ..mechanics.kernels import Kernels
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 AMPLITUDE = 20e3
 """Prior standard deviation of the pressure, Pa: that of a firm touch."""

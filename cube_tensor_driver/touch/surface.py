@@ -18,12 +18,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ..core.arrays import Array
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS
 from ..core.poses import CubePoses
 from .interpolation import Interpolation
-
-Array = NDArray[np.float64]
 
 PRESSURE = [COMPONENTS.index(name) for name in ("zz", "zz_x", "zz_y")]
 SHEAR = [COMPONENTS.index(name) for name in ("zx", "yz")]

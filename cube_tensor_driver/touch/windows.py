@@ -25,17 +25,13 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 
+from ..core.arrays import Array, Index, Mask, Single
 from ..core.poses import CubePoses
 from ..mechanics.cache import cached
 from ..mechanics.kernels import Kernels
 from .flattened import flattened
 from .prior import AMPLITUDE, covariance_matrix
 from .surface import square
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 WINDOW, INNER = 25, 13
 """Cubes of a window: 5 x 5 of a square grid; and those next to its middle that tell how large the

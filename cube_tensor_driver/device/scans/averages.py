@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...core.arrays import Array
 from ...core.rows import FrequencyRows
-
-Array = NDArray[np.float64]
 
 
 def scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:

@@ -20,9 +20,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ...core.arrays import Array
 
 
 class Polygon(NamedTuple):

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...config.skin import Skin
+from ...core.arrays import Array
 from ...core.errors import ConfigError
 from ..load import total
 from .source import MujocoSkin, Touch, load_mujoco
@@ -24,7 +25,6 @@ from .source import MujocoSkin, Touch, load_mujoco
 if TYPE_CHECKING:
     from mujoco import MjModel
 
-Array = NDArray[np.float64]
 KEPT_S = 2.0
 """What is kept of a scene that does not repeat: hubs ask for slightly different times."""
 WHOLE_S = 10.0

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...config.skin import Skin, SkinCube
+from ...core.arrays import Array
 from ...core.defaults import POISSONS_RATIO, YOUNGS_MODULUS
 from ...core.errors import ConfigError
 from ...core.poses import CubePoses
@@ -50,7 +51,6 @@ from .patches import Polygon, flat_contact, hertz_radius
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
 
-Array = NDArray[np.float64]
 
 SAME_DEPTH = 0.1
 """How far a cube's depth may be from the others', over the depth: there is one table for all."""

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ...core.arrays import Array, Index
 from ...mechanics.kernels import REACH, hertz_pressure
 from ...mechanics.layer import FIELD
 from ..inverse import SurfaceInverse, TractionField
 from ..surface import square
 from .disc_fit import Parts
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 FINER = 8
 """Places along the side of a point's square over which a disc's traction is averaged."""

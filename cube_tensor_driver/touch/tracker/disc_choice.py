@@ -8,11 +8,9 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...core.arrays import Array
 from .disc import Disc, DiscModel
-
-Array = NDArray[np.float64]
 
 ADDED, DROPPED = 0.2, 0.1
 """A contact begins where what is left of the pressure exceeds this part of its greatest, and ends

@@ -23,17 +23,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from ...core.arrays import Array, Index
 from ...core.modes import COMPONENTS
 from ...mechanics.kernels import SIZES
 from ..inverse import SurfaceInverse
 from ..pad_noise import GAIN_ERROR, pad_stresses
 from ..prior import AMPLITUDE
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 USUAL_SIZE, SIZE_SPREAD = 0.8, 1.0
 """Radius of contacts over the depth, and the standard deviation of its logarithm, before anything

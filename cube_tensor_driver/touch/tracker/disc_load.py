@@ -14,14 +14,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
+from ...core.arrays import Array
 from ...mechanics.kernels import LENGTHS, SHEAR
 from ..prior import AMPLITUDE
 from .disc_fit import Fitted, Scan
-
-Array = NDArray[np.float64]
 
 LITTLE_LEFT = 2.5e-4
 """Alpha over AMPLITUDE below which what is left adds less than a hundredth to any variance: the

@@ -8,11 +8,9 @@ and both halves in four. What is likeliest at first sight is fitted.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...core.arrays import Array
 from .disc_fit import COLD, LOOK, USUAL_SIZE, Fitted, Scan, fit
-
-Array = NDArray[np.float64]
 
 FITTED = 3
 """Pairs that are fitted, those likeliest at first sight."""

@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ...core.arrays import Array, Index
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from ..prior import AMPLITUDE, covariance_matrix, positive
 from .disc import Disc, DiscModel
@@ -22,9 +22,6 @@ from .disc_choice import beginning, remaining, same
 from .disc_fit import COLD, USUAL_SIZE, WARM, Fitted, Scan, fit
 from .disc_load import Load, load_of
 from .disc_split import split
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 NEAR = 16
 """Cubes next to a contact that it is computed from."""

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from ...core.arrays import Array
 from .style import print_style
-
-Array = NDArray[np.float64]
 
 _AXES = (("x", "o", "C0", "--"), ("y", "s", "C1", ":"), ("z", "D", "black", "-"))
 """Letter, marker, colour and dashes."""
