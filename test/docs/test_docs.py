@@ -30,7 +30,7 @@ ELSEWHERE = {
         "test_end_to_end.test_demo_loses_nothing_and_is_right"
     ),
     "./cube demo --config first.yaml --headless --duration 3": (
-        "test_docs_python.test_subscribers_of_the_pages_print_pressures"
+        "test_docs_python.test_subscriber_of_the_page_prints_pressures"
     ),
     "./cube bringup /dev/ttyACM0 -o hand.yaml": (
         "test_bringup.test_a_turned_cube_is_found_and_written"
