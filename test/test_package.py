@@ -233,6 +233,7 @@ def test_installed_by_pip_it_finds_its_data_and_the_wire_in_c(tmp_path):
     assert Path(file).is_relative_to(prefix) and cubes == "16"
     assert Path(found) == prefix / "share" / PACKAGE.name
     assert Path(wire).parent == Path(file).parent and Path(wire).name == "_wire.abi3.so"
+    assert Path(file).with_name("py.typed").is_file()
     for name in DATA:
         assert listing(Path(found, name)) == listing(tmp_path / "source" / name)
 
