@@ -46,7 +46,7 @@ HOMES = {
     "serial": {"device"},
     "yaml": {"config"},
     "jsonschema": {"config"},
-    "rich": {"views", "cube_tensor_design", "cube_tensor_hub", "workshop"},
+    "rich": {"cli", "views", "cube_tensor_design", "cube_tensor_hub", "workshop"},
     "psutil": {"demo", "workshop"},
     "matplotlib": {"views", "browser", "cube_tensor_design", "workshop"},
     "scipy": {"mechanics", "touch", "browser", "cube_tensor_design"},

@@ -1,11 +1,12 @@
-"""The command line: one module per command, with its arguments and its run.
+"""The command line: one module per command, with its arguments, its work and what it prints.
 
-`table.py` lists the commands, `main.py` reads the words and turns errors into exit codes. Only the
-standard library is imported at the top of these modules: every --help works before the environment
-is set up. Work of more than a page is a function of another room.
+`table.py` lists the commands; `main.py` parses the words and turns errors into exit codes. At the
+top of these modules only the standard library is imported, so that every --help works before the
+environment is set up; all other imports are inside functions. Work of more than a page belongs
+into another folder.
 """
 
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-"""The checkout, which the commands for developers work on."""
+"""The folder of the checkout. The commands for developers work on it."""

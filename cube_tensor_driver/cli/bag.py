@@ -1,42 +1,140 @@
-"""./cube bag info, ./cube bag repair: what a bag holds, and bags made readable again."""
+"""./cube bag info, ./cube bag repair: show what a bag holds, make a damaged bag readable."""
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from .parser import Parser
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..bags.read import Bag
 
 
 def arguments(parser: Parser) -> None:
     info = parser.add_subcommand(
         "info", "print skin, cubes, calibrations, rates, gaps and counters"
     )
-    info.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
     repair = parser.add_subcommand(
         "repair", "make a bag readable that was cut off: killed, disk full, power lost"
     )
-    repair.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+    for command in (info, repair):
+        command.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
 
 
 def run(options: argparse.Namespace) -> int:
     if options.what == "info":
-        from ..views.terminal.bag import show_bag
-
         show_bag(options.bag)
-        return 0
-    return repair_bag(options.bag)
+    else:
+        repair_bag(options.bag)
+    return 0
 
 
-def repair_bag(bag: Path) -> int:
+def repair_bag(path: Path) -> None:
     """Make a bag readable and print what was lost."""
     from ..bags.repair import REST, repair
-    from ..views.terminal.output import warn
+    from ..views.terminal.output import say
 
-    done = repair(bag)
-    print(f"{bag}: {done.messages} messages can be read")
+    done = repair(path)
+    print(f"{path}: {done.messages} messages can be read")
     if done.cut:
         print(f"moved {done.cut} bytes behind the last complete chunk to files ending in {REST}")
     if done.damaged:
-        warn(f"left out {done.damaged} damaged chunks")
-    return 0
+        say(f"left out {done.damaged} damaged chunks", "red")
+
+
+def show_bag(path: Path) -> None:
+    """Print topics, skins, cubes, calibrations, rates, gaps and the last diagnostics.
+
+    Raises:
+        BagError: The bag cannot be read.
+    """
+    import numpy as np
+    from rich.console import Console
+
+    from ..bags.read import Bag
+    from ..bags.summary import last_diagnostics
+    from ..messages.types import FREQUENCIES
+
+    console = Console(highlight=False)
+    with Bag(path) as bag:
+        duration_s = 0.0
+        # The start and end time of a bag without messages are undefined.
+        if any(connection.msgcount for connection in bag.connections):
+            duration_s = (bag.end_ns - bag.start_ns) * 1e-9
+            start = np.datetime64(bag.start_ns, "ns").astype("datetime64[ms]")
+            console.print(f"{path}: {duration_s:.3f} s from {start} UTC")
+        else:
+            console.print(f"{path}: no messages")
+
+        console.print(topic_table(bag, duration_s))
+        for topic in bag.topics(FREQUENCIES):
+            show_skin(bag, topic, console)
+        for status in last_diagnostics(bag):
+            console.print(diagnostics_line(status), markup=False)
+
+
+def topic_table(bag: Bag, duration_s: float) -> Table:
+    """Return a table of the topics with their types, message counts and mean rates."""
+    from rich.table import Table
+
+    table = Table("topic")
+    table.add_column("type", overflow="fold")
+    for heading in ("messages", "Hz"):
+        table.add_column(heading, justify="right")
+    for connection in sorted(bag.connections, key=lambda connection: connection.topic):
+        count = connection.msgcount
+        rate = f"{count / duration_s:.1f}" if duration_s and count > 1 else ""
+        table.add_row(connection.topic, connection.msgtype, str(count), rate)
+    return table
+
+
+def show_skin(bag: Bag, topic: str, console: Console) -> None:
+    """Print the skin whose frequencies are on this topic, its calibrations and its cubes."""
+    from ..bags.recording import skin_infos
+    from ..bags.summary import cube_summaries
+    from ..core.errors import BagError
+    from ..views.terminal.output import make_table
+
+    try:
+        info = skin_infos(bag, topic)[-1]
+    except BagError as error:
+        # The other topics of the bag can still be shown.
+        console.print(str(error), style="red", markup=False)
+        return
+    frame, version = info.header.frame_id, info.version
+    console.print(
+        f"skin {info.name!r}: {cubes_text(len(info.cubes))} in {frame}, info version {version}",
+        markup=False,
+    )
+    for name, count in Counter(cube.calibration_id for cube in info.cubes).items():
+        layouts = sorted({cube.layout for cube in info.cubes if cube.calibration_id == name})
+        cubes = cubes_text(count)
+        console.print(f"  calibration {name}, layout {', '.join(layouts)}: {cubes}")
+
+    table = make_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"))
+    for cube in cube_summaries(bag, topic, info):
+        cells = ["", "", "", ""]
+        if cube.rate is not None and cube.longest_gap is not None:
+            gap_ms = f"{1e3 * cube.longest_gap:.1f}"
+            cells = [f"{cube.rate:.1f}", str(cube.lost), str(cube.gaps), gap_ms]
+        table.add_row(cube.name, f"{cube.uid:#x}", str(cube.samples), *cells)
+    console.print(table)
+
+
+def diagnostics_line(status: Any) -> str:
+    """Return the message of a diagnostic status and those of its values that are not zero."""
+    values = [
+        f"{pair.key} {pair.value}" for pair in status.values if pair.value not in ("0", "0.0", "")
+    ]
+    return f"{status.name}: {status.message or 'nothing wrong'}; {', '.join(values)}"
+
+
+def cubes_text(count: int) -> str:
+    """Return "1 cube" or "5 cubes"."""
+    return f"{count} {'cube' if count == 1 else 'cubes'}"

@@ -1,28 +1,46 @@
-"""./cube bringup: the pads of a new hub, which of them are which, and a skin file."""
+"""./cube bringup: check the pads of a new hub, find swapped ones by presses, write a skin file.
+
+The command first watches the pads at rest, then asks a person to press beside each cube. From the
+presses it computes how each cube is rotated and whether wires of its pads are swapped.
+"""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from .parser import Parser, sample_rate
 
 if TYPE_CHECKING:
     import numpy as np
+    from rich.table import Table
 
     from ..calibrate.pad_order import Explanation
     from ..calibrate.pad_rest import PadsAtRest
     from ..calibrate.press import Press
     from ..config.skin import Skin
     from ..device.live import LinkSource
-    from ..views.terminal.bringup import BringupScreen
 
 REST_S = 5.0
-"""How long pads rest before the presses: their noise and drift are from this time."""
-SHOW_S = 0.25
-"""How often the table is drawn, and the span of the averages in which presses are found."""
+"""Duration, in seconds, of the measurement of noise and drift before the presses."""
+
+AVERAGE_S = 0.25
+"""Period, in seconds, at which the table of pads is drawn, and length of the averages of the
+frequencies in which presses are found."""
+
 PITCH = 0.012
-"""Distance of the cubes in the file, m, which knows nothing of where they are."""
+"""Distance of neighbouring cubes in the written file, in metres.
+
+A placeholder: the hub does not know where its cubes are, so the user writes the positions.
+"""
+
+PPM = 1e6
+"""Parts per million in 1."""
+
+UNKNOWN_MISFIT = 0.5
+"""Misfit (0: perfect, 1: nothing is explained) below which presses that say nothing certain are
+reported as ambiguous, and above which they are reported as unexplained."""
 
 
 def arguments(parser: Parser) -> None:
@@ -48,43 +66,44 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """1 if a pad does not work, pads are swapped, or presses say nothing; else 0."""
+    """Return 1 if a pad does not work, pads are swapped, or presses are not explained; else 0."""
     import numpy as np
 
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
     from ..device.live import open_links
-    from ..views.terminal.bringup import BringupScreen
+    from ..views.terminal.output import say
 
     if options.output.exists():
-        raise ConfigError(f"-o {options.output}: the file is there; remove it, or name another one")
-    data, skin = first_skin(options)
+        raise ConfigError(f"-o {options.output}: the file exists; remove it, or name another one")
+    data, skin = skin_of_hub(options)
     names = [cube.name for cube in skin.cubes]
-    with (
-        open_links(skin) as source,
-        BringupScreen(names, skin.cubes[0].calibration.layout.pads) as screen,
-    ):
-        screen.say("leave the skin alone")
+    pads = skin.cubes[0].calibration.layout.pads
+    with open_links(skin) as source, PadScreen(names, pads) as screen:
+        say("leave the skin alone")
         rest = watch_rest(source, screen)
-        found = press_cubes(source, rest, screen)
-    for cube, explanation in found.items():
+        explanations = press_cubes(source, rest)
+
+    for cube, explanation in explanations.items():
         data["cubes"][cube]["pose"]["rpy"] = rpy(explanation.turn)
-        screen.verdict(names[cube], explanation)
-    if any(each.swapped or not each.is_clear for each in found.values()):
-        screen.say(
-            "no file written: swap the wires, or press again, and run this command again", "red"
-        )
+        show_explanation(names[cube], explanation, pads)
+    if any(each.swapped or not each.is_clear for each in explanations.values()):
+        say("no file written: swap the wires, or press again, and run this command again", "red")
         return 1
     header = f"./cube bringup {options.port}. Write the positions of the cubes into xyz."
     write_yaml(options.output, data, header)
-    screen.say(f"wrote {options.output}: write the positions of the cubes into it")
+    say(f"wrote {options.output}: write the positions of the cubes into it")
     return 0 if np.all(rest.works & ~rest.noisy) else 1
 
 
-def first_skin(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
-    """The content of a skin file for the hub at the port, and the skin that it describes.
+def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
+    """Ask the hub at the port for its cubes and describe them as a skin.
 
-    CubeError: nobody answers, or there is no calibration for so many pads.
+    Returns:
+        The content of a skin file, and the skin that it describes.
+
+    Raises:
+        CubeError: The hub does not answer, or there is no calibration for its number of pads.
     """
     from pathlib import Path
 
@@ -102,6 +121,7 @@ def first_skin(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
         raise CubeError(
             port.problem or f"{port.path}: no answer within 1 s; not a hub, or no power"
         )
+
     shipped = {layout.n_pads: name for name, layout in LAYOUTS.items()}
     name = options.calibration or shipped.get(hello.n_pads)
     if name is None:
@@ -111,7 +131,8 @@ def first_skin(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
         )
     file = find_calibration(name, Path())
     if options.calibration == str(file):
-        name = str(file.resolve())  # the skin file may be elsewhere
+        # A relative path would be searched from the folder of the skin file.
+        name = str(file.resolve())
     calibration = read_calibration(file)
     data = grid(
         options.name,
@@ -123,6 +144,8 @@ def first_skin(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
         layout=calibration.layout.name,
         port=options.port,
     )
+
+    # The hub knows the uids of its cubes; they stay right when cubes are connected otherwise.
     for cube, uid in zip(data["cubes"], hello.cube_uids.tolist(), strict=True):
         del cube["index"]
         cube["uid"] = f"{uid:#x}"
@@ -132,35 +155,34 @@ def first_skin(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
     return data, skin
 
 
-def watch_rest(source: LinkSource, screen: BringupScreen) -> PadsAtRest:
-    """The pads while nothing touches them, for REST_S."""
+def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
+    """Measure the pads for `REST_S` while nothing touches them."""
     import numpy as np
 
     from ..calibrate.pad_rest import LEAST_SAMPLES, pads_at_rest
     from ..device.scans.averages import scans
 
     parts: list[tuple[np.ndarray, np.ndarray]] = []
-    shown = 0.0
+    next_shown_s = 0.0
     for rows in source:
         parts.append(scans(rows, len(source.skin.cubes)))
-        now = float(parts[-1][1][-1] - parts[0][1][0])
-        is_over = now >= REST_S
-        if sum(len(each) for each, _ in parts) < LEAST_SAMPLES or not (is_over or now >= shown):
+        now_s = float(parts[-1][1][-1] - parts[0][1][0])
+        is_over = now_s >= REST_S
+        has_enough = sum(len(each) for each, _ in parts) >= LEAST_SAMPLES
+        if not has_enough or not (is_over or now_s >= next_shown_s):
             continue
-        shown = now + SHOW_S
+        next_shown_s = now_s + AVERAGE_S
         frequency, seconds = (np.concatenate(each) for each in zip(*parts, strict=True))
         rest = pads_at_rest(frequency, seconds)
-        screen.show_rest(rest)
+        screen.show(rest)
         if is_over:
             break
-    screen.end_rest(rest)
+    screen.finish(rest)
     return rest
 
 
-def press_cubes(
-    source: LinkSource, rest: PadsAtRest, screen: BringupScreen
-) -> dict[int, Explanation]:
-    """Ask for presses beside each cube that has working pads; what they say, by cube."""
+def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
+    """Ask for presses beside each cube that has working pads, and explain them, by cube."""
     import numpy as np
 
     from ..calibrate.pad_order import cube_turns, explain_presses
@@ -168,47 +190,134 @@ def press_cubes(
     from ..calibrate.side_press import SIDES, side_presses
     from ..core.oscillator import pad_stress
     from ..device.scans.averages import averages
+    from ..views.terminal.output import say
 
     cubes = source.skin.cubes
     calibration = cubes[0].calibration
     watch = PressWatch(rest.frequency, rest.noise, rest.works)
-    means = averages(source, len(cubes), SHOW_S)
-    left = set(np.flatnonzero(rest.works.any(axis=1)).tolist())
+    means = averages(source, len(cubes), AVERAGE_S)
+    waiting = set(np.flatnonzero(rest.works.any(axis=1)).tolist())
     expected = side_presses(calibration, cube_turns())
-    found: dict[int, Explanation] = {}
+    explanations: dict[int, Explanation] = {}
 
-    def press(of: set[int], where: str) -> Press:
-        """The next press beside one of these cubes."""
+    def wait_for_press(allowed: set[int], where: str) -> Press:
+        """Ask for a press until one is beside an allowed cube."""
         while True:
-            screen.say(f"press the skin next to {where}, and hold")
-            read = next(each for each in map(watch.update, means) if each is not None)
-            screen.say(f"{cubes[read.cube].name} answers: let go")
+            say(f"press the skin next to {where}, and hold")
+            press = next(each for each in map(watch.update, means) if each is not None)
+            say(f"{cubes[press.cube].name} answers: let go")
             while watch.is_held:
                 watch.update(next(means))
-            if read.cube in of:
-                return read
+            if press.cube in allowed:
+                return press
 
-    while left:
-        presses: list[Press] = []
-        for side in SIDES:
-            if presses:
-                one = {presses[0].cube}
-                presses.append(press(one, f"{cubes[presses[0].cube].name} on its {side} side"))
-            else:
-                which = "a cube" if not found else "a cube that was not pressed yet,"
-                presses.append(press(left, f"{which} on its {side} side"))
+    while waiting:
+        which = "a cube that was not pressed yet," if explanations else "a cube"
+        first_side, *other_sides = SIDES
+        # The first press chooses the cube, the others belong to it.
+        presses = [wait_for_press(waiting, f"{which} on its {first_side} side")]
+        cube = presses[0].cube
+        for side in other_sides:
+            presses.append(wait_for_press({cube}, f"{cubes[cube].name} on its {side} side"))
         ratio = 1 + np.array([each.change for each in presses])
         measured = pad_stress(ratio, 1.0, calibration.beta, calibration.modulus)
-        found[presses[0].cube] = explain_presses(measured, expected)
-        left.discard(presses[0].cube)
-    return found
+        explanations[cube] = explain_presses(measured, expected)
+        waiting.discard(cube)
+    return explanations
 
 
-def rpy(turn: np.ndarray) -> list[float]:
-    """Roll, pitch and yaw of a turn, rad, as in a skin file."""
+class PadScreen:
+    """Shows a table of the pads on stdout, live where that is a terminal; a context manager."""
+
+    def __init__(self, cubes: Sequence[str], pads: Sequence[str]) -> None:
+        """Args are the names of the cubes and of the pads of each cube."""
+        from rich.console import Console
+        from rich.live import Live
+
+        self._cubes, self._pads = cubes, pads
+        self._console = Console(highlight=False)
+        self._live = Live(console=self._console, transient=True, auto_refresh=False)
+
+    def __enter__(self) -> PadScreen:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def show(self, rest: PadsAtRest) -> None:
+        """Draw the live table."""
+        if self._live.is_started:
+            self._live.update(self._table(rest), refresh=True)
+
+    def finish(self, rest: PadsAtRest) -> None:
+        """End the live table and print it once more, to stay."""
+        self._live.stop()
+        self._console.print(self._table(rest))
+
+    def _table(self, rest: PadsAtRest) -> Table:
+        import numpy as np
+
+        from ..views.terminal.output import make_table
+
+        table = make_table(("cube", "pad"), ("f / Hz", "noise / ppm", "drift / (ppm/min)"))
+        table.add_column("state")
+        for cube, pad in np.ndindex(rest.frequency.shape):
+            numbers = ("", "", "")
+            if np.isfinite(rest.frequency[cube, pad]):
+                numbers = (
+                    f"{rest.frequency[cube, pad]:.1f}",
+                    f"{PPM * rest.noise[cube, pad]:.1f}",
+                    f"{PPM * rest.drift[cube, pad]:+.0f}",
+                )
+            name = self._cubes[cube] if pad == 0 else ""
+            fault = pad_fault(rest, cube, pad)
+            style = "red" if fault else ""
+            table.add_row(name, self._pads[pad], *numbers, fault or "ok", style=style)
+        return table
+
+
+def pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:
+    """Return what is wrong with a pad: silent, stuck or noisy; empty if nothing is."""
+    faults = [name for name in ("silent", "stuck", "noisy") if getattr(rest, name)[cube, pad]]
+    return faults[0] if faults else ""
+
+
+def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -> None:
+    """Print what the presses tell about a cube: its rotation and its swapped pads."""
+    from ..views.terminal.output import say
+
+    if not explanation.is_clear:
+        misfit = explanation.misfit
+        why = f"{100 * misfit:.0f} % of what its pads measured is not explained"
+        if misfit < UNKNOWN_MISFIT:
+            why = "several explanations fit"
+        say(f"{name}: the presses do not say how it sits ({why})", "red")
+        return
+    findings = []
+    if explanation.is_turned:
+        findings.append(f"turned, rpy {rotation_text(explanation.turn)}")
+    if explanation.swapped:
+        pairs = [
+            f"{pads[wire]} is {pads[explanation.places[wire]]}" for wire in explanation.swapped
+        ]
+        findings.append(f"pads are swapped: {', '.join(pairs)}")
+    style = "red" if explanation.swapped else "yellow" if findings else "green"
+    say(f"{name}: {'; '.join(findings) or 'as it should be'}", style)
+
+
+def rpy(rotation: np.ndarray) -> list[float]:
+    """Return roll, pitch and yaw of a rotation matrix (3, 3), in radians, as in a skin file."""
     from ..core.tensor import quaternion_from_rotation, rpy_from_quaternion
 
-    return [
-        round(float(angle) + 0.0, 9)
-        for angle in rpy_from_quaternion(quaternion_from_rotation(turn))
-    ]
+    angles = rpy_from_quaternion(quaternion_from_rotation(rotation))
+    # Adding 0.0 turns -0.0 into 0.0.
+    return [round(float(angle) + 0.0, 9) for angle in angles]
+
+
+def rotation_text(rotation: np.ndarray) -> str:
+    """Return roll, pitch and yaw of a rotation matrix (3, 3) in degrees."""
+    import math
+
+    return " ".join(f"{math.degrees(angle):.0f}°" for angle in rpy(rotation))

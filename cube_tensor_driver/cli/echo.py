@@ -1,12 +1,19 @@
-"""./cube echo: what comes on a topic of a running skin."""
+"""./cube echo: print what comes on a topic of a running skin."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import os
 import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from .parser import Parser
+
+if TYPE_CHECKING:
+    from ..ros.commands.listening import StressReading
 
 
 def arguments(parser: Parser) -> None:
@@ -16,15 +23,14 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Until Ctrl-C, or until the reader of a pipe has enough: neither is an error."""
+    """Print until Ctrl-C, or until the reader of a pipe closes it: neither is an error."""
     from ..config.yaml import to_yaml
-    from ..ros.commands.listening import listen
-    from ..views.terminal.echo import Reading, message_json, reading_json, reading_line
+    from ..ros.commands.listening import StressReading, listen
 
     try:
         for items in listen(options.topic, options.once):
             for item in items:
-                if isinstance(item, Reading):
+                if isinstance(item, StressReading):
                     print(reading_json(item) if options.json else reading_line(item))
                 elif options.json:
                     print(message_json(item))
@@ -32,6 +38,66 @@ def run(options: argparse.Namespace) -> int:
                     print(f"{to_yaml(item)}---")
             sys.stdout.flush()
     except BrokenPipeError:
-        # What is left, at the end of the process too, goes nowhere.
+        # Python flushes stdout once more when it ends, which must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
+
+
+def reading_line(reading: StressReading) -> str:
+    """Return time, cube, observed components with units, residual and status as one line."""
+    from ..core.modes import COMPONENTS, STRESS
+
+    pairs = zip(COMPONENTS, reading.values, strict=True)
+    observed = {name: value for name, value in pairs if not math.isnan(value)}
+    stress = [f"{name} {value:9.1f}" for name, value in observed.items() if name in STRESS]
+    gradient = [f"{name} {value:10.0f}" for name, value in observed.items() if name not in STRESS]
+    parts = [f"{reading.stamp_ns * 1e-9:.3f} s", reading.cube]
+    if stress:
+        parts += [*stress[:-1], f"{stress[-1]} Pa"]
+    if gradient:
+        parts += [*gradient[:-1], f"{gradient[-1]} Pa/m"]
+    if not math.isnan(reading.residual):
+        parts.append(f"residual {reading.residual:.2f}")
+    parts.append(", ".join(status_words(reading.status)) or "fine")
+    return "  ".join(parts)
+
+
+def reading_json(reading: StressReading) -> str:
+    """Return a reading as a JSON object on one line; components not observed are null."""
+    from ..core.modes import COMPONENTS, STRESS
+
+    values = dict(zip(COMPONENTS, reading.values, strict=True))
+    content = {
+        "stamp_ns": reading.stamp_ns,
+        "cube": reading.cube,
+        "stress_pa": {name: values[name] for name in COMPONENTS if name in STRESS},
+        "gradient_pa_per_m": {name: values[name] for name in COMPONENTS if name not in STRESS},
+        "residual": reading.residual,
+        "status": status_words(reading.status),
+    }
+    return message_json(content)
+
+
+def status_words(status: int) -> list[str]:
+    """Return the names of the status bits that are set, as in SkinStress.msg, and why pads were
+    left out."""
+    from ..core.status import STATUS, WORDS
+
+    names = [name for name, bit in STATUS.items() if status & bit]
+    return names + [f"pad {word}" for bit, word in WORDS.items() if status & bit]
+
+
+def message_json(content: Mapping[str, Any]) -> str:
+    """Return a message of plain values as JSON on one line."""
+    return json.dumps(without_nan(content))
+
+
+def without_nan(value: Any) -> Any:
+    """Replace NaN and infinity by None, because JSON has no word for them."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: without_nan(field) for name, field in value.items()}
+    if isinstance(value, list):
+        return [without_nan(one) for one in value]
+    return value

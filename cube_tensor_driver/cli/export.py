@@ -1,18 +1,27 @@
-"""./cube export: bags into the formats of learning and analysis; without ROS."""
+"""./cube export: write bags in the formats of machine learning and data analysis, without ROS."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from . import reprocess
 from .parser import Parser, count
+
+if TYPE_CHECKING:
+    from ..lerobot.export import Exported
+
+UNUSUAL_DEPTH = 2
+"""Ratio of the largest number of samples in a frame to the usual one, above which it is reported:
+every window of the data set is as long as the largest."""
 
 TABLES = {
     "parquet": "one Parquet table per bag",
     "csv": "one CSV table per bag",
     "zarr": "one Zarr group per bag",
 }
+"""Formats of tables, with the help of their commands."""
 
 
 def arguments(parser: Parser) -> None:
@@ -65,28 +74,58 @@ def _add_common(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """1 if a table could not be made. CubeError: nothing was begun."""
+    """Return 1 if a table could not be made, else 0.
+
+    Raises:
+        CubeError: The options or the output cannot be used; nothing was begun.
+    """
     from ..bags.reprocess.all_bags import RECIPE
     from ..lerobot.choices import Choices
     from ..lerobot.export import check_empty, export_lerobot
-    from ..views.terminal.exporting import say_exported
     from ..views.terminal.output import progress_bar
 
     if options.what in TABLES:
-        if not (options.output / RECIPE).exists():  # an export that was interrupted goes on
+        # A folder with a recipe is an export that was interrupted: it is continued.
+        if not (options.output / RECIPE).exists():
             check_empty(options.output)
         return reprocess.run(options)
+
     choices = Choices(
-        options.fps,
-        options.task,
-        options.marks,
-        options.frequencies,
-        options.topics,
-        options.state,
-        options.action,
-        reprocess.overrides_of(options),
+        fps=options.fps,
+        task=options.task,
+        marks=options.marks,
+        frequencies=options.frequencies,
+        topics=options.topics,
+        state=options.state,
+        action=options.action,
+        overrides=reprocess.overrides_of(options),
     )
     with progress_bar() as report:
         exported = export_lerobot(options.bags, options.output, choices, report)
-    say_exported(options.output, exported)
+    show_exported(options.output, exported)
     return 0
+
+
+def show_exported(folder: Path, exported: Exported) -> None:
+    """Print what the data set holds, and how much of each kind of data was left out."""
+    from ..views.terminal.output import say
+
+    others = ", ".join(exported.features) or "no other topics"
+    say(
+        f"{folder}: {exported.episodes} episodes, {exported.frames} frames, {exported.rows} "
+        f"samples, {exported.depth} in a window; {others}"
+    )
+    if exported.depth > UNUSUAL_DEPTH * exported.usual:
+        say(
+            f"usual are {exported.usual} samples in a window, but one frame holds "
+            f"{exported.depth}: hubs paused, or stamps are in doubt; --marks can leave that out",
+            "yellow",
+        )
+    left_out = {
+        "samples outside of the marks": exported.outside,
+        "samples of cubes that the skin does not have": exported.unknown,
+        "marks without a sample": exported.empty,
+    }
+    for what, number in left_out.items():
+        if number:
+            say(f"left out: {number} {what}", "yellow")

@@ -1,17 +1,20 @@
-"""./cube fit: a calibration from known loads, with what the loads say about it."""
+"""./cube fit: compute a calibration from known loads and the frequencies measured under them."""
 
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .parser import Parser, positive, uid
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..calibrate.fit import Fit
+    from ..calibrate.load_table import Loads
+    from ..core.arrays import Array
+    from ..core.calibration import Calibration
+    from ..core.layout import Layout
 
 
 def arguments(parser: Parser) -> None:
@@ -65,49 +68,19 @@ def run(options: argparse.Namespace) -> int:
     import datetime
     from dataclasses import replace
 
-    from ..bags.read import is_bag
     from ..calibrate.fit import fit, measured_stress
-    from ..calibrate.load_table import read_loads, unloaded
-    from ..config.calibration import find_calibration, read_calibration, write_calibration
-    from ..config.layout import named_layout, shipped_calibration
+    from ..config.calibration import write_calibration
+    from ..config.layout import named_layout
     from ..config.output_files import write_json
-    from ..core.errors import ConfigError
     from ..core.symmetry import find_structure
     from ..views.figures.calibration import draw_fit
     from ..views.figures.style import save
-    from ..views.terminal.fit import show_fit
 
     layout = named_layout(options.layout)
-    base = shipped_calibration(layout)
-    rest: np.ndarray | None
-    if options.reference is not None:
-        from ..calibrate.recorded_loads import bag_loads
-
-        loads, base = bag_loads(
-            options.loads, options.cube, options.reference, layout, options.area
-        )
-        # A reference sensor never reads exactly 0: only the tare tells when there was no load.
-        rest, rest_source = base.rest_frequency, "of the bag, after tare"
-    else:
-        if is_bag(options.loads):
-            raise ConfigError(
-                f"{options.loads} is a bag: name the topic to fit to with --reference; "
-                f"./cube bag info {options.loads} lists them"
-            )
-        loads = read_loads(options.loads, layout, options.area)
-        rest, rest_source = unloaded(loads), "of the rows without load"
-    if options.base is not None:
-        base = read_calibration(find_calibration(options.base, Path()))
-        base.check(layout, options.uid)
-    if base is None:
-        raise ConfigError(
-            f"layout {layout.name!r} is not a built-in one: name a calibration for it with --base"
-        )
-    if rest is None:
-        rest = base.rest_frequency
-        rest_source = "of the base calibration: the table has no row without load"
+    loads, base, rest, rest_source = read_inputs(options, layout)
     base = replace(base, rest_frequency=rest, uid=options.uid)
 
+    # Rows without load say nothing about the response: they were averaged to the rest frequencies.
     loaded = loads.state.any(axis=1)
     temperature = None if loads.temperature is None else loads.temperature[loaded]
     measured = measured_stress(base, loads.frequency[loaded], temperature)
@@ -127,8 +100,95 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def read_inputs(
+    options: argparse.Namespace, layout: Layout
+) -> tuple[Loads, Calibration, Array, str]:
+    """Read the loads and the calibration that the fit starts from.
+
+    Returns:
+        Loads; base calibration; rest frequencies (pads,) in Hz; where these come from, in words.
+
+    Raises:
+        CubeError: The table or bag cannot be used, or there is no base calibration.
+    """
+    from ..bags.read import is_bag
+    from ..calibrate.load_table import read_loads, unloaded
+    from ..calibrate.recorded_loads import bag_loads
+    from ..config.calibration import find_calibration, read_calibration
+    from ..config.layout import shipped_calibration
+    from ..core.errors import ConfigError
+
+    base = shipped_calibration(layout)
+    rest: Array | None
+    if options.reference is not None:
+        loads, base = bag_loads(
+            options.loads, options.cube, options.reference, layout, options.area
+        )
+        # A reference sensor never reads exactly 0, so that only the tare of the recorded skin
+        # tells when there was no load.
+        rest, rest_source = base.rest_frequency, "of the bag, after tare"
+    elif is_bag(options.loads):
+        raise ConfigError(
+            f"{options.loads} is a bag: name the topic to fit to with --reference; "
+            f"./cube bag info {options.loads} lists them"
+        )
+    else:
+        loads = read_loads(options.loads, layout, options.area)
+        rest, rest_source = unloaded(loads), "of the rows without load"
+
+    if options.base is not None:
+        base = read_calibration(find_calibration(options.base, Path()))
+        base.check(layout, options.uid)
+    if base is None:
+        raise ConfigError(
+            f"layout {layout.name!r} is not a built-in one: name a calibration for it with --base"
+        )
+    if rest is None:
+        rest = base.rest_frequency
+        rest_source = "of the base calibration: the table has no row without load"
+    return loads, base, rest, rest_source
+
+
+def show_fit(result: Fit, remark: str) -> None:
+    """Print coefficients, gains, how well they fit, and which loads would determine more.
+
+    Args:
+        result: The fit.
+        remark: Where the rest frequencies come from.
+    """
+    from rich.console import Console
+
+    from ..views.terminal.output import make_table
+
+    console = Console(highlight=False)
+    console.print(f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {remark}")
+    table = make_table(("coefficient",), ("value", "standard deviation"))
+    for name, value in result.coefficients.items():
+        if math.isfinite(value):
+            table.add_row(name, f"{value:+.5f}", f"{result.deviations[name]:.2g}")
+        else:
+            table.add_row(name, "open", "not determined")
+    console.print(table)
+
+    console.print("gains (average 1 over pads that the symmetry carries onto each other)")
+    gains = make_table(("pad",), ("gain", "standard deviation"))
+    pads = result.structure.layout.pads
+    for pad, gain, deviation in zip(pads, result.gain, result.gain_deviation, strict=True):
+        gains.add_row(pad, f"{gain:.5f}", f"{deviation:.2g}")
+    console.print(gains)
+
+    console.print(
+        f"scatter {result.scale:.3g} × the stated noise; "
+        f"chi-square {result.chi2:.4g} for {result.dof} degrees of freedom; "
+        f"held-out error {100 * result.held_out:.3g} % of the readings; "
+        f"{int(result.outliers.sum())} outliers"
+    )
+    for sentence in result.advice:
+        console.print(sentence, style="red")
+
+
 def figures(result: Fit) -> dict[str, object]:
-    """For the JSON file. outliers: pairs (row, pad), of the rows that are under load."""
+    """Return the content of the JSON file; outliers are pairs (row among those with load, pad)."""
     rows, pads = result.outliers.nonzero()
     return {
         "coefficients": result.coefficients,

@@ -1,11 +1,15 @@
-"""./cube layout: what a layout's pads can measure, in numbers and as a picture."""
+"""./cube layout: show what the pads of a layout can measure, in numbers and as a picture."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from .parser import Parser
+
+if TYPE_CHECKING:
+    from ..core.layout import Layout
 
 
 def arguments(parser: Parser) -> None:
@@ -38,7 +42,6 @@ def run(options: argparse.Namespace) -> int:
     from ..core.symmetry import find_structure, largest_symmetry
     from ..views.figures.calibration import draw_layout
     from ..views.figures.style import save
-    from ..views.terminal.layout import show_layout
 
     layout = named_layout(options.name)
     calibration = shipped_calibration(layout)
@@ -53,7 +56,8 @@ def run(options: argparse.Namespace) -> int:
         symmetry = largest_symmetry(layout)
     structure = find_structure(layout, symmetry)
     if calibration is None:
-        # Any response of this structure has its ranks; conditions and noise are of one response.
+        # Every response of this structure has the same ranks, but condition numbers and noise
+        # depend on the values of the response.
         result = summary(structure, generic_response(structure))
         result |= {
             "condition_uniform": None,
@@ -69,3 +73,47 @@ def run(options: argparse.Namespace) -> int:
         write_json(options.json, result)
     save(draw_layout(layout), options.figure)
     return 0
+
+
+def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: str) -> None:
+    """Print what a layout can measure.
+
+    Args:
+        layout: The layout.
+        symmetry: Symmetry group of the response.
+        result: What `core.estimator.summary` found; None stands for unknown values.
+        source: Where the response comes from, in words.
+    """
+    from rich.console import Console
+
+    from ..core.symmetry import coefficient_counts
+    from ..views.terminal.output import make_table
+
+    console = Console(highlight=False)
+    pads = " ".join(layout.pads)
+    console.print(f"layout {layout.name}: {layout.n_pads} pads   {pads}", markup=False)
+    counts = [
+        f"{name} {'not possible' if count is None else count}"
+        for name, count in coefficient_counts(layout).items()
+    ]
+    console.print(f"coefficients by symmetry: {', '.join(counts)}")
+    console.print(f"symmetry {symmetry}; {source}", markup=False)
+
+    for part in ("uniform", "gradient"):
+        condition = result[f"condition_{part}"]
+        text = "unknown" if condition is None else f"{condition:.3g}"
+        console.print(f"{part + ':':10} rank {result[f'rank_{part}']}, condition {text}")
+    console.print(f"unobservable: {', '.join(result['unobservable']) or 'nothing'}")
+    console.print("noise of each mode per unit of pad noise (gradients times the half side):")
+    table = make_table(("mode",), ("noise",))
+    for name in result["modes"]:
+        table.add_row(name, noise_text(result, name))
+    console.print(table)
+
+
+def noise_text(result: dict[str, Any], mode: str) -> str:
+    """Return the noise of a mode per unit of pad noise, or why there is no number."""
+    if mode in result["unobservable"]:
+        return "not observed"
+    noise = result["noise"][mode]
+    return "unknown" if noise is None else f"{noise:.3f}"

@@ -1,11 +1,15 @@
-"""./cube record: topics of a running skin into a bag."""
+"""./cube record: record topics of a running skin into a bag."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from .parser import Parser, positive
+
+if TYPE_CHECKING:
+    from ..ros.commands.recorder import Recorder
 
 
 def arguments(parser: Parser) -> None:
@@ -47,23 +51,10 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """1 if messages were dropped, else 0."""
-    from ..ros.commands.recorder import Recorder
+    """Return 1 if messages were dropped, else 0."""
     from ..ros.commands.recording import record
-    from ..views.terminal.recording import RecordingStatus
 
-    status = RecordingStatus(options.output)
-
-    def show(recorder: Recorder, seconds: float) -> None:
-        status.show(
-            seconds,
-            received=recorder.received,
-            dropped=recorder.dropped,
-            missing=recorder.missing,
-            refused=recorder.refused,
-        )
-
-    with status:
+    with RecordingStatus(options.output) as status:
         recorder = record(
             options.output,
             options.topics,
@@ -71,7 +62,57 @@ def run(options: argparse.Namespace) -> int:
             max_bytes=round((options.split_size or 0) * 1e6),
             max_seconds=options.split_time or 0.0,
             duration=options.duration,
-            show=show,
+            show=status.show,
         )
-    status.summary(recorder.counts, dropped=recorder.dropped, missing=recorder.missing)
+    status.print_summary(recorder)
     return 1 if recorder.dropped else 0
+
+
+class RecordingStatus:
+    """Shows on stderr how a recording goes on; a context manager.
+
+    One line is updated; a red line is added for each topic that cannot be recorded, and whenever
+    more messages were dropped.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """path: folder of the bag."""
+        from rich.console import Console
+
+        self._path = path
+        self._console = Console(stderr=True, highlight=False)
+        self._status = self._console.status("")
+        self._refused: set[str] = set()
+        self._dropped = 0
+
+    def __enter__(self) -> RecordingStatus:
+        self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._status.stop()
+
+    def show(self, recorder: Recorder, seconds: float) -> None:
+        """Update the line; seconds: since the first message."""
+        missing, refused = recorder.missing, recorder.refused
+        waiting = f"; waiting for {', '.join(missing)}" if missing else ""
+        self._status.update(f"{self._path}: {seconds:.0f} s, {recorder.received} messages{waiting}")
+        for topic in refused.keys() - self._refused:
+            self._console.print(f"not recorded: {refused[topic]}", style="red")
+        self._refused |= refused.keys()
+        if recorder.dropped > self._dropped:
+            self._dropped = recorder.dropped
+            self._console.print(
+                f"the disk is too slow: {self._dropped} messages dropped so far", style="red"
+            )
+
+    def print_summary(self, recorder: Recorder) -> None:
+        """Print how many messages of each topic were recorded, dropped or not offered."""
+        counts, dropped = recorder.counts, recorder.dropped
+        self._console.print(f"{self._path}: {sum(counts.values()) - dropped} messages")
+        for topic, count in sorted(counts.items()):
+            self._console.print(f"  {count:8} {topic}")
+        for topic in recorder.missing:
+            self._console.print(f"         0 {topic}: nobody offers it", style="yellow")
+        if dropped:
+            self._console.print(f"{dropped} messages dropped: the disk is too slow", style="red")

@@ -1,8 +1,10 @@
-"""./cube replay: a bag onto its topics, with keys to pause, step and quit, and the browser view."""
+"""./cube replay: publish a bag, with keys to pause, step and quit, and with the browser view."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import select
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,8 +18,11 @@ if TYPE_CHECKING:
     from ..processes.children import Children
     from ..ros.commands.player import Player
 
-START_S = 30.0
-"""How long the browser view may take to start."""
+MAX_START_S = 30.0
+"""Time, in seconds, that the browser view may take to start."""
+
+KEYS = "space: pause, s: step, q: quit"
+"""The line of help beside the bar."""
 
 
 def arguments(parser: Parser) -> None:
@@ -51,15 +56,14 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from ..bags.read import Bag
     from ..ros.commands.replaying import replay
-    from ..views.terminal.replaying import ReplayBar, pressed_key, single_keys
 
-    with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as keys:
-        length = (bag.end_ns - bag.start_ns) * 1e-9
-        with ReplayBar(length, keys) as bar:
+    with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as has_keys:
+        length_s = (bag.end_ns - bag.start_ns) * 1e-9
+        with ReplayBar(length_s, has_keys) as bar:
 
             def each(player: Player) -> None:
                 children.check()
-                if keys:
+                if has_keys:
                     obey(pressed_key(), player)
                 bar.show(player.position, player.paused)
 
@@ -77,6 +81,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def obey(key: str, player: Player) -> None:
+    """Do what a key stands for; other keys do nothing."""
     if key == " ":
         player.pause(not player.paused)
     elif key == "s":
@@ -86,8 +91,72 @@ def obey(key: str, player: Player) -> None:
 
 
 @contextmanager
+def single_keys() -> Iterator[bool]:
+    """Let keys arrive one by one, without Enter and without echo.
+
+    Yields:
+        Whether there are keys; there are none where stdin is no terminal.
+    """
+    import termios
+    import tty
+
+    if not sys.stdin.isatty():
+        yield False
+        return
+    number = sys.stdin.fileno()
+    before = termios.tcgetattr(number)
+    try:
+        tty.setcbreak(number)
+        yield True
+    finally:
+        termios.tcsetattr(number, termios.TCSADRAIN, before)
+
+
+def pressed_key() -> str:
+    """Return the next key that was pressed, empty if none was."""
+    if not select.select([sys.stdin], [], [], 0)[0]:
+        return ""
+    # Not sys.stdin.read, whose buffer would hide further keys from select.
+    return os.read(sys.stdin.fileno(), 1).decode(errors="replace")
+
+
+class ReplayBar:
+    """Shows on stderr how far a replay is; a context manager."""
+
+    def __init__(self, length_s: float, has_keys: bool) -> None:
+        """length_s: of the bag, in seconds. has_keys: whether to print the help for keys."""
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.1f} / {task.total:.1f} s"),
+            TextColumn(KEYS if has_keys else ""),
+            console=Console(stderr=True),
+        )
+        self._task = self._progress.add_task("replaying", total=length_s)
+
+    def __enter__(self) -> ReplayBar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, position_s: float, paused: bool) -> None:
+        """position_s: time after the start of the bag, in seconds."""
+        text = "paused" if paused else "replaying"
+        self._progress.update(self._task, completed=position_s, description=text)
+
+
+@contextmanager
 def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
-    """The browser view as a child, if wanted. BagError: it would have nothing to show."""
+    """Start the browser view as a child process, if wanted.
+
+    Raises:
+        BagError: The bag has no stress, which is all that the view shows.
+    """
     import tempfile
 
     from ..core.errors import BagError
@@ -106,5 +175,5 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
                     "./cube reprocess computes it from the frequencies"
                 )
             children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-            print(children.wait_for_line("view", "http://", START_S), file=sys.stderr)
+            print(children.wait_for_line("view", "http://", MAX_START_S), file=sys.stderr)
         yield children

@@ -1,4 +1,7 @@
-"""./cube reprocess: bags to stress again, in parallel, here or on a Dask cluster; without ROS."""
+"""./cube reprocess: compute the stress of bags again, in parallel, here or on a Dask cluster.
+
+It needs no ROS. What it computes has the same bits as what the reconstruction node published.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,8 @@ from .parser import Parser, count, number
 
 if TYPE_CHECKING:
     from ..bags.reprocess.contacts import ContactsOverTime
-    from ..bags.reprocess.job import Overrides
+    from ..bags.reprocess.job import Overrides, ReprocessResult
+    from ..core.errors import CubeError
 
 
 def arguments(parser: Parser) -> None:
@@ -52,7 +56,7 @@ def arguments(parser: Parser) -> None:
 
 
 def add_overrides(parser: Parser) -> None:
-    """Options that say what differs from the recording; `overrides_of` reads them."""
+    """Add the options that replace parts of the recording; `overrides_of` reads them."""
     parser.add_argument(
         "--calibration", metavar="FILE", help="calibration of all cubes (default: as recorded)"
     )
@@ -72,7 +76,11 @@ def add_overrides(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """1 if a bag could not be reprocessed. CubeError: nothing was begun."""
+    """Return 1 if a bag could not be reprocessed, else 0.
+
+    Raises:
+        CubeError: The options cannot be used; nothing was begun.
+    """
     from ..bags.reprocess.all_bags import (
         make_jobs,
         remove_without_results,
@@ -81,26 +89,84 @@ def run(options: argparse.Namespace) -> int:
         workers,
         write_recipe,
     )
-    from ..views.terminal.reprocessing import ReprocessingReport
 
     overrides, contacts = overrides_of(options), contacts_of(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
     write_recipe(options.output, options.format, overrides, contacts)
     waiting = [job for job in jobs if not job.output.exists()]
-    report = ReprocessingReport(options.output, jobs=len(jobs), waiting=len(waiting))
     processes = useful_workers(options.jobs, len(waiting))
     try:
-        with workers(processes, options.scheduler) as executor, report:
+        with (
+            workers(processes, options.scheduler) as executor,
+            ReprocessingReport(options.output, len(jobs), len(waiting)) as report,
+        ):
             for job, result in reprocess_all(waiting, executor):
                 report.add(job.output, result)
     finally:
         remove_without_results(options.output)
-    report.summary()
+    report.print_summary()
     return 1 if report.failed else 0
 
 
+class ReprocessingReport:
+    """Shows on stderr a bar over the bags and a line for each; a context manager.
+
+    Attributes:
+        failed: Number of bags that could not be reprocessed.
+    """
+
+    def __init__(self, folder: Path, jobs: int, waiting: int) -> None:
+        """Start a report.
+
+        Args:
+            folder: Folder of the results.
+            jobs: Number of bags.
+            waiting: Number of bags without a result, which are reprocessed now.
+        """
+        from rich.console import Console
+        from rich.progress import Progress
+
+        self.failed = 0
+        self._jobs = jobs
+        self._console = Console(stderr=True, highlight=False)
+        self._progress = Progress(console=self._console, disable=not waiting)
+        self._task = self._progress.add_task("reprocessing", total=waiting)
+        if waiting < jobs:
+            self._console.print(f"{jobs - waiting} of {jobs} bags are there already in {folder}")
+
+    def __enter__(self) -> ReprocessingReport:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def add(self, output: Path, result: ReprocessResult | CubeError) -> None:
+        """Print the result of a bag, or the error that ended its reprocessing."""
+        from ..core.errors import CubeError
+
+        if isinstance(result, CubeError):
+            self.failed += 1
+            self._console.print(f"cube: {result}", style="red", markup=False)
+        else:
+            self._console.print(
+                f"{output}: {result.messages} messages, {result.rows} rows, {result.seconds:.1f} s"
+            )
+        self._progress.advance(self._task)
+
+    def print_summary(self) -> None:
+        """Print how many bags failed, if any did."""
+        if self.failed:
+            text = f"{self.failed} of {self._jobs} bags could not be reprocessed"
+            self._console.print(text, style="red")
+
+
 def overrides_of(options: argparse.Namespace) -> Overrides:
-    """ConfigError: options that contradict each other, or files that are wrong."""
+    """Return what the options replace of a recording.
+
+    Raises:
+        ConfigError: Options contradict each other, or a file cannot be used.
+    """
     from ..bags.reprocess.job import Overrides
     from ..config.calibration import find_calibration, read_calibration
     from ..config.skin import read_skin
@@ -121,7 +187,12 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
 
 
 def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
-    """ConfigError: a method or value that the node `contacts` would not take; or a table."""
+    """Return how contacts are to be computed; None: they are not wanted.
+
+    Raises:
+        ConfigError: The format holds no contacts, or the node `contacts` would refuse the method
+            or a value.
+    """
     from ..bags.reprocess.contacts import ContactsOverTime
     from ..core.errors import ConfigError
     from ..ros.parameters import CONTACTS
@@ -131,12 +202,14 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
         return None
     if options.format != "bag":
         raise ConfigError(f"--contacts with --format {options.format}: only a bag holds contacts")
-    method, *others = options.contacts
-    known = {one.name: one for one in CONTACTS if one.span is not None or one.name == "influence"}
+    method, *assignments = options.contacts
     if method not in CONTACT_METHODS:
         raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
+
+    # The numbers and the influence file; other parameters of the node concern its topics.
+    known = {one.name: one for one in CONTACTS if one.span is not None or one.name == "influence"}
     values = {name: one.default for name, one in known.items()}
-    for text in others:
+    for text in assignments:
         name, _, value = text.partition(":=")
         if name not in known:
             raise ConfigError(f"--contacts {text}: use NAME:=VALUE with one of {', '.join(known)}")
@@ -148,6 +221,7 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
             values[name] = float(value)
         except ValueError:
             values[name] = math.nan
+        # NaN fails the comparison, too.
         if not low <= values[name] <= high:
             raise ConfigError(f"--contacts {text}: needed is a number from {low:g} to {high:g}")
     rate = values.pop("rate")

@@ -1,10 +1,14 @@
-"""./cube check: does a hub keep every rule of docs/protocol.md?"""
+"""./cube check: test whether a hub keeps every rule of docs/protocol.md."""
 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from cube_tensor_driver.cli.parser import Parser, count
+
+if TYPE_CHECKING:
+    from ..check import Checked
 
 
 def arguments(parser: Parser) -> None:
@@ -25,13 +29,12 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """1 if the hub breaks a rule, else 0."""
+    """Return 1 if the hub breaks a rule, else 0."""
     from cube_tensor_driver.config.output_files import write_json
     from cube_tensor_driver.views.terminal.output import progress_bar
 
     from ..check import check
     from ..port_wire import PortWire
-    from ..show_check import show_check
 
     with PortWire(options.port, options.baud) as wire, progress_bar() as report:
         result = check(wire, report)
@@ -39,3 +42,31 @@ def run(options: argparse.Namespace) -> int:
     if options.json is not None:
         write_json(options.json, result.to_dict())
     return 1 if result.failed() else 0
+
+
+def show_check(result: Checked) -> None:
+    """Print the hub, a line for each rule, and how many rules have each outcome."""
+    from rich.console import Console
+    from rich.text import Text
+
+    from ..verdict import RULES, Outcome
+
+    styles = {Outcome.PASSED: "green", Outcome.FAILED: "bold red", Outcome.NOT_TRIED: "dim"}
+    console = Console(highlight=False, soft_wrap=True)
+    hello = result.hello
+    if hello is not None:
+        console.print(
+            f"{result.port}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} "
+            f"pads, firmware 0x{hello.firmware:x}",
+            markup=False,
+        )
+    for number, verdict in result.verdicts.items():
+        line = Text(f"{number}  ")
+        line.append(f"{verdict.outcome.value:<9}", styles[verdict.outcome])
+        line.append(f"  {verdict.text}")
+        if verdict.outcome is Outcome.FAILED:
+            rule = RULES[number]
+            line.append(f". The page says: {rule.says} (docs/protocol.md, {rule.section})")
+        console.print(line)
+    counts = [f"{result.count(outcome)} {outcome.value}" for outcome in Outcome]
+    console.print(f"{len(result.verdicts)} rules: {', '.join(counts)}")

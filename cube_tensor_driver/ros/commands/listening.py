@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from ...core.errors import CubeError, MessageError
 from ...core.rows import StressRows
 from ...messages.codec import stress_codec
 from ...msg import SkinInfo, SkinStress, StressTensorStamped
-from ...views.terminal.echo import Reading
 from ..messages import message_class, to_ns
 from ..session import node_session, on_stop_signal
 from .asking import STEP_S, discover, domain_text, spin
@@ -29,13 +29,33 @@ INFO_S = 3.0
 MESSAGE_S = 5.0
 """How long the first message may take, where one is wanted."""
 
-Item = Reading | dict[str, Any]
+
+@dataclass(frozen=True)
+class StressReading:
+    """The stress of one cube at one instant.
+
+    Attributes:
+        stamp_ns: Time at which the pads were read.
+        cube: Name of the cube.
+        values: One per name of `COMPONENTS`, in Pa and Pa/m; NaN where it is not observed.
+        residual: Residual relative to the expected noise.
+        status: Bits of `core/status.py`.
+    """
+
+    stamp_ns: int
+    cube: str
+    values: list[float]
+    residual: float
+    status: int
+
+
+Item = StressReading | dict[str, Any]
 
 
 def listen(topic: str, once: bool) -> Iterator[list[Item]]:
     """What each message of a topic says, until a signal asks to end; `once`: the first message.
 
-    Topics of stress give one `Reading` per row, others one dict of plain values.
+    Topics of stress give one `StressReading` per row, others one dict of plain values.
     CubeError: nobody publishes it, its messages are not installed here, or with
     `once` no message comes within MESSAGE_S.
     """
@@ -151,21 +171,21 @@ class Listener:
             return
         self.waiting.append(rows)
 
-    def _rows(self, rows: StressRows) -> Iterator[Reading]:
+    def _rows(self, rows: StressRows) -> Iterator[StressReading]:
         names = dict(enumerate(self._names or []))
         values = np.hstack([rows.stress, rows.gradient]).tolist()
         columns = (rows.stamp_ns, rows.cube, rows.residual, rows.status)
         numbers = zip(*(column.tolist() for column in columns), values, strict=True)
         for stamp_ns, cube, residual, status, row in numbers:
-            yield Reading(stamp_ns, names.get(cube, f"cube {cube}"), row, residual, status)
+            yield StressReading(stamp_ns, names.get(cube, f"cube {cube}"), row, residual, status)
 
-    def _tensor(self, message: StressTensorStamped) -> Reading:
+    def _tensor(self, message: StressTensorStamped) -> StressReading:
         tensor = message.tensor
         normal, shear = tensor.normal, tensor.shear
         stress = [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z]
         values = [*stress, *tensor.normal_gradient.tolist()]
         stamp_ns = to_ns(message.header.stamp)
-        return Reading(stamp_ns, self._cube, values, tensor.residual, tensor.status)
+        return StressReading(stamp_ns, self._cube, values, tensor.residual, tensor.status)
 
 
 def plain(value: Any) -> Any:

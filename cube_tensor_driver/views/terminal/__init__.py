@@ -1,1 +1,1 @@
-"""What commands show in a terminal: tables of results, progress, the live table of a skin."""
+"""What several commands show in a terminal: progress, tables, the live table of a skin, Ctrl-C."""

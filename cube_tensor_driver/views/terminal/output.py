@@ -1,30 +1,59 @@
-"""Progress of long work, and warnings."""
+"""Lines, tables and progress in a terminal, as all commands print them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Column
+from rich.table import Column, Table
 from rich.text import Text
+
+BAR_WIDTH = 20
+"""Width of a progress bar in columns; the rest of the line is for the name of the step."""
+
+
+def say(text: str, style: str = "", *, stderr: bool = False) -> None:
+    """Print a line as it is: square brackets are no markup, and long lines are not broken.
+
+    Args:
+        text: The line.
+        style: Colour or weight, as rich names it; it is dropped where the output is no terminal.
+        stderr: Whether the line goes to stderr instead of stdout.
+    """
+    console = Console(stderr=stderr, highlight=False)
+    console.print(text, style=style, markup=False, soft_wrap=True)
+
+
+def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
+    """Make an empty table: columns for names, then right-justified columns for numbers."""
+    table = Table(*names)
+    for heading in numbers:
+        table.add_column(heading, justify="right")
+    return table
 
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
-    """A bar of one line on stderr, where that is a terminal; yields report(done, total, what)."""
+    """Show a progress bar of one line on stderr, where that is a terminal.
+
+    Yields:
+        A function ``report(done, total, what)``: the work done, the whole work in the same unit,
+        and the name of the present step.
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
-        # rich 11 ends even a bar that is disabled with an empty line.
+        # rich 11 (Ubuntu 22.04) prints an empty line at the end even of a disabled bar.
         yield lambda done, total, what: None
         return
+
     what_column = TextColumn(
         "{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)
     )
     bar = Progress(
         what_column,
-        BarColumn(bar_width=20),
+        BarColumn(bar_width=BAR_WIDTH),
         TextColumn("{task.percentage:>3.0f}%"),
         TimeElapsedColumn(),
         console=console,
@@ -32,7 +61,7 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
         expand=True,
     )
     with bar:
-        task = bar.add_task("meshing", total=1.0)
+        task = bar.add_task("starting", total=1.0)
 
         def report(done: float, total: float, what: str) -> None:
             bar.update(task, completed=done, total=total, description=what)
@@ -42,11 +71,5 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
 
 
 def working(text: str) -> AbstractContextManager[object]:
-    """A moving line on stderr, where that is a terminal, while something takes long whose progress
-    is not known."""
+    """Show a moving line on stderr, where that is a terminal, during work of unknown progress."""
     return Console(stderr=True).status(Text(text))
-
-
-def warn(text: str) -> None:
-    """A red line on stdout."""
-    Console(highlight=False).print(text, style="red", markup=False, soft_wrap=True)
