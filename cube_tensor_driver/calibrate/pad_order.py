@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.symmetry import group
+from ..core.symmetry import find_group
 
 GAIN = 0.5
 """A swap must lower misfit² to this share."""
@@ -65,7 +65,7 @@ class Explanation:
 
 def cube_turns() -> np.ndarray:
     """(24, 3, 3) the rotations of a cube, the identity first."""
-    elements = group("full")
+    elements = find_group("full")
     return elements[np.linalg.det(elements) > 0]
 
 

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     from ..config.calibration import find_calibration, read_calibration
     from ..config.layout import named_layout, shipped_calibration
     from ..config.output_files import write_json
-    from ..core.estimator import summary
+    from ..core.estimator import summarize_response
     from ..core.response import generic_response
     from ..core.symmetry import find_structure, largest_symmetry
     from ..views.figures.calibration import draw_layout
@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
     if calibration is None:
         # Every response of this structure has the same ranks, but condition numbers and noise
         # depend on the values of the response.
-        result = summary(structure, generic_response(structure))
+        result = summarize_response(structure, generic_response(structure))
         result |= {
             "condition_uniform": None,
             "condition_gradient": None,
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
         }
         source = "no calibration: conditions and noise unknown"
     else:
-        result = summary(structure, calibration.response, calibration.neglect)
+        result = summarize_response(structure, calibration.response, calibration.neglect)
         source = f"calibration {calibration.id} ({calibration.source or 'no source given'})"
     show_layout(layout, symmetry, result, source)
     if options.json is not None:

@@ -1,5 +1,6 @@
-"""The physics: pad frequencies to stress and gradient, and what is measured to get there.
+"""The physics: from pad frequencies to stress and its gradient, and what is measured to get there.
 
-numpy only (and transforms3d for rotations): no I/O, no clock, no ROS, no threads. What leaves this
-folder as data is `FrequencyRows` and `StressRows`; what makes one of the other is `Reconstructor`.
+The folder needs numpy, and transforms3d for rotations. It has no input or output, no clock, no
+threads and no ROS. Data leave it as `FrequencyRows` and `StressRows`; `Reconstructor` computes the
+second from the first.
 """

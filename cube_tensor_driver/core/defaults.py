@@ -1,28 +1,40 @@
-"""Values that several parts take when nobody gives another one; SI units."""
+"""Default values that several parts of the package share, in SI units."""
 
 from __future__ import annotations
 
 SURFACE_DEPTH = 4e-3
-"""From the cubes' centres to the skin's surface, m."""
+"""Distance from the centres of the cubes to the surface of the skin, in m."""
+
 CONTACT_PRESSURE = 300.0
-"""A contact is where the pressure in the cubes' plane exceeds this, Pa."""
+"""Pressure in the plane of the cubes, in Pa, above which a place counts as part of a contact."""
 
 CONTACT_METHODS = ("interpolation", "inverse")
-"""How contacts are found: from the pressure interpolated between the cubes, or from the surface's
-traction through the elastomer."""
+"""Names of the methods that find contacts.
+
+The first interpolates the pressure between the cubes. The second computes the traction on the
+surface from the elasticity of the layer above the cubes.
+"""
 
 YOUNGS_MODULUS = 0.3e6
-"""Of the elastomer, Pa: soft silicone."""
+"""Young's modulus of the elastomer, in Pa; the value is typical of soft silicone."""
+
 POISSONS_RATIO = 0.48
-"""Of the elastomer, which is nearly incompressible."""
+"""Poisson's ratio of the elastomer, which is nearly incompressible."""
 
 HALF_SIDE = 2e-3
-"""Of a cube, m."""
+"""Half side d0 of a cube, in m."""
+
 REST_FREQUENCY = 100e3
-"""Of a pad without load, Hz."""
+"""Frequency of a pad without load, in Hz."""
+
 BETA = 0.3
-"""Of a pad: parasitic capacitance over that of the foam at rest (docs/physics.md, section 1)."""
+"""Ratio of a pad's parasitic capacitance to the capacitance of its foam at rest.
+
+docs/physics.md, section 1, derives where it enters the pad law.
+"""
+
 FOAM_MODULUS = 0.3e6
-"""Of a pad's foam, Pa."""
+"""Modulus of a pad's foam, in Pa."""
+
 FREQUENCY_NOISE = 8e-6
-"""Relative standard deviation of a frequency that is counted for 1 ms."""
+"""Relative standard deviation of a frequency whose periods are counted for 1 ms."""

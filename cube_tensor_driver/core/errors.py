@@ -2,33 +2,35 @@
 
 
 class CubeError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base class of every error that the package raises on purpose."""
 
 
 class LayoutError(CubeError):
-    """A layout, or an array that should match one, has the wrong pads."""
+    """A layout has impossible pads, or an array does not have the shape that a layout needs."""
 
 
 class SymmetryError(CubeError):
-    """A symmetry that is unknown, or that the layout or the modes do not have."""
+    """A symmetry is unknown, or the layout or the modes do not have it."""
 
 
 class CalibrationError(CubeError):
-    """A calibration that is malformed, edited by hand, or made for something else."""
+    """A calibration is malformed, was edited by hand, or belongs to another cube or layout."""
 
 
 class FitError(CubeError):
-    """Loads or measurements from which no calibration can be fitted."""
+    """No calibration can be fitted to the given loads or measurements."""
 
 
 class ProtocolError(CubeError):
-    """A frame that cannot be put into bytes: a field or an array outside what the protocol
-    carries."""
+    """A field or an array of a frame is outside the range that the protocol can carry."""
 
 
 class LinkError(CubeError):
-    """A link that cannot be opened or was lost; `kind` is one word for programs, the text names the
-    fix."""
+    """A link cannot be opened, or it was lost.
+
+    Attributes:
+        kind: One word for programs. The text of the error tells a person how to fix it.
+    """
 
     def __init__(self, message: str, kind: str) -> None:
         super().__init__(message)
@@ -36,21 +38,23 @@ class LinkError(CubeError):
 
 
 class ElasticError(CubeError):
-    """A body, mesh or contact load outside what the elasticity code can compute."""
+    """A body, mesh or contact load is outside the range of the elasticity code."""
 
 
 class ConfigError(CubeError):
-    """A configuration file or parameter that cannot be used: file, key, what was found, what is
-    allowed."""
+    """A configuration file or a parameter is invalid.
+
+    The message names the file, the key, the value found and the allowed values.
+    """
 
 
 class MessageError(CubeError):
-    """A message whose fields contradict each other."""
+    """The fields of a message contradict each other."""
 
 
 class BagError(CubeError):
-    """A bag that cannot be read or written, or that lacks what a command needs."""
+    """A bag cannot be read or written, or it lacks the data that a command needs."""
 
 
 class TareError(CubeError):
-    """Tare refused: which pad of which cube moves, is noisy, or is too far from its calibration."""
+    """A tare is refused because a pad moves, is noisy, or is too far from its calibration."""

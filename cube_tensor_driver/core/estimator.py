@@ -1,15 +1,15 @@
-"""Inversion of a response by weighted least squares: what the pads see, how well, and the residual.
+"""Inversion of a response by weighted least squares, and the residual that tells broken pads.
 
-With W = diag(1 / noise) and W A = U1 S V1' (the singular values above RANK_TOLERANCE of the
-largest):
+With W = diag(1 / noise) and the singular value decomposition W A = U1 S V1', of which only singular
+values above `RANK_TOLERANCE` of the largest are kept:
 
-    components    T V1 S^-1 U1' W v           T: components of a state, see Modes.components
+    components    T V1 S^-1 U1' W v           T takes a state to components, see Modes.components
     covariance    T V1 S^-2 V1' T'
-    chi-square    |U2' W v|^2                 U2: the rest of U, with as many columns as there is
-    redundancy
+    chi-square    |U2' W v|^2                 U2 completes U1 to a basis of the pads; its number of
+                                              columns is the number of degrees of freedom
 
-Source: the paper's eqs. 2 to 5 are the closed forms for one layout; docs/physics.md corrects 4 and
-5.
+Source: eqs. 2 to 5 of the paper are the closed forms for one layout; docs/physics.md corrects eqs.
+4 and 5.
 """
 
 from __future__ import annotations
@@ -22,57 +22,82 @@ from typing import Any
 
 import numpy as np
 
+from .arrays import Array, Index, Mask
 from .modes import Modes
 from .symmetry import Structure
 
 RANK_TOLERANCE = 1e-4
-"""The pads do not see a combination of modes whose response is below this part of the strongest."""
+"""Smallest singular value of the whitened response, relative to the largest, that counts.
+
+A combination of modes below it moves the pads so little that its amplitude would be mostly noise.
+"""
+
 LEAK_TOLERANCE = 1e-3
-"""A component is observed when at most this part of it lies along combinations not seen."""
+"""Largest part of a component, relative to its size, that may lie along combinations of modes that
+the pads do not respond to. A component with a larger part is not observed."""
+
 FALSE_ALARM = 1e-3
 """Probability that pads with nothing but their stated noise set the residual bit."""
+
 SUSPECT_MARGIN = 2 * math.log(100)
-"""Of chi-square: a pad is cleared when another explains the residual with odds of 100 to 1."""
+"""Difference of chi-square that corresponds to odds of 100 to 1.
+
+A pad is no suspect if another pad explains the residual better by more than this.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Linear maps for one response, noise and set of present pads.
+    """Linear maps for one response, one noise and one set of present pads.
 
-    matrix: (T, P) pad stresses to targets; rows of unobserved targets are NaN, columns of missing
-        pads are 0
-    observed: (T,) bool, which targets the pads see
-    covariance: (T, T), NaN in rows and columns of unobserved targets
-    null: (dof, P) whitened rows; chi-square is the sum of squares of null @ v
-    limit: chi-square that noise alone exceeds with probability FALSE_ALARM; NaN without redundancy
-    rank: number of combinations of modes that the pads see
+    Attributes:
+        matrix: Map (T, P) from pad stresses to targets. Rows of unobserved targets are NaN, columns
+            of missing pads are 0.
+        observed: Which targets the pads determine (T,).
+        covariance: Covariance of the targets (T, T), NaN in rows and columns of unobserved ones.
+        null: Whitened rows (D, P); chi-square is the sum of squares of null @ v.
+        limit: Chi-square that noise alone exceeds with probability `FALSE_ALARM`; NaN without
+            redundancy.
+        rank: Number of combinations of modes that the pads determine.
+        noise: Standard deviation of the pads' stresses (P,), in Pa.
     """
 
-    matrix: np.ndarray
-    observed: np.ndarray
-    covariance: np.ndarray
-    null: np.ndarray
+    matrix: Array
+    observed: Mask
+    covariance: Array
+    null: Array
     limit: float
     rank: int
-    noise: np.ndarray
+    noise: Array
 
     @property
     def dof(self) -> int:
+        """Number of degrees of freedom of chi-square."""
         return len(self.null)
 
-    def chi2(self, pad_stress: np.ndarray) -> np.ndarray:
-        """(N,) chi-square of pad stresses (N, P); missing pads must hold any finite number."""
-        return np.sum((np.asarray(pad_stress) @ self.null.T) ** 2, axis=-1)
+    def chi2(self, pad_stress: Array) -> Array:
+        """Compute chi-square (N,) of pad stresses (N, P); missing pads may hold any number."""
+        whitened = np.asarray(pad_stress) @ self.null.T
+        chi2: Array = np.sum(whitened**2, axis=-1)
+        return chi2
 
-    def suspects(self, pad_stress: np.ndarray) -> np.ndarray:
-        """(N, P) bool: pads that, broken alone, explain a bad chi-square of pad stresses (N, P).
+    def suspects(self, pad_stress: Array) -> Mask:
+        """Find the pads that, broken alone, explain a high chi-square.
 
-        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, with z = null v and u_p its
-        column of U2'. A row has suspects when chi-square is above its limit, but below the limit of
-        one degree less without the best pad. The best pad is one, and so are all that explain as
-        much within SUSPECT_MARGIN; if that is every pad, none is. Pads that lie opposite each other
-        through the centre of a symmetric cube always come as a pair: a gradient takes up their
-        difference.
+        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, with z = null v and u_p the
+        column of U2' of the pad. A row has suspects if its chi-square is above the limit, and
+        without the best pad below the limit for one degree of freedom less. Suspects are the best
+        pad and all pads that explain as much within `SUSPECT_MARGIN`. If these are all pads, none
+        is a suspect.
+
+        Two pads that are opposite each other through the centre of a symmetric cube are always
+        suspects together, because a gradient absorbs their difference.
+
+        Args:
+            pad_stress: Stresses on the pads (N, P), in Pa.
+
+        Returns:
+            Whether each pad is a suspect (N, P).
         """
         v = np.atleast_2d(np.asarray(pad_stress, dtype=float))
         if self.dof < 2:
@@ -80,119 +105,173 @@ class Estimator:
         z = v @ self.null.T
         columns = self.null * self.noise
         size = np.sum(columns**2, axis=0)
-        checked = size > LEAK_TOLERANCE**2  # an unchecked pad could be anything without a residual
-        drop = np.where(checked, (z @ columns) ** 2 / np.where(checked, size, 1), -np.inf)
-        chi2, best = np.sum(z**2, axis=1), drop.max(axis=1)
-        marked = drop > best[:, None] - SUSPECT_MARGIN
-        explained = (chi2 > self.limit) & (chi2 - best < chi2_limit(self.dof - 1, FALSE_ALARM))
-        return marked & (explained & (marked.sum(axis=1) < checked.sum()))[:, None]
+        # A pad without redundancy could show anything and leave no residual.
+        is_checked = size > LEAK_TOLERANCE**2
+        safe_size = np.where(is_checked, size, 1)
+        drop = np.where(is_checked, (z @ columns) ** 2 / safe_size, -np.inf)
+
+        chi2 = np.sum(z**2, axis=1)
+        best = drop.max(axis=1)
+        is_similar = drop > best[:, None] - SUSPECT_MARGIN
+        limit_without = chi2_limit(self.dof - 1, FALSE_ALARM)
+        is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
+        is_specific = is_similar.sum(axis=1) < is_checked.sum()
+        suspects: Mask = is_similar & (is_explained & is_specific)[:, None]
+        return suspects
 
 
 def make_estimator(
-    response: np.ndarray,
-    noise: np.ndarray,
+    response: Array,
+    noise: Array,
     modes: Modes,
-    missing: Sequence[int] | np.ndarray = (),
+    missing: Sequence[int] | Index = (),
     neglect: Sequence[str] = (),
-    targets: np.ndarray | None = None,
+    targets: Array | None = None,
 ) -> Estimator:
-    """The estimator of the COMPONENTS (or of targets @ state) from the pads that are not missing.
+    """Construct the estimator of a response.
 
-    response: (P, M) in Pa per Pa
-    noise: (P,) standard deviation of each pad's stress, Pa
-    missing: indices of pads to leave out
-    neglect: names of modes stated to be zero; they are unobserved themselves
-    targets: (T, M), by default modes.components
+    Args:
+        response: Response (P, M), in Pa per Pa.
+        noise: Standard deviation of each pad's stress (P,), in Pa.
+        modes: The M modes.
+        missing: Numbers of pads that are left out.
+        neglect: Names of modes that are stated to be zero; they are unobserved themselves.
+        targets: Map (T, M) from a state to the quantities to estimate; by default the components.
     """
-    response, noise = np.asarray(response, dtype=float), np.asarray(noise, dtype=float)
+    response = np.asarray(response, dtype=float)
+    noise = np.asarray(noise, dtype=float)
     targets = modes.components if targets is None else np.asarray(targets, dtype=float)
-    present = np.setdiff1d(np.arange(len(response)), np.asarray(missing, dtype=int))
+    n_pads, n_targets = len(response), len(targets)
+    present = np.setdiff1d(np.arange(n_pads), np.asarray(missing, dtype=int))
     kept = np.setdiff1d(np.arange(modes.n_modes), modes.index(neglect))
+
     whitened = response[np.ix_(present, kept)] / noise[present, None]
     u, s, vt = np.linalg.svd(whitened, full_matrices=True)
-    rank = int(np.sum(s > RANK_TOLERANCE * s[0])) if s.size and s[0] > 0 else 0
+    rank = 0
+    if s.size and s[0] > 0:
+        rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
     v1 = vt[:rank].T
-    t = targets[:, kept]
-    size = np.linalg.norm(targets, axis=1)
-    leak = np.linalg.norm(t - (t @ v1) @ v1.T, axis=1) + np.linalg.norm(
-        np.delete(targets, kept, axis=1), axis=1
-    )
-    observed = (size > 0) & (leak <= LEAK_TOLERANCE * size)
 
-    half = t @ v1 / s[:rank]
-    matrix = np.zeros((len(targets), len(response)))
+    kept_targets = targets[:, kept]
+    projected = (kept_targets @ v1) @ v1.T
+    unseen = np.linalg.norm(kept_targets - projected, axis=1)
+    neglected = np.linalg.norm(np.delete(targets, kept, axis=1), axis=1)
+    size = np.linalg.norm(targets, axis=1)
+    observed = (size > 0) & (unseen + neglected <= LEAK_TOLERANCE * size)
+
+    half = kept_targets @ v1 / s[:rank]
+    matrix = np.zeros((n_targets, n_pads))
     matrix[:, present] = half @ u[:, :rank].T / noise[present]
     matrix[~observed] = np.nan
     covariance = half @ half.T
     covariance[~observed] = covariance[:, ~observed] = np.nan
-    null = np.zeros((len(present) - rank, len(response)))
+    null = np.zeros((len(present) - rank, n_pads))
     null[:, present] = u[:, rank:].T / noise[present]
     return Estimator(
-        matrix, observed, covariance, null, chi2_limit(len(null), FALSE_ALARM), rank, noise
+        matrix=matrix,
+        observed=observed,
+        covariance=covariance,
+        null=null,
+        limit=chi2_limit(len(null), FALSE_ALARM),
+        rank=rank,
+        noise=noise,
     )
 
 
-def chi2_tail(x: float, dof: int) -> float:
-    """Probability that a chi-square of dof degrees of freedom exceeds x: Q(dof/2, x/2) by
-    recurrence."""
-    if x <= 0:
-        return 1.0
-    h = x / 2
-    a, tail = (0.5, math.erfc(math.sqrt(h))) if dof % 2 else (1.0, math.exp(-h))
-    while a < dof / 2:
-        tail += math.exp(a * math.log(h) - h - math.lgamma(a + 1))
-        a += 1
-    return tail
-
-
-def summary(
-    structure: Structure, response: np.ndarray, neglect: Sequence[str] = ()
+def summarize_response(
+    structure: Structure, response: Array, neglect: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """What a response (P, M) lets a layout see, in plain types.
+    """Summarise, in plain types, which modes a response determines and how well.
 
-    rank_uniform, rank_gradient: of the columns of uniform and of gradient modes
-    condition_uniform, condition_gradient: their condition numbers
-    unobservable: modes that the pads do not see
-    noise: {mode: standard deviation per unit of pad noise}
-    None stands for a value that does not exist.
+    Args:
+        structure: Layout and modes of the response.
+        response: Response (P, M), in Pa per Pa.
+        neglect: Names of modes that are stated to be zero.
+
+    Returns:
+        A table with the keys
+
+        - pads, modes, n_coefficients: names and numbers of the structure;
+        - rank_uniform, rank_gradient: ranks of the columns of uniform and of gradient modes;
+        - condition_uniform, condition_gradient: condition numbers of these columns;
+        - unobservable: names of modes that the pads do not determine;
+        - noise: standard deviation of each mode per unit of pad noise.
+
+        None stands for a value that does not exist.
     """
-    modes, n_pads = structure.modes, structure.layout.n_pads
+    modes = structure.modes
     estimator = make_estimator(
-        response, np.ones(n_pads), modes, neglect=neglect, targets=np.eye(modes.n_modes)
+        response,
+        noise=np.ones(structure.layout.n_pads),
+        modes=modes,
+        neglect=neglect,
+        targets=np.eye(modes.n_modes),
     )
-    deviations = np.sqrt(np.diag(estimator.covariance))
     result: dict[str, Any] = {
         "pads": list(structure.layout.pads),
         "modes": list(modes.names),
         "n_coefficients": structure.n_coefficients,
     }
-    uniform = np.any(modes.stress, axis=(1, 2)) & ~np.isin(modes.names, neglect)
-    gradient = np.any(modes.gradient, axis=(1, 2, 3)) & ~np.isin(modes.names, neglect)
-    for part, columns in (("uniform", uniform), ("gradient", gradient)):
-        s = np.linalg.svd(response[:, columns], compute_uv=False)
-        s = s[s > RANK_TOLERANCE * s[0]] if s.size else s
+    is_kept = ~np.isin(modes.names, neglect)
+    parts = {
+        "uniform": np.any(modes.stress, axis=(1, 2)),
+        "gradient": np.any(modes.gradient, axis=(1, 2, 3)),
+    }
+    for part, columns in parts.items():
+        s = np.linalg.svd(response[:, columns & is_kept], compute_uv=False)
+        if s.size:
+            s = s[s > RANK_TOLERANCE * s[0]]
         result[f"rank_{part}"] = len(s)
         result[f"condition_{part}"] = float(s[0] / s[-1]) if s.size else None
-    result["unobservable"] = [
-        name for name, seen in zip(modes.names, estimator.observed, strict=True) if not seen
-    ]
-    result["noise"] = {
-        name: float(d) if seen else None
-        for name, d, seen in zip(modes.names, deviations, estimator.observed, strict=True)
+
+    deviations = np.sqrt(np.diag(estimator.covariance)).tolist()
+    noise = {
+        name: deviation if observed else None
+        for name, deviation, observed in zip(
+            modes.names, deviations, estimator.observed, strict=True
+        )
     }
+    result["unobservable"] = [name for name, value in noise.items() if value is None]
+    result["noise"] = noise
     return result
+
+
+def chi2_tail(x: float, dof: int) -> float:
+    """Compute the probability that chi-square of `dof` degrees of freedom exceeds x.
+
+    The regularised gamma function Q(dof/2, x/2) follows from Q(1/2, h) = erfc(sqrt(h)) or
+    Q(1, h) = exp(-h) by the recurrence Q(a + 1, h) = Q(a, h) + h^a exp(-h) / Gamma(a + 1).
+    """
+    if x <= 0:
+        return 1.0
+    h = x / 2
+    if dof % 2:
+        a, tail = 0.5, math.erfc(math.sqrt(h))
+    else:
+        a, tail = 1.0, math.exp(-h)
+    while a < dof / 2:
+        # In logarithms, because h^a alone overflows for many degrees of freedom.
+        tail += math.exp(a * math.log(h) - h - math.lgamma(a + 1))
+        a += 1
+    return tail
 
 
 @lru_cache
 def chi2_limit(dof: int, probability: float) -> float:
-    """The x that chi-square of dof degrees of freedom exceeds with this probability; NaN for
-    dof = 0."""
+    """Compute the value that chi-square of `dof` degrees of freedom exceeds with a probability.
+
+    It is NaN without degrees of freedom.
+    """
     if dof < 1:
         return math.nan
     low, high = 0.0, 1.0
     while chi2_tail(high, dof) > probability:
         high *= 2
+    # A hundred bisections reach the last bit of a float, whatever the interval.
     for _ in range(100):
-        middle = (low + high) / 2
-        low, high = (middle, high) if chi2_tail(middle, dof) > probability else (low, middle)
+        centre = (low + high) / 2
+        if chi2_tail(centre, dof) > probability:
+            low = centre
+        else:
+            high = centre
     return high

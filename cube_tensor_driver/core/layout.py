@@ -1,6 +1,7 @@
-"""Layouts: where the pads of a cube are.
+"""Layouts: the positions of the pads of a cube.
 
-Frame: z out of the skin, x and y along it. Lengths are in d0, the half side of the cube.
+Frame of the cube: z points out of the skin, x and y lie along it, the origin is the centre of the
+cube. Lengths are in units of the half side d0 of the cube.
 """
 
 from __future__ import annotations
@@ -12,71 +13,89 @@ from typing import Any
 
 import numpy as np
 
+from .arrays import Array
 from .errors import LayoutError
 
 AXES = "xyz"
-MAX_PADS = 32  # a fault mask on the wire has 32 bits
-PAD_OFFSET = 0.5  # of the built-in layouts' pads from the face's centre
+"""Names of the axes of the cube frame."""
+
+MAX_PADS = 32
+"""Maximum number of pads of a cube: a fault mask on the wire has 32 bits."""
+
+PAD_OFFSET = 0.5
+"""Distance of a built-in layout's pads from the centre of their face, in units of d0."""
+
 PAD_SIZE = 0.4
+"""Side of a square pad, in units of d0, if a layout does not state it."""
+
+TOLERANCE = 1e-9
+"""Largest difference, in units of d0, of coordinates that count as equal.
+
+It is far above the rounding error of decimal numbers in a file, and far below any real distance.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Pads of one kind of cube.
+    """The pads of one kind of cube.
 
-    name: what calibration and configuration files call it
-    positions: (P, 3) pad centres in units of the half side d0
-    normals: (P, 3) outward normals of the pads' faces, each plus or minus one axis
-    pad_size: side of a (square) pad in units of d0
-    Raises LayoutError when a pad is not on the face that its normal names, or two pads coincide.
+    Attributes:
+        name: Name that calibration and configuration files use.
+        positions: Centres of the pads (P, 3), in units of d0.
+        normals: Outward normals of the pads' faces (P, 3), each plus or minus one axis.
+        pad_size: Side of a square pad, in units of d0.
+
+    Raises:
+        LayoutError: A pad is not on the face that its normal names, or two pads coincide.
     """
 
     name: str
-    positions: np.ndarray
-    normals: np.ndarray
+    positions: Array
+    normals: Array
     pad_size: float = PAD_SIZE
 
     def __post_init__(self) -> None:
-        positions = _vectors(self.positions, "positions")
-        normals = _vectors(self.normals, "normals")
+        positions = _read_vectors(self.positions, "positions")
+        normals = _read_vectors(self.normals, "normals")
         if len(positions) != len(normals):
-            raise LayoutError(
-                f"layout {self.name!r}: {len(positions)} positions but {len(normals)} normals"
-            )
+            self._refuse(f"{len(positions)} positions but {len(normals)} normals")
         if not 1 <= len(positions) <= MAX_PADS:
-            raise LayoutError(
-                f"layout {self.name!r}: {len(positions)} pads; allowed are 1 to {MAX_PADS}"
-            )
+            self._refuse(f"{len(positions)} pads; allowed are 1 to {MAX_PADS}")
         if not 0 < self.pad_size <= 2:
-            raise LayoutError(
-                f"layout {self.name!r}: pad_size {self.pad_size}; allowed is above 0, up to 2"
-            )
-        for i, (x, n) in enumerate(zip(positions, normals, strict=True)):
-            if sorted(np.abs(n)) != [0, 0, 1]:
-                raise LayoutError(
-                    f"layout {self.name!r}: pad {i + 1} has normal {n.tolist()}; "
-                    "a normal is one axis, such as [0, 0, -1]"
-                )
-            if abs(x @ n - 1) > 1e-9:
-                raise LayoutError(
-                    f"layout {self.name!r}: pad {i + 1} at {x.tolist()} is not on the face "
-                    f"{n.tolist()}; its coordinate along the normal must be 1"
-                )
-            edge = np.max(np.abs(x - n * (x @ n))) + self.pad_size / 2
-            if edge > 1 + 1e-9:
-                raise LayoutError(
-                    f"layout {self.name!r}: pad {i + 1} reaches {edge:.3g} from the face's centre; "
-                    "the face ends at 1"
-                )
-            for j in range(i):
-                if np.allclose(x, positions[j], atol=1e-9) and np.array_equal(n, normals[j]):
-                    raise LayoutError(
-                        f"layout {self.name!r}: pads {j + 1} and {i + 1} coincide at {x.tolist()}"
-                    )
+            self._refuse(f"pad_size {self.pad_size}; allowed is above 0, up to 2")
+
         positions.flags.writeable = normals.flags.writeable = False
+        # The class is frozen for its users; only here the checked values replace the given ones.
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "normals", normals)
         object.__setattr__(self, "pad_size", float(self.pad_size))
+        for number in range(len(positions)):
+            self._check_pad(number)
+
+    def _check_pad(self, number: int) -> None:
+        """Raise LayoutError if a pad is not on its face, or coincides with an earlier one."""
+        position, normal = self.positions[number], self.normals[number]
+        pad = f"pad {number + 1}"
+        if sorted(np.abs(normal)) != [0, 0, 1]:
+            self._refuse(
+                f"{pad} has normal {normal.tolist()}; a normal is one axis, such as [0, 0, -1]"
+            )
+        height = position @ normal
+        if abs(height - 1) > TOLERANCE:
+            self._refuse(
+                f"{pad} at {position.tolist()} is not on the face {normal.tolist()}; "
+                "its coordinate along the normal must be 1"
+            )
+        edge = np.max(np.abs(position - normal * height)) + self.pad_size / 2
+        if edge > 1 + TOLERANCE:
+            self._refuse(f"{pad} reaches {edge:.3g} from the face's centre; the face ends at 1")
+        for other in range(number):
+            same_place = np.allclose(position, self.positions[other], atol=TOLERANCE)
+            if same_place and np.array_equal(normal, self.normals[other]):
+                self._refuse(f"pads {other + 1} and {number + 1} coincide at {position.tolist()}")
+
+    def _refuse(self, problem: str) -> None:
+        raise LayoutError(f"layout {self.name!r}: {problem}")
 
     @property
     def n_pads(self) -> int:
@@ -84,24 +103,29 @@ class Layout:
 
     @cached_property
     def pads(self) -> tuple[str, ...]:
-        """Names that stay: face, then side of the face, such as "+z-x"; a second pad there is
-        "+z-x#2"."""
-        plain = [
-            _signed_axes(n) + _signed_axes(x - n * (x @ n))
-            for x, n in zip(self.positions, self.normals, strict=True)
-        ]
-        repeats = [plain[:i].count(name) for i, name in enumerate(plain)]
-        return tuple(
-            f"{name}#{k + 1}" if k else name for name, k in zip(plain, repeats, strict=True)
-        )
+        """Names of the pads: the face, then the side of the face, such as "+z-x".
+
+        A second pad at the same side of a face is "+z-x#2". The names do not change if pads are
+        added at the end.
+        """
+        names: list[str] = []
+        places: list[str] = []
+        for position, normal in zip(self.positions, self.normals, strict=True):
+            side = position - normal * (position @ normal)
+            place = _name_axes(normal) + _name_axes(side)
+            earlier = places.count(place)
+            places.append(place)
+            names.append(f"{place}#{earlier + 1}" if earlier else place)
+        return tuple(names)
 
     @property
     def planar(self) -> bool:
-        """True when all pads and normals lie in the plane y = 0."""
-        return not (np.any(np.abs(self.positions[:, 1]) > 1e-9) or np.any(self.normals[:, 1]))
+        """Whether all pads and normals lie in the plane y = 0."""
+        is_off_plane = np.any(np.abs(self.positions[:, 1]) > TOLERANCE)
+        return not (is_off_plane or np.any(self.normals[:, 1]))
 
     def index(self, pad: str) -> int:
-        """Row of a pad by its name; LayoutError when there is none."""
+        """Return the number of a pad by its name. LayoutError: there is no such pad."""
         try:
             return self.pads.index(pad)
         except ValueError:
@@ -110,16 +134,16 @@ class Layout:
             ) from None
 
     def same_as(self, other: Layout) -> bool:
-        """True when both have the same pads in the same order."""
+        """Return whether both layouts have the same pads in the same order."""
         return (
             self.positions.shape == other.positions.shape
             and self.pad_size == other.pad_size
-            and np.allclose(self.positions, other.positions, atol=1e-9)
+            and np.allclose(self.positions, other.positions, atol=TOLERANCE)
             and np.array_equal(self.normals, other.normals)
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types, as from_dict takes them."""
+        """Return the layout in plain types, which `from_dict` reads."""
         return {
             "name": self.name,
             "pad_size": self.pad_size,
@@ -129,14 +153,19 @@ class Layout:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Layout:
-        """A layout from plain types: name, positions, normals, optional pad_size.
+        """Construct a layout from plain types.
 
-        LayoutError: a key or value that is wrong.
+        Args:
+            data: name, positions, normals and, optionally, pad_size.
+
+        Raises:
+            LayoutError: A key is missing or unknown, or a value is invalid.
         """
         if not isinstance(data, Mapping):
             raise LayoutError(f"a layout is a table with name, positions, normals; found {data!r}")
-        unknown = set(data) - {"name", "positions", "normals", "pad_size"}
-        missing = {"name", "positions", "normals"} - set(data)
+        required = {"name", "positions", "normals"}
+        unknown = set(data) - required - {"pad_size"}
+        missing = required - set(data)
         if unknown or missing:
             raise LayoutError(
                 f"layout: unknown keys {sorted(unknown)}, missing keys {sorted(missing)}; "
@@ -150,52 +179,63 @@ class Layout:
         return cls(str(data["name"]), data["positions"], data["normals"], size)
 
 
-def _vectors(value: Any, what: str) -> np.ndarray:
+def find_layout(name: str) -> Layout:
+    """Return a built-in layout by its name. LayoutError: there is none of this name."""
+    try:
+        return LAYOUTS[name]
+    except (KeyError, TypeError):
+        raise LayoutError(f"unknown layout {name!r}; built in are {', '.join(LAYOUTS)}") from None
+
+
+def _read_vectors(value: Any, name: str) -> Array:
+    """Return a list of [x, y, z] as an array (N, 3). LayoutError: it is something else."""
     try:
         vectors = np.array(value, dtype=float)
     except (TypeError, ValueError):
         raise LayoutError(
-            f"layout: {what} must be a list of [x, y, z] numbers; found {value!r}"
+            f"layout: {name} must be a list of [x, y, z] numbers; found {value!r}"
         ) from None
     if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.all(np.isfinite(vectors)):
         raise LayoutError(
-            f"layout: {what} must be a list of [x, y, z] finite numbers; "
+            f"layout: {name} must be a list of [x, y, z] finite numbers; "
             f"found shape {vectors.shape}"
         )
     return vectors
 
 
-def _signed_axes(vector: np.ndarray) -> str:
-    return "".join("-+"[int(c > 0)] + a for c, a in zip(vector, AXES, strict=True) if abs(c) > 1e-9)
+def _name_axes(vector: Array) -> str:
+    """Return the directions of a vector's nonzero coordinates, such as "+z" or "-x+y"."""
+    return "".join(
+        ("+" if coordinate > 0 else "-") + axis
+        for coordinate, axis in zip(vector, AXES, strict=True)
+        if abs(coordinate) > TOLERANCE
+    )
 
 
-def _section(sides: str, name: str, offset: float = PAD_OFFSET) -> Layout:
-    """Layout from a text such as "+z-x +z+x": face and side of each pad."""
-
-    def axis(text: str) -> np.ndarray:
-        return (1.0 if text[0] == "+" else -1.0) * np.eye(3)[AXES.index(text[1])]
-
-    normals = np.array([axis(pad[:2]) for pad in sides.split()])
-    side = np.array([axis(pad[2:]) for pad in sides.split()])
-    return Layout(name, normals + offset * side, normals)
+def _parse_axis(text: str) -> Array:
+    """Return the unit vector of a direction such as "+z"."""
+    sign = 1.0 if text[0] == "+" else -1.0
+    unit: Array = sign * np.eye(3)[AXES.index(text[1])]
+    return unit
 
 
-_PLANAR = "+z-x +z+x -z-x -z+x +x-z +x+z -x-z -x+z"  # V1 .. V8 of the paper
-_CYCLE = str.maketrans("xyz", "yzx")
-_CUBE = " ".join([_PLANAR, _PLANAR.translate(_CYCLE), _PLANAR.translate(_CYCLE).translate(_CYCLE)])
+def _make_layout(name: str, pads: str) -> Layout:
+    """Construct a layout from the face and side of each pad, such as "+z-x +z+x"."""
+    normals = np.array([_parse_axis(pad[:2]) for pad in pads.split()])
+    sides = np.array([_parse_axis(pad[2:]) for pad in pads.split()])
+    return Layout(name, normals + PAD_OFFSET * sides, normals)
 
-# cube: the planar section in the planes z-x, x-y, y-z in this order, each from the last by x -> y
-# -> z -> x
-LAYOUTS: dict[str, Layout] = {
-    "quad": _section(" ".join(_PLANAR.split()[:4]), "quad"),
-    "planar": _section(_PLANAR, "planar"),
-    "cube": _section(_CUBE, "cube"),
+
+_QUAD_PADS = "+z-x +z+x -z-x -z+x"
+_PLANAR_PADS = f"{_QUAD_PADS} +x-z +x+z -x-z -x+z"  # V1 to V8 of the paper, in its order
+_NEXT_AXES = str.maketrans("xyz", "yzx")
+# The cube has the planar section three times: in the planes z-x, x-y and y-z.
+_SECOND_SECTION = _PLANAR_PADS.translate(_NEXT_AXES)
+_THIRD_SECTION = _SECOND_SECTION.translate(_NEXT_AXES)
+
+LAYOUTS = {
+    "quad": _make_layout("quad", _QUAD_PADS),
+    "planar": _make_layout("planar", _PLANAR_PADS),
+    "cube": _make_layout("cube", f"{_PLANAR_PADS} {_SECOND_SECTION} {_THIRD_SECTION}"),
 }
-
-
-def find_layout(name: str) -> Layout:
-    """A built-in layout by its name; LayoutError when there is none."""
-    try:
-        return LAYOUTS[name]
-    except (KeyError, TypeError):
-        raise LayoutError(f"unknown layout {name!r}; built in are {', '.join(LAYOUTS)}") from None
+"""Built-in layouts by name: four pads on two faces, eight on four, and 24 on all six faces."""

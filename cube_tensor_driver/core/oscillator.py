@@ -1,16 +1,19 @@
 """The pad law: from the frequency of a pad's oscillator to the normal stress on the pad.
 
-    r = f / f0,   strain d/d0 = r / (1 + beta (1 - r)),   v = E (d/d0 - 1)
+    r = f / f0,   d/d0 = r / (1 + beta (1 - r)),   v = E (d/d0 - 1)
 
-which with u = r - 1 is v = E (1 + beta) u / (1 - beta u).
+With u = r - 1 this is v = E (1 + beta) u / (1 - beta u).
 
-    v          Pa, tension positive
-    f, f0      Hz, now and without load
-    beta       parasitic over active capacitance at rest
-    E          modulus, Pa
+    v          normal stress on the pad in Pa, tension positive
+    f, f0      frequency in Hz, under load and at rest
+    d, d0      thickness of the pad's foam, under load and at rest
+    beta       ratio of the parasitic capacitance to the active capacitance at rest
+    E          modulus of the foam, in Pa
 
-Frequencies outside 0 < f < f0 (1 + beta) / beta belong to no thickness and give NaN. All functions
-broadcast. Source: the paper's eq. 6, f = k d / (R (eps S + C' d)), solved for d relative to rest.
+No thickness belongs to a frequency outside 0 < f < f0 (1 + beta) / beta; there the result is NaN.
+All functions broadcast their arguments.
+
+Source: eq. 6 of the paper, f = k d / (R (eps S + C' d)), solved for d relative to its rest value.
 """
 
 from __future__ import annotations
@@ -20,59 +23,74 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .arrays import Array, Real
 from .errors import CalibrationError
 
 
-def pad_stress(frequency, rest_frequency, beta, modulus):
-    """Normal stress in Pa, tension positive, from frequencies in Hz; NaN outside the law."""
+def pad_stress(frequency: ArrayLike, rest_frequency: ArrayLike, beta: Real, modulus: Real) -> Array:
+    """Compute normal stresses in Pa, tension positive, from frequencies in Hz."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
         u = (f - f0) / f0
-        rest = 1 - beta * u
-        v = modulus * (1 + beta) * u / rest
-        return np.where((f > 0) & np.isfinite(f) & (rest > 0), v, np.nan)
+        # The foam is infinitely thick where this reaches zero.
+        denominator = 1 - beta * u
+        v = modulus * (1 + beta) * u / denominator
+        is_possible = (f > 0) & np.isfinite(f) & (denominator > 0)
+        return np.where(is_possible, v, np.nan)
 
 
-def pad_frequency(stress, rest_frequency, beta, modulus):
-    """The inverse of pad_stress: Hz from Pa; NaN at or below -E, where no thickness is left."""
-    strain = 1 + np.asarray(stress) / modulus
+def pad_frequency(stress: ArrayLike, rest_frequency: Real, beta: Real, modulus: Real) -> Array:
+    """Compute frequencies in Hz from stresses in Pa, the inverse of `pad_stress`.
+
+    The result is NaN at or below -E, where no thickness is left.
+    """
+    thickness = 1 + np.asarray(stress) / modulus
     with np.errstate(all="ignore"):
-        f = rest_frequency * strain * (1 + beta) / (1 + beta * strain)
-        return np.where((strain > 0) & np.isfinite(strain), f, np.nan)
+        f = rest_frequency * thickness * (1 + beta) / (1 + beta * thickness)
+        is_possible = (thickness > 0) & np.isfinite(thickness)
+        return np.where(is_possible, f, np.nan)
 
 
-def stress_slope(frequency, rest_frequency, beta, modulus):
-    """dv/df in Pa/Hz; at rest E (1 + beta) / f0. NaN outside the law's range."""
+def stress_slope(
+    frequency: ArrayLike, rest_frequency: ArrayLike, beta: Real, modulus: Real
+) -> Array:
+    """Compute the derivative dv/df in Pa/Hz; at rest it is E (1 + beta) / f0."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
-        rest = 1 - beta * (f - f0) / f0
-        return np.where((f > 0) & (rest > 0), modulus * (1 + beta) / (f0 * rest**2), np.nan)
+        denominator = 1 - beta * (f - f0) / f0
+        slope = modulus * (1 + beta) / (f0 * denominator**2)
+        return np.where((f > 0) & (denominator > 0), slope, np.nan)
 
 
-def highest_frequency(rest_frequency, beta):
-    """f0 (1 + beta) / beta in Hz, of an infinitely thick pad; inf without parasitic capacitance."""
+def highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
+    """Compute the frequency f0 (1 + beta) / beta of an infinitely thick pad, in Hz.
+
+    It is infinite without parasitic capacitance.
+    """
+    f0, beta = np.asarray(rest_frequency), np.asarray(beta, dtype=float)
     with np.errstate(divide="ignore", over="ignore"):
-        return rest_frequency * (1 + beta) / np.asarray(beta, dtype=float)
-
-
-def linear_pad_stress(frequency, rest_frequency, beta, modulus):
-    """v = E (1 + beta) (f - f0) / f0: the paper's eq. 7 with R/k for k/R, tension positive. A
-    check."""
-    f0 = np.asarray(rest_frequency)
-    return modulus * (1 + beta) * (np.asarray(frequency) - f0) / f0
+        highest: Array = f0 * (1 + beta) / beta
+        return highest
 
 
 @dataclass(frozen=True, eq=False)
 class TemperatureModel:
-    """f0(T) = f0 (1 + sum_d c_d (T - reference)^d), d = 1, 2 ...; f0 is the rest frequency at the
-    reference.
+    """Polynomial of the rest frequency over temperature, relative to the reference temperature.
 
-    reference: degrees Celsius; coefficients: (P, D) per degree^d and pad
+        f0(T) = f0 (1 + sum_d c_d (T - reference)^d),   d = 1, 2, ...
+
+    Attributes:
+        reference: Temperature in °C at which the calibration states the rest frequencies.
+        coefficients: c_d of each pad (P, D), in 1/K^d, the linear term first.
+
+    Raises:
+        CalibrationError: A value is not a finite number, or the shape is wrong.
     """
 
     reference: float
-    coefficients: np.ndarray
+    coefficients: Array
 
     def __post_init__(self) -> None:
         try:
@@ -88,23 +106,27 @@ class TemperatureModel:
                 f"temperature: coefficients have shape {coefficients.shape}; "
                 "they must be one list per pad, the linear term first"
             )
-        if not (np.isfinite(reference) and np.all(np.isfinite(coefficients))):
+        if not np.isfinite([reference, *coefficients.flat]).all():
             raise CalibrationError("temperature: reference and coefficients must be finite")
         coefficients.flags.writeable = False
         object.__setattr__(self, "reference", reference)
         object.__setattr__(self, "coefficients", coefficients)
 
-    def factor(self, temperature) -> np.ndarray:
-        """f0(T) / f0, shape (N, P) for temperatures (N,) in degrees Celsius."""
-        dt = np.asarray(temperature, dtype=float)[..., None] - self.reference
-        powers = dt[..., None] ** np.arange(1, self.coefficients.shape[1] + 1)
-        return 1 + np.sum(self.coefficients * powers, axis=-1)
+    def factor(self, temperature: ArrayLike) -> Array:
+        """Compute f0(T) / f0, (N, P), for temperatures (N,) in °C."""
+        difference = np.asarray(temperature, dtype=float)[..., None] - self.reference
+        exponents = np.arange(1, self.coefficients.shape[1] + 1)
+        powers = difference[..., None] ** exponents
+        factor: Array = 1 + np.sum(self.coefficients * powers, axis=-1)
+        return factor
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the model in plain types, which `from_dict` reads."""
         return {"reference": self.reference, "coefficients": self.coefficients.tolist()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TemperatureModel:
+        """Construct a model from plain types. CalibrationError: a key is missing or unknown."""
         if not isinstance(data, Mapping) or set(data) != {"reference", "coefficients"}:
             raise CalibrationError(
                 f"temperature: found {data!r}; it is a table of reference and coefficients"

@@ -1,17 +1,19 @@
-"""Response matrix A (pads x modes, Pa per Pa): pad stresses v = A s. Source: the paper's eq. 1."""
+"""Response matrix A of a cube (pads x modes, Pa per Pa): the stresses on the pads are v = A s.
+
+Source: eq. 1 of the paper.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from .arrays import Array
 from .errors import CalibrationError, LayoutError
 from .symmetry import Structure, find_structure
 
-# Illustrative: neither computed nor measured; calibrations that are fitted or computed replace
-# them.
-ILLUSTRATIVE: dict[str, float] = {
+ILLUSTRATIVE = {
     "a": 1.4,
     "b": 0.3,
     "c_plus_d": 0.5,
@@ -20,11 +22,15 @@ ILLUSTRATIVE: dict[str, float] = {
     "g": -1.4,
     "h": 0.3,
 }
+"""Illustrative coefficients of the layouts quad and planar, in Pa per Pa.
 
-# Entries of row V1 for the cube. Those across the pad's section (yy, yy_x, yy_z) and the two free
-# shears are illustrative too; the others make each section answer plane modes as ILLUSTRATIVE does.
-_FREE_SHEAR_Z, _FREE_SHEAR_X = 0.4, 0.2
-ILLUSTRATIVE_CUBE: dict[str, float] = {
+They are neither computed nor measured; a calibration that is fitted or computed replaces them.
+"""
+
+_FREE_SHEAR_Z = 0.4
+_FREE_SHEAR_X = 0.2
+
+ILLUSTRATIVE_CUBE = {
     "+z-x:zz": 1.4,
     "+z-x:xx": -0.3,
     "+z-x:yy": -0.2,
@@ -38,97 +44,130 @@ ILLUSTRATIVE_CUBE: dict[str, float] = {
     "+z-x:zx_x-yz_y": _FREE_SHEAR_Z,
     "+z-x:xy_y-zx_z": _FREE_SHEAR_X,
 }
+"""Illustrative coefficients of the layout cube: entries of the row of pad V1, in Pa per Pa.
+
+The entries across the section of the pad (yy, yy_x, yy_z) and of the two free shears are chosen
+freely. The others make each section respond to plane modes as `ILLUSTRATIVE` does.
+"""
+
+_LARGEST_SYMMETRY = {"quad": "slab", "planar": "full", "cube": "full"}
+MAX_LISTED_NAMES = 6
+"""Number of names that an error message lists before it only counts the others."""
 
 
 def illustrative_coefficients(structure: Structure) -> dict[str, float]:
-    """Illustrative coefficients of a built-in layout under any of its symmetries.
+    """Return illustrative coefficients of a built-in layout under any of its symmetries.
 
-    LayoutError: another layout.
+    Raises:
+        LayoutError: The layout is not built in.
     """
-    letters = structure.layout.name in ("quad", "planar")
-    if not letters and structure.layout.name != "cube":
+    layout = structure.layout
+    if layout.name not in _LARGEST_SYMMETRY:
         raise LayoutError(
-            f"no illustrative response for layout {structure.layout.name!r}; there is one for "
+            f"no illustrative response for layout {layout.name!r}; there is one for "
             "quad, planar and cube: fit a calibration for yours"
         )
-    if set(structure.names) in (set(ILLUSTRATIVE), set(ILLUSTRATIVE_CUBE)):
-        return {
-            name: (ILLUSTRATIVE if letters else ILLUSTRATIVE_CUBE)[name] for name in structure.names
-        }
-    return project(structure, _illustrative_response(structure))[0]
+    known = ILLUSTRATIVE_CUBE if layout.name == "cube" else ILLUSTRATIVE
+    if set(structure.names) == set(known):
+        return {name: known[name] for name in structure.names}
+
+    # A smaller symmetry has more coefficients: read them off the most symmetric response.
+    symmetric = find_structure(layout, _LARGEST_SYMMETRY[layout.name])
+    matrix = response(symmetric, illustrative_coefficients(symmetric))
+    coefficients, _ = project(structure, matrix)
+    return coefficients
 
 
-def generic_response(structure: Structure) -> np.ndarray:
-    """A response (P, M) with random coefficients: its ranks are those of almost all others."""
-    names = structure.names
-    values = np.random.default_rng(0).uniform(0.5, 1.5, len(names))
-    return response(structure, dict(zip(names, values.tolist(), strict=True)))
+def generic_response(structure: Structure) -> Array:
+    """Return a response (P, M) with random coefficients; it has the ranks of almost all others."""
+    generator = np.random.default_rng(0)
+    values = generator.uniform(0.5, 1.5, structure.n_coefficients)
+    return response(structure, dict(zip(structure.names, values.tolist(), strict=True)))
 
 
-def response(structure: Structure, coefficients: Mapping[str, float]) -> np.ndarray:
-    """A = sum_k c_k B_k, shape (P, M).
+def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
+    """Compute the response A = sum_k c_k B_k.
 
-    CalibrationError names the coefficients that are missing, unknown or not finite.
+    Args:
+        structure: The K basis matrices B_k.
+        coefficients: Value of each coefficient, in Pa per Pa.
+
+    Returns:
+        Response (P, M), in Pa per Pa.
+
+    Raises:
+        CalibrationError: Coefficients are missing, unknown or not finite.
     """
     missing = set(structure.names) - set(coefficients)
     unknown = set(coefficients) - set(structure.names)
     if missing or unknown:
         raise CalibrationError(
             f"layout {structure.layout.name!r} with symmetry {structure.symmetry!r} has "
-            f"{structure.n_coefficients} coefficients; missing {_some(missing)}, "
-            f"unknown {_some(unknown)}"
+            f"{structure.n_coefficients} coefficients; missing {_list_names(missing)}, "
+            f"unknown {_list_names(unknown)}"
         )
     values = np.array([coefficients[name] for name in structure.names], dtype=float)
-    if not np.all(np.isfinite(values)):
-        bad = [n for n, v in zip(structure.names, values, strict=True) if not np.isfinite(v)]
-        raise CalibrationError(f"coefficients must be finite; {_some(bad)} are not")
+    is_finite = np.isfinite(values)
+    if not is_finite.all():
+        invalid = np.array(structure.names)[~is_finite]
+        raise CalibrationError(f"coefficients must be finite; {_list_names(invalid)} are not")
     return np.tensordot(values, structure.basis, axes=1)
 
 
-def project(structure: Structure, matrix: np.ndarray) -> tuple[dict[str, float], float]:
-    """The nearest member of a structure to a response (P, M).
+def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], float]:
+    """Find the member of a structure that is nearest to a response (P, M).
 
-    Returns its coefficients (means over each orbit, as averaging P(R)^-1 A M(R) over the group
-    gives) and the relative part left over, |A - A_sym| / |A|, 0 for a perfectly symmetric response.
+    Each coefficient is the mean over its orbit. This equals the average of P(R)^-1 A M(R) over the
+    symmetry group.
+
+    Returns:
+        The coefficients, and the relative remainder |A - A_sym| / |A|, which is 0 for a response
+        that has the symmetry.
+
+    Raises:
+        CalibrationError: The matrix has another shape.
     """
     matrix = np.asarray(matrix, dtype=float)
-    if matrix.shape != structure.basis.shape[1:]:
+    basis = structure.basis
+    if matrix.shape != basis.shape[1:]:
         raise CalibrationError(
             f"the response matrix has shape {matrix.shape}; layout {structure.layout.name!r} "
-            f"with its modes needs {structure.basis.shape[1:]}"
+            f"with its modes needs {basis.shape[1:]}"
         )
-    values = np.einsum("kpm,pm->k", structure.basis, matrix) / np.einsum(
-        "kpm,kpm->k", structure.basis, structure.basis
-    )
-    left = matrix - np.tensordot(values, structure.basis, axes=1)
+    orbit_sizes = np.einsum("kpm,kpm->k", basis, basis)
+    values = np.einsum("kpm,pm->k", basis, matrix) / orbit_sizes
+    remainder = np.linalg.norm(matrix - np.tensordot(values, basis, axes=1))
     size = np.linalg.norm(matrix)
-    unexplained = float(np.linalg.norm(left) / size) if size else 0.0
-    return dict(zip(structure.names, values.tolist(), strict=True)), unexplained
+    relative = float(remainder / size) if size else 0.0
+    return dict(zip(structure.names, values.tolist(), strict=True)), relative
 
 
-def prototype(shift: np.ndarray) -> np.ndarray:
-    """Readings (N, 3) of the paper's prototype: normal, shear, gradient.
+def prototype(shift: Array) -> Array:
+    """Compute the readings of the paper's prototype, eqs. 8 to 10 as they stand.
 
-    shift: (N, 4) of the frequencies of V1 .. V4. These are the paper's eqs. 8 to 10 as they stand,
-    in the unit of the shifts and uncalibrated. In terms of eq. 1 they are
+    In terms of eq. 1 the readings are
 
         -4 (a zz - b xx),   4 (c + d) zx,   -4 (e zz_x - h xx_x)
 
-    The normal reading holds sigma_xx too, and the third shows the true gradient only where that of
+    The normal reading includes sigma_xx. The third is the true gradient only where the gradient of
     sigma_xx is known.
+
+    Args:
+        shift: Frequency shifts of the pads V1 to V4, (N, 4).
+
+    Returns:
+        Normal, shear and gradient readings (N, 3), uncalibrated, in the unit of the shifts.
     """
-    return np.asarray(shift) @ np.array([[-1, -1, 1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1]])
+    weights = [[-1, -1, 1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1]]
+    readings: Array = np.asarray(shift) @ np.array(weights)
+    return readings
 
 
-def _illustrative_response(structure: Structure) -> np.ndarray:
-    largest = {"quad": "slab", "planar": "full", "cube": "full"}[structure.layout.name]
-    symmetric = find_structure(structure.layout, largest)
-    return response(symmetric, illustrative_coefficients(symmetric))
-
-
-def _some(names) -> str:
-    """The first few names of a set."""
-    if not names:
+def _list_names(names: Iterable[str]) -> str:
+    """Return the first few names in alphabetical order, and how many more there are."""
+    ordered = sorted(names)
+    if not ordered:
         return "none"
-    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-    return ", ".join(sorted(names)[:6]) + more
+    hidden = len(ordered) - MAX_LISTED_NAMES
+    more = f" and {hidden} more" if hidden > 0 else ""
+    return ", ".join(ordered[:MAX_LISTED_NAMES]) + more

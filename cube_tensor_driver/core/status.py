@@ -1,17 +1,32 @@
-"""Status bits of rows and pads, as in SkinStress.msg."""
+"""Status bits of rows and conditions of pads, with the values that SkinStress.msg states."""
 
 from __future__ import annotations
 
 PAD_FAULT = 1
-"""At least one pad was left out: the device reports it, or its frequency is impossible."""
+"""Status bit: at least one pad was left out, because the device reports a fault or its frequency
+is impossible."""
+
 RESIDUAL = 2
-"""Chi-square is above its false-alarm limit: a load outside the modes, or a broken pad."""
+"""Status bit: chi-square is above its false-alarm limit.
+
+Either the load is outside the modes, or a pad is broken.
+"""
+
 INVALID = 4
-"""Nothing was recovered: all components are NaN."""
+"""Status bit: no component was recovered, so all of them are NaN."""
+
 TEMPERATURE = 8
-"""The calibration needs the temperature, which is unknown; its reference was assumed."""
+"""Status bit: the temperature that the calibration needs is unknown.
+
+The reference temperature of the calibration was assumed instead.
+"""
+
 STAMP = 2048
-"""The stamp is in doubt: the device's clock seems to have been set, or is no clock."""
+"""Status bit: the time stamp is doubtful.
+
+The clock of the device seems to have been set, or the counter that it sends is not a clock.
+"""
+
 STATUS = {
     "PAD_FAULT": PAD_FAULT,
     "RESIDUAL": RESIDUAL,
@@ -19,8 +34,23 @@ STATUS = {
     "TEMPERATURE": TEMPERATURE,
     "STAMP": STAMP,
 }
+"""Status bits by name, as messages and tables show them."""
 
-OPEN, SHORT, RANGE, STUCK, NOISY, REPORTED, DRIFT = 16, 32, 64, 128, 256, 512, 1024
+OPEN = 16
+"""Condition of a pad: its frequency is so high that its capacitor must be disconnected."""
+SHORT = 32
+"""Condition of a pad: it has no frequency, as with a short circuit."""
+RANGE = 64
+"""Condition of a pad: its frequency stands for a strain that the elastomer does not survive."""
+STUCK = 128
+"""Condition of a pad: its frequency does not change while the other pads of the cube move."""
+NOISY = 256
+"""Condition of a pad: it is much noisier than its calibration and the other pads of the cube."""
+REPORTED = 512
+"""Condition of a pad: the hub reports a fault."""
+DRIFT = 1024
+"""Condition of a pad: its rest frequency moves away from those of the other pads of the cube."""
+
 WORDS = {
     OPEN: "open",
     SHORT: "short",
@@ -30,5 +60,10 @@ WORDS = {
     REPORTED: "reported by the hub",
     DRIFT: "drifting",
 }
+"""Words for the conditions of a pad, as diagnostics and tables show them."""
+
 LEFT_OUT = OPEN | SHORT | RANGE | STUCK | NOISY | REPORTED
-"""A pad with one of these is not used. A drifting pad still is: only tare can correct it."""
+"""Conditions with which a pad is left out of the reconstruction.
+
+A drifting pad is still used, because its error is small and a tare corrects it.
+"""

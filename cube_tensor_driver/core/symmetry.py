@@ -1,10 +1,10 @@
-"""Symmetry: which response matrices a cube can have, given the group that its surroundings respect.
+"""Symmetry: the response matrices that a cube can have, given the symmetry of its surroundings.
 
-Every element R of the group permutes the pads (P(R)) and turns the modes (M(R)). The response A
-obeys A M(R) = P(R) A for all R. Because both act as signed permutations, the entries of A fall into
-orbits of equal magnitude. Each orbit is one coefficient, named after one of its entries.
+Every element R of the symmetry group permutes the pads (P(R)) and transforms the modes (M(R)). The
+response A satisfies A M(R) = P(R) A for all R. Both act as signed permutations, so the entries of A
+form orbits of equal magnitude. Each orbit is one coefficient, named after one of its entries.
 
-Source: the symmetry argument of the paper's section on eq. 1, for any layout.
+Source: the symmetry argument of the paper's section on eq. 1, applied to any layout.
 """
 
 from __future__ import annotations
@@ -15,24 +15,38 @@ from functools import lru_cache
 
 import numpy as np
 
+from .arrays import Array, Index
 from .errors import SymmetryError
 from .layout import Layout
 from .modes import PLANE, SPACE, Modes
 
-_TURN_Z = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
-_CYCLE = ((0, 0, 1), (1, 0, 0), (0, 1, 0))
-_MIRRORS = tuple(
-    tuple(tuple(-1 if i == j == k else int(i == j) for j in range(3)) for i in range(3))
-    for k in range(3)
-)
-GENERATORS: dict[str, tuple] = {
-    "full": (_TURN_Z, _CYCLE, *_MIRRORS),  # 48: the cube alone in a wide body
-    "slab": (_TURN_Z, *_MIRRORS),  # 16: z differs from x and y, but up and down are alike
-    "mirrors": _MIRRORS,  # 8: three different axes
-    "none": (),  # 1: nothing is known, every entry is its own coefficient
-}
+POSITION_TOLERANCE = 1e-6
+"""Largest distance, in units of d0, of a rotated pad from the pad that it coincides with."""
 
-# The paper's letters, as entries of row V1 with its signs; used where all pads are images of V1.
+_QUARTER_TURN_Z = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
+_CYCLE_AXES = ((0, 0, 1), (1, 0, 0), (0, 1, 0))
+_MIRRORS = (
+    ((-1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    ((1, 0, 0), (0, 1, 0), (0, 0, -1)),
+)
+Matrix = Sequence[Sequence[int]]
+
+GENERATORS: dict[str, tuple[Matrix, ...]] = {
+    "full": (_QUARTER_TURN_Z, _CYCLE_AXES, *_MIRRORS),
+    "slab": (_QUARTER_TURN_Z, *_MIRRORS),
+    "mirrors": _MIRRORS,
+    "none": (),
+}
+"""Generators of each symmetry group, the largest group first.
+
+- full (48 elements): the cube is alone in a wide body.
+- slab (16): z differs from x and y, but up and down are alike.
+- mirrors (8): the three axes differ from each other.
+- none (1): nothing is known, and every entry of the response is a coefficient of its own.
+"""
+
+# The paper's letters stand for entries of the row of pad V1, with these signs.
 _LETTERS = {
     "zz": ("a", 1),
     "xx": ("b", -1),
@@ -45,80 +59,93 @@ _LETTERS = {
 _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
 
 
-def closure(generators: Sequence) -> np.ndarray:
-    """All products (G, 3, 3) of the generators, integers, the identity first."""
+def generate_group(generators: Sequence[Matrix]) -> Index:
+    """Return all products (G, 3, 3) of the generators, the identity first."""
+    matrices = [np.array(generator, dtype=int) for generator in generators]
     identity = np.eye(3, dtype=int)
     found = {identity.tobytes(): identity}
-    new = [identity]
-    while new:
-        products = [np.array(g, dtype=int) @ r for r in new for g in generators]
-        new = []
-        for r in products:
-            if r.tobytes() not in found:
-                found[r.tobytes()] = r
-                new.append(r)
+    newest = [identity]
+    while newest:
+        products = [generator @ element for element in newest for generator in matrices]
+        newest = []
+        for product in products:
+            if product.tobytes() not in found:
+                found[product.tobytes()] = product
+                newest.append(product)
     return np.array(list(found.values()))
 
 
 @lru_cache
-def group(name: str) -> np.ndarray:
-    """Elements (G, 3, 3) of a named group, signed permutation matrices; SymmetryError when
-    unknown."""
+def find_group(name: str) -> Index:
+    """Return the elements (G, 3, 3) of a symmetry group, which are signed permutation matrices.
+
+    Raises:
+        SymmetryError: There is no group of this name.
+    """
     if name not in GENERATORS:
         raise SymmetryError(f"unknown symmetry {name!r}; known are {', '.join(GENERATORS)}")
-    elements = closure(GENERATORS[name])
+    elements = generate_group(GENERATORS[name])
     elements.flags.writeable = False
     return elements
 
 
-def layout_group(layout: Layout, name: str) -> np.ndarray:
-    """The elements of a group that concern a layout: for a planar one, those that keep the plane y
-    = 0."""
-    elements = group(name)
-    return elements[np.abs(elements[:, 1, 1]) == 1] if layout.planar else elements
+def find_layout_group(layout: Layout, name: str) -> Index:
+    """Return the elements of a group that map a layout's space onto itself.
+
+    For a planar layout these are the elements that keep the plane y = 0.
+    """
+    elements = find_group(name)
+    if not layout.planar:
+        return elements
+    keeps_plane = np.abs(elements[:, 1, 1]) == 1
+    planar: Index = elements[keeps_plane]
+    return planar
 
 
-def pad_images(layout: Layout, rotation: np.ndarray) -> np.ndarray:
-    """(P,) the pad onto which a rotation or mirror carries each; SymmetryError names one without
-    image."""
+def map_pads(layout: Layout, rotation: Array | Index) -> Index:
+    """Return, for each pad, the number of the pad onto which a rotation or mirror maps it (P,).
+
+    Raises:
+        SymmetryError: A pad is mapped to a place without a pad; the message names both.
+    """
     r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
-    for pad, (x, n) in enumerate(zip(layout.positions @ r.T, layout.normals @ r.T, strict=True)):
-        same = np.all(np.abs(layout.positions - x) < 1e-6, axis=1) & np.all(
-            np.abs(layout.normals - n) < 1e-6, axis=1
-        )
-        if not same.any():
+    positions, normals = layout.positions @ r.T, layout.normals @ r.T
+    for pad in range(layout.n_pads):
+        offset = np.abs(layout.positions - positions[pad])
+        rotation_error = np.abs(layout.normals - normals[pad])
+        largest = np.maximum(offset, rotation_error).max(axis=1)
+        matches = np.flatnonzero(largest < POSITION_TOLERANCE)
+        if not len(matches):
             raise SymmetryError(
                 f"layout {layout.name!r} lacks this symmetry: pad {layout.pads[pad]!r} would be "
-                f"carried to {x.round(6).tolist()} on face {n.astype(int).tolist()}, where there "
-                f"is no pad; choose a smaller group of {', '.join(GENERATORS)}"
+                f"carried to {positions[pad].round(6).tolist()} on face "
+                f"{normals[pad].astype(int).tolist()}, where there is no pad; choose a smaller "
+                f"group of {', '.join(GENERATORS)}"
             )
-        images[pad] = np.flatnonzero(same)[0]
+        images[pad] = matches[0]
     return images
-
-
-def pad_action(layout: Layout, rotation: np.ndarray) -> np.ndarray:
-    """(P, P) permutation matrix of the pads: the turned pad stresses are pad_action @ pad
-    stresses."""
-    action = np.zeros((layout.n_pads, layout.n_pads))
-    action[pad_images(layout, rotation), np.arange(layout.n_pads)] = 1
-    return action
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
     """All response matrices that a symmetry allows: sum_k coefficient_k basis_k.
 
-    names: (K,) of the coefficients; a name such as "+z-x:zz" is the entry of that pad and mode
-    basis: (K, P, M) with entries 0, 1, -1; every entry of a response belongs to at most one
-    coefficient
+    Attributes:
+        layout: Layout of the P pads.
+        modes: The M modes.
+        symmetry: Name of the symmetry group.
+        names: Names of the K coefficients. A name such as "+z-x:zz" is the entry of that pad and
+            mode.
+        basis: Matrices (K, P, M) with entries 0, 1 and -1. Every entry of a response belongs to at
+            most one coefficient.
     """
 
     layout: Layout
     modes: Modes
     symmetry: str
     names: tuple[str, ...]
-    basis: np.ndarray
+    basis: Array
 
     @property
     def n_coefficients(self) -> int:
@@ -126,70 +153,92 @@ class Structure:
 
     @property
     def pad_orbits(self) -> list[list[int]]:
-        """Pads that the symmetry carries onto each other."""
-        images = np.array(
-            [pad_images(self.layout, r) for r in layout_group(self.layout, self.symmetry)]
-        )
-        return [
-            list(orbit) for orbit in dict.fromkeys(tuple(np.unique(column)) for column in images.T)
-        ]
+        """Sets of pads that the symmetry maps onto each other."""
+        elements = find_layout_group(self.layout, self.symmetry)
+        images = np.array([map_pads(self.layout, element) for element in elements])
+        # Pads of one orbit have the same images, so a dictionary leaves each orbit once.
+        orbits = dict.fromkeys(tuple(np.unique(column).tolist()) for column in images.T)
+        return [list(orbit) for orbit in orbits]
 
 
 def default_modes(layout: Layout) -> Modes:
-    """PLANE for a planar layout, else SPACE."""
+    """Return the modes of the plane for a planar layout, and those of space for all others."""
     return PLANE if layout.planar else SPACE
 
 
 def find_structure(layout: Layout, symmetry: str = "full", modes: Modes | None = None) -> Structure:
-    """The structure of a layout under a group; SymmetryError when the layout does not have the
-    symmetry."""
-    return _structure(layout, symmetry, modes or default_modes(layout))
+    """Derive the response matrices that a symmetry allows for a layout.
+
+    Args:
+        layout: Layout of the pads.
+        symmetry: Name of the symmetry group.
+        modes: Modes; by default `default_modes` of the layout.
+
+    Raises:
+        SymmetryError: The layout does not have this symmetry.
+    """
+    return _derive_structure(layout, symmetry, modes or default_modes(layout))
 
 
 @lru_cache(maxsize=64)
-def _structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
-    elements = layout_group(layout, symmetry)
-    pads = np.array([pad_images(layout, r) for r in elements])
-    actions = np.array([modes.action(r) for r in elements])
-    images, signs = np.abs(actions).argmax(axis=1), np.sign(actions.sum(axis=1)).astype(int)
-    if not np.allclose(np.abs(actions).sum(axis=1), 1) or not np.allclose(
-        np.abs(actions).max(axis=1), 1
-    ):
-        raise SymmetryError("the group does not act on these modes as signed permutations")
-    n_pads, n_modes = layout.n_pads, modes.n_modes
-    seen = np.zeros((n_pads, n_modes), dtype=bool)
-    names, basis = [], []
+def _derive_structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
+    elements = find_layout_group(layout, symmetry)
+    pad_images = np.array([map_pads(layout, element) for element in elements])
+    mode_images, mode_signs = _read_signed_permutations(
+        np.array([modes.action(element) for element in elements])
+    )
+
     letters: dict[str, tuple[str, int]] = {}
-    if len(set(pads[:, 0])) == n_pads and layout.planar and layout.pads[0] == "+z-x":
+    is_one_orbit = len(set(pad_images[:, 0])) == layout.n_pads
+    if is_one_orbit and layout.planar and layout.pads[0] == "+z-x":
+        # Every pad is an image of V1, so the paper's letters for its row name all entries.
         letters = _PAPER_LETTERS if "xz" in modes.names else _LETTERS
-    for pad in range(n_pads):
-        for mode in range(n_modes):
-            if seen[pad, mode]:
-                continue
-            rows, columns, sign = pads[:, pad], images[:, mode], signs[:, mode]
-            seen[rows, columns] = True
-            if np.any((rows == pad) & (columns == mode) & (sign < 0)):
-                continue  # an element that flips the mode but keeps the pad forbids this entry
-            name, flip = letters.get(
-                modes.names[mode], (f"{layout.pads[pad]}:{modes.names[mode]}", 1)
-            )
-            member = np.zeros((n_pads, n_modes))
-            member[rows, columns] = flip * sign
-            names.append(name)
-            basis.append(member)
+
+    is_assigned = np.zeros((layout.n_pads, modes.n_modes), dtype=bool)
+    members: list[tuple[str, Array]] = []
+    for pad, mode in np.ndindex(is_assigned.shape):
+        if is_assigned[pad, mode]:
+            continue
+        rows, columns = pad_images[:, pad], mode_images[:, mode]
+        signs = mode_signs[:, mode]
+        is_assigned[rows, columns] = True
+        if np.any((rows == pad) & (columns == mode) & (signs < 0)):
+            continue  # An element keeps the pad and flips the mode: the entry must be zero.
+        mode_name = modes.names[mode]
+        own_name = (f"{layout.pads[pad]}:{mode_name}", 1)
+        name, letter_sign = letters.get(mode_name, own_name)
+        member = np.zeros(is_assigned.shape)
+        member[rows, columns] = letter_sign * signs
+        members.append((name, member))
+
     if letters:
-        names, basis = map(
-            list,
-            zip(*sorted(zip(names, basis, strict=True), key=lambda pair: pair[0]), strict=True),
-        )
-    stacked = np.array(basis).reshape(-1, n_pads, n_modes)
-    stacked.flags.writeable = False
-    return Structure(layout, modes, symmetry, tuple(names), stacked)
+        members.sort(key=lambda pair: pair[0])
+    names = tuple(name for name, _ in members)
+    basis = np.array([member for _, member in members])
+    basis = basis.reshape(-1, *is_assigned.shape)
+    basis.flags.writeable = False
+    return Structure(layout, modes, symmetry, names, basis)
+
+
+def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
+    """Return the row of the nonzero entry in each column, and its sign, of matrices (G, M, M).
+
+    Raises:
+        SymmetryError: A matrix is not a signed permutation.
+    """
+    magnitude = np.abs(matrices)
+    is_permutation = np.allclose(magnitude.sum(axis=1), 1) and np.allclose(magnitude.max(axis=1), 1)
+    if not is_permutation:
+        raise SymmetryError("the group does not act on these modes as signed permutations")
+    signs = np.sign(matrices.sum(axis=1)).astype(int)
+    return magnitude.argmax(axis=1), signs
 
 
 def coefficient_counts(layout: Layout) -> dict[str, int | None]:
-    """Number of coefficients under each symmetry, the largest group first; None where the layout
-    lacks it."""
+    """Count the coefficients under each symmetry, the largest group first.
+
+    The count is None if the layout does not have the symmetry.
+    """
     counts: dict[str, int | None] = {}
     for name in GENERATORS:
         try:
@@ -200,13 +249,5 @@ def coefficient_counts(layout: Layout) -> dict[str, int | None]:
 
 
 def largest_symmetry(layout: Layout) -> str:
-    """The largest group whose response matrices are not all zero."""
+    """Return the largest symmetry of a layout whose response matrices are not all zero."""
     return next(name for name, count in coefficient_counts(layout).items() if count)
-
-
-def count_by_characters(layout: Layout, symmetry: str, modes: Modes | None = None) -> int:
-    """Number of coefficients as the mean over the group of (pads kept) x (trace on modes)."""
-    modes = modes or default_modes(layout)
-    elements = layout_group(layout, symmetry)
-    total = sum(np.trace(pad_action(layout, r)) * np.trace(modes.action(r)) for r in elements)
-    return round(total / len(elements))

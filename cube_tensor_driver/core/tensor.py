@@ -10,7 +10,7 @@ import numpy as np
 from transforms3d import euler, quaternions
 
 from .errors import CubeError
-from .modes import to_matrix, to_six
+from .modes import to_matrix, to_voigt
 
 
 def principal_stresses(stress: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,7 +57,7 @@ def traction(stress: np.ndarray, normal: np.ndarray) -> np.ndarray:
 def rotate_stress(stress: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """(..., 6) of R s R' : the stress in a frame of coordinates R x. NaN spreads."""
     r = np.asarray(rotation, dtype=float)
-    return to_six(r @ to_matrix(stress) @ np.swapaxes(r, -1, -2))
+    return to_voigt(r @ to_matrix(stress) @ np.swapaxes(r, -1, -2))
 
 
 def rotate_gradient(gradient: np.ndarray, rotation: np.ndarray) -> np.ndarray:

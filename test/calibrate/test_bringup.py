@@ -26,7 +26,7 @@ from cube_tensor_driver.config.layout import named_layout, shipped_calibration
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.core.modes import to_matrix, to_six
+from cube_tensor_driver.core.modes import to_matrix, to_voigt
 from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.simulation.simulator import FIRST_UID, Simulator
@@ -139,7 +139,7 @@ class Person:
         stress, gradient = contact.field(self._position - [0, 0, 4e-3], finger + place, force, 0.48)
         tensor = np.moveaxis(to_matrix(np.moveaxis(gradient, -1, -2)), -3, -1)
         turned = np.moveaxis(rotate_gradient(tensor, self._back), -1, -3)
-        return rotate_stress(stress, self._back), np.moveaxis(to_six(turned), -1, -2)
+        return rotate_stress(stress, self._back), np.moveaxis(to_voigt(turned), -1, -2)
 
 
 @contextlib.contextmanager

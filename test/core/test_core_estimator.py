@@ -13,7 +13,7 @@ from cube_tensor_driver.core.estimator import (
     chi2_limit,
     chi2_tail,
     make_estimator,
-    summary,
+    summarize_response,
 )
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE
@@ -121,7 +121,7 @@ def test_what_the_layouts_see():
 
 def test_the_summary_of_a_layout():
     c = illustrative("cube")
-    s = summary(c.structure, c.response)
+    s = summarize_response(c.structure, c.response)
     keys = (
         "pads modes n_coefficients rank_uniform condition_uniform rank_gradient condition_gradient"
     )
@@ -133,7 +133,7 @@ def test_the_summary_of_a_layout():
     singular = np.linalg.svd(c.response[:, :6], compute_uv=False)
     assert s["condition_uniform"] == pytest.approx(singular[0] / singular[-1])
     quad = illustrative("quad", ("xx", "xx_z", "xx_x"))
-    s = summary(quad.structure, quad.response, quad.neglect)
+    s = summarize_response(quad.structure, quad.response, quad.neglect)
     assert s["rank_uniform"] == s["rank_gradient"] == 2 and s["unobservable"] == [
         "xx",
         "xx_z",

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from cube_tensor_driver.core.errors import CalibrationError, LayoutError, SymmetryError
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS, Layout, find_layout
-from cube_tensor_driver.core.modes import COMPONENTS, PAPER, PLANE, SPACE, to_matrix, to_six
+from cube_tensor_driver.core.modes import COMPONENTS, PAPER, PLANE, SPACE, to_matrix, to_voigt
 from cube_tensor_driver.core.response import (
     ILLUSTRATIVE,
     ILLUSTRATIVE_CUBE,
@@ -21,13 +21,12 @@ from cube_tensor_driver.core.response import (
 from cube_tensor_driver.core.symmetry import (
     GENERATORS,
     Structure,
-    closure,
-    count_by_characters,
     default_modes,
+    find_group,
+    find_layout_group,
     find_structure,
-    group,
-    layout_group,
-    pad_action,
+    generate_group,
+    map_pads,
 )
 
 # Eq. 1 of the paper, typed in here and nowhere else; columns zz zx xx xz zz_x zz_z xx_z xx_x.
@@ -56,6 +55,20 @@ COUNTS = {
     ("cube", "none"): 504,
 }
 PAIRS = sorted(COUNTS)
+
+
+def pad_action(layout: Layout, rotation: np.ndarray) -> np.ndarray:
+    """(P, P) permutation matrix of the pads: rotated pad stresses are pad_action @ pad stresses."""
+    action = np.zeros((layout.n_pads, layout.n_pads))
+    action[map_pads(layout, rotation), np.arange(layout.n_pads)] = 1
+    return action
+
+
+def count_by_characters(layout: Layout, symmetry: str) -> int:
+    """Number of coefficients as the mean over the group of (pads kept) x (trace on modes)."""
+    modes, elements = default_modes(layout), find_layout_group(layout, symmetry)
+    total = sum(np.trace(pad_action(layout, r)) * np.trace(modes.action(r)) for r in elements)
+    return round(total / len(elements))
 
 
 def paper_matrix(**letters: float) -> np.ndarray:
@@ -155,26 +168,28 @@ def test_a_field_becomes_a_state_and_back():
     state = np.random.default_rng(1).normal(size=(5, 21))
     np.testing.assert_allclose(SPACE.state(*SPACE.field(state)), state, atol=1e-14)
     stress, gradient = SPACE.field(state)
-    read = np.concatenate([to_six(stress), np.einsum("niij->nij", gradient).reshape(5, 9)], axis=1)
+    read = np.concatenate(
+        [to_voigt(stress), np.einsum("niij->nij", gradient).reshape(5, 9)], axis=1
+    )
     np.testing.assert_allclose(state @ SPACE.components.T, read, atol=1e-14)
     np.testing.assert_array_equal(
         PLANE.state(np.array([[3, 9, 1, 9, 2, 9.0]])), [[1, 2, 3, 0, 0, 0, 0]]
     )
-    np.testing.assert_array_equal(to_six(to_matrix(np.arange(6.0))), np.arange(6.0))
+    np.testing.assert_array_equal(to_voigt(to_matrix(np.arange(6.0))), np.arange(6.0))
 
 
 @pytest.mark.parametrize("name, order", [("full", 48), ("slab", 16), ("mirrors", 8), ("none", 1)])
 def test_groups_are_groups(name, order):
-    elements = group(name)
+    elements = find_group(name)
     keys = {r.tobytes() for r in elements}
     assert len(elements) == len(keys) == order
     assert all((a @ b).tobytes() in keys for a in elements for b in elements)
     assert all(np.ascontiguousarray(r.T).tobytes() in keys for r in elements)
 
 
-@given(st.lists(st.sampled_from(group("full").tolist()), max_size=3))
+@given(st.lists(st.sampled_from(find_group("full").tolist()), max_size=3))
 def test_closure_of_any_generators_is_a_group(generators):
-    elements = closure(generators)
+    elements = generate_group(generators)
     keys = {r.tobytes() for r in elements}
     assert 48 % len(elements) == 0  # Lagrange
     assert all((a @ b).tobytes() in keys for a in elements for b in elements)
@@ -182,7 +197,7 @@ def test_closure_of_any_generators_is_a_group(generators):
 
 @given(st.integers(0, 47), st.integers(0, 47))
 def test_the_action_on_modes_composes(i, j):
-    a, b = group("full")[i], group("full")[j]
+    a, b = find_group("full")[i], find_group("full")[j]
     np.testing.assert_allclose(SPACE.action(a @ b), SPACE.action(a) @ SPACE.action(b), atol=1e-12)
     inverse = np.linalg.inv(a)
     np.testing.assert_allclose(SPACE.action(inverse) @ SPACE.action(a), np.eye(21), atol=1e-12)
@@ -217,7 +232,7 @@ def test_turned_loads_are_seen_by_turned_pads(layout, symmetry):
     estimator = make_estimator(a, np.ones(len(a)), modes, targets=np.eye(modes.n_modes))
     seen = estimator.observed
     pads = a @ state
-    for r in layout_group(structure.layout, symmetry):
+    for r in find_layout_group(structure.layout, symmetry):
         turn, permute = modes.action(r), pad_action(structure.layout, r)
         np.testing.assert_allclose(a @ turn, permute @ a, atol=1e-12)
         back = (estimator.matrix @ (permute @ pads))[seen]
@@ -228,7 +243,7 @@ def test_turned_loads_are_seen_by_turned_pads(layout, symmetry):
 def test_projection_averages_over_the_group(layout, symmetry):
     structure = find_structure(LAYOUTS[layout], symmetry)
     a = np.random.default_rng(3).normal(size=structure.basis.shape[1:])
-    elements = layout_group(structure.layout, symmetry)
+    elements = find_layout_group(structure.layout, symmetry)
     mean = np.mean(
         [pad_action(structure.layout, r).T @ a @ structure.modes.action(r) for r in elements],
         axis=0,
@@ -310,7 +325,7 @@ def test_a_symmetry_that_the_layout_lacks_names_the_pad():
     with pytest.raises(SymmetryError, match=r"'round'.*full, slab, mirrors, none"):
         find_structure(LAYOUTS["quad"], "round")
     with pytest.raises(SymmetryError, match="do not stay"):
-        PLANE.action(group("full")[[abs(r[1, 1]) != 1 for r in group("full")]][0])
+        PLANE.action(find_group("full")[[abs(r[1, 1]) != 1 for r in find_group("full")]][0])
 
 
 def test_the_illustrative_responses_agree_with_each_other():

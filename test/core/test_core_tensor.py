@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.forces import Forces
-from cube_tensor_driver.core.modes import SPACE, to_matrix, to_six
+from cube_tensor_driver.core.modes import SPACE, to_matrix, to_voigt
 from cube_tensor_driver.core.rows import StressRows
-from cube_tensor_driver.core.symmetry import group
+from cube_tensor_driver.core.symmetry import find_group
 from cube_tensor_driver.core.tensor import (
     contact_wrench,
     invariants,
@@ -99,10 +99,10 @@ def test_a_turned_field_is_the_field_at_the_turned_point(rpy):
 
 def test_rotations_agree_with_the_groups_action():
     state = RNG.normal(size=21)
-    for r in group("full")[::5]:
+    for r in find_group("full")[::5]:
         stress, gradient = SPACE.field(SPACE.action(r) @ state)
         before, slope = SPACE.field(state)
-        np.testing.assert_allclose(to_six(stress), rotate_stress(to_six(before), r), atol=1e-12)
+        np.testing.assert_allclose(to_voigt(stress), rotate_stress(to_voigt(before), r), atol=1e-12)
         np.testing.assert_allclose(gradient, rotate_gradient(slope, r), atol=1e-12)
 
 
