@@ -97,9 +97,7 @@ def test_blocks_of_the_page_run_in_their_order(folder, hubs, monkeypatch):
     assert np.allclose(tared, 1.01 * ctd.Reconstructor(skin).rest_frequency)
     assert not there["observed"][:, [1, 3, 5]].any() and there["observed"][:, [0, 2, 4]].all()
     assert np.nanmin(simulated.stress[:, 2]) < -100.0
-    assert there["table"].num_rows == len(simulated)
     assert (folder / "c05.png").stat().st_size > 1000
-    assert (folder / "stress.parquet").is_file()
 
 
 def test_example_of_the_readme_runs(folder, hubs):
