@@ -17,7 +17,6 @@ import pytest
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 
-from bag_maker import make_bag
 from test_docs_python import blocks
 
 from conftest import ROOT
@@ -87,15 +86,6 @@ def test_examples_of_the_page_read_messages():
     for example in examples:
         message = frequencies if "n_pads" in example else filled(messages.SkinStress)
         exec(example, there | {"message": message})
-
-
-def test_recorded_messages_are_read_as_the_page_says(tmp_path, monkeypatch, capsys):
-    make_bag(tmp_path / "run1", ROOT / "config" / "skin_demo.yaml", 2)
-    monkeypatch.chdir(tmp_path)
-    [program] = [block for block in blocks(PAGE, "python") if "rclpy" not in block]
-    exec(compile(program, PAGE, "exec"), {})
-    said = capsys.readouterr().out.splitlines()
-    assert len(said) == 16 and re.fullmatch(r"c05: \d+\.\d\d Hz on pad \+z-x", said[5])
 
 
 def test_program_in_cpp_fits_the_messages(tmp_path):
