@@ -22,7 +22,7 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.mechanics.kernels import LENGTHS, SHEAR
+from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.windows import MODEL_ERROR
 
@@ -105,9 +105,9 @@ def rod_shear(
 def _estimate(seen: Array, shear: Array, x: Array, depth: float) -> Array:
     """(n,) weights of y for the shear; seen (n, m, 2), shear (m, 2): per traction at x (m,)."""
     apart = np.subtract.outer(x, x) ** 2
-    prior = np.mean([np.exp(-apart / 2 / (l * depth) ** 2) for l in LENGTHS], axis=0)
+    prior = np.mean([np.exp(-apart / 2 / (l * depth) ** 2) for l in PRIOR_LENGTHS], axis=0)
     total, cross = np.zeros((len(seen),) * 2), np.zeros(len(seen))
-    for component, size in enumerate((SHEAR, 1.0)):
+    for component, size in enumerate((SHEAR_RATIO, 1.0)):
         smooth = size**2 * seen[:, :, component] @ prior
         total += smooth @ seen[:, :, component].T
         cross += smooth @ shear[:, component]

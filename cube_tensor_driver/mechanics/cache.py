@@ -1,7 +1,8 @@
-"""Arrays that take seconds to compute, kept in the user's cache folder for the next time.
+"""Cache of arrays that take seconds to compute, in the user's cache folder.
 
-A file is named by a hash of what its arrays are made from, the code included. A file that is
-damaged, or of another version, is made again; where nothing can be written, nothing is kept.
+The name of a file contains a hash of everything its arrays depend on, the source code included. A
+damaged file, or one of another version of the code, is computed again. If the folder cannot be
+written, the arrays are computed at every start.
 """
 
 from __future__ import annotations
@@ -16,73 +17,106 @@ from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-MOST_BYTES = 1 << 30
-"""Of all files; the ones that were used longest ago go first."""
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+from ..core.arrays import AnyArray
+
+MAX_CACHE_BYTES = 1 << 30
+"""Maximum size of all cached files together, in bytes. Beyond it, the least recently used files are
+removed."""
+
+_READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+"""Errors that numpy raises for a missing or damaged file."""
+
 _CODE = (
     "mechanics/layer.py",
     "mechanics/circular.py",
     "mechanics/spectra.py",
     "mechanics/kernels.py",
-    "mechanics/disc_tables.py",
-    "mechanics/polygon_tables.py",
+    "mechanics/contact_tables.py",
     "mechanics/cache.py",
     "touch/prior.py",
-    "touch/flattened.py",
-    "touch/windows.py",
+    "touch/unrolled_skin.py",
+    "touch/posterior.py",
 )
+"""Source files, relative to the package, whose change makes all cached arrays invalid."""
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, AnyArray]
 
 
 def cache_folder() -> Path:
-    """`cube_tensor_driver` below XDG_CACHE_HOME, which is ~/.cache if it is not set."""
+    """Return the folder of the cached files, below XDG_CACHE_HOME or else below ~/.cache."""
     home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(home) if home else Path.home() / ".cache") / "cube_tensor_driver"
+    parent = Path(home) if home else Path.home() / ".cache"
+    return parent / "cube_tensor_driver"
 
 
-def cached(kind: str, made_from: Iterable[Any], make: Callable[[], Arrays]) -> Arrays:
-    """The arrays that `make` gives for numbers and arrays that they are made from."""
-    path = cache_folder() / f"{kind}-{_digest(made_from)}.npz"
-    found = _read(path)
-    if found is None:
-        found = make()
-        with suppress(OSError):
-            _write(path, found)
-    return found
+def load_or_compute(
+    kind: str,
+    inputs: Iterable[Any],
+    compute: Callable[[], Arrays],
+) -> Arrays:
+    """Load arrays from the cache, or compute and store them.
+
+    Args:
+        kind: Name of the kind of arrays; the file name begins with it.
+        inputs: Numbers and arrays that determine the result.
+        compute: Function that computes the arrays.
+
+    Returns:
+        The arrays by name, the same whether they were loaded or computed.
+    """
+    path = cache_folder() / f"{kind}-{_hash_inputs(inputs)}.npz"
+
+    arrays = _load(path)
+    if arrays is not None:
+        return arrays
+
+    arrays = compute()
+    with suppress(OSError):  # without a writable folder, nothing is stored
+        _store(path, arrays)
+    return arrays
 
 
-def _digest(made_from: Iterable[Any]) -> str:
+def _hash_inputs(inputs: Iterable[Any]) -> str:
+    """Return a hash of the source code and of the values, types and shapes of the inputs."""
     digest = hashlib.sha256()
+    package = Path(__file__).parents[1]
     for name in _CODE:
         with suppress(OSError):
-            digest.update((Path(__file__).parents[1] / name).read_bytes())
-    for one in made_from:
-        array = np.ascontiguousarray(one)
+            digest.update((package / name).read_bytes())
+
+    for value in inputs:
+        array = np.ascontiguousarray(value)
+        # Without type and shape, arrays of equal bytes would get the same hash.
         digest.update(f"{array.dtype.str} {array.shape} ".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()[:32]
 
 
-def _read(path: Path) -> Arrays | None:
+def _load(path: Path) -> Arrays | None:
+    """Load a file, or return None if it is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:  # its checksums find damage
-            found = dict(file)
-        os.utime(path)
-    except _DAMAGE:
+        # The checksums of the zip format detect damage.
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        os.utime(path)  # `_make_room` goes by the time of the last use
+    except _READ_ERRORS:
         return None
-    return found
+    return arrays
 
 
-def _write(path: Path, arrays: Arrays) -> None:
-    """Completely or not at all, whoever else writes the same."""
+def _store(path: Path, arrays: Arrays) -> None:
+    """Write a file completely or not at all, even if several processes write it at once."""
     size = sum(array.nbytes for array in arrays.values())
-    if size > MOST_BYTES:
+    if size > MAX_CACHE_BYTES:
         return
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    with NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+    with NamedTemporaryFile(
+        dir=path.parent,
+        suffix=".part",
+        delete=False,
+    ) as file:
         try:
             np.savez(file, allow_pickle=False, **arrays)
             file.close()
@@ -94,14 +128,12 @@ def _write(path: Path, arrays: Arrays) -> None:
 
 
 def _make_room(newest: Path) -> None:
-    """Remove the files that were used longest ago, until all fit."""
-    files = sorted(
-        (path for path in newest.parent.glob("*.npz") if path != newest),
-        key=lambda path: path.stat().st_mtime,
-        reverse=True,
-    )
+    """Remove the least recently used files until all fit into `MAX_CACHE_BYTES`."""
+    others = [path for path in newest.parent.glob("*.npz") if path != newest]
+    others.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+
     total = newest.stat().st_size
-    for path in files:
+    for path in others:
         total += path.stat().st_size
-        if total > MOST_BYTES:
+        if total > MAX_CACHE_BYTES:
             path.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """Stress and stress gradient in a half space under contact loads on its surface.
 
 The skin is the half space z <= 0: z points out of the skin, its surface is z = 0 and a cube sits at
-z = -depth. A force acts *on* the skin, so pressing has a negative z component.
+z = -depth. A force acts *on* the skin, so that pressing has a negative z component.
 
 With d = point - source, R = |d|, Z = -d_z and the harmonic potential chi = Z ln(R + Z) - R, the
 solutions of Boussinesq (normal force) and Cerruti (tangential force) are one expression::
@@ -9,12 +9,12 @@ solutions of Boussinesq (normal force) and Cerruti (tangential force) are one ex
     sigma_ij = -3 / (2 pi) d_i d_j (F . d) / R^5  +  (1 - 2 nu) / (2 pi) C_ij
     C_xx = g_yy,  C_yy = g_xx,  C_xy = -g_xy,  C_zi = 0,   g = F_x chi_x + F_y chi_y - F_z chi_Z
 
-The first term is all there is in an incompressible body. The second is a plane stress field with
-the Airy function g: it balances by itself and leaves every plane z = const free of traction.
+An incompressible body has only the first term. The second term is a plane stress field with the
+Airy function g: it is in equilibrium by itself and leaves every plane z = const free of traction.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 3.2 (normal) and 3.6 (tangential); A. E. H. Love,
-Phil. Trans. R. Soc. A 228 (1929) 377. They print the components. The form with g is ours; the tests
-compare it with their components.
+Phil. Trans. R. Soc. A 228 (1929) 377. They print the components. The form with g was derived here;
+the tests compare it with the printed components.
 """
 
 from __future__ import annotations
@@ -27,40 +27,60 @@ from numpy.typing import ArrayLike
 from ..core.arrays import Array
 from ..core.errors import ElasticError
 
-_ORDER_PER_RADIUS = 5.5
-"""Order of a Hertz contact over its radius in depths, measured (`hertz_order`)."""
-_PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # xx, yy, zz, yz, zx, xy
+_HERTZ_ORDER_PER_RADIUS = 5.5
+"""Quadrature order that a Hertz contact needs, per radius divided by depth; measured."""
+
+_MIN_HERTZ_ORDER = 6
+"""Quadrature order of Hertz contacts that are small compared with the depth."""
+
+_STRESS_AXES = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+"""Axes of the stress components xx, yy, zz, yz, zx, xy."""
+
+_THIRD_DERIVATIVES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
+"""Axes of all different third derivatives in a plane: xxx, xxy, xyy, yyy."""
 
 
 def field(
-    points: ArrayLike, sources: ArrayLike, forces: ArrayLike, poisson: float
+    points: ArrayLike,
+    sources: ArrayLike,
+    forces: ArrayLike,
+    poisson: float,
 ) -> tuple[Array, Array]:
-    """Stress and its gradient at points under point forces on the surface.
+    """Compute stress and its gradient at points under point forces on the surface.
 
-    points: (..., N, 3) m, z <= 0
-    sources: (..., L, 3) m, z = 0
-    forces: (..., L, 3) N on the skin
-    poisson: Poisson's ratio, -1 < nu <= 0.5; Young's modulus does not matter
+    Leading axes, such as time, broadcast. About 500 bytes of memory are used per pair of point and
+    force.
 
-    Returns stress (..., N, 6) in Pa, order xx yy zz yz zx xy, tension positive, and its gradient
-    (..., N, 6, 3) in Pa/m, whose last axis is the direction of the derivative. Leading axes, such
-    as time, broadcast. Memory: about 500 bytes per pair of point and force.
+    Args:
+        points: Positions (..., N, 3) in m, z <= 0.
+        sources: Positions (..., L, 3) of the forces in m, z = 0.
+        forces: Forces (..., L, 3) in N on the skin.
+        poisson: Poisson's ratio, -1 < nu <= 0.5. Young's modulus does not influence the stress.
 
-    Raises ElasticError for a point above the surface or on a source, a source off the surface, or a
-    Poisson's ratio out of range.
+    Returns:
+        Stress (..., N, 6) in Pa, order xx yy zz yz zx xy, tension positive, and its gradient
+        (..., N, 6, 3) in Pa/m, whose last axis is the direction of the derivative.
+
+    Raises:
+        ElasticError: A point lies above the surface or on a source, a source lies off the surface,
+            or Poisson's ratio is out of range.
     """
-    p, s, f = (np.asarray(a, dtype=np.float64) for a in (points, sources, forces))
-    _check(p, s, f, poisson)
-    d = p[..., :, None, :] - s[..., None, :, :]
-    f = f[..., None, :, :]
-    radius = np.sqrt(np.einsum("...i,...i->...", d, d))
-    if not np.all(radius > 0.0):
+    points = np.asarray(points, dtype=np.float64)
+    sources = np.asarray(sources, dtype=np.float64)
+    forces = np.asarray(forces, dtype=np.float64)
+    _check(points, sources, forces, poisson)
+
+    d = points[..., :, np.newaxis, :] - sources[..., np.newaxis, :, :]
+    forces = forces[..., np.newaxis, :, :]
+    distance = np.sqrt(np.einsum("...i,...i->...", d, d))
+    if not np.all(distance > 0.0):
         raise ElasticError(
             "a point lies on a point force, where the stress is infinite; move it below the surface"
         )
-    stress, gradient = _radial(d, f, radius)
+
+    stress, gradient = _radial(d, forces, distance)
     if poisson != 0.5:
-        airy_stress, airy_gradient = _airy(d, f, radius)
+        airy_stress, airy_gradient = _airy(d, forces, distance)
         scale = (1.0 - 2.0 * poisson) / (2.0 * np.pi)
         stress += scale * airy_stress
         gradient += scale * airy_gradient
@@ -68,61 +88,117 @@ def field(
 
 
 def disc(
-    radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 6
+    radius: float,
+    force: ArrayLike,
+    centre: ArrayLike = (0.0, 0.0),
+    order: int = 6,
 ) -> tuple[Array, Array]:
-    """Uniform traction on a disc, as point forces: sources (L, 3) m, forces (L, 3) N.
+    """Return point forces that represent a uniform traction on a disc.
 
-    radius m; force (3,) N; centre (2,) m; L = 4 order^2. The points are Gauss points in r^2 at
-    equally spaced angles: the error falls exponentially with `order` at points deeper than the
-    spacing. Raises ElasticError unless radius > 0 and order >= 1.
+    The point forces are Gauss points in r^2 at equally spaced angles. At points deeper than their
+    spacing, the error decreases exponentially with `order`.
+
+    Args:
+        radius: Radius of the disc in m.
+        force: Total force (3,) in N.
+        centre: Centre (2,) of the disc in m.
+        order: Number of rings.
+
+    Returns:
+        Sources (L, 3) in m and forces (L, 3) in N, with L = 4 order^2.
+
+    Raises:
+        ElasticError: `radius` is not positive or `order` is below 1.
     """
-    t, weight = _gauss(order)
-    return _rings(radius, np.sqrt(t), weight, force, centre)
+    nodes, weights = _gauss_points(order)
+    return _place_rings(radius, np.sqrt(nodes), weights, force, centre)
 
 
 def hertz(
-    radius: float, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 12
+    radius: float,
+    force: ArrayLike,
+    centre: ArrayLike = (0.0, 0.0),
+    order: int = 12,
 ) -> tuple[Array, Array]:
-    """Traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2) on a disc: a sphere that presses or slides.
+    """Return point forces that represent the traction below a sphere that presses or slides.
 
-    Parameters, result and errors as for `disc`; Johnson 4.2 (normal) and 7.1 (sliding). The default
-    order is good from a depth of half the radius on; `hertz_order` gives that for any depth.
+    The traction is 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2), Johnson 4.2 (normal) and 7.1 (sliding).
+    Arguments, result and errors are those of `disc`. The default order is accurate from a depth of
+    half the radius on; `hertz_order` returns the order for any depth.
     """
-    t, weight = _gauss(order)  # with t = sqrt(1 - r^2): p r dr = t^2 dt, smooth at the rim
-    return _rings(radius, np.sqrt(1.0 - t**2), 3.0 * weight * t**2, force, centre)
+    nodes, weights = _gauss_points(order)
+    # With t = sqrt(1 - r^2), p r dr = t^2 dt is smooth at the rim, where p itself is not.
+    radii = np.sqrt(1.0 - nodes**2)
+    return _place_rings(radius, radii, 3.0 * weights * nodes**2, force, centre)
 
 
 def hertz_order(radius: float, depth: float) -> int:
-    """The order with which `hertz` is good from this depth on, both in m.
+    """Return the order with which `hertz` is accurate from a depth on; both arguments are in m.
 
-    Stress and gradient are then within 1e-3 of their greatest value at that depth, for radii of up
-    to four depths: the error falls exponentially with order * depth / radius.
+    Stress and gradient are then within 1e-3 of their largest value at that depth, for radii of up
+    to four depths. The error decreases exponentially with order * depth / radius.
+
+    Raises:
+        ElasticError: An argument is not positive.
     """
     if not (radius > 0.0 and depth > 0.0):
         raise ElasticError(
             f"radius is {radius} m and depth {depth} m; a contact has a radius above 0, and its "
             "stress is asked for below the surface"
         )
-    return max(6, math.ceil(_ORDER_PER_RADIUS * radius / depth))
+    return max(_MIN_HERTZ_ORDER, math.ceil(_HERTZ_ORDER_PER_RADIUS * radius / depth))
 
 
 def rectangle(
-    sides: ArrayLike, force: ArrayLike, centre: ArrayLike = (0.0, 0.0), order: int = 8
+    sides: ArrayLike,
+    force: ArrayLike,
+    centre: ArrayLike = (0.0, 0.0),
+    order: int = 8,
 ) -> tuple[Array, Array]:
-    """Uniform traction on a rectangle, as point forces; see `disc`. sides (2,) m; L = order^2."""
+    """Return point forces that represent a uniform traction on a rectangle.
+
+    Args:
+        sides: Side lengths (2,) along x and y, in m.
+        force: As in `disc`.
+        centre: As in `disc`.
+        order: Number of Gauss points along each side.
+
+    Returns:
+        Sources (L, 3) in m and forces (L, 3) in N, with L = order^2.
+
+    Raises:
+        ElasticError: A side is not positive or `order` is below 1.
+    """
     length = np.asarray(sides, dtype=np.float64)
     if length.shape != (2,) or not np.all(length > 0.0):
         raise ElasticError(f"rectangle sides are {sides!r}; give two positive lengths in m")
-    t, weight = _gauss(order)
-    x, y = np.meshgrid((t - 0.5) * length[0], (t - 0.5) * length[1], indexing="ij")
-    return _patch(x.ravel(), y.ravel(), np.outer(weight, weight).ravel(), force, centre)
+    nodes, weights = _gauss_points(order)
+    x, y = np.meshgrid(
+        (nodes - 0.5) * length[0],
+        (nodes - 0.5) * length[1],
+        indexing="ij",
+    )
+    fractions = np.outer(weights, weights)
+    return _place_forces(
+        x.ravel(),
+        y.ravel(),
+        fractions.ravel(),
+        force,
+        centre,
+    )
 
 
-def _check(points: Array, sources: Array, forces: Array, poisson: float) -> None:
-    for name, a in (("points", points), ("sources", sources), ("forces", forces)):
-        if a.ndim < 2 or a.shape[-1] != 3 or not np.all(np.isfinite(a)):
+def _check(
+    points: Array,
+    sources: Array,
+    forces: Array,
+    poisson: float,
+) -> None:
+    """Raise ElasticError for arguments that `field` cannot use."""
+    for name, array in (("points", points), ("sources", sources), ("forces", forces)):
+        if array.ndim < 2 or array.shape[-1] != 3 or not np.all(np.isfinite(array)):
             raise ElasticError(
-                f"{name} have shape {a.shape}; give finite numbers of shape (..., n, 3)"
+                f"{name} have shape {array.shape}; give finite numbers of shape (..., n, 3)"
             )
     if sources.shape[-2] != forces.shape[-2]:
         raise ElasticError(
@@ -139,92 +215,169 @@ def _check(points: Array, sources: Array, forces: Array, poisson: float) -> None
         raise ElasticError("a force acts off the surface; sources must have z = 0")
 
 
-def _radial(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
-    """The first term of the module head and its gradient, summed over forces."""
-    k = -3.0 / (2.0 * np.pi)
-    pair = np.stack([d[..., i] * d[..., j] for i, j in _PAIRS], axis=-2)  # (..., N, 6, L)
-    weight = k * np.einsum("...i,...i->...", d, f) / radius**5
-    stress = np.einsum("...cl,...l->...c", pair, weight)
-    slope = k * f / radius[..., None] ** 5 - 5.0 * (weight / radius**2)[..., None] * d
-    gradient = pair @ slope
-    arm = np.einsum("...l,...li->...i", weight, d)
-    for c, (i, j) in enumerate(_PAIRS):
-        gradient[..., c, i] += arm[..., j]
-        gradient[..., c, j] += arm[..., i]
+def _radial(
+    d: Array,
+    forces: Array,
+    distance: Array,
+) -> tuple[Array, Array]:
+    """Return the first term of the module head and its gradient, summed over the forces.
+
+    With w = -3 / (2 pi) (F . d) / R^5, sigma_ij = w d_i d_j and its derivative along k is
+    d_i d_j dw/dk + w (delta_ik d_j + delta_jk d_i).
+    """
+    constant = -3.0 / (2.0 * np.pi)
+    products = np.stack([d[..., i] * d[..., j] for i, j in _STRESS_AXES], axis=-2)
+    w = constant * np.einsum("...i,...i->...", d, forces) / distance**5
+    stress = np.einsum("...cl,...l->...c", products, w)
+
+    by_force = constant * forces / distance[..., np.newaxis] ** 5
+    by_distance = 5.0 * (w / distance**2)[..., np.newaxis] * d
+    gradient = products @ (by_force - by_distance)
+    weighted_d = np.einsum("...l,...li->...i", w, d)
+    for component, (i, j) in enumerate(_STRESS_AXES):
+        gradient[..., component, i] += weighted_d[..., j]
+        gradient[..., component, j] += weighted_d[..., i]
     return stress, gradient
 
 
-def _airy(d: Array, f: Array, radius: Array) -> tuple[Array, Array]:
-    """The field C_ij of the module head and its gradient, summed over forces.
+def _airy(
+    d: Array,
+    forces: Array,
+    distance: Array,
+) -> tuple[Array, Array]:
+    """Return the field C_ij of the module head and its gradient, summed over the forces.
 
-    In a plane Z = const a function h of r has the derivatives h_ab = delta_ab h1 + d_a d_b h2 and
-    so on, with h1 = h'/r, h2 = h1'/r, ... Below they are those of chi (chi2, chi3, chi4), of
+    In a plane Z = const, a function h of r has the second derivatives delta_ij h1 + d_i d_j h2 with
+    h1 = h'/r, h2 = h1'/r and so on. The names below are those of chi (chi2, chi3, chi4), of
     chi_Z = ln(R + Z) (log1, log2, log3) and of chi_ZZ = 1/R (inv1, inv2).
     """
     x, y, z = np.moveaxis(d, -1, 0)
-    fx, fy, fz = np.moveaxis(np.broadcast_to(f, d.shape), -1, 0)
-    u, v = 1.0 / radius, 1.0 / (radius - z)  # v = 1 / (R + Z) is finite: Z >= 0
-    chi2, chi3 = u * v**2, -(u**3) * v**2 - 2 * u**2 * v**3
+    fx, fy, fz = np.moveaxis(
+        np.broadcast_to(forces, d.shape),
+        -1,
+        0,
+    )
+    position = (x, y)
+    force = (fx, fy)
+    f_dot_d = fx * x + fy * y
+
+    u = 1.0 / distance
+    v = 1.0 / (distance - z)  # 1 / (R + Z), finite because Z >= 0
+    chi2 = u * v**2
+    chi3 = -(u**3) * v**2 - 2 * u**2 * v**3
     chi4 = 3 * u**5 * v**2 + 6 * u**4 * v**3 + 6 * u**3 * v**4
-    log1, log2 = u * v, -(u**3) * v - u**2 * v**2
+    log1 = u * v
+    log2 = -(u**3) * v - u**2 * v**2
     log3 = 3 * u**5 * v + 3 * u**4 * v**2 + 2 * u**3 * v**3
-    inv1, inv2 = -(u**3), 3 * u**5
-    q = fx * x + fy * y
+    inv1 = -(u**3)
+    inv2 = 3 * u**5
 
-    def second(c2: Array, c3: Array, l1: Array, l2: Array) -> list[Array]:
-        """g_xx, g_xy, g_yy from the derivatives of its tangential and its normal potential."""
-        a, b, c = q * c2 - fz * l1, q * c3 - fz * l2, 2 * c2
-        gxx, gyy = a + c * fx * x + b * x * x, a + c * fy * y + b * y * y
-        return [_sum(gxx), _sum(c2 * (fx * y + fy * x) + b * x * y), _sum(gyy)]
+    def second(
+        i: int,
+        j: int,
+        t2: Array,
+        t3: Array,
+        n1: Array,
+        n2: Array,
+    ) -> Array:
+        """Return g_ij from the derivatives t of its tangential and n of its normal potential."""
+        mixed = force[i] * position[j] + force[j] * position[i]
+        value = t2 * mixed + (f_dot_d * t3 - fz * n2) * position[i] * position[j]
+        if i == j:
+            value = value + f_dot_d * t2 - fz * n1
+        return np.asarray(value.sum(axis=-1))
 
-    gxx, gxy, gyy = second(chi2, chi3, log1, log2)
-    gxxz, gxyz, gyyz = (-g for g in second(log2, log3, inv1, inv2))  # d/dz = -d/dZ
-    a, b = q * chi3 - fz * log2, q * chi4 - fz * log3
-    gxxx = _sum(3 * (chi2 * fx + a * x + chi3 * x * x * fx) + b * x**3)
-    gyyy = _sum(3 * (chi2 * fy + a * y + chi3 * y * y * fy) + b * y**3)
-    gxxy = _sum(chi2 * fy + a * y + chi3 * x * (x * fy + 2 * y * fx) + b * x * x * y)
-    gxyy = _sum(chi2 * fx + a * x + chi3 * y * (y * fx + 2 * x * fy) + b * x * y * y)
-    zero = np.zeros_like(gxx)
-    stress = np.stack([gyy, gxx, zero, zero, zero, -gxy], axis=-1)
-    rows = [
-        [gxyy, gyyy, gyyz],
-        [gxxx, gxxy, gxxz],
-        [zero] * 3,
-        [zero] * 3,
-        [zero] * 3,
-        [-gxxy, -gxyy, -gxyz],
-    ]
-    return stress, np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    def third(
+        i: int,
+        j: int,
+        k: int,
+    ) -> Array:
+        """Return g_ijk; every pair of the three indices contributes alike."""
+        value = (f_dot_d * chi4 - fz * log3) * position[i] * position[j] * position[k]
+        for a, b, c in ((i, j, k), (j, i, k), (k, i, j)):
+            value = value + chi3 * force[a] * position[b] * position[c]
+            if b == c:
+                value = value + chi2 * force[a] + (f_dot_d * chi3 - fz * log2) * position[a]
+        return np.asarray(value.sum(axis=-1))
+
+    third_derivatives = {
+        (i, j, k): third(
+            i,
+            j,
+            k,
+        )
+        for i, j, k in _THIRD_DERIVATIVES
+    }
+
+    # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy; d/dz = -d/dZ
+    n_components = len(_STRESS_AXES)
+    stress = np.zeros((*distance.shape[:-1], n_components))
+    gradient = np.zeros((*distance.shape[:-1], n_components, 3))
+    for component, i, j, sign in ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0)):
+        stress[..., component] = sign * second(
+            i,
+            j,
+            chi2,
+            chi3,
+            log1,
+            log2,
+        )
+        for axis in (0, 1):
+            i1, i2, i3 = sorted((i, j, axis))
+            gradient[..., component, axis] = sign * third_derivatives[i1, i2, i3]
+        gradient[..., component, 2] = -sign * second(
+            i,
+            j,
+            log2,
+            log3,
+            inv1,
+            inv2,
+        )
+    return stress, gradient
 
 
-def _sum(a: Array) -> Array:
-    return np.asarray(a.sum(axis=-1))
-
-
-def _gauss(order: int) -> tuple[Array, Array]:
-    """Gauss-Legendre points and weights on (0, 1)."""
+def _gauss_points(order: int) -> tuple[Array, Array]:
+    """Return Gauss-Legendre nodes (order,) and weights (order,) on the interval from 0 to 1."""
     if order < 1:
         raise ElasticError(f"quadrature order is {order}; it must be at least 1")
-    t, weight = np.polynomial.legendre.leggauss(order)
-    return (t + 1.0) / 2.0, weight / 2.0
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    return (nodes + 1.0) / 2.0, weights / 2.0
 
 
-def _rings(
-    radius: float, r: Array, weight: Array, force: ArrayLike, centre: ArrayLike
+def _place_rings(
+    radius: float,
+    rings: Array,
+    fractions: Array,
+    force: ArrayLike,
+    centre: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Point forces on rings of radii r (n,) times the patch's, each with its part of the force."""
+    """Return point forces on rings of radii (n,) relative to `radius`, each with its force
+    fraction."""
     if not radius > 0.0:
         raise ElasticError(f"patch radius is {radius} m; it must be positive")
-    n = 4 * len(r)
+    n = 4 * len(rings)
     angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
-    x, y = np.outer(r, np.cos(angle)), np.outer(r, np.sin(angle))
-    return _patch(radius * x.ravel(), radius * y.ravel(), np.repeat(weight / n, n), force, centre)
+    x = radius * np.outer(rings, np.cos(angle))
+    y = radius * np.outer(rings, np.sin(angle))
+    return _place_forces(
+        x.ravel(),
+        y.ravel(),
+        np.repeat(fractions / n, n),
+        force,
+        centre,
+    )
 
 
-def _patch(
-    x: Array, y: Array, fraction: Array, force: ArrayLike, centre: ArrayLike
+def _place_forces(
+    x: Array,
+    y: Array,
+    fractions: Array,
+    force: ArrayLike,
+    centre: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Point forces at x, y (L,) about the centre; fraction (L,): of the force that each carries."""
+    """Return point forces at (x, y) (L,) from the centre, with these fractions (L,) of the
+    force."""
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
     sources = np.stack([cx + x, cy + y, np.zeros_like(x)], axis=-1)
-    return sources, fraction[:, None] * np.asarray(force, dtype=np.float64)
+    forces = fractions[:, np.newaxis] * np.asarray(force, dtype=np.float64)
+    return sources, forces

@@ -1,4 +1,4 @@
-"""Influence functions: what each pad of a cube in a layer sees of forces on the surface."""
+"""Influence functions: response of each pad of a cube in a layer to forces on the surface."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from .layer import Layer
 
 @dataclass(frozen=True, eq=False)
 class Influence:
-    """Influence functions of a cube's pads, at places on the surface of a layer on rigid ground.
+    """Influence functions of the pads of a cube, on a grid of positions on the surface.
 
-    layout: of the pads; side: of the cube, m; depth: from its middle to the surface, m
-    place: (n, dim - 1) m, from the point above the cube's middle: all combinations of some x and,
-    in space, some y, sorted
-    pads: (P, n, dim) mean normal stress of each pad under a unit force along x, (y,) z at a place:
-    in Pa per N in space, Pa per N/m in a plane; tension is positive
+    They come from finite elements in space (three components of the force) or in a plane (two).
+
+    Attributes:
+        layout: Layout of the P pads.
+        side: Side length of the cube, in m.
+        layer: Layer on rigid ground that contains the cube.
+        depth: Distance from the centre of the cube to the surface, in m.
+        place: Positions (n, dim - 1) of the forces in m, from the point of the surface above the
+            centre of the cube: a sorted rectangular grid of x and, in space, y.
+        pads: Mean normal stress (P, n, dim) of each pad under a unit force along x, (y,) z at each
+            position: in Pa per N in space, in Pa per N/m in a plane. Tension is positive.
     """
 
     layout: Layout
@@ -31,17 +37,25 @@ class Influence:
     pads: Array
 
     def at(self, place: Array) -> Array:
-        """(P, m, dim) at places (m, dim - 1) m between the known ones, by cubic splines; 0 beyond
-        them."""
+        """Interpolate with cubic splines.
+
+        Args:
+            place: Positions (m, dim - 1) of forces, in m.
+
+        Returns:
+            Pad stresses (P, m, dim); 0 outside of the grid.
+        """
         axes = [np.unique(column) for column in self.place.T]
         nodes = np.moveaxis(self.pads, 1, 0)
         grid = nodes.reshape(*map(len, axes), *nodes.shape[1:])
-        between = RegularGridInterpolator(
+        interpolate = RegularGridInterpolator(
             tuple(axes), grid, "cubic", bounds_error=False, fill_value=0.0
         )
-        return np.moveaxis(between(place), 0, 1)
+        return np.moveaxis(interpolate(place), 0, 1)
 
     @property
     def reach(self) -> float:
-        """Distance from the middle within which all directions are known, m."""
-        return float(min(-self.place.min(axis=0).max(), self.place.max(axis=0).min()))
+        """Distance from the centre, in m, up to which the grid covers all directions."""
+        smallest = -self.place.min(axis=0).max()
+        largest = self.place.max(axis=0).min()
+        return float(min(smallest, largest))

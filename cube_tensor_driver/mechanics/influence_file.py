@@ -1,4 +1,4 @@
-"""Files of influence functions: numpy's arrays in a zip file (.npz)."""
+"""Files of influence functions: numpy arrays in a zip file (.npz)."""
 
 from __future__ import annotations
 
@@ -12,24 +12,40 @@ from ..config.atomic_write import atomic_write
 from ..config.input_files import read_bounded
 from ..core.errors import ConfigError, CubeError
 from ..core.layout import Layout
+from .cache import Arrays
 from .influence import Influence
 from .layer import Layer
 
 SCHEMA = 1
-LIMIT = 64 << 20
-"""Bytes of a file and of what is in it."""
-STEPS = 30_000
-"""The greatest value is so many of the steps that values are rounded to: ten times finer than the
-finite elements they come from."""
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile)
+"""Version of the file format."""
+
+MAX_FILE_BYTES = 64 << 20
+"""Maximum size of a file, and of its content after decompression, in bytes."""
+
+MAX_INTEGER = 30_000
+"""Integer to which the largest stress is scaled. Values are stored as 16-bit integers; the rounding
+error is a tenth of the error of the finite elements."""
+
+_READ_ERRORS = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile)
+"""Errors that numpy raises for a damaged file."""
 
 
-def write_influence(path: Path, influence: Influence, made_by: str) -> None:
-    """Write influence functions, completely or not at all. Raises ConfigError if it cannot.
+def write_influence(
+    path: Path,
+    influence: Influence,
+    made_by: str,
+) -> None:
+    """Write influence functions, completely or not at all.
 
-    made_by: the command
+    Args:
+        path: File to write.
+        influence: Influence functions.
+        made_by: Command that computed them; it is stored in the file.
+
+    Raises:
+        ConfigError: The file cannot be written.
     """
-    step = np.abs(influence.pads).max() / STEPS
+    step = np.abs(influence.pads).max() / MAX_INTEGER
     layout = influence.layout
     with atomic_write(path) as partial, partial.open("wb") as file:
         np.savez_compressed(
@@ -51,60 +67,76 @@ def write_influence(path: Path, influence: Influence, made_by: str) -> None:
 
 
 def read_influence(path: Path) -> Influence:
-    """Read and check influence functions of a cube in space. Raises ConfigError if it cannot."""
+    """Read and check influence functions of a cube in space.
+
+    Raises:
+        ConfigError: The file is missing, damaged or inconsistent.
+    """
     try:
-        return _influence(read_bounded(path, LIMIT, "file of influence functions"))
+        data = read_bounded(path, MAX_FILE_BYTES, "file of influence functions")
+        influence = _parse(_load_arrays(data))
+        _check(influence)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; make it with ./cube fem --surface --3d") from None
-    except (CubeError, *_DAMAGE) as error:
+    except (CubeError, *_READ_ERRORS) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise ConfigError(
             f"{path}: {reason}; make the file again with ./cube fem --surface --3d --influence"
         ) from None
-
-
-def _influence(data: bytes) -> Influence:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        size = sum(member.file_size for member in archive.infolist())
-    if size > LIMIT:
-        raise ConfigError(f"holds {size} bytes, the limit is {LIMIT}")
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        found = dict(arrays)
-    if int(found["schema"]) != SCHEMA:
-        raise ConfigError(f"schema is {found['schema']}, this package reads {SCHEMA}")
-    layout = Layout(
-        str(found["layout"]), found["positions"], found["normals"], float(found["pad_size"])
-    )
-    place, pads = found["place"].astype(float), found["pads"] * float(found["step"])
-    influence = Influence(
-        layout=layout,
-        side=float(found["side"]),
-        layer=Layer(float(found["thickness"]), float(found["poisson"])),
-        depth=float(found["depth"]),
-        place=place,
-        pads=pads,
-    )
-    influence.layer.check_depth(influence.depth)
-    _check(influence)
     return influence
 
 
+def _load_arrays(data: bytes) -> Arrays:
+    """Decompress the arrays of a file after checking their size."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+    if size > MAX_FILE_BYTES:
+        raise ConfigError(f"the content has {size} bytes, the limit is {MAX_FILE_BYTES}")
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def _parse(arrays: Arrays) -> Influence:
+    """Build the influence functions from the arrays of a file."""
+    if int(arrays["schema"]) != SCHEMA:
+        raise ConfigError(f"schema is {arrays['schema']}, this package reads {SCHEMA}")
+    layout = Layout(
+        str(arrays["layout"]),
+        arrays["positions"],
+        arrays["normals"],
+        float(arrays["pad_size"]),
+    )
+    return Influence(
+        layout=layout,
+        side=float(arrays["side"]),
+        layer=Layer(float(arrays["thickness"]), float(arrays["poisson"])),
+        depth=float(arrays["depth"]),
+        place=arrays["place"].astype(float),
+        pads=arrays["pads"] * float(arrays["step"]),
+    )
+
+
 def _check(influence: Influence) -> None:
-    place, pads = influence.place, influence.pads
+    """Raise ElasticError or ConfigError if the quantities contradict each other."""
+    influence.layer.check_depth(influence.depth)
     if not 0 < influence.side < 2 * influence.depth:
         raise ConfigError(
             f"the cube has a side of {influence.side} m at a depth of {influence.depth} m; it must "
             "lie below the surface"
         )
+
+    place = influence.place
     if place.ndim != 2 or place.shape[1] != 2:
         raise ConfigError(f"place has shape {place.shape}, needed is (n, 2)")
-    if pads.shape != (influence.layout.n_pads, len(place), 3):
-        raise ConfigError(
-            f"pads have shape {pads.shape}, needed is {(influence.layout.n_pads, len(place), 3)}"
-        )
-    if not (np.isfinite(place).all() and np.isfinite(pads).all()):
-        raise ConfigError("a place or a value is not finite")
+    shape = (influence.layout.n_pads, len(place), 3)
+    if influence.pads.shape != shape:
+        raise ConfigError(f"pads have shape {influence.pads.shape}, needed is {shape}")
+    if not (np.isfinite(place).all() and np.isfinite(influence.pads).all()):
+        raise ConfigError("a position or a stress is not finite")
+
     x, y = np.meshgrid(*(np.unique(column) for column in place.T), indexing="ij")
-    whole = np.column_stack([x.ravel(), y.ravel()])
-    if min(x.shape) < 4 or not np.array_equal(place, whole) or not influence.reach > 0:
-        raise ConfigError("the places are no grid around the cube")
+    grid = np.column_stack([x.ravel(), y.ravel()])
+    is_grid = np.array_equal(place, grid)
+    # Cubic interpolation needs four nodes per axis.
+    if min(x.shape) < 4 or not is_grid or not influence.reach > 0:
+        raise ConfigError("the positions are no grid of at least 4 x 4 points around the cube")

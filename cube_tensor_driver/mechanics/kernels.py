@@ -1,17 +1,21 @@
-"""What cubes at one depth see of tractions on the surface, and how that varies together.
+"""Response of cubes at one depth to traction on the surface, and covariances of random traction.
 
-The layer is the same everywhere and in all directions. So whatever depends on two places is known
-from its values along one line: the offset p = r (cos phi, sin phi) turns them by phi. With the
-spectra c(k) of spectra.py and a prior of the traction with the spectrum S(k)::
+A layer is the same everywhere and in all directions. Quantities that depend on two positions are
+therefore tabulated along one line: the offset p = r (cos phi, sin phi) only multiplies circular
+components by a phase. With the spectra c(k) of spectra.py and a prior of the traction with the
+spectrum S(k)::
 
     response(p) = int c exp(i k.p) B_a,     B_a = 3 (sin ka - ka cos ka) / (ka)^3
     cross(p)    = int c S exp(i k.p),       covariance(p) = int c S c* exp(i k.p)      [d2k / 4 pi2]
 
-B_a is the spectrum of Hertz's pressure on a disc of radius a, of force 1. The prior is Gaussian
-with mean zero; normal traction and both shears are independent. It has two lengths, because
-contacts are narrow or wide: per unit of variance half of each::
+B_a is the spectrum of Hertz's pressure on a disc of radius a with a force of 1 N. The prior is a
+Gaussian process with mean zero; normal traction and both shears are independent. Because contacts
+may be narrow or wide, it has two correlation lengths, each with half of the variance::
 
-    S = sum_l (1/2) 2 pi l^2 exp(-(k l)^2 / 2)        (shear: SHEAR^2 times that)
+    S = sum_l (1/2) 2 pi l^2 exp(-(k l)^2 / 2)        (shear: SHEAR_RATIO^2 times that)
+
+Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 4.2.1
+(covariance and spectrum); K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz).
 """
 
 from __future__ import annotations
@@ -19,247 +23,483 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.arrays import Array, Index
+from ..core.arrays import Array, Complex, Index
 from ..core.modes import COMPONENTS, STRESS
-from .cache import cached
-from .circular import BACK, CIRCULAR, ORDERS
+from .cache import Arrays, load_or_compute
+from .circular import CIRCULAR_FROM_FIELD, FIELD_FROM_CIRCULAR, ORDERS, Orders
 from .layer import FIELD, Layer
-from .spectra import Bessel, Spectra, bessel_functions, layer_spectra
+from .spectra import BesselTable, Spectra, layer_spectra, tabulate_bessel
 
-LENGTHS = (0.2, 0.8)
-"""Of the prior over the depth: near the pair that explained contacts of 2 to 20 mm best, in a half
-space at a depth of 5 mm."""
-SHEAR = 0.5
-"""Prior standard deviation of shear over that of pressure."""
-SIZES = np.geomspace(0.1, 5.0, 44)
-"""Radii of the discs of `response` over the depth. What lies between them is interpolated, to a
-hundredth of the greatest value at the wide end."""
-PER_DEPTH = 32
-"""Places of the tables per depth: cubic interpolation is then good to 1e-4 of the peak."""
-REACH = 20
-"""Of the tables, over the depth; beyond it everything counts as zero."""
+PRIOR_LENGTHS = (0.2, 0.8)
+"""Correlation lengths of the prior, divided by the depth. They are close to the pair that explained
+contacts of 2 to 20 mm best, in a half space at a depth of 5 mm."""
+
+SHEAR_RATIO = 0.5
+"""Prior standard deviation of the shear divided by that of the pressure."""
+
+DISC_SIZES = np.geomspace(0.1, 5.0, 44)
+"""Tabulated radii of discs, divided by the depth. Between them, `Kernels.response` interpolates
+with an error of at most a hundredth of the largest value, at the wide end."""
+
+POINTS_PER_DEPTH = 32
+"""Number of tabulated distances per depth. Cubic interpolation between them has an error of 1e-4 of
+the peak."""
+
+REACH_DEPTHS = 20
+"""Largest tabulated distance, divided by the depth. Responses and covariances at larger distances
+count as zero."""
+
 _OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
-_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
-_ZZ = int(np.argmax(CIRCULAR[:, FIELD.index("zz")].real))
+_IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
+_FIELD_ZZ = FIELD.index("zz")
+_CIRCULAR_ZZ = int(np.argmax(CIRCULAR_FROM_FIELD[:, _FIELD_ZZ].real))
 
 
-class Reading(NamedTuple):
-    """What cubes see, and what they say of it.
+class MeasurementModel(NamedTuple):
+    """Linear model of what the cubes of a skin measure under traction on the surface.
 
-    spectra: of the n circular components that they see
-    said: (readings, 2 n, 15) COMPONENTS from the real parts and the imaginary parts, in the cube's
-    frame, Pa and Pa/m
-    of_cube: (cubes,) which of these readings each cube has
-    of_pads: (readings, 2 n, P) what pads see, over their noise; None: cubes count as points
+    All cubes respond to the same n circular components. Cubes of one calibration, and with the same
+    pads in use, form a variant: they compute their measured components in the same way.
+
+    Attributes:
+        spectra: Spectra of the circular components.
+        components: Matrix (variants, 2 n, 15) from the real and imaginary parts of the circular
+            components to the measured `COMPONENTS` in the frame of the cube, in Pa and Pa/m.
+        variant: Variant (cubes,) of each cube.
+        pads: Matrix (variants, 2 n, P) to the stresses of the pads divided by their noise; None if
+            cubes are modelled as points.
     """
 
     spectra: Spectra
-    said: Array
-    of_cube: Index
-    of_pads: Array | None = None
+    components: Array
+    variant: Index
+    pads: Array | None = None
 
 
-def read_points(layer: Layer, depth: float, cubes: int) -> Reading:
-    """Of cubes that count as points: they say the stress and the gradient at their middles. Raises
-    ElasticError where the layer has no such depth."""
+def model_points(
+    layer: Layer,
+    depth: float,
+    cubes: int,
+) -> MeasurementModel:
+    """Model cubes as points, which measure the stress and its gradient at their centres.
+
+    Args:
+        layer: Elastic layer that contains the cubes.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        cubes: Number of cubes.
+
+    Raises:
+        ElasticError: The layer does not contain this depth.
+    """
     spectra = layer_spectra(layer, depth)
-    return Reading(spectra, BACK[None, :, _OBSERVED], np.zeros(cubes, np.intp))
+    components = FIELD_FROM_CIRCULAR[np.newaxis, :, _OBSERVED]
+    return MeasurementModel(spectra, components, np.zeros(cubes, np.intp))
 
 
 class Kernels:
-    """Tables for cubes at one depth in a layer; lengths in m.
+    """Tabulated responses and covariances of cubes at one depth in a layer.
 
-    Places are (N, 2) m. Components are COMPONENTS with gradients times `scale` (m), all in Pa, in
-    the frame of a cube that is turned about z by `angle` (N,) rad and has the reading of this
-    number, `reading` (N,). Tractions are along x, y, z.
+    Positions (N, 2) are in m. Measured components are `COMPONENTS` with the gradients multiplied by
+    `scale`, so that all are in Pa. They are in the frame of a cube that is rotated about z by
+    `angle` (N,) in rad and belongs to the variant `variant` (N,) of the measurement model.
+    Tractions and forces are along x, y and z.
 
-    made_from: arrays and numbers that say what the tables hold
+    The first set-up takes a few seconds; cache.py keeps the tables.
 
-    Parameters: reading: how cubes see; by default as points. Raises ElasticError where the layer
-    has no such depth. Takes a few seconds the first time (cache.py).
+    Attributes:
+        layer: Elastic layer.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        scale: Length in m that gradients are multiplied by.
+        step: Distance in m between two tabulated positions.
+        variance: Prior variance (3,) of the traction along x, y and z, relative to the pressure.
+        pressure_variance: Prior variance of the pressure at the depth of the cubes.
+        component_matrices: `MeasurementModel.components` with scaled gradients.
+        inputs: Arrays and numbers that determine the tables.
     """
 
     def __init__(
-        self, layer: Layer, depth: float, scale: float, reading: Reading | None = None
+        self,
+        layer: Layer,
+        depth: float,
+        scale: float,
+        model: MeasurementModel | None = None,
     ) -> None:
-        at_points = read_points(layer, depth, 1)
-        self.layer, self.depth, self.scale = layer, depth, scale
-        self.step, self._last = depth / PER_DEPTH, REACH * PER_DEPTH
-        # (-1, 0, ...) steps: cubic interpolation needs one more on the left.
-        r = np.arange(-1.0, self._last + 3) * self.step
-        spectra, said, *_ = reading or at_points
-        bessel = bessel_functions(spectra.k, r)
-        self.readings = said * np.where(_GRADIENT, scale, 1.0)
+        """Compute the tables or load them from the cache.
+
+        Args:
+            layer: Elastic layer.
+            depth: Distance from the centres of the cubes to the surface, in m.
+            scale: Length in m that gradients are multiplied by.
+            model: Measurement model of the cubes; by default they are points.
+
+        Raises:
+            ElasticError: The layer does not contain this depth.
+        """
+        points = model_points(layer, depth, 1)
+        spectra, components, *_ = model or points
+        self.layer = layer
+        self.depth = depth
+        self.scale = scale
+        self.step = depth / POINTS_PER_DEPTH
+        self.variance = np.array([SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0])
+        self.component_matrices = components * self._unit_factors
         self._order = spectra.order
-        self.variance = np.array([SHEAR**2, SHEAR**2, 1.0])
-        seen = [layer.thickness, layer.poisson, depth, *vars(spectra).values()]
-        self.made_from = [*seen, self.readings]
-        self._field = self._discs(at_points.spectra, bessel)
-        self._response = self._field if reading is None else self._discs(spectra, bessel)
-        tables = cached("kernels", seen, lambda: self._tables(spectra, at_points.spectra, bessel))
-        self._cross, self._pressure = tables["cross"], tables["pressure"]
-        self._even, self._odd = tables["even"], tables["odd"]
+        table_inputs = [layer.thickness, layer.poisson, depth, *vars(spectra).values()]
+        self.inputs = [*table_inputs, self.component_matrices]
+
+        # Cubic interpolation needs one more distance on the left, and two on the right.
+        self._last = REACH_DEPTHS * POINTS_PER_DEPTH
+        distance = np.arange(-1.0, self._last + 3) * self.step
+        bessel = tabulate_bessel(spectra.k, distance)
+        self._field = self._tabulate_discs(points.spectra, bessel)
+        self._response = self._field
+        if model is not None:
+            self._response = self._tabulate_discs(spectra, bessel)
+        tables = load_or_compute(
+            "kernels", table_inputs, lambda: self._tabulate_prior(spectra, points.spectra, bessel)
+        )
+        self._cross = tables["cross"]
+        self._pressure = tables["pressure"]
+        self._real = tables["even"]
+        self._imaginary = tables["odd"]
         self.pressure_variance = float(tables["own"])
 
-    def add_reading(self, said: Array) -> int:
-        """The number of one more reading (2 n, 15), as those of `Reading`, or of the same one."""
-        own = said * np.where(_GRADIENT, self.scale, 1.0)
-        same = np.flatnonzero((self.readings == own).all(axis=(1, 2)))
-        if not len(same):
-            self.readings = np.concatenate([self.readings, own[None]])
-        return int(same[0]) if len(same) else len(self.readings) - 1
+    @property
+    def _unit_factors(self) -> Array:
+        """Factors (15,) that convert the gradients from Pa/m to Pa."""
+        return np.where(_IS_GRADIENT, self.scale, 1.0)
 
-    def _discs(self, spectra: Spectra, bessel: Bessel) -> Array:
-        """(sizes, places, 3, n) R, Z and T of the discs of SIZES."""
-        factors = np.stack([disc_spectrum(spectra.k * size) for size in SIZES * self.depth])
-        key = [self.depth, *vars(spectra).values()]
-        return cached("discs", key, lambda: {"discs": spectra.radial(bessel, factors)})["discs"]
+    def add_variant(self, components: Array) -> int:
+        """Add a variant of the measurement model, unless it exists already.
 
-    def _tables(self, spectra: Spectra, at_points: Spectra, bessel: Bessel) -> dict[str, Array]:
-        """cross (places, 3, n): R, Z, T; even, odd (places, n, n): covariance of real and of
-        imaginary parts; pressure (places, n): of real parts with the pressure at a point; own:
-        its variance."""
-        prior = _prior(spectra.k * self.depth) * self.depth**2
-        cross = spectra.radial(bessel, prior[None])[0] * np.array([SHEAR**2, 1, SHEAR**2])[:, None]
-        even, odd = spectra.covariance(spectra, bessel, prior, SHEAR)
-        pressure = -spectra.covariance(at_points, bessel, prior, SHEAR)[0][:, :, _ZZ]
-        here = bessel_functions(spectra.k, np.zeros(1))
-        own = at_points.covariance(at_points, here, prior, SHEAR)[0][0, _ZZ, _ZZ]
-        return {"cross": cross, "even": even, "odd": odd, "pressure": pressure, "own": own}
+        Args:
+            components: Matrix (2 n, 15) as in `MeasurementModel`, for cubes without some pads.
 
-    def response(self, place: Array, angle: Array, reading: Index, size: float) -> Array:
-        """(N, 15, 3) of cubes at `place` from the middle of a disc with force 1 N; size: m."""
-        table = self._disc_table(self._response, size, place)
-        return self._said(self._under(table, place, angle, self._order), reading)
+        Returns:
+            The number of the variant.
+        """
+        matrix = components * self._unit_factors
+        equal = np.flatnonzero((self.component_matrices == matrix).all(axis=(1, 2)))
+        if len(equal):
+            return int(equal[0])
+        self.component_matrices = np.concatenate([self.component_matrices, matrix[np.newaxis]])
+        return len(self.component_matrices) - 1
+
+    def _tabulate_discs(self, spectra: Spectra, bessel: BesselTable) -> Array:
+        """Return R, Z and T (radii, distances, 3, n) under the discs of `DISC_SIZES`."""
+        inputs = [self.depth, *vars(spectra).values()]
+
+        def compute() -> Arrays:
+            radii = DISC_SIZES * self.depth
+            loads = np.stack([disc_spectrum(spectra.k * radius) for radius in radii])
+            return {"discs": spectra.radial(bessel, loads)}
+
+        return load_or_compute("discs", inputs, compute)["discs"]
+
+    def _tabulate_prior(
+        self,
+        spectra: Spectra,
+        points: Spectra,
+        bessel: BesselTable,
+    ) -> Arrays:
+        """Return the tables that depend on the prior.
+
+        Returns:
+            cross: R, Z and T (distances, 3, n) of the covariance with the traction at a point.
+            even, odd: Covariance (distances, n, n) of real parts and of imaginary parts.
+            pressure: Covariance (distances, n) of real parts with the pressure below a point.
+            own: Variance of this pressure.
+        """
+        prior = _prior_spectrum(spectra.k * self.depth) * self.depth**2
+        shear, normal = SHEAR_RATIO**2, 1.0
+        axis_variance = np.array([shear, normal, shear])[:, np.newaxis]
+        cross = spectra.radial(bessel, prior[np.newaxis])[0] * axis_variance
+
+        real, imaginary = spectra.covariance(spectra, bessel, prior, SHEAR_RATIO)
+        with_points, _ = spectra.covariance(points, bessel, prior, SHEAR_RATIO)
+        at_zero = tabulate_bessel(spectra.k, np.zeros(1))
+        own, _ = points.covariance(points, at_zero, prior, SHEAR_RATIO)
+        return {
+            "cross": cross,
+            "even": real,
+            "odd": imaginary,
+            "pressure": -with_points[:, :, _CIRCULAR_ZZ],  # pressure = -zz
+            "own": own[0, _CIRCULAR_ZZ, _CIRCULAR_ZZ],
+        }
+
+    def response(
+        self,
+        place: Array,
+        angle: Array,
+        variant: Index,
+        size: float,
+    ) -> Array:
+        """Compute the measured components (N, 15, 3) under a disc with a force of 1 N.
+
+        Args:
+            place: Positions (N, 2) of the cubes from the centre of the disc.
+            angle: Rotations (N,) of the cubes.
+            variant: Variants (N,) of the cubes.
+            size: Radius of the disc in m.
+        """
+        table = self._interpolate_size(self._response, size, place)
+        return self._measure(
+            self._rotate_loads(
+                table,
+                place,
+                angle,
+                self._order,
+            ),
+            variant,
+        )
 
     def field(self, place: Array, size: float) -> Array:
-        """(N, 24, 3) FIELD in Pa and Pa/m at `place` from the middle of such a disc."""
-        table = self._disc_table(self._field, size, place)
-        circular = self._under(table, place, np.zeros(len(place)), ORDERS)
-        return np.asarray((circular @ BACK).swapaxes(1, 2))
+        """Compute the stress field under a disc with a force of 1 N.
 
-    def cross(self, place: Array, angle: Array, reading: Index) -> Array:
-        """(N, 15, 3) covariance of cubes at `place` from a point with the point's traction."""
-        return self._said(self._under(self._cross, place, angle, self._order), reading)
+        Args:
+            place: Positions (N, 2) from the centre of the disc.
+            size: Radius of the disc in m.
+
+        Returns:
+            `FIELD` (N, 24, 3) at the depth of the cubes, in Pa and Pa/m.
+        """
+        table = self._interpolate_size(self._field, size, place)
+        circular = self._rotate_loads(
+            table,
+            place,
+            np.zeros(len(place)),
+            ORDERS,
+        )
+        return np.asarray((circular @ FIELD_FROM_CIRCULAR).swapaxes(1, 2))
+
+    def disc_pressure(
+        self,
+        place: Array,
+        size: float,
+        force: Array,
+    ) -> Array:
+        """Compute the pressure (N,) at the depth of the cubes under a disc with a force (3,) in
+        N."""
+        return -self.field(place, size)[:, _FIELD_ZZ] @ force
+
+    def cross(
+        self,
+        place: Array,
+        angle: Array,
+        variant: Index,
+    ) -> Array:
+        """Compute the covariance (N, 15, 3) of cubes with the traction at one point.
+
+        Args:
+            place: Positions (N, 2) of the cubes from the point.
+            angle: Rotations (N,) of the cubes.
+            variant: Variants (N,) of the cubes.
+        """
+        circular = self._rotate_loads(self._cross, place, angle, self._order)
+        return self._measure(circular, variant)
 
     def covariance(
-        self, place: Array, angle: Array, reading: Index, other: Array, other_reading: Index
+        self,
+        place: Array,
+        angle: Array,
+        variant: Index,
+        other_angle: Array,
+        other_variant: Index,
     ) -> Array:
-        """(N, 15, 15) of cubes at `place` from other cubes, turned by `angle` and `other`."""
-        r, direction = _polar(place)
-        of_one, of_other = (
-            self._turned(direction - turn, which)
-            for turn, which in ((angle, reading), (other, other_reading))
-        )
+        """Compute the covariance (N, 15, 15) of N pairs of cubes.
+
+        Args:
+            place: Positions (N, 2) of the first cubes from the other ones.
+            angle: Rotations (N,) of the first cubes.
+            variant: Variants (N,) of the first cubes.
+            other_angle: Rotations (N,) of the other cubes.
+            other_variant: Variants (N,) of the other cubes.
+        """
+        distance, direction = _polar(place)
+        first = self._matrices_towards(direction - angle, variant)
+        second = self._matrices_towards(direction - other_angle, other_variant)
+
         total = np.zeros((len(place), len(COMPONENTS), len(COMPONENTS)))
-        for one, table, two in zip(of_one, (self._even, self._odd), of_other, strict=True):
-            total += one @ _at(table, r / self.step, self._last) @ two.swapaxes(1, 2)
+        for left, table, right in zip(
+            first,
+            (self._real, self._imaginary),
+            second,
+            strict=True,
+        ):
+            total += left @ self._interpolate(table, distance) @ right.swapaxes(1, 2)
         return total
 
-    def pressure(self, place: Array, angle: Array, reading: Index) -> Array:
-        """(N, 15) covariance of cubes at `place` from a point with the pressure at the cubes' depth
-        below the point."""
-        r, direction = _polar(place)
-        table = _at(self._pressure, r / self.step, self._last)
-        rows, _ = self._turned(direction - angle, reading)
-        return np.asarray((rows @ table[:, :, None])[:, :, 0])
+    def pressure(
+        self,
+        place: Array,
+        angle: Array,
+        variant: Index,
+    ) -> Array:
+        """Compute the covariance (N, 15) of cubes with the pressure at their depth below one point.
 
-    def disc_pressure(self, place: Array, size: float, force: Array) -> Array:
-        """(N,) pressure at the cubes' depth at `place` from the middle of a disc; force (3,) N."""
-        return -self.field(place, size)[:, FIELD.index("zz")] @ force
-
-    def _under(self, table: Array, place: Array, angle: Array, order: NDArray[np.int64]) -> Array:
-        """(N, 3, 2 n) real and imaginary parts in turned frames under a force along x, y and z.
-
-        table: (places, 3, n) R, Z and T of components of these orders (n,)
+        Arguments as in `cross`.
         """
-        r, direction = _polar(place)
-        parts = _at(table, r / self.step, self._last)
-        radial, normal, across = parts[:, 0], parts[:, 1], 1j * parts[:, 2]
-        c, s = np.cos(direction)[:, None], np.sin(direction)[:, None]
-        forces = np.stack([c * radial - s * across, s * radial + c * across, normal], axis=1)
-        turned = _powers(direction - angle, order)[:, None] * forces
-        return np.concatenate([turned.real, turned.imag], axis=2)
+        distance, direction = _polar(place)
+        covariance = self._interpolate(self._pressure, distance)
+        real, _ = self._matrices_towards(direction - angle, variant)
+        return np.asarray((real @ covariance[:, :, np.newaxis])[:, :, 0])
 
-    def _said(self, circular: Array, reading: Index) -> Array:
-        """(N, 15, 3) what cubes say that see (N, 3, 2 n)."""
-        # One product for all rows is faster than one for each.
-        said = self.readings[0] if len(self.readings) == 1 else self.readings[reading]
-        return np.asarray((circular @ said).swapaxes(1, 2))
+    def _rotate_loads(
+        self,
+        table: Array,
+        place: Array,
+        angle: Array,
+        order: Orders,
+    ) -> Array:
+        """Return circular components in rotated frames under loads along x, y and z.
 
-    def _turned(self, angle: Array, reading: Index) -> tuple[Array, Array]:
-        """(N, 15, n) what cubes in frames that are turned by -angle say of real parts, and of
-        imaginary parts."""
-        powers = _powers(angle, self._order)[:, None]
-        real, imaginary = np.split(self.readings.swapaxes(1, 2), 2, axis=2)
-        said = (real - 1j * imaginary)[reading] * powers
-        return said.real, -said.imag
+        Args:
+            table: R, Z and T (distances, 3, n).
+            place: Positions (N, 2) from the load.
+            angle: Rotations (N,) of the frames.
+            order: Orders (n,) of the components.
 
-    def _disc_table(self, discs: Array, size: float, place: Array) -> Array:
-        """(places, 3, n) of a disc of this radius, m, as far as it is needed."""
+        Returns:
+            Real and imaginary parts (N, 3, 2 n).
+        """
+        distance, direction = _polar(place)
+        parts = self._interpolate(table, distance)
+        radial = parts[:, 0]
+        normal = parts[:, 1]
+        across = 1j * parts[:, 2]
+
+        # A force along x has the components F_r = cos(phi) and F_t = -sin(phi).
+        cosine = np.cos(direction)[:, np.newaxis]
+        sine = np.sin(direction)[:, np.newaxis]
+        along_x = cosine * radial - sine * across
+        along_y = sine * radial + cosine * across
+        loads = np.stack([along_x, along_y, normal], axis=1)
+
+        rotated = _phases(direction - angle, order)[:, np.newaxis] * loads
+        return np.concatenate([rotated.real, rotated.imag], axis=2)
+
+    def _measure(self, circular: Array, variant: Index) -> Array:
+        """Return measured components (N, 15, 3) of circular components (N, 3, 2 n)."""
+        matrices = self.component_matrices
+        # One product for all rows is faster than one for each row.
+        matrix = matrices[0] if len(matrices) == 1 else matrices[variant]
+        return np.asarray((circular @ matrix).swapaxes(1, 2))
+
+    def _matrices_towards(self, angle: Array, variant: Index) -> tuple[Array, Array]:
+        """Return matrices from circular components in frames along the line between two cubes.
+
+        Args:
+            angle: Direction (N,) of the line in the frame of the cube.
+            variant: Variants (N,) of the cubes.
+
+        Returns:
+            Matrices (N, 15, n) of the real parts and of the imaginary parts.
+        """
+        phases = _phases(angle, self._order)[:, np.newaxis]
+        real, imaginary = np.split(
+            self.component_matrices.swapaxes(1, 2),
+            2,
+            axis=2,
+        )
+        matrices = (real - 1j * imaginary)[variant] * phases
+        return matrices.real, -matrices.imag
+
+    def _interpolate_size(
+        self,
+        discs: Array,
+        size: float,
+        place: Array,
+    ) -> Array:
+        """Return R, Z and T (distances, 3, n) of a disc of one radius, up to the farthest
+        position."""
         farthest = np.hypot(*place.T).max(initial=0.0) / self.step
-        places = int(min(farthest, self._last)) + 4
-        position = np.log(size / self.depth / SIZES[0]) / np.log(SIZES[1] / SIZES[0])
-        first, weight = _cubic(np.clip(position, 1.0, len(SIZES) - 2.001))
-        near = discs[int(first) - 1 : int(first) + 3, :places]
-        return np.asarray(np.tensordot(weight, near, axes=1))
+        n_distances = int(min(farthest, self._last)) + 4
 
+        log_step = np.log(DISC_SIZES[1] / DISC_SIZES[0])
+        index = np.log(size / self.depth / DISC_SIZES[0]) / log_step
+        first, weights = _cubic_weights(
+            np.clip(
+                index,
+                1.0,
+                len(DISC_SIZES) - 2.001,
+            )
+        )
+        neighbours = discs[int(first) - 1 : int(first) + 3, :n_distances]
+        return np.asarray(np.tensordot(weights, neighbours, axes=1))
 
-def _prior(wave: Array) -> Array:
-    """Spectrum of the prior over its depth squared, at wavenumbers times the depth."""
-    parts = [2 * np.pi * l**2 * np.exp(-((wave * l) ** 2) / 2) for l in LENGTHS]
-    return np.mean(parts, axis=0)
+    def _interpolate(self, table: Array, distance: Array) -> Array:
+        """Interpolate a table (distances, ...) at distances (N,) in m; 0 beyond the last one."""
+        index = distance / self.step
+        first, weights = _cubic_weights(np.minimum(index, self._last))
+        weights = weights * (index <= self._last)
+
+        # Entry 1 of the table belongs to the distance 0.
+        shape = (len(index),) + (1,) * (table.ndim - 1)
+        neighbours = [weights[j].reshape(shape) * table[first + j] for j in range(4)]
+        return np.asarray(sum(neighbours))
 
 
 def hertz_pressure(distance: Array, size: float) -> Array:
-    """Pressure of a disc of radius `size` with force 1 N at its distances from the middle, Pa."""
-    inside = np.clip(1 - (distance / size) ** 2, 0, None)
-    return 3 / (2 * np.pi * size**2) * np.sqrt(inside)
+    """Compute the pressure in Pa of a Hertz contact with a force of 1 N.
+
+    Args:
+        distance: Distances from the centre in m.
+        size: Radius of the contact in m.
+    """
+    inside = np.clip(
+        1 - (distance / size) ** 2,
+        0,
+        None,
+    )
+    peak = 3 / (2 * np.pi * size**2)
+    return np.asarray(peak * np.sqrt(inside))
 
 
 def disc_spectrum(x: Array) -> Array:
-    """Spectrum of Hertz's pressure over x = k a."""
+    """Compute the spectrum B of Hertz's pressure with a force of 1 N over x = k a."""
+    # Near zero, the difference of sin and cos would lose all digits.
     safe = np.maximum(x, 1e-2)
     exact = 3 * (np.sin(safe) - safe * np.cos(safe)) / safe**3
     return np.where(x < 1e-2, 1 - x**2 / 10, exact)
 
 
-class _Polar(NamedTuple):
-    r: Array
-    direction: Array
+def _prior_spectrum(wavenumber: Array) -> Array:
+    """Return the spectrum S of the prior divided by depth^2, over wavenumber times depth."""
+    parts = [
+        2 * np.pi * length**2 * np.exp(-((wavenumber * length) ** 2) / 2)
+        for length in PRIOR_LENGTHS
+    ]
+    return np.asarray(np.mean(parts, axis=0))
 
 
-def _polar(place: Array) -> _Polar:
-    return _Polar(np.hypot(place[:, 0], place[:, 1]), np.arctan2(place[:, 1], place[:, 0]))
+def _polar(place: Array) -> tuple[Array, Array]:
+    """Return distance (N,) and direction (N,) in rad of positions (N, 2)."""
+    x, y = place.T
+    return np.hypot(x, y), np.arctan2(y, x)
 
 
-def _powers(angle: Array, order: NDArray[np.int64]) -> NDArray[np.complex128]:
-    """(N, n) exp(i m angle) of angles (N,) and orders m (n,)."""
-    powers: NDArray[np.complex128] = np.exp(1j * angle[:, None] * order)
-    return powers
+def _phases(angle: Array, order: Orders) -> Complex:
+    """Return exp(i m angle) (N, n) of angles (N,) and orders m (n,)."""
+    phases: Complex = np.exp(1j * angle[:, np.newaxis] * order)
+    return phases
 
 
-def _cubic(position: Array | float) -> tuple[NDArray[np.intp], Array]:
-    """Lagrange's cubic between the two middle ones of four places: the second of them, and the
-    weights (4, ...)."""
-    first = np.floor(position).astype(np.intp)
-    t = position - first
-    weights = np.stack(
-        [
-            -t * (t - 1) * (t - 2) / 6,
-            (t + 1) * (t - 1) * (t - 2) / 2,
-            -(t + 1) * t * (t - 2) / 2,
-            (t + 1) * t * (t - 1) / 6,
-        ]
-    )
-    return first, weights
+def _cubic_weights(index: Array | float) -> tuple[Index, Array]:
+    """Return Lagrange's cubic weights between the two middle ones of four entries.
 
+    Args:
+        index: Fractional index (...) into a table.
 
-def _at(table: Array, position: Array, last: int) -> Array:
-    """(N, ...) of a table whose entry 1 is at the position 0, zero beyond the last one."""
-    first, weights = _cubic(np.minimum(position, last))
-    weights = weights * (position <= last)
-    shape = (len(position),) + (1,) * (table.ndim - 1)
-    return sum(weights[j].reshape(shape) * table[first + j] for j in range(4))
+    Returns:
+        Index (...) of the second of the four entries, and the weights (4, ...).
+    """
+    first = np.floor(index).astype(np.intp)
+    t = index - first
+    weights = [
+        -t * (t - 1) * (t - 2) / 6,
+        (t + 1) * (t - 1) * (t - 2) / 2,
+        -(t + 1) * t * (t - 2) / 2,
+        (t + 1) * t * (t - 1) / 6,
+    ]
+    return first, np.stack(weights)

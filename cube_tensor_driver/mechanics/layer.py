@@ -1,19 +1,20 @@
 """Stress in an elastic layer under traction on its surface, in wavenumber space.
 
-The layer fills -thickness < z < 0. Its surface z = 0 carries the traction t, its bottom is bonded
-to rigid ground; an infinite thickness is a half space. A traction t exp(i k.x) with k = |k| makes
-plane strain in the plane of k and z (L along k, T across) and a twist across it. With zeta = k z,
-h = k thickness, eta = zeta + h and an Airy function psi / k^2::
+The layer fills -thickness < z < 0. The traction t acts on its surface z = 0, and its bottom is
+bonded to rigid ground; an infinite thickness is a half space. A traction t exp(i k.x) with k = |k|
+causes plane strain in the plane of k and z (axis L along k), and a twist perpendicular to that
+plane (axis T). With zeta = k z, h = k thickness, eta = zeta + h and an Airy function psi / k^2::
 
     psi = (A + B zeta) exp(zeta) + (C + D eta) exp(-eta)
     sigma_zz = -psi,  sigma_Lz = -i psi',  sigma_LL = psi'',  sigma_TT = nu (psi'' - psi)
     2 mu k (i u_L, u_z) = (1 - nu) psi'' + nu psi,  (1 - nu) psi''' - (2 - nu) psi'
     sigma_Tz = t_T cosh(eta) / cosh(h),  sigma_LT = i t_T sinh(eta) / cosh(h)
 
-The traction fixes psi(0) = -t_z and psi'(0) = i t_L, the bond u_L = u_z = 0 at zeta = -h.
+The traction determines psi(0) = -t_z and psi'(0) = i t_L; the bond means u_L = u_z = 0 at zeta =
+-h.
 
 Source: I. N. Sneddon, Fourier Transforms (1951), 45-47 and 52; K. L. Johnson, Contact Mechanics
-(1985), 2.2 and 5.8. The tests compare it with the point forces of contact.py and with finite
+(1985), 2.2 and 5.8. The tests compare the layer with the point forces of contact.py and with finite
 elements.
 """
 
@@ -30,15 +31,24 @@ from ..core.errors import ElasticError
 from ..core.modes import STRESS
 
 FIELD = STRESS + tuple(f"{name}_{axis}" for name in STRESS for axis in "xyz")
-"""What `Layer.transfer` gives: six stresses, then the three derivatives of each of them."""
+"""Names of the 24 quantities of a stress field at a point: six stresses in Pa, then the derivatives
+of each of them along x, y and z in Pa/m."""
+
+_WaveStress = dict[str, tuple[Any, Any]]
+"""Stress and its derivative along z; the key is the stress component and the load, in axes L, T,
+z."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """An elastic layer on rigid ground. thickness: m, inf for a half space; poisson: its ratio.
+    """An elastic layer on rigid ground. Young's modulus does not influence the stress.
 
-    Young's modulus does not matter for stress. Raises ElasticError unless thickness > 0 and
-    0 <= poisson <= 0.5.
+    Attributes:
+        thickness: Thickness in m; infinite for a half space.
+        poisson: Poisson's ratio, 0 to 0.5.
+
+    Raises:
+        ElasticError: A value is out of range.
     """
 
     thickness: float = np.inf
@@ -55,113 +65,172 @@ class Layer:
             )
 
     def check_depth(self, depth: float) -> None:
-        """Raises ElasticError unless the layer has this depth, m."""
+        """Check that a depth in m lies within the layer.
+
+        Raises:
+            ElasticError: It does not.
+        """
         if not 0 < depth < self.thickness:
             raise ElasticError(
                 f"depth is {depth} m in a layer of {self.thickness} m; it must lie between 0 and "
                 "the thickness"
             )
 
-    def transfer(self, kx: Array, ky: Array, depth: float) -> Complex:
-        """FIELD at z = -depth under unit traction exp(i k.x).
+    def transfer(
+        self,
+        kx: Array,
+        ky: Array,
+        depth: float,
+    ) -> Complex:
+        """Compute the stress field under a unit traction exp(i k.x) on the surface.
 
-        kx, ky: (...) 1/m; depth: m, above 0 and above the ground
-        Returns (..., 24, 3): Pa and Pa/m per Pa of the traction along x, y and z. Tension is
-        positive, so pressing is a negative traction along z. The mean traction (k = 0) of a half
-        space has no limit of sigma_xx and sigma_yy; their mean over directions stands for it.
-        Raises ElasticError where there is no such depth.
+        The mean traction (k = 0) of a half space has no limit of sigma_xx and sigma_yy, because
+        their values depend on the direction of k. The mean over all directions is returned.
+
+        Args:
+            kx: Wavenumber along x (...) in 1/m.
+            ky: Wavenumber along y (...) in 1/m.
+            depth: Distance below the surface in m.
+
+        Returns:
+            `FIELD` (..., 24, 3) at z = -depth, in Pa and Pa/m per Pa of the traction along x, y and
+            z. Tension is positive, so that pressing is a negative traction along z.
+
+        Raises:
+            ElasticError: The layer does not contain this depth.
         """
         self.check_depth(depth)
         kx, ky = np.broadcast_arrays(np.asarray(kx, float), np.asarray(ky, float))
         k = np.hypot(kx, ky)
-        zero = k == 0
-        safe = np.where(zero, 1.0, k)
-        c, s = np.where(zero, 1.0, kx / safe), ky / safe
-        along, across = self._plane(safe, depth), self._twist(safe, depth)
-        # (..., 24, 3) first in the axes L, T, z of the wave, then turned to x, y, z
-        out = np.zeros((*k.shape, 6, 3), complex)
-        slope = np.zeros_like(out)
-        for source, part in ((along, 0), (across, 0), (along, 1), (across, 1)):
-            _turn(out if part == 0 else slope, c, s, {key: v[part] for key, v in source.items()})
-        out[zero] = self._uniform()
-        slope[zero] = 0.0
-        gradient = np.stack([1j * kx[..., None, None] * out, 1j * ky[..., None, None] * out, slope])
-        gradient = np.moveaxis(gradient, 0, -2).reshape(*k.shape, 18, 3)
-        return np.concatenate([out, gradient], axis=-2)
+        is_zero = k == 0
+        k_safe = np.where(is_zero, 1.0, k)
+        cosine = np.where(is_zero, 1.0, kx / k_safe)
+        sine = ky / k_safe
 
-    def _plane(self, k: Array, depth: float) -> dict[str, tuple[Any, Any]]:
-        """Stress and its derivative along z under traction along L ("?L") and z ("?z")."""
-        zeta = -k * depth
-        psi = self._airy(k, zeta)  # (4 derivatives, ..., 2 loads)
-        found = {}
-        for load, column in (("L", 1), ("z", 0)):
-            p = psi[..., column] * (1j if load == "L" else -1.0)
+        stress = np.zeros((*k.shape, 6, 3), complex)
+        slope = np.zeros_like(stress)
+        waves = self._plane_strain(k_safe, depth) | self._twist(k_safe, depth)
+        for name, (value, derivative) in waves.items():
+            _add_rotated(stress, cosine, sine, name, value)
+            _add_rotated(slope, cosine, sine, name, derivative)
+        stress[is_zero] = self._uniform()
+        slope[is_zero] = 0.0
+
+        # d/dx exp(i k.x) = i kx exp(i k.x)
+        by_x = 1j * kx[..., np.newaxis, np.newaxis] * stress
+        by_y = 1j * ky[..., np.newaxis, np.newaxis] * stress
+        gradient = np.stack([by_x, by_y, slope], axis=-2)
+        gradient = gradient.reshape(*k.shape, 18, 3)
+        return np.concatenate([stress, gradient], axis=-2)
+
+    def _plane_strain(self, k: Array, depth: float) -> _WaveStress:
+        """Return the stress under traction along L (keys "..L") and along z (keys "..z")."""
+        psi = self._airy(k, -k * depth)  # (derivatives 0 to 3, ..., psi(0) = 1 or psi'(0) = 1)
+        by_load = {"L": 1j * psi[..., 1], "z": -psi[..., 0]}
+
+        nu = self.poisson
+        waves: _WaveStress = {}
+        for load, p in by_load.items():
+            # Each pair is a stress and its derivative by zeta, see the module head.
             parts = {
                 "zz": (-p[0], -p[1]),
                 "Lz": (-1j * p[1], -1j * p[2]),
                 "LL": (p[2], p[3]),
-                "TT": (self.poisson * (p[2] - p[0]), self.poisson * (p[3] - p[1])),
+                "TT": (nu * (p[2] - p[0]), nu * (p[3] - p[1])),
             }
             for name, (value, slope) in parts.items():
-                found[name + load] = (value, k * slope)
-        return found
+                waves[name + load] = (value, k * slope)
+        return waves
 
     def _airy(self, k: Array, zeta: Array) -> Array:
-        """psi and its first three derivatives by zeta (4, ..., 2) for psi(0) = 1 and psi'(0) = 1,
-        the other one zero."""
-        up = np.exp(zeta)
+        """Return psi and its first three derivatives by zeta for both unit boundary conditions.
+
+        Returns:
+            Array (4, ..., 2); the last axis is psi(0) = 1, psi'(0) = 0 and psi(0) = 0, psi'(0) = 1.
+        """
         if np.isinf(self.thickness):
-            a = np.stack([np.ones_like(k), np.zeros_like(k)], axis=-1)
-            b = np.stack([-np.ones_like(k), np.ones_like(k)], axis=-1)
-            return np.stack([(a + (n + zeta[..., None]) * b) * up[..., None] for n in range(4)])
+            return self._airy_half_space(zeta)
         h = k * self.thickness
 
-        def terms(n: int, zeta: Array) -> Array:
-            """(..., 4) of the n-th derivative by A, B, C, D."""
+        def differentiate(n: int, zeta: Array) -> Array:
+            """Return the factors (..., 4) of A, B, C and D in the n-th derivative of psi."""
             eta = zeta + h
-            rise, fall = np.exp(zeta), (-1) ** n * np.exp(-eta)
+            rise = np.exp(zeta)
+            fall = (-1) ** n * np.exp(-eta)
             return np.stack([rise, (n + zeta) * rise, fall, (eta - n) * fall], axis=-1)
 
-        nu, bottom = self.poisson, -h
-        rows = [
-            terms(0, 0 * h),
-            terms(1, 0 * h),
-            (1 - nu) * terms(2, bottom) + nu * terms(0, bottom),
-            (1 - nu) * terms(3, bottom) - (2 - nu) * terms(1, bottom),
+        # Boundary conditions: psi(0), psi'(0), u_L and u_z at the bottom.
+        nu = self.poisson
+        psi, psi1, psi2, psi3 = (differentiate(n, -h) for n in range(4))
+        conditions = [
+            differentiate(0, 0 * h),
+            differentiate(1, 0 * h),
+            (1 - nu) * psi2 + nu * psi,
+            (1 - nu) * psi3 - (2 - nu) * psi1,
         ]
-        constants = np.linalg.inv(np.stack(rows, axis=-2))[..., :2]
-        return np.stack(
-            [np.einsum("...c,...cl->...l", terms(n, zeta), constants) for n in range(4)]
-        )
+        constants = np.linalg.inv(np.stack(conditions, axis=-2))[..., :2]
+        derivatives = [
+            np.einsum("...c,...cl->...l", differentiate(n, zeta), constants) for n in range(4)
+        ]
+        return np.stack(derivatives)
 
-    def _twist(self, k: Array, depth: float) -> dict[str, tuple[Any, Any]]:
-        """The same under traction along T."""
-        fall = np.exp(-k * depth)
-        if np.isinf(self.thickness):
-            cosh, sinh = fall, fall
-        else:  # cosh(eta) / cosh(h) without overflow
-            echo = np.exp(-2 * k * (self.thickness - depth))
-            base = fall / (1 + np.exp(-2 * k * self.thickness))
-            cosh, sinh = base * (1 + echo), base * (1 - echo)
+    @staticmethod
+    def _airy_half_space(zeta: Array) -> Array:
+        """Return the same for a half space: psi = (A + B zeta) exp(zeta), C = D = 0."""
+        decay = np.exp(zeta)[..., np.newaxis]
+        a = np.array([1.0, 0.0])
+        b = np.array([-1.0, 1.0])  # psi'(0) = A + B
+        depth_factor = zeta[..., np.newaxis]
+        return np.stack([(a + (n + depth_factor) * b) * decay for n in range(4)])
+
+    def _twist(self, k: Array, depth: float) -> _WaveStress:
+        """Return the stress under traction along T."""
+        decay = np.exp(-k * depth)
+        cosh = sinh = decay
+        if np.isfinite(self.thickness):
+            # cosh(eta) / cosh(h) and sinh(eta) / cosh(h), without overflow for large k
+            reflected = np.exp(-2 * k * (self.thickness - depth))
+            base = decay / (1 + np.exp(-2 * k * self.thickness))
+            cosh = base * (1 + reflected)
+            sinh = base * (1 - reflected)
         return {"TzT": (cosh + 0j, k * sinh + 0j), "LTT": (1j * sinh, 1j * k * cosh)}
 
     def _uniform(self) -> Array:
-        """Stress (6, 3) under uniform traction."""
-        side = (1 + 2 * self.poisson) / 2
+        """Return the stress (6, 3) under uniform unit traction along x, y and z."""
+        # Lateral stress per normal stress: the mean over directions in a half space, zero lateral
+        # strain in a layer.
+        lateral = (1 + 2 * self.poisson) / 2
         if np.isfinite(self.thickness):
-            side = self.poisson / (1 - self.poisson)
+            lateral = self.poisson / (1 - self.poisson)
+
         stress = np.zeros((6, 3))
-        stress[[0, 1, 2], 2] = side, side, 1.0
-        stress[4, 0] = stress[3, 1] = 1.0
+        stress[STRESS.index("xx"), 2] = lateral
+        stress[STRESS.index("yy"), 2] = lateral
+        stress[STRESS.index("zz"), 2] = 1.0
+        stress[STRESS.index("zx"), 0] = 1.0
+        stress[STRESS.index("yz"), 1] = 1.0
         return stress
 
 
-def _turn(out: Complex, c: Array, s: Array, wave: dict[str, Complex]) -> None:
-    """Add a wave's stress, named by component and load in its axes L, T, z, to `out` (..., 6, 3).
+def _add_rotated(
+    out: Complex,
+    cosine: Array,
+    sine: Array,
+    name: str,
+    value: Complex,
+) -> None:
+    """Add one stress component of a wave to a stress in the axes x, y, z.
 
-    c, s: (...) L = (c, s, 0), T = (-s, c, 0)
+    Args:
+        out: Stress (..., 6, 3) under loads along x, y and z, to which is added.
+        cosine: First component (...) of the axis L = (cosine, sine, 0); T = (-sine, cosine, 0).
+        sine: Second component (...) of L.
+        name: Stress component and load in the axes L, T and z, such as "LzT".
+        value: Amplitude (...).
     """
-    stress: dict[str, dict[int, Any]] = {
+    c, s = cosine, sine
+    # Contribution of a component in the wave's axes to the rows xx yy zz yz zx xy.
+    stress_rows: dict[str, dict[int, Any]] = {
         "LL": {0: c * c, 1: s * s, 5: c * s},
         "TT": {0: s * s, 1: c * c, 5: -c * s},
         "LT": {0: -2 * c * s, 1: 2 * c * s, 5: c * c - s * s},
@@ -169,8 +238,13 @@ def _turn(out: Complex, c: Array, s: Array, wave: dict[str, Complex]) -> None:
         "Lz": {4: c, 3: s},
         "Tz": {4: -s, 3: c},
     }
-    load: dict[str, dict[int, Any]] = {"L": {0: c, 1: s}, "T": {0: -s, 1: c}, "z": {2: 1.0}}
-    for name, value in wave.items():
-        for row, turned in stress[name[:2]].items():
-            for column, share in load[name[2]].items():
-                out[..., row, column] += turned * share * value
+    # Component of a unit load along x, y or z in the wave's axes.
+    load_columns: dict[str, dict[int, Any]] = {
+        "L": {0: c, 1: s},
+        "T": {0: -s, 1: c},
+        "z": {2: 1.0},
+    }
+    component, load = name[:2], name[2]
+    for row, rotated in stress_rows[component].items():
+        for column, share in load_columns[load].items():
+            out[..., row, column] += rotated * share * value

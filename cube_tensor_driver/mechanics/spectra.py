@@ -1,17 +1,20 @@
-"""What cubes see of waves of traction, whatever the direction: spectra of circular components.
+"""Response of circular components to waves of traction, independent of the direction of the wave.
 
-The layer is the same in all directions. So a circular component of order m (circular.py) sees of
-traction of the wavenumber k in the direction phi, with F+ = F_x + i F_y and F- = F_x - i F_y::
+A layer is the same in all directions. A circular component of order m (circular.py) therefore
+responds to a traction of the wavenumber k in the direction phi as follows, with F+ = F_x + i F_y
+and F- = F_x - i F_y::
 
     c(k) = (-i)^m exp(i m phi) (N F_z + (i/2) P exp(-i phi) F+  -  (i/2) M exp(i phi) F-)
 
-The spectra P, M and N are real. Of a force that is spread with the spectrum S around it, at the
-distance r the components have the R, T and Z of circular.py::
+The spectra P (plus), M (minus) and N (normal) are real functions of k. A force that is spread over
+the surface with the spectrum S causes, at the distance r, components with the R, T and Z of
+circular.py. They are Hankel transforms, [k dk / 2 pi]::
 
-    R + T = int P S J_{m-1}(kr),   R - T = int M S J_{m+1}(kr),   Z = int N S J_m(kr)  [k dk / 2 pi]
+    R + T = int P S J_{m-1}(kr),   R - T = int M S J_{m+1}(kr),   Z = int N S J_m(kr)
 
-A random traction of the spectrum S, whose axes are independent and whose shear has s^2 times the
-variance of the pressure, makes two components of orders m and n vary together as::
+A random traction of the spectrum S has independent axes, and its shear has s^2 times the variance
+of the pressure. Two components c of order m and d of order n, at a distance r in the direction phi,
+then have the covariances::
 
     <c d*> = exp(i (m - n) phi) int S (N N' + (P P' + M M') s^2 / 2) J_{m-n}(kr)
     <c d>  = exp(i (m + n) phi) (-1)^n int S (N N' - (P M' + M P') s^2 / 2) J_{m+n}(kr)
@@ -26,106 +29,183 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import jv
 
 from ..core.arrays import Array
-from .circular import CIRCULAR, ORDERS
+from .circular import CIRCULAR_FROM_FIELD, ORDERS, Orders
 from .layer import Layer
 
-Bessel = Callable[[int], Array]
+BesselTable = Callable[[int], Array]
+"""Function that returns the Bessel function of one order at fixed arguments (positions,
+wavenumbers)."""
 
-GREATEST = 25.0
-"""Wavenumber times depth at which integrals end: the field has decayed by exp(-25)."""
-WAVES = 256
-"""Gauss points in k, which resolve the Bessel functions out to 20 depths."""
+MAX_WAVENUMBER_TIMES_DEPTH = 25.0
+"""Upper limit of the integrals over k, multiplied by the depth. There, the field has decayed by the
+factor exp(-25)."""
+
+N_WAVENUMBERS = 256
+"""Number of Gauss points in k. They resolve the Bessel functions up to a distance of 20 depths."""
 
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Of n components that a cube sees.
+    """Spectra of n circular components.
 
-    k: (waves,) 1/m; weight: (waves,) of integrals k dk / 2 pi
-    order: (n,) m of each component; plus, minus, normal: (waves, n) P, M and N
+    Attributes:
+        k: Wavenumbers (waves,) in 1/m.
+        weight: Weights (waves,) of integrals over k dk / 2 pi, in 1/m^2.
+        order: Order (n,) m of each component.
+        plus: Spectra P (waves, n), response to F+.
+        minus: Spectra M (waves, n), response to F-.
+        normal: Spectra N (waves, n), response to F_z.
     """
 
     k: Array
     weight: Array
-    order: NDArray[np.int64]
+    order: Orders
     plus: Array
     minus: Array
     normal: Array
 
-    def radial(self, bessel: Bessel, factors: Array) -> Array:
-        """(factors, places, 3, n) R, Z and T at the places of `bessel` of forces that are spread
-        with each of the factors (factors, waves)."""
-        sums = np.zeros((3, len(factors), len(bessel(0)), len(self.order)))
+    def radial(self, bessel: BesselTable, load_spectra: Array) -> Array:
+        """Compute the R, Z and T of forces of 1 N that are spread over the surface.
+
+        Args:
+            bessel: Bessel functions at the wanted distances.
+            load_spectra: Spectra S (loads, waves) of the loads.
+
+        Returns:
+            R, Z and T (loads, distances, 3, n), in this order, in units of the component per N.
+        """
+        n_distances = len(bessel(0))
+        shape = (len(load_spectra), n_distances, len(self.order))
+        plus = np.zeros(shape)
+        minus = np.zeros(shape)
+        normal = np.zeros(shape)
+
         for order in np.unique(self.order):
-            mine = self.order == order
-            for part, spectrum, shift in zip(
-                sums, (self.plus, self.minus, self.normal), (-1, 1, 0), strict=True
-            ):
+            chosen = self.order == order
+            parts = ((plus, self.plus, -1), (minus, self.minus, 1), (normal, self.normal, 0))
+            for total, spectrum, shift in parts:
                 wave = bessel(int(order) + shift) * self.weight
-                for total, factor in zip(part, factors, strict=True):
-                    total[:, mine] = wave @ (spectrum[:, mine] * factor[:, None])
-        plus, minus, normal = sums
+                for load, load_spectrum in enumerate(load_spectra):
+                    weighted = spectrum[:, chosen] * load_spectrum[:, np.newaxis]
+                    total[load][:, chosen] = wave @ weighted
+
+        # plus = R + T, minus = R - T
         return np.stack([(plus + minus) / 2, normal, (plus - minus) / 2], axis=2)
 
     def covariance(
-        self, other: Spectra, bessel: Bessel, factor: Array, shear: float
+        self,
+        other: Spectra,
+        bessel: BesselTable,
+        prior: Array,
+        shear: float,
     ) -> tuple[Array, Array]:
-        """(places, n, n') of the real parts and of the imaginary parts, at the places of `bessel`
-        along x from the other's; real and imaginary parts are independent there.
+        """Compute covariances under a random traction, for positions along x from the other ones.
 
-        factor: (waves,) spectrum of the pressure; shear: s
+        Args:
+            other: Spectra of the n' components at the other position.
+            bessel: Bessel functions at the distances between both positions.
+            prior: Spectrum S (waves,) of the pressure.
+            shear: Standard deviation s of the shear divided by that of the pressure.
+
+        Returns:
+            Covariances (distances, n, n') of the real parts, and of the imaginary parts. On the x
+            axis, real and imaginary parts are independent of each other.
         """
+        normal = _outer(self.normal, other.normal)
+        same = _outer(self.plus, other.plus) + _outer(self.minus, other.minus)
+        crossed = _outer(self.plus, other.minus) + _outer(self.minus, other.plus)
         half = shear**2 / 2
-        normal = self.normal[:, :, None] * other.normal[:, None]
-        same = self.plus[:, :, None] * other.plus[:, None]
-        same += self.minus[:, :, None] * other.minus[:, None]
-        crossed = self.plus[:, :, None] * other.minus[:, None]
-        crossed += self.minus[:, :, None] * other.plus[:, None]
-        sign = (-1.0) ** other.order
-        difference = self.order[:, None] - other.order
-        total = self.order[:, None] + other.order
-        with_conjugate = self._integral(normal + half * same, difference, bessel, factor)
-        without = self._integral(sign * (normal - half * crossed), total, bessel, factor)
-        return (with_conjugate + without) / 2, (with_conjugate - without) / 2
 
-    def _integral(
-        self, spectrum: Array, order: NDArray[np.int64], bessel: Bessel, factor: Array
+        # <c d*> and <c d> of the module head at phi = 0
+        order_difference = self.order[:, np.newaxis] - other.order
+        order_sum = self.order[:, np.newaxis] + other.order
+        sign = (-1.0) ** other.order
+        conjugate = self._integrate(normal + half * same, order_difference, bessel, prior)
+        direct = self._integrate(
+            sign * (normal - half * crossed),
+            order_sum,
+            bessel,
+            prior,
+        )
+
+        # Re c Re d = Re(c d* + c d) / 2 and Im c Im d = Re(c d* - c d) / 2
+        return (conjugate + direct) / 2, (conjugate - direct) / 2
+
+    def _integrate(
+        self,
+        spectrum: Array,
+        order: Orders,
+        bessel: BesselTable,
+        prior: Array,
     ) -> Array:
-        """(places, n, n') int factor spectrum J_order(kr), with an order (n, n') for each."""
+        """Integrate prior * spectrum (waves, n, n') * J_order(kr), with its own order (n, n')
+        each."""
         result = np.zeros((len(bessel(0)), *order.shape))
         for one in np.unique(order):
-            mine = order == one
-            result[:, mine] = (bessel(int(one)) * (self.weight * factor)) @ spectrum[:, mine]
+            chosen = order == one
+            wave = bessel(int(one)) * (self.weight * prior)
+            result[:, chosen] = wave @ spectrum[:, chosen]
         return result
 
 
-def bessel_functions(k: Array, r: Array) -> Bessel:
-    """J(kr) (places, waves) of any order, at distances r (places,) m."""
+def _outer(first: Array, second: Array) -> Array:
+    """Return the products (waves, n, n') of all pairs of two sets of spectra."""
+    return first[:, :, np.newaxis] * second[:, np.newaxis]
+
+
+def tabulate_bessel(k: Array, r: Array) -> BesselTable:
+    """Prepare the Bessel functions J_m(kr) for wavenumbers (waves,) and distances (positions,) in
+    m.
+
+    Returns:
+        A function that returns J_m (positions, waves) of any order m and computes each order once.
+    """
     x = np.outer(r, k)
 
-    @cache  # each takes long, and is needed many times
-    def of(order: int) -> Array:
-        return np.asarray(jv(order, x)) if order >= 0 else (-1) ** order * of(-order)
+    @cache
+    def evaluate(order: int) -> Array:
+        if order < 0:  # J_{-m} = (-1)^m J_m
+            return np.asarray((-1) ** order * evaluate(-order))
+        return np.asarray(jv(order, x))
 
-    return of
+    return evaluate
 
 
-def waves(depth: float) -> tuple[Array, Array]:
-    """Wavenumbers (waves,) 1/m and their weights in integrals k dk / 2 pi, for this depth, m."""
-    nodes, weights = np.polynomial.legendre.leggauss(WAVES)
-    k = (nodes + 1) * GREATEST / depth / 2
-    return k, weights * GREATEST / depth / 2 * k / (2 * np.pi)
+def wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
+    """Return Gauss points for integrals over all wavenumbers at a depth in m.
+
+    Returns:
+        Wavenumbers (waves,) in 1/m, and their weights (waves,) in integrals over k dk / 2 pi.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(N_WAVENUMBERS)
+    half_range = MAX_WAVENUMBER_TIMES_DEPTH / depth / 2
+    k = (nodes + 1) * half_range
+    return k, weights * half_range * k / (2 * np.pi)
 
 
 def layer_spectra(layer: Layer, depth: float) -> Spectra:
-    """Of the circular components of FIELD in a layer. Raises ElasticError where there is no such
-    depth."""
-    k, weight = waves(depth)
+    """Return the spectra of the circular components of `FIELD` at a point in a layer.
+
+    Args:
+        layer: Elastic layer.
+        depth: Distance from the point to the surface, in m.
+
+    Raises:
+        ElasticError: The layer does not contain this depth.
+    """
+    k, weight = wavenumber_quadrature(depth)
     along_x = layer.transfer(k, np.zeros_like(k), depth)
-    seen = 1j ** ORDERS[:, None] * np.einsum("cf,kfi->kci", CIRCULAR, along_x)
-    x, y, z = np.moveaxis(seen, -1, 0)
-    return Spectra(k, weight, ORDERS, x.imag - y.real, -x.imag - y.real, z.real)
+    circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
+
+    # At phi = 0, i^m c = N F_z + (i/2) P (F_x + i F_y) - (i/2) M (F_x - i F_y).
+    x, y, z = np.moveaxis(
+        1j ** ORDERS[:, np.newaxis] * circular,
+        -1,
+        0,
+    )
+    plus = x.imag - y.real
+    minus = -x.imag - y.real
+    return Spectra(k, weight, ORDERS, plus, minus, z.real)

@@ -17,7 +17,7 @@ from ..core.modes import STRESS
 from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
 from ..mechanics.influence import Influence
-from ..mechanics.kernels import Kernels, Reading
+from ..mechanics.kernels import Kernels, MeasurementModel
 from ..mechanics.layer import Layer
 from .flattened import flattened
 from .missing import Missing
@@ -93,7 +93,7 @@ class SurfaceInverse:
         layer: Layer,
         depth: float,
         side: int = 2,
-        reading: Reading | None = None,
+        reading: MeasurementModel | None = None,
     ) -> SurfaceInverse:
         """The same from poses and by_pad (cubes, 15, P), see `noise_of_all_pads`. reading: how the
         cubes see; by default as points."""
@@ -108,7 +108,7 @@ class SurfaceInverse:
         layer: Layer,
         depth: float,
         side: int,
-        reading: Reading | None,
+        reading: MeasurementModel | None,
     ) -> None:
         if side < 1:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
@@ -116,7 +116,7 @@ class SurfaceInverse:
         scale = float(np.median(poses.half_side))
         self.kernels = Kernels(layer, depth, scale, reading)
         n = len(poses.position)
-        self.reading = np.zeros(n, np.intp) if reading is None else reading.of_cube.copy()
+        self.reading = np.zeros(n, np.intp) if reading is None else reading.variant.copy()
         self.spacing = poses.pitch / side
         self.area = self.spacing**2
         flat = patches(poses, self.spacing, side)
@@ -129,7 +129,7 @@ class SurfaceInverse:
         self._units = np.where(self.columns < len(STRESS), 1.0, scale)
         self.by_pad = by_pad[:, self.columns] * self._units[:, None]
         self._all_pads = self.by_pad.copy()
-        self._of_pads = None if reading is None else reading.of_pads
+        self._of_pads = None if reading is None else reading.pads
         self._kind = self.reading.copy()
         self._differs = np.zeros(n, bool)
         self.observed = observed[:, self.columns]
@@ -160,7 +160,7 @@ class SurfaceInverse:
             return
         for cube, own in zip(cubes.tolist(), by_pad, strict=True):
             said = self._of_pads[self._kind[cube]] @ np.nan_to_num(own).T
-            self.reading[cube] = self.kernels.add_reading(said)
+            self.reading[cube] = self.kernels.add_variant(said)
             here, whole = self.by_pad[cube], self._all_pads[cube]
             self._differs[cube] = not np.array_equal(here, whole, equal_nan=True)
 

@@ -26,8 +26,8 @@ from ..core.calibration import Calibration
 from ..core.errors import ElasticError
 from ..core.pipeline import Pipeline
 from ..mechanics.influence import Influence
-from ..mechanics.kernels import Reading
-from ..mechanics.spectra import Spectra, bessel_functions, waves
+from ..mechanics.kernels import MeasurementModel
+from ..mechanics.spectra import Spectra, tabulate_bessel, wavenumber_quadrature
 
 ANGLES = 32
 """Directions from force to cube that the Fourier series is made from."""
@@ -41,7 +41,7 @@ _SAME = 1e-6
 """Relative lengths closer than this are the same."""
 
 
-def read_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Reading:
+def read_pads(influence: Influence, calibrations: Sequence[Calibration]) -> MeasurementModel:
     """How cubes with these calibrations see forces on the surface of the influence functions' body.
 
     ElasticError: the influence functions are of a cube of another size, or lack a pad.
@@ -56,7 +56,7 @@ def read_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Read
     for k, (one, mine) in enumerate(zip(kinds, pads, strict=True)):
         over_noise[k, :, : len(mine)] = made[:, mine] / one.noise
     of_cube = np.array([number[id(one)] for one in calibrations], np.intp)
-    return Reading(spectra, np.stack(said), of_cube, over_noise)
+    return MeasurementModel(spectra, np.stack(said), of_cube, over_noise)
 
 
 def _pads(influence: Influence, calibration: Calibration) -> list[int]:
@@ -93,8 +93,8 @@ def _components(influence: Influence) -> tuple[Spectra, Array]:
         np.linalg.svd((one * root).reshape(len(one), -1), full_matrices=False) for one in series
     ]
     greatest = max(sizes[0] for _, sizes, _ in parts)
-    k, wave_weight = waves(influence.depth)
-    bessel = bessel_functions(k, r)
+    k, wave_weight = wavenumber_quadrature(influence.depth)
+    bessel = tabulate_bessel(k, r)
     orders, spectra, made = [], [], []
     for order, (pads, sizes, shapes) in enumerate(parts):
         kept = sizes > NEGLIGIBLE * greatest

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from ..core.arrays import Array, Index, Mask, Single
 from ..core.poses import CubePoses
-from ..mechanics.cache import cached
+from ..mechanics.cache import load_or_compute
 from ..mechanics.kernels import Kernels
 from .flattened import flattened
 from .prior import AMPLITUDE, covariance_matrix
@@ -48,7 +48,7 @@ class Observed(NamedTuple):
     """What n cubes observe.
 
     columns: (C,) which of COMPONENTS some cube of the skin observes; known: (n, C) which each does
-    by_pad: (n, C, P) as `noise_by_pad`, all in Pa; reading: (n,) as `Reading.of_cube`
+    by_pad: (n, C, P) as `noise_by_pad`, all in Pa; reading: (n,) as `MeasurementModel.variant`
     """
 
     columns: Index
@@ -103,9 +103,9 @@ class Windows:
             return solved
 
         own = observed.of(self.near[first])
-        key: list[Any] = [*kernels.made_from, spacing, side, place[first], angle[first]]
+        key: list[Any] = [*kernels.inputs, spacing, side, place[first], angle[first]]
         key += [own.columns, own.by_pad, own.reading]
-        solved = cached("windows", key, solve)
+        solved = load_or_compute("windows", key, solve)
         self.gain, self.precision = solved["gain"], solved["precision"]
         self.prior = solved["variance"]
         self.by_pad, self.of_size = solved["by_pad"], solved["of_size"]

@@ -30,8 +30,8 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 def test_it_is_made_once_for_each_input(folder):
     make = Counted()
-    made = cache.cached("kind", [1.0, np.arange(3)], make)
-    again = cache.cached("kind", [1.0, np.arange(3)], make)
+    made = cache.load_or_compute("kind", [1.0, np.arange(3)], make)
+    again = cache.load_or_compute("kind", [1.0, np.arange(3)], make)
     assert make.times == 1
     for name, array in make().items():
         for one in (made, again):
@@ -39,7 +39,7 @@ def test_it_is_made_once_for_each_input(folder):
             assert one[name].dtype == array.dtype
     make.times = 0
     for number, other in enumerate(([1.0, np.arange(4)], [1.1, np.arange(3)], [1.0, np.ones(3)])):
-        cache.cached("kind", other, make)
+        cache.load_or_compute("kind", other, make)
         assert make.times == number + 1
     assert len(list(folder.iterdir())) == 4
 
@@ -47,30 +47,30 @@ def test_it_is_made_once_for_each_input(folder):
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "text"])
 def test_a_damaged_file_is_made_again(folder, damage):
     make = Counted()
-    cache.cached("kind", [1.0], make)
+    cache.load_or_compute("kind", [1.0], make)
     (path,) = folder.iterdir()
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 4
     damaged = {"cut": data[: len(data) // 2], "flipped": data, "empty": b"", "text": b"no zip"}
     path.write_bytes(damaged[damage])
-    found = cache.cached("kind", [1.0], make)
+    found = cache.load_or_compute("kind", [1.0], make)
     np.testing.assert_array_equal(found["one"], np.arange(300.0))
     assert make.times == 2
-    cache.cached("kind", [1.0], make)
+    cache.load_or_compute("kind", [1.0], make)
     assert make.times == 2
 
 
 def test_it_is_bounded_and_the_oldest_go(folder, monkeypatch):
     make = Counted()
-    cache.cached("kind", [0], make)
+    cache.load_or_compute("kind", [0], make)
     (first,) = folder.iterdir()
-    monkeypatch.setattr(cache, "MOST_BYTES", 3 * first.stat().st_size)
+    monkeypatch.setattr(cache, "MAX_CACHE_BYTES", 3 * first.stat().st_size)
     for number in range(1, 3):
-        cache.cached("kind", [number], make)
+        cache.load_or_compute("kind", [number], make)
     for age, path in enumerate(sorted(folder.iterdir(), key=lambda one: one != first)):
         os.utime(path, (1e9 + age, 1e9 + age))
-    cache.cached("kind", [0], make)  # used again: it stays
-    cache.cached("kind", [3], make)
+    cache.load_or_compute("kind", [0], make)  # used again: it stays
+    cache.load_or_compute("kind", [3], make)
     assert len(list(folder.iterdir())) == 3 and first.exists()
 
 
@@ -79,5 +79,5 @@ def test_without_a_place_to_write_it_is_made_each_time(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     make = Counted()
     for _ in range(2):
-        assert cache.cached("kind", [1.0], make)["one"][299] == 299
+        assert cache.load_or_compute("kind", [1.0], make)["one"][299] == 299
     assert make.times == 2

@@ -13,7 +13,7 @@ from scipy.integrate import trapezoid
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS, to_matrix
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.mechanics.kernels import LENGTHS, SHEAR, Kernels, hertz_pressure
+from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO, Kernels, hertz_pressure
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
 
 DEPTH, SCALE = 4e-3, 2e-3
@@ -110,12 +110,12 @@ def test_covariances_of_the_prior_are_sums_over_its_waves(half_space):
     line = (np.arange(-80, 80) + 0.5) * 12 / 80 / DEPTH
     kx, ky = (part.ravel() for part in np.meshgrid(line, line))
     square = (kx**2 + ky**2) * DEPTH**2
-    lengths = np.array(LENGTHS)
+    lengths = np.array(PRIOR_LENGTHS)
     prior = np.mean([2 * np.pi * l**2 * np.exp(-square * l**2 / 2) for l in lengths], axis=0)
     prior *= DEPTH**2 * (line[1] - line[0]) ** 2 / (2 * np.pi) ** 2
     transfer = half_space.layer.transfer(kx, ky, DEPTH)
     shift = np.exp(1j * (np.stack([kx, ky], axis=1) @ (place[0] - place[1])))
-    weighted = transfer * (prior * shift)[:, None, None] * [SHEAR**2, SHEAR**2, 1.0]
+    weighted = transfer * (prior * shift)[:, None, None] * [SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0]
     matrix = np.einsum("nai,nbi->ab", weighted, transfer.conj(), optimize=True).real
     views = []
     for one in angle:  # (15, 24): what a turned cube reports of each unit field

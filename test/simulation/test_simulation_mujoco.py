@@ -17,9 +17,8 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, check_skin_data, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.mechanics.disc_tables import SIZES, DiscTables
+from cube_tensor_driver.mechanics.contact_tables import CONTACT_SIZES, DiscTables, PolygonTables
 from cube_tensor_driver.mechanics.layer import Layer
-from cube_tensor_driver.mechanics.polygon_tables import PolygonTables
 from cube_tensor_driver.simulation.mujoco.patches import Polygon, flat_contact
 from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
 from cube_tensor_driver.simulation.mujoco.source import MujocoSkin
@@ -93,7 +92,7 @@ def test_discs_are_those_of_point_forces():
     cubes = np.column_stack([random.uniform(-0.02, 0.02, (20, 2)), np.full(20, -DEPTH)])
     middle, forces = random.uniform(-0.02, 0.02, (6, 2)), random.normal(size=(6, 3))
     cubes[0, :2] = middle[0]  # right below: the direction to the disc is lost there
-    radius = SIZES[[0, 4, 8, 12, 16, 18]] * DEPTH
+    radius = CONTACT_SIZES[[0, 4, 8, 12, 16, 18]] * DEPTH
     place = cubes[:, None, :2] - middle
     stress, gradient = DiscTables(Layer(poisson=0.3), DEPTH).field(
         place, np.broadcast_to(forces, (20, 6, 3)), radius

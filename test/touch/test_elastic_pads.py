@@ -19,7 +19,7 @@ from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.influence_file import read_influence, write_influence
-from cube_tensor_driver.mechanics.kernels import LENGTHS, SHEAR, Kernels
+from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO, Kernels
 from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
 from cube_tensor_driver.touch.pad_noise import noise_by_pad
 from cube_tensor_driver.touch.pad_reading import read_pads
@@ -42,7 +42,7 @@ def influence():
 def kernels(influence):
     """Of two cubes, the second one planar."""
     reading = read_pads(influence, [CUBE, PLANAR])
-    assert reading.of_cube.tolist() == [0, 1]
+    assert reading.variant.tolist() == [0, 1]
     return Kernels(influence.layer, influence.depth, SCALE, reading)
 
 
@@ -83,9 +83,9 @@ def test_covariances_of_the_prior_are_sums_over_the_surface(influence, kernels):
     line = np.arange(-24, 25) * step
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     square = ((points[:, None] - points) ** 2).sum(axis=2) / influence.depth**2
-    prior = np.mean([np.exp(-square / (2 * length**2)) for length in LENGTHS], axis=0)
+    prior = np.mean([np.exp(-square / (2 * length**2)) for length in PRIOR_LENGTHS], axis=0)
     seen = [said(influence, k, points - place[k], angle[k]) * step**2 for k in (0, 1)]
-    cross = np.einsum("nm,mci->nci", prior, seen[0]) * [SHEAR**2, SHEAR**2, 1.0]
+    cross = np.einsum("nm,mci->nci", prior, seen[0]) * [SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0]
     expected = np.einsum("nci,ndi->cd", cross, seen[1])
     first, second = np.array([0]), np.array([1])
     found = kernels.covariance(place[:1] - place[1:], angle[:1], first, angle[1:], second)[0]

@@ -16,7 +16,7 @@ hold in the model's reference configuration (qpos0). The surface is that of the 
 the cubes.
 
 Each cube sees a layer whose surface lies `depth` above it, across its own z axis, as in `load.py`;
-patches.py says how contact points become tractions, mechanics/disc_tables.py and polygon_tables.py
+patches.py says how contact points become tractions, mechanics/contact_tables.py
 what these do to a cube.
 Contacts with the back of a body, where no cube looks, are not felt. The contact's own damping is
 MuJoCo's.
@@ -40,9 +40,8 @@ from ...core.poses import CubePoses
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
 from ...core.tensor import rotation_from_rpy
-from ...mechanics.disc_tables import DiscTables
+from ...mechanics.contact_tables import DiscTables, PolygonTables
 from ...mechanics.layer import Layer
-from ...mechanics.polygon_tables import PolygonTables
 from ..imperfections import Imperfections
 from ..load import Press, surface_normal
 from ..source import SkinPads

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...core.arrays import Array, Index
-from ...mechanics.kernels import REACH, hertz_pressure
+from ...mechanics.kernels import REACH_DEPTHS, hertz_pressure
 from ...mechanics.layer import FIELD
 from ..inverse import SurfaceInverse, TractionField
 from ..surface import square
@@ -140,7 +140,7 @@ class DiscModel:
     def cubes_around(self, home: int) -> tuple[Index, Array, Array]:
         """Cubes that see contacts of this home: which, places and angles laid flat."""
         inverse = self.inverse
-        reach = REACH * inverse.depth
+        reach = REACH_DEPTHS * inverse.depth
         cubes = np.sort(self._cubes.query_ball_point(inverse.poses.position[home], reach))
         cubes = np.asarray(cubes, dtype=np.intp)
         facing = inverse.poses.rotation[cubes, :, 2] @ inverse.poses.rotation[home, :, 2] > 0.5

@@ -27,7 +27,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ...core.arrays import Array, Index
 from ...core.modes import COMPONENTS
-from ...mechanics.kernels import SIZES
+from ...mechanics.kernels import DISC_SIZES
 from ..inverse import SurfaceInverse
 from ..pad_noise import GAIN_ERROR, pad_stresses
 from ..prior import AMPLITUDE
@@ -180,7 +180,7 @@ def fit(scan: Scan, middles: Array, sizes: Array, alpha: float, steps: int) -> F
     depth, count = scan.kernels.depth, len(middles)
     middles, logs = middles.copy(), np.log(sizes)
     start, farthest = middles.copy(), FARTHEST * scan.pitch
-    low, high = np.log(np.array([SIZES[1], SIZES[-3]]) * depth)
+    low, high = np.log(np.array([DISC_SIZES[1], DISC_SIZES[-3]]) * depth)
     usual = np.log(USUAL_SIZE * depth)
     prior = np.zeros(6 * count)
     prior[5::6] = SIZE_SPREAD**-2

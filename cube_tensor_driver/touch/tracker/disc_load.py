@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 from ...core.arrays import Array
-from ...mechanics.kernels import LENGTHS, SHEAR
+from ...mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO
 from ..prior import AMPLITUDE
 from .disc_fit import Fitted, Scan
 
@@ -66,9 +66,9 @@ def load_of(scan: Scan, fitted: Fitted, j: int) -> Load:
     slopes[3:5, first + 3 : first + 5] = np.eye(2) * (disc_force[2] / pressing)
     slopes[5, first : first + 2] = shift[1], -shift[0]
     # Variance of an integral of what is left, of pressure, per area.
-    density = fitted.alpha**2 * np.mean([2 * np.pi * (l * depth) ** 2 for l in LENGTHS])
+    density = fitted.alpha**2 * np.mean([2 * np.pi * (l * depth) ** 2 for l in PRIOR_LENGTHS])
     levers = [radius**2 / 4 / pressing**2] * 2
-    shape = np.array([SHEAR**2, SHEAR**2, 1.0, *levers, SHEAR**2 * radius**2 / 2])
+    shape = np.array([SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0, *levers, SHEAR_RATIO**2 * radius**2 / 2])
     own = density * np.pi * radius**2 * shape
     weighted = cho_solve(fitted.factor, functionals.T)
     known = np.einsum("fd,df->f", functionals, weighted)

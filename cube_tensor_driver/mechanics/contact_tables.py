@@ -1,0 +1,336 @@
+"""Tables of the stress and gradient at cubes under contacts, fast enough for every simulation step.
+
+`DiscTables` are for round contacts, `PolygonTables` for polygons of uniform traction. Both hold
+circular components (circular.py) of unit loads, and both compute a field in three steps:
+interpolate the tables, weight the unit loads with the loads, rotate the sum into the frame of the
+cube.
+
+A round contact needs R, T and Z over the distance r and the radius of the contact.
+
+A polygon is, as seen from the point of the surface above a cube (the origin O), the sum of the
+triangles between O and its edges; they count negative if O lies outside of the edge. A triangle is
+the difference of two right triangles. One leg of both is the perpendicular of length d from O to
+the line of the edge, in the direction beta; the other leg has the length t along the line. With the
+position q from O, the traction is (v_x, v_y, v_z) + w z x q. A right triangle then has::
+
+    c = exp(i m beta) (A v + B conj(v) + Z v_z + W w),     v = (v_x + i v_y) exp(-i beta)
+
+A, B, Z and W over d and t are integrals of the R, T and Z of a point force. In polar coordinates
+about O, with alpha from the first leg on, the hypotenuse is at r = d / cos(alpha)::
+
+    A = -(-1)^m int exp(i (m-1) alpha) int (R + T) / 2 r dr dalpha
+    B = -(-1)^m int exp(i (m+1) alpha) int (R - T) / 2 r dr dalpha
+    Z =  (-1)^m int exp(i m alpha) int Z r dr dalpha
+    W = -i (-1)^m int exp(i m alpha) int T r^2 dr dalpha
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+from ..core.arrays import Array, Complex, Index, Single
+from .cache import Arrays, load_or_compute
+from .circular import ORDERS, sum_rotated
+from .kernels import POINTS_PER_DEPTH, REACH_DEPTHS, disc_spectrum
+from .layer import Layer
+from .spectra import layer_spectra, tabulate_bessel
+
+CONTACT_SIZES = np.geomspace(0.1, 5.0, 23)
+"""Radii of the tabulated round contacts, divided by the depth. Other radii are rounded to the
+nearest of these, by at most 10 %."""
+
+GRID_STEP = 1 / 16
+"""Step of the polygon tables in asinh(d) and in asinh(t / sqrt(1 + d**2)), with d and t divided by
+the depth. The asinh makes the grid fine near the cube and coarse far away."""
+
+MAX_LEG_RATIO = 50.0
+"""Largest tabulated t / sqrt(1 + d**2), with d and t divided by the depth. Longer legs are cut
+there: beyond it hardly any stress reaches the cube."""
+
+_LAST_RADIUS = REACH_DEPTHS * POINTS_PER_DEPTH
+_GRID_ROWS = int(np.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP)) + 2
+_CENTRE_COLUMN = int(np.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP))
+_GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
+_ORIGIN_TOLERANCE = 1e-12
+
+
+class _ContactTables:
+    """Look-up and summation that both kinds of tables share.
+
+    Args:
+        layer: Elastic layer that contains the cubes.
+        depth: Distance from the centres of the cubes to the surface, in m.
+
+    Raises:
+        ElasticError: The layer does not contain this depth.
+    """
+
+    _kind: str
+    """Name of the cached file."""
+
+    def __init__(self, layer: Layer, depth: float) -> None:
+        layer.check_depth(depth)
+        self.layer = layer
+        self.depth = depth
+        inputs = [layer.thickness, layer.poisson, depth]
+        table = load_or_compute(self._kind, inputs, self._compute)["table"]
+        # One row of real numbers per grid point: a product of real matrices interpolates.
+        self._rows = table.reshape(-1, table.shape[-2] * len(ORDERS)).view(np.float32)
+
+    def _compute(self) -> Arrays:
+        """Return table (grid points ..., unit loads, 14), complex circular components."""
+        raise NotImplementedError
+
+    def _sum_loads(
+        self,
+        weights: Single,
+        rows: Index,
+        loads: Complex,
+        rotation: Complex,
+    ) -> tuple[Array, Array]:
+        """Interpolate the tables and sum the fields of all loads.
+
+        Args:
+            weights: Interpolation weights (N, L, W) of W grid points.
+            rows: Rows (N, L, W) of the tables that hold these grid points.
+            loads: Amplitudes (N, L, unit loads) in the frame in which the tables are given.
+            rotation: exp(i angle) (N, L) of this frame in the frame of the cube.
+
+        Returns:
+            Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m.
+        """
+        neighbours = self._rows.take(rows, axis=0)
+        interpolated = (weights[..., np.newaxis, :] @ neighbours).view(np.complex64)
+        unit_fields = interpolated.reshape(*loads.shape, len(ORDERS))
+
+        amplitudes = loads[..., np.newaxis, :].astype(np.complex64)
+        circular = amplitudes @ unit_fields
+        return sum_rotated(circular[..., 0, :], rotation)
+
+
+class DiscTables(_ContactTables):
+    """Tables of round contacts for cubes at one depth in a layer.
+
+    The first set-up for a depth takes a second or two; cache.py keeps the tables.
+    """
+
+    _kind = "disc_tables"
+
+    def _compute(self) -> Arrays:
+        spectra = layer_spectra(self.layer, self.depth)
+        radii = CONTACT_SIZES * self.depth
+        disc_spectra = np.stack([disc_spectrum(spectra.k * radius) for radius in radii])
+
+        distance = np.arange(_LAST_RADIUS + 2) * self.depth / POINTS_PER_DEPTH
+        bessel = tabulate_bessel(spectra.k, distance)
+        # (radii, distances, R Z T, 14); the tangential force F_t acts with the factor i.
+        table = spectra.radial(bessel, disc_spectra) * np.array([1, 1, 1j])[:, np.newaxis]
+        return {"table": table.astype(np.complex64)}
+
+    def field(
+        self,
+        position: ArrayLike,
+        force: ArrayLike,
+        radius: ArrayLike,
+    ) -> tuple[Array, Array]:
+        """Compute the sum of the fields of L Hertz contacts at N cubes.
+
+        Each contact carries the traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2). Contacts farther
+        away than `REACH_DEPTHS` depths have no effect.
+
+        Args:
+            position: Position (N, L, 2) in m of each cube relative to the centre of the contact, in
+                the frame of the cube.
+            force: Force (N, L, 3) in N on the skin, in the frame of the cube.
+            radius: Radius (L,) of the contacts, in m.
+
+        Returns:
+            Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, in the order xx yy zz yz zx xy,
+            tension positive, as `contact.field` returns them.
+        """
+        offset = _to_complex(np.asarray(position, float))
+        forces = np.asarray(force, float)
+        distance = np.abs(offset)
+        is_centred = distance == 0
+        direction = np.where(
+            is_centred,
+            1.0,
+            offset
+            / np.where(
+                is_centred,
+                1.0,
+                distance,
+            ),
+        )
+
+        polar_force = _to_complex(forces) * direction.conj()  # F_r + i F_t
+        loads = np.stack([polar_force.real, forces[..., 2], polar_force.imag], axis=-1)
+
+        index = distance / self.depth * POINTS_PER_DEPTH
+        is_near = index < _LAST_RADIUS
+        below = np.minimum(index, _LAST_RADIUS - 1).astype(np.intp)
+        fraction = index - below
+        weights = np.stack(
+            [1 - fraction, fraction],
+            axis=-1,
+            dtype=np.float32,
+        )
+        weights *= is_near[..., np.newaxis]
+
+        first_row = self._nearest_size(radius) * (_LAST_RADIUS + 2) + below
+        rows = first_row[..., np.newaxis] + np.array([0, 1])
+        return self._sum_loads(weights, rows, loads.astype(complex), direction)
+
+    def _nearest_size(self, radius: ArrayLike) -> Index:
+        """Return, for each radius in m, the index of the nearest tabulated radius."""
+        size = np.clip(
+            np.asarray(radius, float) / self.depth,
+            CONTACT_SIZES[0],
+            CONTACT_SIZES[-1],
+        )
+        log_step = np.log(CONTACT_SIZES[1] / CONTACT_SIZES[0])
+        steps = np.log(size / CONTACT_SIZES[0]) / log_step
+        nearest: Index = np.rint(steps).astype(np.intp)
+        return nearest
+
+
+class PolygonTables(_ContactTables):
+    """Tables of right triangles, of which polygons are sums, for cubes at one depth in a layer.
+
+    The first set-up for a depth takes a second or two; cache.py keeps the tables.
+    """
+
+    _kind = "polygon_tables"
+
+    def _compute(self) -> Arrays:
+        """Compute A, B, Z and W (rows of d, columns of t, 4, 14) of the module head."""
+        over_distance = self._integrate_distance()
+
+        # Grid of d (rows) and t (columns), divided by the depth.
+        eta = np.arange(-_CENTRE_COLUMN, _CENTRE_COLUMN + 1) * GRID_STEP
+        d = np.sinh(np.arange(_GRID_ROWS) * GRID_STEP)[:, np.newaxis]
+        t = np.hypot(1.0, d) * np.sinh(eta)
+        r = np.hypot(d, t)
+        is_origin = r == 0
+        r_safe = np.where(is_origin, 1.0, r)
+        direction = np.where(
+            is_origin,
+            1.0,
+            (d + 1j * t) / r_safe,
+        )  # exp(i alpha)
+
+        # The integral over alpha becomes one over eta: alpha = atan(t / d), t = t(eta).
+        alpha_slope = d * np.hypot(1.0, d) * np.cosh(eta) / r_safe**2
+        exponents = np.stack([ORDERS - 1, ORDERS + 1, ORDERS, ORDERS])
+        integrand = over_distance(np.minimum(r, REACH_DEPTHS))
+        integrand = integrand * direction[..., np.newaxis, np.newaxis] ** exponents
+        integrand *= alpha_slope[..., np.newaxis, np.newaxis]
+        table = CubicSpline(eta, integrand, axis=1).antiderivative()(eta)
+        table -= table[:, _CENTRE_COLUMN : _CENTRE_COLUMN + 1]  # the integral begins at t = 0
+
+        sign = (-1.0) ** ORDERS * np.array([-1.0, -1.0, 1.0, -1j])[:, np.newaxis]
+        # Lengths were divided by the depth: A, B and Z are areas, W is a volume.
+        unit = self.depth ** np.array([2.0, 2.0, 2.0, 3.0])[:, np.newaxis]
+        return {"table": (table * sign * unit).astype(np.complex64)}
+
+    def _integrate_distance(self) -> CubicSpline:
+        """Return the inner integrals over r of A, B, Z and W, as functions (..., 4, 14) of r."""
+        spectra = layer_spectra(self.layer, self.depth)
+        r = np.arange(_LAST_RADIUS + 2) / POINTS_PER_DEPTH
+        bessel = tabulate_bessel(spectra.k, r * self.depth)
+        point_force = np.ones((1, len(spectra.k)))
+        along, normal, across = spectra.radial(bessel, point_force)[0].swapaxes(0, 1)
+
+        distance = r[:, np.newaxis]
+        a = (along + across) / 2
+        b = (along - across) / 2
+        w = across * distance
+        integrand = np.stack([a, b, normal, w], axis=1) * distance[..., np.newaxis]
+        return CubicSpline(r, integrand).antiderivative()
+
+    def field(
+        self,
+        start: ArrayLike,
+        end: ArrayLike,
+        traction: ArrayLike,
+        twist: ArrayLike,
+    ) -> tuple[Array, Array]:
+        """Compute the sum of the fields of polygons with L edges in total at N cubes.
+
+        Point forces farther away than `REACH_DEPTHS` depths have no effect.
+
+        Args:
+            start: Start (N, L, 2) of each edge relative to the cube, in m, in the frame of the
+                cube. Polygons run counterclockwise as seen from outside of the skin.
+            end: End (N, L, 2) of each edge, likewise.
+            traction: Traction (N, L, 3) in Pa on the skin that the edge's polygon has at the
+                origin, the point of the surface above the cube.
+            twist: Gradient (N, L) in Pa/m of a tangential traction that turns about the origin: at
+                the position q from it, the traction is larger by twist z x q.
+
+        Returns:
+            Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, as `contact.field`.
+        """
+        first = _to_complex(np.asarray(start, float)) / self.depth
+        second = _to_complex(np.asarray(end, float)) / self.depth
+        edge = second - first
+        edge /= np.maximum(np.abs(edge), _ORIGIN_TOLERANCE)
+
+        # In axes along and across the edge, both ends have the coordinates t - i d.
+        local = np.stack([first, second], axis=-1) * edge.conj()[..., np.newaxis]
+        signed_distance = -local[..., 0].imag
+        side = np.where(signed_distance < 0, -1.0, 1.0)
+        direction = -1j * edge * side  # exp(i beta)
+        d = np.abs(signed_distance)
+        t = local.real * side[..., np.newaxis]
+
+        # Triangles that begin beyond the reach of the tables depend on their angle only.
+        shrink = np.minimum(1.0, REACH_DEPTHS / np.maximum(d, REACH_DEPTHS))
+        weights, rows = _triangle_neighbours(d * shrink, t * shrink[..., np.newaxis])
+
+        tractions = np.asarray(traction, float)
+        v = _to_complex(tractions) * direction.conj()
+        loads = np.stack([v, v.conj(), tractions[..., 2], np.asarray(twist, float)], axis=-1)
+        return self._sum_loads(weights, rows, loads, direction)
+
+
+def _to_complex(vectors: Array) -> Complex:
+    """Return x + i y (...) of vectors (..., 2) or (..., 3)."""
+    result: Complex = vectors[..., 0] + 1j * vectors[..., 1]
+    return result
+
+
+def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
+    """Return weights and table rows (..., 8) that give the triangle between two legs t.
+
+    Args:
+        d: Distance (...) of the edge's line, divided by the depth.
+        t: Start and end (..., 2) of the edge along this line, divided by the depth.
+
+    Returns:
+        Weights of bilinear interpolation at four grid points for the start, which are negative, and
+        at four for the end; rows of these grid points.
+    """
+    column = np.arcsinh(t / np.hypot(1.0, d)[..., np.newaxis]) / GRID_STEP + _CENTRE_COLUMN
+    column = np.clip(column, 0, _GRID_COLUMNS - 1 - 1e-6)
+    row = np.arcsinh(d) / GRID_STEP
+    above = row.astype(np.intp)
+    left = column.astype(np.intp)
+
+    down = (row - above)[..., np.newaxis]
+    right = column - left
+    upper = [(1 - down) * (1 - right), (1 - down) * right]
+    lower = [down * (1 - right), down * right]
+    weights = np.stack(
+        upper + lower,
+        axis=-1,
+        dtype=np.float32,
+    )
+    weights[..., 0, :] *= -1
+
+    corners = np.array([0, 1, _GRID_COLUMNS, _GRID_COLUMNS + 1])
+    first = _GRID_COLUMNS * above[..., np.newaxis] + left
+    rows = first[..., np.newaxis] + corners
+    return weights.reshape(*d.shape, 8), rows.reshape(*d.shape, 8)
