@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pygments.lexers.special import TextLexer
 
-from cube_tensor_driver.ros.parameters import CONTACTS, DRIVER, MARKERS, RECONSTRUCTION
+from cube_tensor_driver.config.parameters import CONTACTS, DRIVER, MARKERS, RECONSTRUCTION
 
 project = "cube_tensor_driver"
 author = "the cube_tensor_driver authors"
@@ -100,8 +100,8 @@ def parameter_table() -> str:
         allowed = parameter.choices or {bool: "true, false"}.get(type(parameter.default), "text")
         if parameter.span:
             low, high = parameter.span
-            allowed = f"{parameter.least or low:.12g} to {high:.12g}"
-            allowed = f"0, {allowed}" if parameter.least else allowed
+            allowed = f"{parameter.minimum or low:.12g} to {high:.12g}"
+            allowed = f"0, {allowed}" if parameter.minimum else allowed
         live = "yes" if parameter.live else "no"
         name, text = f"`{parameter.name}`", parameter.description
         rows.append([name, ", ".join(nodes), default.lower(), allowed, live, text])

@@ -219,7 +219,7 @@ def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
 
 def padded_layout(options: argparse.Namespace) -> Layout:
     """The layout with the pads that are asked for. ElasticError: they do not fit."""
-    from cube_tensor_driver.config.layout import named_layout
+    from cube_tensor_driver.config.calibration import named_layout
     from cube_tensor_driver.core.errors import ElasticError, LayoutError
 
     from ..fem.body import strip_layout

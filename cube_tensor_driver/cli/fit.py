@@ -69,8 +69,7 @@ def run(options: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from ..calibrate.fit import fit, measured_stress
-    from ..config.calibration import write_calibration
-    from ..config.layout import named_layout
+    from ..config.calibration import named_layout, write_calibration
     from ..config.output_files import write_json
     from ..core.symmetry import find_structure
     from ..views.figures.calibration import draw_fit
@@ -114,8 +113,7 @@ def read_inputs(
     from ..bags.read import is_bag
     from ..calibrate.load_table import read_loads, unloaded
     from ..calibrate.recorded_loads import bag_loads
-    from ..config.calibration import find_calibration, read_calibration
-    from ..config.layout import shipped_calibration
+    from ..config.calibration import find_calibration, read_calibration, shipped_calibration
     from ..core.errors import ConfigError
 
     base = shipped_calibration(layout)

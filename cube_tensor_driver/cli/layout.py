@@ -34,8 +34,12 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..config.calibration import find_calibration, read_calibration
-    from ..config.layout import named_layout, shipped_calibration
+    from ..config.calibration import (
+        find_calibration,
+        named_layout,
+        read_calibration,
+        shipped_calibration,
+    )
     from ..config.output_files import write_json
     from ..core.estimator import summarize_response
     from ..core.response import generic_response

@@ -194,8 +194,8 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
             or a value.
     """
     from ..bags.reprocess.contacts import ContactsOverTime
+    from ..config.parameters import CONTACTS
     from ..core.errors import ConfigError
-    from ..ros.parameters import CONTACTS
     from ..touch.contact_finder import ContactSettings
 
     if options.contacts is None:

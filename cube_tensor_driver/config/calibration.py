@@ -1,21 +1,28 @@
-"""Calibration files: a `core.calibration.Calibration` as YAML."""
+"""Calibration and layout files: `Calibration` and `Layout` of `core` as YAML."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from ..core.calibration import Calibration
 from ..core.errors import CalibrationError, ConfigError
+from ..core.layout import LAYOUTS, Layout, find_layout
+from .output_files import YAML_SUFFIXES
 from .package_data import package_data
 from .yaml import read_yaml, to_yaml, write_yaml
 
 
 def find_calibration(name: str, folder: Path) -> Path:
-    """The calibration file that `name` means.
+    """Return the path of the calibration file that a name means.
 
-    That is the name of one of the calibrations in the package, or else a path relative to `folder`
-    (where the skin file is). Raises ConfigError if there is neither, and lists these names. A name
-    comes first: a folder may well have a program called cube.
+    Args:
+        name: Name of one of the calibrations in the package, or else a path relative to `folder`.
+            The shipped name comes first, because a folder may well have a program called cube.
+        folder: The folder of the skin file that contains the name.
+
+    Raises:
+        ConfigError: There is neither. The message lists the shipped names.
     """
     shipped = package_data() / "config" / "calibration"
     for path in (shipped / f"{name}.yaml", folder / name):
@@ -30,7 +37,8 @@ def find_calibration(name: str, folder: Path) -> Path:
 def read_calibration(path: Path) -> Calibration:
     """Read and check a calibration file.
 
-    Raises ConfigError if it cannot be read, or if `Calibration.from_dict` refuses its content.
+    Raises:
+        ConfigError: The file cannot be read, or `Calibration.from_dict` refuses its content.
     """
     try:
         return Calibration.from_dict(read_yaml(path))
@@ -39,13 +47,44 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def write_calibration(path: Path, calibration: Calibration, header: str = "") -> None:
-    """Write a calibration file, completely or not at all. Raises ConfigError if it cannot.
+    """Write a calibration file, completely or not at all.
 
-    header: comment lines at the top of the file.
+    Args:
+        path: The file, which is replaced if it exists.
+        calibration: The calibration.
+        header: Lines for a comment at the top of the file.
+
+    Raises:
+        ConfigError: The file cannot be written.
     """
     write_yaml(path, calibration.to_dict(), header)
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """The content of the calibration's file."""
+    """Return the text of a calibration file."""
     return to_yaml(calibration.to_dict())
+
+
+def named_layout(name: str) -> Layout:
+    """Return a built-in layout by its name, or the layout in a YAML file.
+
+    Raises:
+        LayoutError: There is no built-in layout of this name, or the file holds none.
+        ConfigError: The file cannot be read.
+    """
+    path = Path(name)
+    if path.suffix in YAML_SUFFIXES:
+        return Layout.from_dict(read_yaml(path))
+    return find_layout(name)
+
+
+def shipped_calibration(layout: Layout) -> Calibration | None:
+    """Return the computed calibration of a built-in layout with no mode neglected.
+
+    Other layouts have none, and give None.
+    """
+    built_in = LAYOUTS.get(layout.name)
+    if built_in is None or not built_in.same_as(layout):
+        return None
+    path = package_data() / "config" / "calibration" / f"{layout.name}.yaml"
+    return replace(read_calibration(path), neglect=())

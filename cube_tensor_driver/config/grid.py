@@ -6,10 +6,11 @@ from typing import Any
 
 from ..core.errors import ConfigError
 
-MOST_CUBES = 1 << 16
-"""Messages number cubes with 16 bits."""
-PLACE = "{}"
-"""In a port, for the number of the link."""
+MAX_CUBES = 1 << 16
+"""Maximum number of cubes of a skin. Messages number cubes with 16 bits."""
+
+LINK_NUMBER = "{}"
+"""Placeholder in a port that stands for the number of the link."""
 
 
 def grid(
@@ -24,58 +25,68 @@ def grid(
     layout: str = "planar",
     port: str = "/dev/ttyACM{}",
 ) -> dict[str, Any]:
-    """The content of a skin file with nx × ny cubes in the x-y plane of the parent frame.
+    """Return the content of a skin file with nx × ny cubes in the x-y plane of the parent frame.
 
-    The grid is centred on the frame's origin; x runs fastest. pitch: distance of neighbours, m.
-    rate: samples per second. The links carry equally many cubes, or one more, in order. port: the
-    port of each link, where {} stands for the number of the link. calibration: file or name;
-    None: that of the package for the layout.
+    The grid is centred on the frame's origin, and x runs fastest.
 
-    Raises ConfigError if a number is not greater than 0, if there are more links than cubes or
-    more cubes than messages can number, or if all links would have one port.
+    Args:
+        name: Name of the skin.
+        nx: Number of cubes along x.
+        ny: Number of cubes along y.
+        pitch: Distance of neighbours, in m.
+        rate: Samples per second.
+        links: Number of links. They carry equally many cubes, or one more, in order.
+        calibration: Calibration of the cubes, a file or a name; None: the package's for the layout.
+        layout: Layout of the cubes.
+        port: Port of each link, where {} stands for the number of the link.
+
+    Raises:
+        ConfigError: A number is not greater than 0, there are more links than cubes or more cubes
+            than `MAX_CUBES`, or all links would have one port.
     """
-    numbers = {"nx": nx, "ny": ny, "pitch": pitch, "links": links, "rate": rate}
-    for what, value in numbers.items():
-        if value <= 0:
-            raise ConfigError(f"grid: {what} is {value}, must be greater than 0")
-    count = nx * ny
-    if links > count:
-        raise ConfigError(f"grid: {links} links for {count} cubes; use at most one link per cube")
-
-    if count > MOST_CUBES:
+    n_cubes = nx * ny
+    _check_numbers(nx=nx, ny=ny, pitch=pitch, links=links, rate=rate)
+    if links > n_cubes:
+        raise ConfigError(f"grid: {links} links for {n_cubes} cubes; use at most one link per cube")
+    if n_cubes > MAX_CUBES:
         raise ConfigError(
-            f"grid: {nx} x {ny} are {count} cubes, a skin has at most {MOST_CUBES}: "
+            f"grid: {nx} x {ny} are {n_cubes} cubes, a skin has at most {MAX_CUBES}: "
             "make several skins"
         )
-    if links > 1 and PLACE not in port:
+    if links > 1 and LINK_NUMBER not in port:
         raise ConfigError(
-            f"grid: the port {port!r} is that of all {links} links; write {PLACE} where the number "
-            "of the link belongs"
+            f"grid: the port {port!r} is that of all {links} links; write {LINK_NUMBER} where the "
+            "number of the link belongs"
         )
 
-    digits = len(str(count - 1))
+    digits = len(str(n_cubes - 1))
     cubes = []
-    for number in range(count):
-        link = number * links // count
-        first_of_link = -(-link * count // links)
+    for number in range(n_cubes):
+        link = number * links // n_cubes
+        first_of_link = -(-link * n_cubes // links)  # rounded up
         x = (number % nx - (nx - 1) / 2) * pitch
         y = (number // nx - (ny - 1) / 2) * pitch
-        cubes.append(
-            {
-                "name": f"c{number:0{digits}d}",
-                "link": f"hub{link}",
-                "index": number - first_of_link,
-                "pose": {"xyz": [round(x, 9), round(y, 9), 0.0], "rpy": [0.0, 0.0, 0.0]},
-                "layout": layout,
-                "calibration": calibration or layout,
-            }
-        )
+        cube = {
+            "name": f"c{number:0{digits}d}",
+            "link": f"hub{link}",
+            "index": number - first_of_link,
+            "pose": {"xyz": [round(x, 9), round(y, 9), 0.0], "rpy": [0.0, 0.0, 0.0]},
+            "layout": layout,
+            "calibration": calibration or layout,
+        }
+        cubes.append(cube)
+
+    ports = [port.replace(LINK_NUMBER, str(link)) for link in range(links)]
     return {
         "name": name,
         "parent_frame": f"{name}_base",
         "rate": rate,
-        "links": [
-            {"name": f"hub{link}", "port": port.replace(PLACE, str(link))} for link in range(links)
-        ],
+        "links": [{"name": f"hub{link}", "port": port} for link, port in enumerate(ports)],
         "cubes": cubes,
     }
+
+
+def _check_numbers(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if value <= 0:
+            raise ConfigError(f"grid: {name} is {value}, must be greater than 0")

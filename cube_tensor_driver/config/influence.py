@@ -9,9 +9,13 @@ from .package_data import package_data
 
 
 def find_influence(name: str) -> Path:
-    """The file of influence functions that `name` means: a shipped one, or a path.
+    """Return the path of the influence functions that a name means.
 
-    Raises ConfigError if there is neither, and lists the shipped ones.
+    Args:
+        name: Name of a shipped file, or else a path.
+
+    Raises:
+        ConfigError: There is neither. The message lists the shipped names.
     """
     shipped = package_data() / "config" / "influence"
     for path in (shipped / f"{name}.npz", Path(name)):
@@ -25,7 +29,7 @@ def find_influence(name: str) -> Path:
 
 
 def influence_problem(name: str) -> str:
-    """Why `find_influence` finds nothing, in words; empty if it does."""
+    """Return why `find_influence` finds nothing for a name, or an empty text if it does."""
     try:
         find_influence(name)
     except ConfigError as error:

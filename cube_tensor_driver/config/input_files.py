@@ -1,4 +1,4 @@
-"""Input files of any kind, read with a bound on memory and time."""
+"""Input files of any kind, read only if they are regular files and up to a maximum size."""
 
 from __future__ import annotations
 
@@ -11,45 +11,36 @@ from ..core.errors import ConfigError
 
 
 def check_regular(path: Path) -> None:
-    """Raise ConfigError if the path leads to something else than a file of a disk.
+    """Raise ConfigError if the path leads to a device, a pipe or a socket.
 
-    A device has no end, and opening a pipe waits for a writer. OSError: nothing is
-    there, or it cannot be looked at.
+    A device such as /dev/zero has no end, and opening a pipe waits for a writer.
+
+    Raises:
+        OSError: Nothing is there, it is a folder, or it cannot be looked at.
     """
-    _check_mode(path, path.stat().st_mode)
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(mode):
+        raise ConfigError(f"{path}: a device, a pipe or a socket; name a regular file")
 
 
 def read_bounded(path: Path, limit: int, purpose: str) -> bytes:
-    """The bytes of a regular file, never more than `limit` of them, and without waiting.
+    """Return the bytes of a regular file.
 
-    purpose: what the file should be, for the message. ConfigError: no regular file, or larger.
-    OSError: nothing is there, or it cannot be read.
+    Args:
+        path: The file.
+        limit: Maximum size, in bytes.
+        purpose: What the file should be, for the error message.
+
+    Raises:
+        ConfigError: The path leads to no regular file, or the file is larger than the limit.
+        OSError: Nothing is there, or it cannot be read.
     """
-    # Looked at before it is opened, because opening alone moves some devices, and afterwards too,
-    # because another file may have taken its place.
     check_regular(path)
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
-        _check_mode(path, status.st_mode)
-        # The size is not enough: files of /proc say 0.
-        data = b"" if status.st_size > limit else file.read(limit + 1)
-    size = max(len(data), status.st_size)
-    if size > limit:
-        raise ConfigError(f"{path}: {size} bytes, the limit is {limit}: this is no {purpose}")
+    with path.open("rb") as file:
+        # The size that the system states is 0 for files of /proc, so one byte more is asked for.
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise ConfigError(f"{path}: too large, the limit is {limit} bytes: this is no {purpose}")
     return data
-
-
-def _check_mode(path: Path, mode: int) -> None:
-    if stat.S_ISREG(mode):
-        return
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    names = {
-        stat.S_IFIFO: "a pipe",
-        stat.S_IFSOCK: "a socket",
-        stat.S_IFCHR: "a device",
-        stat.S_IFBLK: "a device",
-    }
-    found = names.get(stat.S_IFMT(mode), "no file")
-    raise ConfigError(f"{path}: {found}, needed is a regular file; name one that can be read")

@@ -1,4 +1,4 @@
-"""Where the files are that the package brings along: shipped skins, calibrations, launch files."""
+"""The folder of the files that the package brings along: skins, calibrations, launch files."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ _NAME = "cube_tensor_driver"
 
 
 def package_data() -> Path:
-    """The folder that holds config/ and launch/.
+    """Return the folder that holds config/ and launch/.
 
     In a checkout it is the checkout itself, after an installation share/cube_tensor_driver.
 
-    Raises ConfigError if there is neither, which means that the installation is broken.
+    Raises:
+        ConfigError: There is neither, which means that the installation is broken.
     """
     for parent in Path(__file__).parents:
         for folder in (parent, parent / "share" / _NAME):

@@ -1,4 +1,4 @@
-"""Poses that no skin has: what can be read, but is most likely a slip of the hand."""
+"""Doubts about the poses of a skin: they can be read, but are most likely a slip of the hand."""
 
 from __future__ import annotations
 
@@ -6,50 +6,66 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ..core.arrays import Array
 from .skin import Skin
 
-FARTHEST_M = 5.0
-"""From the parent frame. Cubes are millimetres wide: a skin beyond that was typed in mm."""
-APART_M = 1.0
-"""Neighbours in a skin of at least FEWEST cubes are closer than that."""
-FEWEST = 3
-MOST_COMPARED = 500
-"""Cubes of which each is compared with each."""
-SAME_M = 1e-6
-"""Cubes so close are at one place."""
+MAX_DISTANCE_M = 5.0
+"""Largest credible distance, in m, of a cube from the origin of the parent frame along an axis.
+
+Cubes are millimetres wide, so a skin that reaches farther was most likely typed in mm.
+"""
+
+MAX_SPACING_M = 1.0
+"""Largest credible distance, in m, between the two closest cubes of a skin."""
+
+MIN_SPACED_CUBES = 3
+"""Minimum number of cubes for which their spacing is checked. Two may well be far apart."""
+
+MAX_SPACED_CUBES = 500
+"""Maximum number of cubes for which their spacing is checked, as every pair is compared."""
+
+POSITION_RESOLUTION_M = 1e-6
+"""Cubes closer than this, in m, count as being at one position."""
+
+MAX_NAMES = 4
+"""Maximum number of cubes at one position that a message names."""
 
 
 def pose_doubts(skin: Skin) -> Iterator[str]:
-    """One line for each doubt about the poses of the cubes."""
-    xyz = np.array([cube.xyz for cube in skin.cubes])
-    yield from _at_one_place(skin, xyz)
-    if _in_millimetres(xyz):
-        farthest = int(np.abs(xyz).max(axis=1).argmax())
-        place = ", ".join(f"{value:g}" for value in skin.cubes[farthest].xyz)
+    """Yield one line for each doubt about the poses of the cubes."""
+    positions = np.array([cube.xyz for cube in skin.cubes])
+    yield from _find_shared_positions(skin, positions)
+    if _seems_in_millimetres(positions):
+        farthest = int(np.abs(positions).max(axis=1).argmax())
+        cube = skin.cubes[farthest]
         yield (
-            f"cubes: {skin.cubes[farthest].name!r} is at [{place}] m, where no skin reaches: "
+            f"cubes: {cube.name!r} is at [{_format(cube.xyz)}] m, where no skin reaches: "
             "xyz is in m; divide by 1000 what was typed in mm"
         )
 
 
-def _at_one_place(skin: Skin, xyz: np.ndarray) -> Iterator[str]:
-    """Cubes whose positions are equal: at most one cube can be there."""
-    _, place, count = np.unique(
-        np.round(xyz / SAME_M), axis=0, return_inverse=True, return_counts=True
-    )
-    place = place.reshape(-1)
+def _find_shared_positions(skin: Skin, positions: Array) -> Iterator[str]:
+    """Yield a line for each position with several cubes, because at most one can be there."""
+    rounded = np.round(positions / POSITION_RESOLUTION_M)
+    _, group, count = np.unique(rounded, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)  # numpy 2.0 alone gives it a second axis
     for number in np.flatnonzero(count > 1).tolist():
-        members = np.flatnonzero(place == number).tolist()
-        names = [repr(skin.cubes[member].name) for member in members[:4]]
-        others = f" and {len(members) - 4} more" if len(members) > 4 else ""
-        where = ", ".join(f"{value:g}" for value in skin.cubes[members[0]].xyz)
-        yield f"cubes: {', '.join(names)}{others} are at one place, [{where}] m; correct xyz"
+        members = [skin.cubes[member] for member in np.flatnonzero(group == number)]
+        names = ", ".join(repr(cube.name) for cube in members[:MAX_NAMES])
+        if len(members) > MAX_NAMES:
+            names += f" and {len(members) - MAX_NAMES} more"
+        yield f"cubes: {names} are at one place, [{_format(members[0].xyz)}] m; correct xyz"
 
 
-def _in_millimetres(xyz: np.ndarray) -> bool:
-    if np.abs(xyz).max() > FARTHEST_M:
+def _seems_in_millimetres(positions: Array) -> bool:
+    if np.abs(positions).max() > MAX_DISTANCE_M:
         return True
-    if not FEWEST <= len(xyz) <= MOST_COMPARED:
+    if not MIN_SPACED_CUBES <= len(positions) <= MAX_SPACED_CUBES:
         return False
-    apart = np.linalg.norm(xyz[:, None] - xyz, axis=2)
-    return bool(apart[~np.eye(len(xyz), dtype=bool)].min() > APART_M)
+    distance = np.linalg.norm(positions[:, np.newaxis] - positions, axis=2)
+    np.fill_diagonal(distance, np.inf)
+    return bool(distance.min() > MAX_SPACING_M)
+
+
+def _format(xyz: tuple[float, float, float]) -> str:
+    return ", ".join(f"{value:g}" for value in xyz)

@@ -10,26 +10,37 @@ from .package_data import package_data
 from .skin import Skin
 from .yaml import read_yaml
 
-DISTANCE, LEAST_DISTANCE = 1.5, 0.05
-"""Of the camera: in diagonals of the skin with its legend, and at least, in m."""
-LEGEND = 0.8
-"""Height of the legend of `markers`, below the skin, in widths of the skin."""
+CAMERA_DISTANCE = 1.5
+"""Distance of the camera from the skin, in diagonals of the skin with its legend."""
+
+MIN_CAMERA_DISTANCE_M = 0.05
+"""Minimum distance of the camera, in m. A single cube has no diagonal."""
+
+LEGEND_HEIGHT = 0.8
+"""Height of the legend of `markers`, which is drawn below the skin, in widths of the skin."""
 
 
 def rviz_view(skin: Skin) -> dict[str, Any]:
-    """rviz/skin.rviz as it fits this skin: its parent frame, a view of all of it, and the wrench of
-    the cube in its middle."""
+    """Return the content of rviz/skin.rviz, fitted to a skin.
+
+    It has the skin's parent frame, a view of the whole skin, and the wrench of its central cube.
+    """
+    positions = np.array([cube.xyz for cube in skin.cubes])
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    to_centre = np.linalg.norm(positions - (low + high) / 2, axis=1)
+    central_cube = skin.cubes[int(to_centre.argmin())]
+
+    # The legend stands beside the skin, towards -y.
+    low[1] -= LEGEND_HEIGHT * (high[0] - low[0])
+    diagonal = float(np.linalg.norm(high - low))
+    focal_point = (low + high) / 2
+
     view: dict[str, Any] = read_yaml(package_data() / "rviz" / "skin.rviz")
     manager = view["Visualization Manager"]
-    position = np.array([cube.xyz for cube in skin.cubes])
-    low, high = position.min(axis=0), position.max(axis=0)
-    middle = skin.cubes[int(np.linalg.norm(position - (low + high) / 2, axis=1).argmin())]
-    low[1] -= LEGEND * (high[0] - low[0])
-    centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
     manager["Global Options"]["Fixed Frame"] = skin.parent_frame
     displays = {display["Name"]: display for display in manager["Displays"]}
-    displays["Wrench"]["Topic"]["Value"] = f"cubes/{middle.name}/wrench"
+    displays["Wrench"]["Topic"]["Value"] = f"cubes/{central_cube.name}/wrench"
     camera = manager["Views"]["Current"]
-    camera["Focal Point"] = dict(zip("XYZ", centre.tolist(), strict=True))
-    camera["Distance"] = max(LEAST_DISTANCE, DISTANCE * size)
+    camera["Focal Point"] = dict(zip("XYZ", focal_point.tolist(), strict=True))
+    camera["Distance"] = max(MIN_CAMERA_DISTANCE_M, CAMERA_DISTANCE * diagonal)
     return view

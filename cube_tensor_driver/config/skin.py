@@ -1,5 +1,7 @@
-"""Skin files: which links there are, which cubes they carry, where these sit and how they are
-calibrated. docs/config.md describes the keys."""
+"""Skin files: the links of a skin, the cubes that they carry, their poses and calibrations.
+
+docs/config.md describes the keys.
+"""
 
 from __future__ import annotations
 
@@ -14,36 +16,27 @@ from ..core.calibration import Calibration
 from ..core.errors import ConfigError, CubeError
 from .calibration import find_calibration, read_calibration
 from .port import port_problem
-from .schema import NAME, TEXT, TRIPLE, Schema, list_of, mapping, real
+from .schema import NAME, TEXT, TRIPLE, JsonSchema, Schema, integer, list_of, mapping, real
 from .yaml import read_yaml
 
 BAUD = 921_600
+"""Bits per second of a serial port for which the skin file gives no number."""
 
-_FRAME = {
+_FRAME: JsonSchema = {
     "type": "string",
     "pattern": r"^[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z",
     "description": "a frame id of letters, digits, _ and /, a letter first",
 }
 # Labels on cubes give uids in hexadecimal, so a text such as 0x1f is allowed.
-_UID = {
+_UID: JsonSchema = {
     "anyOf": [
         {"type": "integer", "minimum": 1, "maximum": 2**64 - 1},
         {"type": "string", "pattern": r"^0x(?!0+\Z)[0-9a-fA-F]{1,16}\Z"},
     ],
     "description": "a uid: 1 to 2^64 - 1, or hexadecimal as in 0x1f",
 }
-_INDEX = {
-    "type": "integer",
-    "minimum": 0,
-    "maximum": 65535,
-    "description": "an integer from 0 to 65535",
-}
-_BAUD = {
-    "type": "integer",
-    "minimum": 1200,
-    "maximum": 20_000_000,
-    "description": "1200 to 20000000",
-}
+_INDEX = integer(0, 65535, "an integer from 0 to 65535")
+_BAUD = integer(1200, 20_000_000, "1200 to 20000000")
 _LINK = mapping(("name", "port"), {"name": NAME, "port": TEXT, "baud": _BAUD, "hub_uid": _UID})
 _CUBE = mapping(
     ("name", "pose", "layout", "calibration"),
@@ -75,8 +68,11 @@ _SCHEMA = Schema(
 class SkinLink:
     """A link of a skin.
 
-    port: device path, pattern of device paths, or socket://host:port. hub_uid: uid of the hub that
-    must answer there; None: any hub may.
+    Attributes:
+        name: Its name.
+        port: Device path, pattern of device paths, or socket://host:port.
+        baud: Bits per second of a serial port.
+        hub_uid: Uid of the hub that must answer at the port; None: any hub may.
     """
 
     name: str
@@ -87,11 +83,16 @@ class SkinLink:
 
 @dataclass(frozen=True)
 class SkinCube:
-    """A cube of a skin.
+    """A cube of a skin, recognised by its uid, or by its link and its index in the hub.
 
-    It is recognised by its uid, or by its link and its index in the hub; what is not used is None.
-    xyz, m, and rpy, rad, are its pose in the parent frame of the skin; rpy are rotations about the
-    fixed axes x, y, z (REP 103).
+    Attributes:
+        name: Its name.
+        link: Name of its link; None: any link.
+        index: Its index among the cubes of its hub; None: the uid tells.
+        uid: Its uid; None: link and index tell.
+        xyz: Position of its centre in the parent frame of the skin, in m.
+        rpy: Rotations about the fixed axes x, y and z of the parent frame (REP 103), in rad.
+        calibration: Its calibration.
     """
 
     name: str
@@ -103,12 +104,16 @@ class SkinCube:
     calibration: Calibration
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Skin:
-    """All cubes of one configuration file, in the order of the file.
+    """All cubes of one skin file.
 
-    This order is what `cube` in rows and messages counts. parent_frame: the frame that poses refer
-    to. rate: samples per second to ask of the hubs; None leaves it to them.
+    Attributes:
+        name: Its name.
+        parent_frame: The frame that poses refer to.
+        rate: Samples per second to ask of the hubs; None leaves it to them.
+        links: The links, in the order of the file.
+        cubes: The cubes, in the order of the file. Rows and messages number them in this order.
     """
 
     name: str
@@ -117,77 +122,91 @@ class Skin:
     links: tuple[SkinLink, ...]
     cubes: tuple[SkinCube, ...]
 
+    def __repr__(self) -> str:
+        layouts = ", ".join(sorted({one.layout.name for one in self.calibrations}))
+        rate = "" if self.rate is None else f", {self.rate:g} Hz"
+        sizes = f"{len(self.cubes)} cubes ({layouts}) on {len(self.links)} links"
+        return f"<Skin {self.name!r}: {sizes}{rate}>"
+
     @property
     def names(self) -> tuple[str, ...]:
-        """The name of each cube."""
+        """Name of each cube."""
         return tuple(cube.name for cube in self.cubes)
 
     @property
     def calibrations(self) -> tuple[Calibration, ...]:
-        """The calibration of each cube; cubes with the same file share one object."""
+        """Calibration of each cube. Cubes with the same file share one object."""
         return tuple(cube.calibration for cube in self.cubes)
 
     @property
     def n_pads(self) -> int:
-        """The width of a row: the number of pads of the cube that has most."""
+        """Width of a row: the largest number of pads of a cube."""
         return max(calibration.layout.n_pads for calibration in self.calibrations)
 
     def frame(self, cube: SkinCube) -> str:
-        """The frame id of a cube."""
+        """Return the frame id of a cube."""
         return f"{self.name}_{cube.name}"
 
 
 def read_skin(path: str | Path) -> Skin:
-    """Read a skin file (YAML) with the calibrations it names, and check both.
+    """Read a skin file (YAML) with the calibrations that it names, and check both.
 
-    docs/config.md describes the keys. Nothing is opened and nothing is started: ports are only
-    names here.
+    docs/config.md describes the keys. Ports are only names here: nothing is opened.
 
-    path: the skin file. Calibration files are looked up relative to its folder, then among those
-    of the package.
+    Args:
+        path: The skin file. Calibration files are looked up relative to its folder, then among
+            those of the package.
 
-    Returns the skin: links and cubes in the order of the file, poses in m and rad, the rate in
-    samples per second.
+    Returns:
+        The links and cubes in the order of the file.
 
-    Raises ConfigError if the file cannot be read or has mistakes. The text names the file, the key
-    of the first mistake, what was found and what is allowed, and how many more mistakes there are;
-    `check_skin` gives them all.
+    Raises:
+        ConfigError: The file cannot be read or has mistakes. The message names the file, the key of
+            the first mistake, what was found and what is allowed, and how many more mistakes there
+            are; `check_skin` gives them all.
     """
     path = Path(path)
     skin, mistakes = check_skin(path)
-    if skin is None:
-        others = len(mistakes) - 1
-        more = f" (and {others} more: ./cube config check {path})" if others else ""
-        raise ConfigError(f"{path}: {mistakes[0]}{more}")
-    return skin
+    if skin is not None:
+        return skin
+    others = len(mistakes) - 1
+    more = f" (and {others} more: ./cube config check {path})" if others else ""
+    raise ConfigError(f"{path}: {mistakes[0]}{more}")
 
 
 def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
-    """The skin of a file and no mistakes; or None and all mistakes, one line each.
+    """Return the skin of a file and no mistakes, or None and all mistakes, one line each.
 
-    Entries beside a malformed one are checked as well. Raises ConfigError if the file cannot be
-    read or is not YAML.
+    Entries beside a malformed one are checked as well.
+
+    Raises:
+        ConfigError: The file cannot be read or is not YAML.
     """
     return check_skin_data(read_yaml(path), path.parent)
 
 
 def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
-    """As `check_skin`, of the content of a file that is or will be in `folder`."""
-    found = _SCHEMA.mistakes(data)
-    mistakes = [line for _, line in found]
+    """Check the content of a skin file as `check_skin` does.
+
+    Args:
+        data: The content, as plain values.
+        folder: The folder in which the file is or will be.
+    """
+    schema_mistakes = _SCHEMA.mistakes(data)
+    mistakes = [line for _, line in schema_mistakes]
     if not isinstance(data, dict):
         return None, mistakes
     if not isinstance(data.get("links"), list) or not isinstance(data.get("cubes"), list):
         return None, mistakes
-    # ("cubes", 3) for a mistake anywhere in cubes[3].
-    malformed = {where[:2] for where, _ in found}
+    # ("cubes", 3) stands for a mistake anywhere in cubes[3].
+    malformed = {where[:2] for where, _ in schema_mistakes}
 
     links = tuple(
-        SkinLink(item["name"], item["port"], item.get("baud", BAUD), _uid(item.get("hub_uid")))
+        SkinLink(item["name"], item["port"], item.get("baud", BAUD), _parse_uid(item, "hub_uid"))
         for number, item in enumerate(data["links"])
         if ("links", number) not in malformed
     )
-    mistakes += _link_mistakes(links)
+    mistakes += _find_link_mistakes(links)
 
     # Where a link is malformed its name is unknown, so no cube can be blamed for naming it.
     all_links_known = len({link.name for link in links}) == len(data["links"])
@@ -197,8 +216,9 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
             reader.read(number, item)
     cubes = tuple(reader.cubes)
     mistakes += reader.mistakes
-    mistakes += _cube_mistakes(cubes)
-    mistakes += _pad_mistakes(links, cubes)
+    mistakes += _find_cube_mistakes(cubes)
+    mistakes += _find_pad_mistakes(links, cubes)
+
     if mistakes:
         return None, mistakes
     rate = None if data.get("rate") is None else float(data["rate"])
@@ -206,12 +226,15 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
 
 
 class _CubeReader:
-    """Makes cubes of the entries of a file, and reads each calibration once.
+    """Makes cubes of the entries of a skin file, and reads each calibration once.
 
-    links: the names of the links; None: not all of them are known.
+    Attributes:
+        cubes: The cubes so far.
+        mistakes: The mistakes so far, one line each.
     """
 
     def __init__(self, folder: Path, links: list[str] | None) -> None:
+        """Make a reader for a file in `folder`; `links` is None if some names are unknown."""
         self.cubes: list[SkinCube] = []
         self.mistakes: list[str] = []
         self._folder = folder
@@ -219,26 +242,26 @@ class _CubeReader:
         self._calibrations: dict[str, Calibration | None] = {}
 
     def read(self, number: int, item: dict[str, Any]) -> None:
-        calibration = self._calibration(number, item["calibration"])
+        """Add the cube of the entry `cubes[number]`, or the mistakes in it."""
+        calibration = self._read_calibration(number, item["calibration"])
         if calibration is None:
             return
-        uid = _uid(item.get("uid"))
-        for line in self._contradictions(item, uid, calibration):
+        uid = _parse_uid(item, "uid")
+        for line in self._find_contradictions(item, uid, calibration):
             self.mistakes.append(f"cubes[{number}]{line}")
-        self.cubes.append(
-            SkinCube(
-                name=item["name"],
-                link=item.get("link"),
-                index=item.get("index"),
-                uid=uid,
-                xyz=_triple(item["pose"]["xyz"]),
-                rpy=_triple(item["pose"]["rpy"]),
-                calibration=calibration,
-            )
+        cube = SkinCube(
+            name=item["name"],
+            link=item.get("link"),
+            index=item.get("index"),
+            uid=uid,
+            xyz=_to_triple(item["pose"]["xyz"]),
+            rpy=_to_triple(item["pose"]["rpy"]),
+            calibration=calibration,
         )
+        self.cubes.append(cube)
 
-    def _calibration(self, number: int, name: str) -> Calibration | None:
-        """None after an error, which is reported once, with the first cube that names it."""
+    def _read_calibration(self, number: int, name: str) -> Calibration | None:
+        """Return None after an error, which is reported once, with the first cube that names it."""
         if name not in self._calibrations:
             try:
                 self._calibrations[name] = read_calibration(find_calibration(name, self._folder))
@@ -247,10 +270,10 @@ class _CubeReader:
                 self.mistakes.append(f"cubes[{number}].calibration: {error}")
         return self._calibrations[name]
 
-    def _contradictions(
+    def _find_contradictions(
         self, item: dict[str, Any], uid: int | None, calibration: Calibration
     ) -> Iterator[str]:
-        """Keys of one cube that contradict each other or the rest of the file."""
+        """Yield keys of one cube that contradict each other or the rest of the file."""
         link, index = item.get("link"), item.get("index")
         if link is not None and self._links is not None and link not in self._links:
             allowed = ", ".join(sorted(self._links))
@@ -275,29 +298,29 @@ class _CubeReader:
             )
 
 
-def _link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
+def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
     for link in links:
         problem = port_problem(link.port)
         if problem:
             yield f"links: port of {link.name}: {problem}"
-    yield from _repeated("links", "name", [repr(link.name) for link in links])
+    yield from _find_repeated("links", "name", [repr(link.name) for link in links])
     hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
-    yield from _repeated("links", "hub_uid", hub_uids)
-    # Each match of a pattern is tried: two links may share one.
+    yield from _find_repeated("links", "hub_uid", hub_uids)
+    # Each match of a pattern is tried, so two links may share a pattern.
     ports = [repr(link.port) for link in links if "://" in link.port or not has_magic(link.port)]
-    yield from _repeated("links", "port", ports)
+    yield from _find_repeated("links", "port", ports)
 
 
-def _cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:
-    yield from _repeated("cubes", "name", [repr(cube.name) for cube in cubes])
+def _find_cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:
+    yield from _find_repeated("cubes", "name", [repr(cube.name) for cube in cubes])
     uids = [hex(cube.uid) for cube in cubes if cube.uid is not None]
-    yield from _repeated("cubes", "uid", uids)
-    positions = [f"{cube.link!r}, {cube.index}" for cube in cubes if cube.index is not None]
-    yield from _repeated("cubes", "link and index", positions)
+    yield from _find_repeated("cubes", "uid", uids)
+    addresses = [f"{cube.link!r}, {cube.index}" for cube in cubes if cube.index is not None]
+    yield from _find_repeated("cubes", "link and index", addresses)
 
 
-def _pad_mistakes(links: tuple[SkinLink, ...], cubes: tuple[SkinCube, ...]) -> Iterator[str]:
-    """A frame of a hub has the same number of pads for each of its cubes."""
+def _find_pad_mistakes(links: tuple[SkinLink, ...], cubes: tuple[SkinCube, ...]) -> Iterator[str]:
+    """Yield links with different cubes: a frame of a hub has equally many pads for each cube."""
     for link in links:
         pads = {cube.calibration.layout.n_pads for cube in cubes if cube.link == link.name}
         if len(pads) > 1:
@@ -308,17 +331,18 @@ def _pad_mistakes(links: tuple[SkinLink, ...], cubes: tuple[SkinCube, ...]) -> I
             )
 
 
-def _repeated(where: str, what: str, values: list[str]) -> Iterator[str]:
+def _find_repeated(where: str, what: str, values: list[str]) -> Iterator[str]:
     for value, count in Counter(values).items():
         if count > 1:
             times = "twice" if count == 2 else f"{count} times"
             yield f"{where}: the {what} {value} appears {times}; keep one"
 
 
-def _uid(value: int | str | None) -> int | None:
+def _parse_uid(item: dict[str, Any], key: str) -> int | None:
+    value = item.get(key)
     return int(value, 16) if isinstance(value, str) else value
 
 
-def _triple(values: list[float]) -> tuple[float, float, float]:
+def _to_triple(values: list[float]) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,24 +9,32 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
+from .schema import TEXT, JsonSchema, Schema, mapping
 from .yaml import read_yaml, write_yaml
 
-SCHEMA = 1
-_KEYS = {"schema", "uid", "calibration_id", "created", "rest_frequency"}
+SCHEMA_VERSION = 1
+"""Version of the format of tare files."""
+
 _HEADER = "Rest frequencies in Hz that ~/tare measured; ~/clear_tare removes it."
 
 
 class StoredTare(NamedTuple):
-    """rest_frequency: (P,) Hz. created: when it was measured, with time zone."""
+    """The tare of one cube, as it was read from its file.
 
-    rest_frequency: NDArray[np.float64]
+    Attributes:
+        rest_frequency: Frequency of each pad without load, (P,), in Hz.
+        created: When it was measured, with time zone.
+    """
+
+    rest_frequency: Array
     created: datetime
 
 
 def tare_path(folder: Path, uid: int) -> Path:
-    """The file of the cube with this uid."""
+    """Return the path of the tare file of the cube with this uid."""
     return folder / f"{uid:016x}.yaml"
 
 
@@ -35,12 +42,20 @@ def write_tare(
     folder: Path,
     uid: int,
     calibration: Calibration,
-    rest_frequency: NDArray[np.floating],
+    rest_frequency: NDArray[np.floating[Any]],
     created: datetime,
 ) -> None:
-    """Write the tare of a cube, completely or not at all, and make the folder if it is missing.
+    """Write the tare of a cube, completely or not at all.
 
-    Raises ConfigError if the folder cannot be written.
+    Args:
+        folder: The folder of all tares, which is made if it is missing.
+        uid: Uid of the cube.
+        calibration: Calibration under which the tare was measured.
+        rest_frequency: Frequency of each pad without load, (P,), in Hz.
+        created: When it was measured, with time zone.
+
+    Raises:
+        ConfigError: The folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -49,7 +64,7 @@ def write_tare(
             f"{folder}: {error.strerror}; name a folder that can be written"
         ) from None
     content = {
-        "schema": SCHEMA,
+        "schema": SCHEMA_VERSION,
         "uid": f"{uid:#x}",
         "calibration_id": calibration.id,
         "created": created.isoformat(timespec="seconds"),
@@ -59,23 +74,25 @@ def write_tare(
 
 
 def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | None:
-    """The tare of a cube; None if it has none.
+    """Return the tare of a cube, or None if it has none.
 
-    Raises ConfigError if the file is damaged, belongs to another cube, or was measured under
-    another calibration. The text says which of these it is, and what to do.
+    Args:
+        folder: The folder of all tares.
+        uid: Uid of the cube.
+        calibration: Calibration of the cube now.
+
+    Raises:
+        ConfigError: The file is damaged, belongs to another cube, or was measured under another
+            calibration. The message says which of these it is, and what to do.
     """
     path = tare_path(folder, uid)
     if not path.exists():
         return None
     data = read_yaml(path)
-    if not isinstance(data, dict) or set(data) != _KEYS:
-        keys = ", ".join(sorted(_KEYS))
-        raise ConfigError(f"{path}: no tare file: its keys must be {keys}; tare again")
-    if data["schema"] != SCHEMA:
-        raise ConfigError(
-            f"{path}: schema is {data['schema']!r}, this version reads {SCHEMA}; tare again"
-        )
-    if _uid(data["uid"]) != uid:
+    for _, mistake in _tare_schema(calibration.layout.n_pads).mistakes(data):
+        raise ConfigError(f"{path}: {mistake}; tare again")
+
+    if int(data["uid"], 16) != uid:
         raise ConfigError(
             f"{path}: uid is {data['uid']!r}, the file's name says {uid:#x}; tare again"
         )
@@ -84,8 +101,8 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
             f"{path}: measured under calibration {data['calibration_id']!r}, "
             f"the cube now has {calibration.id!r}; tare again"
         )
-    rest = _rest_frequency(path, data["rest_frequency"], calibration.layout.n_pads)
-    return StoredTare(rest, _created(path, data["created"]))
+    rest_frequency = np.array(data["rest_frequency"], float)
+    return StoredTare(rest_frequency, _parse_time(path, data["created"]))
 
 
 def remove_tare(folder: Path, uid: int) -> None:
@@ -97,30 +114,37 @@ def remove_tare(folder: Path, uid: int) -> None:
         raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from None
 
 
-def _uid(value: Any) -> int | None:
-    if isinstance(value, str) and re.fullmatch("0x[0-9a-f]{1,16}", value):
-        return int(value, 16)
-    return None
+def _tare_schema(n_pads: int) -> Schema:
+    frequencies: JsonSchema = {
+        "type": "array",
+        "items": {"type": "number", "exclusiveMinimum": 0, "description": "a number above 0"},
+        "minItems": n_pads,
+        "maxItems": n_pads,
+        "description": f"{n_pads} numbers above 0",
+    }
+    properties: JsonSchema = {
+        "schema": {"const": SCHEMA_VERSION, "description": f"{SCHEMA_VERSION} in this version"},
+        "uid": {
+            "type": "string",
+            "pattern": r"^0x[0-9a-f]{1,16}\Z",
+            "description": "a uid in hexadecimal as in 0x1f",
+        },
+        "calibration_id": TEXT,
+        # YAML makes a datetime of it, or leaves a text, depending on how it is written.
+        "created": {},
+        "rest_frequency": frequencies,
+    }
+    return Schema(mapping(properties, properties))
 
 
-def _rest_frequency(path: Path, value: Any, n_pads: int) -> NDArray[np.float64]:
-    are_numbers = isinstance(value, list) and all(type(item) in (int, float) for item in value)
-    rest = np.array(value, float) if are_numbers else np.empty(0)
-    if rest.shape != (n_pads,) or not (np.isfinite(rest) & (rest > 0)).all():
-        raise ConfigError(
-            f"{path}: rest_frequency is {str(value)[:60]}, "
-            f"it must be {n_pads} numbers above 0; tare again"
-        )
-    return rest
-
-
-def _created(path: Path, value: Any) -> datetime:
+def _parse_time(path: Path, value: Any) -> datetime:
+    """Return the time when a tare was measured. ConfigError: it is no time with a zone."""
     try:
-        created = datetime.fromisoformat(value) if isinstance(value, str) else value
-        if isinstance(created, datetime) and created.tzinfo is not None:
-            return created
+        time = datetime.fromisoformat(value) if isinstance(value, str) else value
     except ValueError:
-        pass
+        time = None
+    if isinstance(time, datetime) and time.tzinfo is not None:
+        return time
     raise ConfigError(
         f"{path}: created is {value!r}, it must be a date and time with its zone; tare again"
     )

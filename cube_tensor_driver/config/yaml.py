@@ -1,5 +1,4 @@
-"""YAML files, read safely: limited in size, depth and number of values, plain values only, no key
-twice in a mapping."""
+"""YAML files: plain values only, bounded in size, and with no key twice in a mapping."""
 
 from __future__ import annotations
 
@@ -9,151 +8,98 @@ from typing import Any
 import yaml
 
 from ..core.errors import ConfigError
-from .atomic_write import atomic_write
 from .input_files import read_bounded
+from .output_files import atomic_write
 
 MAX_BYTES = 16 << 20
-"""Far more than any skin or calibration file has; a bag or a disk image named by mistake has
-more."""
-MAX_DEPTH = 100
-"""Of lists and mappings within each other. The parser in C calls itself once for each and would
-overflow its stack."""
-MAX_VALUES = 2_000_000
-"""Values, each alias counted with all that it stands for: the largest skin, of 65536 cubes, has
-1.5 million."""
-MAX_DIGITS = 100
-"""Characters of a number: the time to read some grows with the square of their length."""
-MAX_INTEGER = 1 << 64
-"""No uid is larger, and much larger integers have no float and cannot be printed."""
-_MERGE_TAG = "tag:yaml.org,2002:merge"
-_INT_TAG = "tag:yaml.org,2002:int"
-_FLOAT_TAG = "tag:yaml.org,2002:float"
-_NOT_YAML = (
-    yaml.YAMLError,
-    ValueError,
-    TypeError,
-    RecursionError,
-    ArithmeticError,
-    LookupError,
-    AttributeError,
-)
-"""What PyYAML lets through where a value does not fit its tag."""
+"""Maximum size of a YAML file, in bytes.
 
+The largest skin, of 65536 cubes on a grid, has 9 MB. A bag or a disk image that is named by mistake
+has more.
+"""
+
+MAX_DEPTH = 100
+"""Maximum number of lists and mappings within each other.
+
+PyYAML's loader in C recurses once per level, so a text of brackets alone would overflow the stack
+and kill the process. Texts also come from other hosts, inside of SkinInfo messages.
+"""
+
+_MERGE_TAG = "tag:yaml.org,2002:merge"
+
+_INVALID_VALUE_ERRORS = (ValueError, TypeError, ArithmeticError, LookupError, AttributeError)
+"""Errors that PyYAML raises itself where a value does not fit its tag, as in ``!!bool maybe``."""
 
 _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-"""In C where it is installed: half of the time for a large skin, and the same text."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """The safe loader, in C where it is installed, which refuses a key that appears twice.
 
-    PyYAML would silently take the last one.
+    PyYAML would silently take the last one, and half of a copied cube would be lost.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        # Keys that come from a merge (<<) may be overridden.
+        # The call also merges "<<" into the node. Merged keys may be overridden, so the keys that
+        # stand in the mapping itself are listed before.
         own_keys = [key for key, _ in node.value if key.tag != _MERGE_TAG]
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         seen: set[Any] = set()
         for key in own_keys:
             name = self.construct_object(key, deep=True)
             if name in seen:
-                raise yaml.MarkedYAMLError(
-                    problem=f"the key {name!r} appears twice; keep one",
-                    problem_mark=key.start_mark,
-                )
+                problem = f"the key {name!r} appears twice; keep one"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
             seen.add(name)
         return mapping
 
-    def construct_number(self, node: yaml.ScalarNode) -> int | float:
-        if len(node.value) > MAX_DIGITS:
-            self._refuse(node, f"a number of {len(node.value)} characters, limit {MAX_DIGITS}")
-        if node.tag == _FLOAT_TAG:
-            return float(self.construct_yaml_float(node))
-        value = int(self.construct_yaml_int(node))
-        if abs(value) > MAX_INTEGER:
-            self._refuse(node, f"an integer of {value.bit_length()} bits, the limit is 64")
-        return value
-
-    @staticmethod
-    def _refuse(node: yaml.ScalarNode, text: str) -> None:
-        raise yaml.MarkedYAMLError(problem=f"{text}: correct it", problem_mark=node.start_mark)
-
-
-_Loader.add_constructor(_INT_TAG, _Loader.construct_number)
-_Loader.add_constructor(_FLOAT_TAG, _Loader.construct_number)
-
-
-class _Bounds:
-    """Follows the events of a YAML text, and refuses what would cost too much to build.
-
-    Events come one by one whatever the text is; only building values of them recurses. Aliases cost
-    nothing to build but all that they stand for whenever somebody walks through the value.
-    """
-
-    def __init__(self) -> None:
-        self._open: list[tuple[str | None, int]] = []  # anchor, values before it
-        self._values = 0
-        self._sizes: dict[str | None, int] = {}  # of what is anchored
-
-    def check(self, event: yaml.Event) -> None:
-        """MarkedYAMLError: the text goes beyond a bound here."""
-        if isinstance(event, yaml.CollectionEndEvent):
-            anchor, before = self._open.pop()
-            self._anchored(anchor, self._values - before)
-            return
-        if isinstance(event, yaml.CollectionStartEvent):
-            self._open.append((event.anchor, self._values))
-            self._values += 1
-            if len(self._open) > MAX_DEPTH:
-                self._refuse(event, f"more than {MAX_DEPTH} lists and mappings within each other")
-        elif isinstance(event, yaml.ScalarEvent):
-            self._values += 1
-            self._anchored(event.anchor, 1)
-        elif isinstance(event, yaml.AliasEvent):
-            if any(anchor == event.anchor for anchor, _ in self._open):
-                self._refuse(event, f"the alias {event.anchor!r} stands within what it stands for")
-            self._values += self._sizes.get(event.anchor, 1)
-        if self._values > MAX_VALUES:
-            self._refuse(event, f"more than {MAX_VALUES} values, aliases written out")
-
-    def _anchored(self, anchor: str | None, size: int) -> None:
-        if anchor is not None:
-            self._sizes[anchor] = size
-
-    @staticmethod
-    def _refuse(event: Any, text: str) -> None:
-        raise yaml.MarkedYAMLError(
-            problem=f"{text}: this is no configuration file", problem_mark=event.start_mark
-        )
-
 
 def parse_yaml(text: str | bytes, origin: str) -> Any:
-    """The plain Python value of a YAML text; `origin` names the text in error messages.
+    """Return the plain Python value of a YAML text.
 
-    Raises ConfigError, with the line, if it is not YAML, if a key appears twice, if a tag stands
-    for something else than plain data, or beyond the limits of depth, number and length above.
+    Args:
+        text: The YAML text.
+        origin: What error messages call the text, such as the path of its file.
+
+    Raises:
+        ConfigError: The text is not YAML, has a key twice in a mapping, a tag other than those of
+            plain values, or too many levels. The message names the line where one is known.
     """
     try:
-        bounds = _Bounds()
-        for event in yaml.parse(text, _Loader):
-            bounds.check(event)
+        _check_depth(text)
         return yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"{origin}, line {mark.line + 1}, column {mark.column + 1}" if mark else origin
         raise ConfigError(f"{where}: {error.problem or 'not YAML'}") from None
-    except _NOT_YAML as error:
-        lines = str(error).splitlines()
-        reason = lines[0] if lines else type(error).__name__
-        raise ConfigError(f"{origin}: not YAML: {reason}") from None
+    except (yaml.YAMLError, *_INVALID_VALUE_ERRORS) as error:
+        first_line = (str(error) or type(error).__name__).splitlines()[0]
+        raise ConfigError(f"{origin}: not YAML: {first_line}") from None
+
+
+def _check_depth(text: str | bytes) -> None:
+    """Raise MarkedYAMLError if the text has more than `MAX_DEPTH` levels.
+
+    Events are read one after the other without recursion, whatever the text is.
+    """
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > MAX_DEPTH:
+            problem = f"more than {MAX_DEPTH} lists and mappings within each other; use fewer"
+            mark: Any = event.start_mark
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
 
 
 def read_yaml(path: Path) -> Any:
-    """The plain Python value of a YAML file.
+    """Return the plain Python value of a YAML file.
 
-    Raises ConfigError if there is no regular file, if it cannot be read or is larger than 16 MB,
-    and in the cases of `parse_yaml`.
+    Raises:
+        ConfigError: There is no regular file, it cannot be read, it is larger than `MAX_BYTES`, or
+            `parse_yaml` refuses its text.
     """
     try:
         data = read_bounded(path, MAX_BYTES, "configuration file")
@@ -163,7 +109,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def to_yaml(value: Any) -> str:
-    """Plain values as YAML text."""
+    """Return plain values as YAML text, with the keys in the order of their mapping."""
     text: str = yaml.dump(
         value,
         Dumper=_Dumper,
@@ -178,7 +124,13 @@ def to_yaml(value: Any) -> str:
 def write_yaml(path: Path, value: Any, header: str = "") -> None:
     """Write plain values as a YAML file, completely or not at all.
 
-    header: comment lines at the top. Raises ConfigError if the file cannot be written.
+    Args:
+        path: The file, which is replaced if it exists.
+        value: The plain values.
+        header: Lines for a comment at the top of the file.
+
+    Raises:
+        ConfigError: The file cannot be written.
     """
     comment = "".join(f"# {line}".rstrip() + "\n" for line in header.splitlines())
     text = comment + to_yaml(value)

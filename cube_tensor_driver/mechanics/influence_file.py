@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..config.atomic_write import atomic_write
 from ..config.input_files import read_bounded
+from ..config.output_files import atomic_write
 from ..core.errors import ConfigError, CubeError
 from ..core.layout import Layout
 from .cache import Arrays

@@ -19,14 +19,14 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.utilities.namespace_utils import make_namespace_absolute, prefix_namespace
 
 from ..config.load_script import read_script
+from ..config.output_files import temporary_folder
 from ..config.package_data import package_data
+from ..config.parameters import DRIVER
 from ..config.port import port_problem
 from ..config.rviz import rviz_view
 from ..config.skin import Skin, read_skin
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
-from ..processes.temporary import temporary_folder
-from .parameters import DRIVER
 
 _CONFIG = package_data() / "config"
 SINGLE, DEMO, DEMO_LOAD = (

@@ -24,10 +24,10 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from ..config.parameters import Parameter
 from ..core.errors import ConfigError, CubeError
 from .compat import after_parameters_are_set, make_executor
 from .guard import CallbackGuard, refuse_errors
-from .parameters import Parameter
 from .session import start_ros
 
 PAUSE_S = 2.0
@@ -173,8 +173,8 @@ class CubeNode(LifecycleNode):
             return f"parameter {name} is {value!r}, allowed: {known.choices}"
         if isinstance(value, float) and not math.isfinite(value):
             return f"parameter {name} is {value}, allowed: a finite number"
-        if known is not None and known.least is not None and 0 < value < known.least:
-            return f"parameter {name} is {value}, allowed: 0, or at least {known.least:g}"
+        if known is not None and known.minimum is not None and 0 < value < known.minimum:
+            return f"parameter {name} is {value}, allowed: 0, or at least {known.minimum:g}"
         if known is not None and known.problem is not None and value:
             problem = known.problem(value)
             if problem:

@@ -14,6 +14,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from ..config.parameters import Parameter
 from ..core.errors import CubeError, MessageError
 from ..core.newest import STALE_S, Newest
 from ..core.poses import CubePoses
@@ -22,7 +23,6 @@ from ..messages.skin_info import cube_poses, geometry
 from ..msg import SkinInfo, SkinStress
 from .guard import CallbackGuard
 from .node import CubeNode
-from .parameters import Parameter
 
 DEPTH = 10
 """A viewer wants the newest messages, not all of them. So its queue is short and it asks for best

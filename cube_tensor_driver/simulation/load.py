@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config.load_script import Action, Indenter, Script, between, read_script
+from ..config.load_script import Action, Indenter, Script, interpolate_knots, read_script
 from ..config.package_data import package_data
 from ..config.skin import Skin
 from ..core.arrays import Array
@@ -187,7 +187,7 @@ class Load:
         path = self._paths[id(action)]
         position = path.position(when) if path else self._in_metres(action.path[0])
         normal = surface_normal(self.poses, self._pitch, position)
-        size = float(between(action.force, when))
+        size = float(interpolate_knots(action.force, when))
         if path and action.kind == "slide":
             velocity = path.velocity(when) / (action.end - action.start)
             velocity -= normal * (velocity @ normal)
@@ -197,7 +197,7 @@ class Load:
             if len(action.shear) == 1:
                 shear = action.shear[0] * size / action.force.max()
             else:
-                shear = between(action.shear, when)
+                shear = interpolate_knots(action.shear, when)
             shear = shear - normal * (shear @ normal)
         force = shear - size * normal
         return Press(indenter.shape, position, normal, force, self._radius(indenter, size))

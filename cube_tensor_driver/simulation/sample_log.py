@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config.atomic_write import atomic_write
+from ..config.output_files import atomic_write
 from ..core.errors import ConfigError
 from .faults import Fault
 

@@ -22,7 +22,7 @@ from cube_tensor_driver.calibrate.pad_rest import pads_at_rest
 from cube_tensor_driver.calibrate.press import PressWatch
 from cube_tensor_driver.calibrate.side_press import SIDES, side_presses
 from cube_tensor_driver.cli.main import main
-from cube_tensor_driver.config.layout import named_layout, shipped_calibration
+from cube_tensor_driver.config.calibration import named_layout, shipped_calibration
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import Layout

@@ -155,6 +155,11 @@ def test_one_message_per_mistake(tmp_path, break_it, words):
     assert "\n" not in text
 
 
+def test_a_skin_shows_itself_in_one_line():
+    shown = repr(read_skin(package_data() / "config" / "skin_demo.yaml"))
+    assert shown == "<Skin 'skin': 16 cubes (planar) on 2 links, 100 Hz>"
+
+
 def test_names_and_calibrations_are_in_the_order_of_the_cubes(tmp_path):
     data = copy.deepcopy(GOOD)
     for cube in data["cubes"][3:]:
@@ -289,23 +294,14 @@ def test_only_regular_files_are_read_and_only_up_to_their_limit(tmp_path, monkey
         ("[" * 200_000, ["lists and mappings within each other", "100"]),
         ("{a: " * 200_000, ["lists and mappings within each other"]),
         ("- " * 200_000, ["lists and mappings within each other"]),
-        ("a: &a [*a]", ["alias 'a'"]),
-        # Nine aliases of nine aliases of …: small as a file, 3.5e9 values when written out.
-        (
-            "a0: &a0 [x]\n"
-            + "".join(f"a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 9)}]\n" for i in range(10)),
-            ["more than 2000000 values"],
-        ),
-        ("rate: " + ":".join(["1"] * 200_000), ["a number of 399999 characters"]),
-        ("rate: 0x" + "f" * 90, ["an integer of", "bits"]),
-        ("rate: !!int " + "1" * 5000, ["a number of 5000 characters"]),
-        ("rate: 1" + ":1" * 400 + ".5", ["a number of"]),
+        ("links: &a [*a]", ["is missing"]),
+        ("rate: 0x" + "f" * 900, ["is missing"]),
         ("rate: !!bool maybe", ["not YAML"]),
         ("rate: !!timestamp never", ["not YAML"]),
     ],
     ids=lambda part: part[:12] if isinstance(part, str) else "",
 )
-def test_yaml_that_would_cost_too_much_is_one_line(tmp_path, text, words):
+def test_what_yaml_does_not_refuse_itself_is_one_line(tmp_path, text, words):
     with pytest.raises(ConfigError) as caught:
         read(tmp_path, text)
     assert "\n" not in str(caught.value)

@@ -70,7 +70,7 @@ def test_every_executable_of_the_list_is_installed_and_runs_its_module(monkeypat
 
 def test_temporary_folders_end_with_the_process(tmp_path):
     program = """
-from cube_tensor_driver.processes.temporary import temporary_folder
+from cube_tensor_driver.config.output_files import temporary_folder
 print(temporary_folder("cube_").is_dir())
 """
     done = subprocess.run(

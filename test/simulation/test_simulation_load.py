@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy import interpolate
 
-from cube_tensor_driver.config.load_script import Script, between, read_script
+from cube_tensor_driver.config.load_script import Script, interpolate_knots, read_script
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, SkinCube, read_skin
 from cube_tensor_driver.core.errors import ConfigError
@@ -195,8 +195,8 @@ def test_taps_presses_and_the_time_between(tmp_path):
 
 def test_between_meets_its_knots_and_stays_between_them():
     knots = np.array([0.0, 3.0, 1.0, 1.0, 2.0])
-    np.testing.assert_allclose(between(knots, np.linspace(0, 1, 5)), knots)
-    fine = between(knots, np.linspace(0, 1, 401))
+    np.testing.assert_allclose(interpolate_knots(knots, np.linspace(0, 1, 5)), knots)
+    fine = interpolate_knots(knots, np.linspace(0, 1, 401))
     assert (fine >= 0).all() and (fine <= 3).all() and (np.diff(fine[:100]) > 0).all()
 
 

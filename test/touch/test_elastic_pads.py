@@ -11,8 +11,8 @@ import pytest
 
 from cube_tensor_design.studies.pads_study import LayerBench
 from cube_tensor_design.studies.traction_study import CUBES, Setting
+from cube_tensor_driver.config.calibration import shipped_calibration
 from cube_tensor_driver.config.influence import find_influence
-from cube_tensor_driver.config.layout import shipped_calibration
 from cube_tensor_driver.core.errors import ConfigError, ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS

@@ -11,19 +11,24 @@ import sys
 import numpy as np
 from std_msgs.msg import Header
 
+from cube_tensor_driver.config.parameters import AUTOSTART, Parameter
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.ros.messages import packed
 from cube_tensor_driver.ros.node import CubeNode, queue, run
-from cube_tensor_driver.ros.parameters import ECHO
 
 PADS, STRESS, GRADIENT = 8, 6, 9
+PARAMETERS = (
+    AUTOSTART,
+    Parameter("cubes", 64, "Rows of a message."),
+    Parameter("rate", 1000.0, "Messages per second."),
+)
 
 
 class BareSource(CubeNode):
     """Publishes `frequencies` of so many cubes at a rate, with a timer."""
 
     def __init__(self) -> None:
-        super().__init__("source", ECHO)
+        super().__init__("source", PARAMETERS)
 
     def configure(self) -> None:
         n, rate = int(self.value("cubes")), float(self.value("rate"))
@@ -55,7 +60,7 @@ class BareEcho(CubeNode):
     """Answers each `frequencies` with a `stress` of as many rows, which are all zero."""
 
     def __init__(self) -> None:
-        super().__init__("echo", ECHO)
+        super().__init__("echo", PARAMETERS)
 
     def configure(self) -> None:
         n, quality = int(self.value("cubes")), queue(float(self.value("rate")))

@@ -105,6 +105,8 @@ def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
     ConfigError: no scheduler there. ModuleNotFoundError: `distributed` is not installed.
     """
     if scheduler is None:
+        # A process per core needs no threads beside it. The processes inherit it.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # Spawned, not forked: numpy's threads do not survive a fork.
         with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as executor:
             yield executor

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import PointCloud2
 
+from ...config.parameters import CONTACTS
 from ...core.errors import CubeError
 from ...messages.contacts import contacts_message, traction_message
 from ...messages.skin_info import cube_calibrations
@@ -16,7 +17,6 @@ from ...msg import SkinContacts
 from ...touch.contact_finder import INVERSE, ContactFinder, ContactSettings, contact_finder
 from ..messages import make_message
 from ..node import run
-from ..parameters import CONTACTS
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from ...config.parameters import DRIVER
 from ...config.skin import read_skin
 from ...core.pipeline import Pipeline
 from ...core.rows import FrequencyRows
@@ -16,7 +17,6 @@ from ..diagnostics.links import LinkStatuses
 from ..diagnostics.updater import Diagnostics
 from ..messages import info_message
 from ..node import LATCHED, CubeNode, NodeClock, batch_queue, run, scans_per_message
-from ..parameters import DRIVER
 from .frequencies_publisher import FrequenciesPublisher
 
 

@@ -9,6 +9,7 @@ from geometry_msgs.msg import Quaternion, Vector3
 from numpy.typing import NDArray
 from visualization_msgs.msg import Marker, MarkerArray
 
+from ...config.parameters import MARKERS
 from ...core.errors import ConfigError
 from ...core.poses import CubePoses, quaternions
 from ...msg import SkinContacts
@@ -27,7 +28,6 @@ from ..markers.shapes import (
 )
 from ..messages import to_ns
 from ..node import run
-from ..parameters import MARKERS
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 CONTACTS_NS = 1_000_000_000

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from ...config.parameters import RECONSTRUCTION
 from ...config.skin import read_skin
 from ...core.errors import CubeError
 from ...core.reconstructor import Reconstructor
@@ -19,7 +20,6 @@ from ..diagnostics.reconstruction import ReconstructionDiagnostics, log_changes
 from ..diagnostics.updater import Diagnostics
 from ..messages import info_message
 from ..node import LATCHED, CubeNode, batch_queue, run
-from ..parameters import RECONSTRUCTION
 from .message_limit import check_scans, scan_limit
 from .recorded import open_recording
 from .stress_publisher import StressPublisher

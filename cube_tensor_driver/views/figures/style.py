@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from ...config.atomic_write import atomic_write
+from ...config.output_files import atomic_write
 from ...core.errors import ConfigError
 
 SETTINGS: Any = {

@@ -1,24 +1,35 @@
-"""The parameters of the nodes, as tables."""
+"""Parameters of the nodes, as tables of plain data.
+
+The nodes declare them, commands without ROS take some of them as options, and docs/parameters.md
+lists them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from ..config.influence import influence_problem
-from ..config.port import port_problem
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
-from ..views.scene import QUANTITIES
+from ..core.modes import STRESS
+from .influence import influence_problem
+from .port import port_problem
+
+QUANTITIES = ("pressure", "shear", "gradient", *STRESS, "residual")
+"""Names of the quantities that colours can show; `views.scene` draws them."""
 
 
 class Parameter(NamedTuple):
-    """A parameter: its default, what `ros2 param describe` says, and what it allows.
+    """A parameter of a node.
 
-    span: lowest and highest value of a number
-    choices: of a text, separated by commas
-    live: it may change while the node is configured
-    least: lowest value other than 0
-    problem: what is wrong with a text that is not empty, in words; empty if nothing is
+    Attributes:
+        name: Its name.
+        default: Its default, of the parameter's type.
+        description: What `ros2 param describe` says.
+        span: Lowest and highest value of a number.
+        choices: Allowed texts, separated by commas.
+        live: Whether it may change while the node is configured.
+        minimum: Lowest value of a number other than 0.
+        problem: Function that returns what is wrong with a text, or an empty text if nothing is.
     """
 
     name: str
@@ -27,7 +38,7 @@ class Parameter(NamedTuple):
     span: tuple[float, float] | None = None
     choices: str = ""
     live: bool = False
-    least: float | None = None
+    minimum: float | None = None
     problem: Callable[[str], str] | None = None
 
 
@@ -60,7 +71,7 @@ DRIVER = (
         "Samples per second to ask of the hubs; 0: as the skin file says.",
         span=(0.0, 10_000.0),
         live=True,
-        least=0.1,
+        minimum=0.1,
     ),
     Parameter(
         "publish_period",
@@ -114,7 +125,7 @@ RECONSTRUCTION = (
 )
 SKIN_SUBSCRIBER = (
     AUTOSTART,
-    Parameter("rate", 20.0, "Most messages per second.", span=(0.1, 100.0)),
+    Parameter("rate", 20.0, "Maximum number of messages per second.", span=(0.1, 100.0)),
 )
 MARKERS = (
     *SKIN_SUBSCRIBER,
@@ -132,7 +143,7 @@ CONTACTS = (
     Parameter(
         "depth",
         SURFACE_DEPTH,
-        "From the cubes' centres to the skin's surface, m.",
+        "Distance from the cubes' centres to the skin's surface, m.",
         span=(1e-5, 1.0),
     ),
     Parameter(
@@ -151,7 +162,7 @@ CONTACTS = (
     Parameter(
         "thickness",
         0.0,
-        "Of the elastomer over rigid ground, m, for the method inverse; 0: a half space.",
+        "Thickness of the elastomer over rigid ground, m, for the method inverse; 0: a half space.",
         span=(0.0, 1.0),
     ),
     Parameter(
@@ -163,14 +174,9 @@ CONTACTS = (
     Parameter(
         "influence",
         "",
-        "For the method inverse, what the pads see of forces on the surface: the name of a shipped "
-        "table, or a file of `./cube fem --surface --influence`. Then depth, thickness and poisson "
-        "are those of the table. Empty: cubes count as points.",
+        "For the method inverse, what the pads measure of forces on the surface: the name of a "
+        "shipped table, or a file of `./cube fem --surface --influence`. Then depth, thickness and "
+        "poisson are those of the table. Empty: cubes count as points.",
         problem=influence_problem,
     ),
-)
-ECHO = (
-    AUTOSTART,
-    Parameter("cubes", 64, "Rows of a message."),
-    Parameter("rate", 1000.0, "Messages per second."),
 )
