@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import Array
+from ..core.latest_stress import FAULTY, HEALTH_WORDS
 from ..core.modes import COMPONENTS
-from ..core.newest import FAULTY, HEALTH
 from ..core.status import STATUS
 from ..touch.surface import Contact
 from ..views import scene
@@ -206,16 +206,16 @@ def _hundredths(number: float) -> str:
 
 def _state(status: int, health: int) -> str:
     words = [name.lower().replace("_", " ") for name, bit in STATUS.items() if status & bit]
-    return ", ".join(words) or HEALTH[health]
+    return ", ".join(words) or HEALTH_WORDS[health]
 
 
 def conditions(names: list[str], health: NDArray[np.integer], links: list[str]) -> str:
     """The state of the links, how many cubes are in which state, and which are not fine."""
     counts = ", ".join(
-        f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(HEALTH)
+        f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(HEALTH_WORDS)
     )
     not_fine = np.flatnonzero(health)[:MOST_ROWS].tolist()
-    rows = [(names[cube], HEALTH[health[cube]], "") for cube in not_fine]
+    rows = [(names[cube], HEALTH_WORDS[health[cube]], "") for cube in not_fine]
     lines = "".join(f"<div>{escape(line)}</div>" for line in [*links, counts])
     return box(lines + _table(rows))
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import Array
 from ..core.defaults import CONTACT_PRESSURE
-from ..core.newest import Newest
+from ..core.latest_stress import LatestStress
 from ..touch.surface import Contact, Surface
 from ..views.scene import QUANTITIES, Quantity
 
@@ -60,10 +60,10 @@ class Moment(NamedTuple):
 
     @classmethod
     def of(
-        cls, newest: Newest, health: NDArray[np.integer], surface: Surface, found: Found
+        cls, newest: LatestStress, health: NDArray[np.integer], surface: Surface, found: Found
     ) -> Moment:
         """A copy: rows that come later do not change it. What was not found is interpolated."""
-        values = newest.believed(health)
+        values = newest.usable_values(health)
         field, contacts = found.field, found.contacts
         if field is None:
             between = surface.field(values)

@@ -9,7 +9,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.task import Future
 
-from ..core.newest import STALE_S
+from ..core.latest_stress import STALE_S
 from ..msg import ReplayState
 from ..srv import SteerReplay
 from .markup import NoteColour

@@ -16,7 +16,7 @@ import viser
 from numpy.typing import NDArray
 
 from ..core.arrays import Array
-from ..core.newest import DOUBTFUL, FAULTY, STALE
+from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
 from ..views import scene

@@ -25,7 +25,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
 from ..core.errors import ConfigError
-from ..core.newest import STALE_S
+from ..core.latest_stress import STALE_S
 from ..ros.compat import make_executor
 from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros
@@ -182,7 +182,7 @@ class Viewer:
         now = self._subscriber.now()
         health = followed.newest.health(now, NEVER_STALE_S if held else STALE_S)
         if not held:
-            shown.history.add(now, followed.newest.believed(health), followed.newest.residual)
+            shown.history.add(now, followed.newest.usable_values(health), followed.newest.residual)
         if with_numbers:
             self._update_status()
             self._rows.update(time.monotonic(), followed.newest.count)

@@ -1,4 +1,4 @@
-"""The force view of a skin: one force per cube in the frame of the skin, and nothing else."""
+"""Forces on the cubes of a skin, in the frame of the skin."""
 
 from __future__ import annotations
 
@@ -6,52 +6,65 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Array
 from .rows import StressRows
 from .tensor import face_force, rotation_from_rpy
 
-SHEAR_AND_NORMAL = [4, 3, 2]
-"""zx, yz, zz: the components that act on a face +z."""
+TRACTION_COMPONENTS = [4, 3, 2]
+"""Columns of a stress that act on a face +z: zx, yz and zz."""
 
 
-class SkinLike(Protocol):
-    """What is needed of a skin: its cubes, with their poses and calibrations."""
+class PlacedSkin(Protocol):
+    """A skin whose cubes have `xyz`, `rpy` and `calibration`."""
 
     @property
     def cubes(self) -> Sequence[Any]: ...
 
 
 class Forces:
-    """The force on the skin at each cube, N, in the skin's parent frame:
+    """The force on the skin at each cube, in the parent frame of the skin, in N.
 
         F = R w² σ n
 
-    σ n is the traction on the face +z of the cube, w² the area that it is taken for, R the rotation
-    from the cube's frame to the parent's. A pressed skin has forces into the skin. Components that
-    are not observed count as 0; a row that observes none of the traction has NaN.
+    σ n is the traction on the face +z of the cube, w² the area that it acts on, and R the rotation
+    from the frame of the cube to the parent frame. A pressed skin has forces into the skin.
 
-    position: (cubes, 3) m, where the cubes are in the parent frame
-    side: (cubes,) m, w of each cube
+    Components that are not observed count as 0. A row that observes no component of the traction
+    gives NaN.
+
+    Attributes:
+        position: Positions of the cubes in the parent frame (cubes, 3), in m.
+        side: Side w of the area of each cube (cubes,), in m.
     """
 
-    def __init__(self, skin: SkinLike, side: float | None = None) -> None:
-        """side: w for all cubes, m; the distance of neighbours makes the sum the force on the whole
-        skin. None: the side of each cube."""
-        cubes = skin.cubes
-        self.position = np.array([cube.xyz for cube in cubes], float)
-        self.side = np.array([side or 2 * cube.calibration.half_side for cube in cubes])
-        self._rotation = np.array([rotation_from_rpy(*cube.rpy) for cube in cubes])
+    def __init__(self, skin: PlacedSkin, side: float | None = None) -> None:
+        """Prepare the forces of a skin.
 
-    def __call__(self, rows: StressRows) -> NDArray[np.float64]:
-        """(N, 3) of N rows."""
-        force = face_force(rows.stress, self.side[rows.cube, None])
-        force = np.einsum("nij,nj->ni", self._rotation[rows.cube], force)
-        force[np.isnan(rows.stress[:, SHEAR_AND_NORMAL]).all(axis=1)] = np.nan
+        Args:
+            skin: The skin.
+            side: Side w for all cubes, in m. With the distance of neighbouring cubes, the sum of
+                the forces is the force on the whole skin. None stands for the side of each cube.
+        """
+        cubes = skin.cubes
+        sides = [side or 2 * cube.calibration.half_side for cube in cubes]
+        rotations = [rotation_from_rpy(*cube.rpy) for cube in cubes]
+        self.position = np.array([cube.xyz for cube in cubes], float)
+        self.side = np.array(sides)
+        self._rotation = np.array(rotations)
+
+    def __call__(self, rows: StressRows) -> Array:
+        """Compute the force of each row (N, 3)."""
+        in_cube_frame = face_force(rows.stress, self.side[rows.cube, None])
+        rotation = self._rotation[rows.cube]
+        force: Array = np.einsum("nij,nj->ni", rotation, in_cube_frame)
+        traction = rows.stress[:, TRACTION_COMPONENTS]
+        force[np.isnan(traction).all(axis=1)] = np.nan
         return force
 
-    def of_skin(self, rows: StressRows) -> NDArray[np.float64]:
-        """(cubes, 3) of the last row of each cube; NaN for cubes without a row."""
+    def of_skin(self, rows: StressRows) -> Array:
+        """Return the force of the last row of each cube (cubes, 3), NaN for cubes without a row."""
         force = np.full(self.position.shape, np.nan)
+        # If a cube has several rows, numpy keeps the last assignment.
         force[rows.cube] = self(rows)
         return force

@@ -1,7 +1,7 @@
-"""The pattern of cube indices in a message, and what is computed from it once and kept.
+"""Patterns of cube numbers in messages, and a cache of what is computed from them.
 
-A hub sends the same cubes in the same order in every sample, so the index column (N,) of a message
-is one of a few. Whatever depends on it alone is made once per pattern.
+A hub sends the same cubes in the same order in every sample, so the column of cube numbers of a
+message is one of a few. Whatever depends on this column alone is computed once per pattern.
 """
 
 from __future__ import annotations
@@ -11,49 +11,67 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-SKINS_KEPT = 4
-"""Patterns of so many times all cubes are kept: the whole skin's, each hub's, those of a few scans
-in one message."""
+from .arrays import AnyArray
 
-Made = TypeVar("Made")
+MAX_SKINS = 4
+"""Number of rows in the cache, as a multiple of the number of cubes.
+
+This is enough for the pattern of the whole skin, of each hub, and of a few scans in one message.
+"""
+
+Computed = TypeVar("Computed")
 
 
-class PatternCache(Generic[Made]):
-    """What `make` computes from a column of cube indices (N,); the least recently used go first."""
+class PatternCache(Generic[Computed]):
+    """Cache of what a function computes from a column of cube numbers (N,).
 
-    def __init__(self, make: Callable[[np.ndarray], Made], n_cubes: int) -> None:
-        self._make = make
-        self._most_rows = SKINS_KEPT * n_cubes
-        self._kept: dict[tuple[int, ...], tuple[bytes, Made]] = {}
+    If the cache is full, the least recently used patterns are removed.
+    """
+
+    def __init__(self, compute: Callable[[AnyArray], Computed], n_cubes: int) -> None:
+        self._compute = compute
+        self._max_rows = MAX_SKINS * n_cubes
+        self._entries: dict[tuple[int, ...], tuple[bytes, Computed]] = {}
         self._rows = 0
 
-    def get(self, cube: np.ndarray) -> Made:
-        """What belongs to this column, made now if it is not kept."""
+    def get(self, cube: AnyArray) -> Computed:
+        """Return the result for this column, and compute it if it is not in the cache."""
+        # A short key finds the entry; its content decides, because other columns may share the key.
         key = (len(cube), int(cube[0]), int(cube[-1])) if len(cube) else (0,)
         # Bytes are compared in a fifth of the time that numbers are.
         content = cube.tobytes()
-        kept = self._kept.pop(key, None)
-        if kept is None or kept[0] != content:
-            self._rows -= len(cube) if kept else 0
-            kept = content, self._make(cube)
+        entry = self._entries.pop(key, None)
+        if entry is None or entry[0] != content:
+            if entry is not None:
+                self._rows -= len(cube)
+            entry = content, self._compute(cube)
             self._rows += len(cube)
-        self._kept[key] = kept
-        while self._rows > self._most_rows and len(self._kept) > 1:
-            oldest = next(iter(self._kept))
-            del self._kept[oldest]
+        # The dictionary keeps the order of insertion, so the newest entry is the last one.
+        self._entries[key] = entry
+        while self._rows > self._max_rows and len(self._entries) > 1:
+            oldest = next(iter(self._entries))
+            del self._entries[oldest]
             self._rows -= oldest[0]
-        return kept[1]
+        return entry[1]
 
     def clear(self) -> None:
-        self._kept.clear()
+        """Remove all patterns."""
+        self._entries.clear()
         self._rows = 0
 
 
-def count_repeats(cube: np.ndarray) -> int:
-    """How many scans a column (N,) holds: the same rising indices, again and again. 0: it does not
-    have this form."""
-    falls = np.flatnonzero(cube[1:] <= cube[:-1])
-    scan = int(falls[0]) + 1 if len(falls) else len(cube)
-    if not scan or len(cube) % scan or (cube.reshape(-1, scan) != cube[:scan]).any():
+def count_repeats(cube: AnyArray) -> int:
+    """Count the scans in a column of cube numbers (N,): the same rising numbers, repeated.
+
+    Returns:
+        Number of scans; 0 if the column does not have this form.
+    """
+    is_new_scan = cube[1:] <= cube[:-1]
+    starts = np.flatnonzero(is_new_scan)
+    length = int(starts[0]) + 1 if len(starts) else len(cube)
+    if not length or len(cube) % length:
         return 0
-    return len(cube) // scan
+    scans = cube.reshape(-1, length)
+    if (scans != scans[0]).any():
+        return 0
+    return len(scans)

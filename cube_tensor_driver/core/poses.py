@@ -1,4 +1,4 @@
-"""Where the cubes of a skin are."""
+"""Poses of the cubes of a skin."""
 
 from __future__ import annotations
 
@@ -6,30 +6,44 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .arrays import Array
 from .tensor import quaternion_from_rotation
 
 
 class CubePoses(NamedTuple):
-    """Where cubes are: position (N, 3) m, rotation (N, 3, 3) cube to parent, half_side (N,) m."""
+    """Position, rotation and size of N cubes.
 
-    position: np.ndarray
-    rotation: np.ndarray
-    half_side: np.ndarray
+    Attributes:
+        position: Centres in the parent frame (N, 3), in m.
+        rotation: Rotations from the frame of each cube to the parent frame (N, 3, 3).
+        half_side: Half sides (N,), in m.
+    """
+
+    position: Array
+    rotation: Array
+    half_side: Array
 
     @property
     def pitch(self) -> float:
-        """Typical distance of neighbours in m, at least a cube's side: the measure of all that is
-        drawn."""
+        """Median distance of a cube to its nearest neighbour, in m, at least the side of a cube.
+
+        Drawings use it as their unit of length. One cube alone has three times its side.
+        """
         side = 2.0 * float(np.median(self.half_side))
         if len(self.position) < 2:
             return 3.0 * side
         square = (self.position**2).sum(axis=1)
-        apart = square[:, None] + square - 2 * self.position @ self.position.T
-        np.fill_diagonal(apart, np.inf)
-        return max(side, float(np.sqrt(max(0.0, np.median(apart.min(axis=1))))))
+        products = self.position @ self.position.T
+        # |a - b|² = a² + b² - 2 ab needs no array of all differences (N, N, 3).
+        square_distance = square[:, None] + square - 2 * products
+        np.fill_diagonal(square_distance, np.inf)
+        nearest = np.median(square_distance.min(axis=1))
+        return max(side, float(np.sqrt(max(0.0, nearest))))
 
 
-def quaternions(rotation: np.ndarray) -> np.ndarray:
-    """(N, 4) w, x, y, z of rotations (N, 3, 3). It loops: call it once per skin, not per
-    picture."""
+def quaternions(rotation: Array) -> Array:
+    """Return quaternions w, x, y, z (N, 4) of rotations (N, 3, 3).
+
+    The function loops over the cubes, so it should be called once per skin and not per picture.
+    """
     return np.array([np.roll(quaternion_from_rotation(matrix), 1) for matrix in rotation])

@@ -1,7 +1,8 @@
-"""What the program hands on from step to step: rows of frequencies, and rows of stress.
+"""Rows: the data that the steps of the program pass on, as frequencies and as stress.
 
-One row is one sample: all pads of one cube at one instant. Rows of one scan come together, and so
-do the rows of several scans: then all rows of the first, all of the second, and so on.
+One row is one sample: all pads of one cube at one instant. The rows of one scan come together.
+Several scans may come together, too: first all rows of the first scan, then all of the second, and
+so on.
 """
 
 from __future__ import annotations
@@ -13,44 +14,57 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import AnyArray, PadMasks, Real, Single, StatusBits, Times
+
 
 class _Rows:
-    """What both kinds have: their number, and a choice of them. All fields are arrays (N, ...)."""
+    """Number and selection of rows. All fields of a subclass are arrays (N, ...)."""
 
     __slots__ = ()
     cube: NDArray[np.uint16]
+    stamp_ns: Times
 
     def __len__(self) -> int:
         return len(self.cube)
 
+    def __repr__(self) -> str:
+        name = type(self).__name__
+        if not len(self):
+            return f"{name}(no rows)"
+        cubes = len(np.unique(self.cube))
+        duration_s = float(np.ptp(self.stamp_ns)) * 1e-9
+        return f"{name}({len(self)} rows of {cubes} cubes over {duration_s:.3g} s)"
+
     def select(self: _Kind, chosen: Any) -> _Kind:
-        """The rows that an index, a slice or a mask chooses, as numpy indexes arrays."""
+        """Return the rows that an index, a slice or a mask chooses, as numpy indexes arrays."""
         return type(self)(*(getattr(self, field.name)[chosen] for field in fields(self)))  # type: ignore[arg-type]
 
 
 _Kind = TypeVar("_Kind", bound=_Rows)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FrequencyRows(_Rows):
-    """What the pads measured: N rows of P pads.
+    """Measured frequencies: N rows of P pads.
 
-    cube: (N,) index of the cube in the skin
-    sequence: (N,) number that the hub gave the sample; it wraps
-    stamp_ns: (N,) when the pads were read, ns, in the clock of the source
-    frequency: (N, P) Hz; NaN where nothing was measured and where the cube has no such pad
-    temperature: (N,) °C; NaN where it is unknown
-    pad_fault: (N,) bit p: the device reports that pad p is broken
-    status: (N,) bits of `status.py`; only STAMP, which says that stamp_ns is in doubt
+    Attributes:
+        cube: Number of the cube in the skin (N,).
+        sequence: Number that the hub gave the sample (N,); it wraps around.
+        stamp_ns: Time at which the pads were read (N,), in ns of the source's clock.
+        frequency: Frequency of each pad (N, P), in Hz. NaN where nothing was measured, and where
+            the cube has no such pad.
+        temperature: Temperature (N,), in °C; NaN where it is unknown.
+        pad_fault: Bit p is set if the device reports that pad p is broken (N,).
+        status: Bits of `status.py` (N,). Only STAMP is used: the time stamp is doubtful.
     """
 
     cube: NDArray[np.uint16]
     sequence: NDArray[np.uint32]
-    stamp_ns: NDArray[np.int64]
-    frequency: NDArray[np.float32]
-    temperature: NDArray[np.float32]
-    pad_fault: NDArray[np.uint32]
-    status: NDArray[np.uint16]
+    stamp_ns: Times
+    frequency: Single
+    temperature: Single
+    pad_fault: PadMasks
+    status: StatusBits
 
     @classmethod
     def of(
@@ -64,42 +78,52 @@ class FrequencyRows(_Rows):
         pad_fault: Any = 0,
         status: Any = 0,
     ) -> FrequencyRows:
-        """Rows from plain numbers: cube (N,), frequency (N, P), the others (N,) or one for all."""
+        """Construct rows from plain numbers.
+
+        Args:
+            cube: Numbers of the cubes (N,).
+            frequency: Frequencies (N, P), in Hz.
+            stamp_ns, sequence, temperature, pad_fault, status: The other attributes, as (N,) or
+                as one value for all rows.
+        """
         cube = np.asarray(cube)
         return cls(
             cube=cube,
-            sequence=_column(cube, sequence, np.uint32),
-            stamp_ns=_column(cube, stamp_ns, np.int64),
+            sequence=_fill_column(cube, sequence, np.uint32),
+            stamp_ns=_fill_column(cube, stamp_ns, np.int64),
             frequency=np.asarray(frequency),
-            temperature=_column(cube, temperature, np.float32),
-            pad_fault=_column(cube, pad_fault, np.uint32),
-            status=_column(cube, status, np.uint16),
+            temperature=_fill_column(cube, temperature, np.float32),
+            pad_fault=_fill_column(cube, pad_fault, np.uint32),
+            status=_fill_column(cube, status, np.uint16),
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StressRows(_Rows):
-    """What was reconstructed: N rows, in the frame of each cube, tension positive.
+    """Reconstructed stress: N rows, each in the frame of its cube, tension positive.
 
-    cube, sequence, stamp_ns: (N,) of the frequencies that each row was made from
-    stress: (N, 6) Pa, order xx yy zz yz zx xy; NaN where a component is not observed
-    gradient: (N, 9) Pa/m, rows xx yy zz, columns d/dx d/dy d/dz; NaN where it is not observed
-    residual: (N,) sqrt(chi-square / degrees of freedom), about 1 for noise alone; NaN where there
-        is no redundancy
-    status: (N,) bits of `status.py`
-    observed: (N,) bit i: component i of `modes.COMPONENTS` was recovered
-    left_out: (N,) bit p: pad p was not used
+    Attributes:
+        cube, sequence, stamp_ns: Of the row of frequencies that each row was made from (N,).
+        stress: Stress (N, 6), in Pa, in the order xx, yy, zz, yz, zx, xy. NaN where a component is
+            not observed.
+        gradient: Gradients of the normal stresses (N, 9), in Pa/m: rows xx, yy, zz, columns d/dx,
+            d/dy, d/dz. NaN where a component is not observed.
+        residual: sqrt(chi-square / degrees of freedom) (N,), about 1 for noise alone. NaN where
+            there is no redundancy.
+        status: Bits of `status.py` (N,).
+        observed: Bit i is set if component i of `modes.COMPONENTS` was recovered (N,).
+        left_out: Bit p is set if pad p was not used (N,).
     """
 
     cube: NDArray[np.uint16]
     sequence: NDArray[np.uint32]
-    stamp_ns: NDArray[np.int64]
-    stress: NDArray[np.floating]
-    gradient: NDArray[np.floating]
-    residual: NDArray[np.floating]
-    status: NDArray[np.uint16]
+    stamp_ns: Times
+    stress: Real
+    gradient: Real
+    residual: Real
+    status: StatusBits
     observed: NDArray[np.uint16]
-    left_out: NDArray[np.uint32]
+    left_out: PadMasks
 
     @classmethod
     def of(
@@ -115,24 +139,31 @@ class StressRows(_Rows):
         sequence: Any = 0,
         left_out: Any = 0,
     ) -> StressRows:
-        """Rows from plain numbers: cube (N,), stress (N, 6), gradient (N, 9), the others (N,) or
-        one for all."""
+        """Construct rows from plain numbers.
+
+        Args:
+            cube: Numbers of the cubes (N,).
+            stress: Stress (N, 6), in Pa.
+            gradient: Gradients (N, 9), in Pa/m.
+            residual, status, observed, stamp_ns, sequence, left_out: The other attributes, as (N,)
+                or as one value for all rows.
+        """
         cube = np.asarray(cube)
         return cls(
             cube=cube,
-            sequence=_column(cube, sequence, np.uint32),
-            stamp_ns=_column(cube, stamp_ns, np.int64),
+            sequence=_fill_column(cube, sequence, np.uint32),
+            stamp_ns=_fill_column(cube, stamp_ns, np.int64),
             stress=np.asarray(stress),
             gradient=np.asarray(gradient),
-            residual=_column(cube, residual, np.float32),
-            status=_column(cube, status, np.uint16),
-            observed=_column(cube, observed, np.uint16),
-            left_out=_column(cube, left_out, np.uint32),
+            residual=_fill_column(cube, residual, np.float32),
+            status=_fill_column(cube, status, np.uint16),
+            observed=_fill_column(cube, observed, np.uint16),
+            left_out=_fill_column(cube, left_out, np.uint32),
         )
 
 
 def concatenate(parts: Sequence[_Kind]) -> _Kind:
-    """All rows of one or more parts, in order."""
+    """Join the rows of one or more parts, in order."""
     kind = type(parts[0])
     columns = (
         np.concatenate([getattr(part, field.name) for part in parts])
@@ -141,26 +172,27 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
     return kind(*columns)
 
 
-def _column(cube: NDArray[Any], values: Any, dtype: type) -> NDArray[Any]:
-    """(N,) of values, or of one value for all rows."""
+def _fill_column(cube: AnyArray, values: Any, dtype: type) -> AnyArray:
+    """Return a column (N,) of values (N,), or of one value for all rows."""
     return np.array(np.broadcast_to(values, cube.shape), dtype)
 
 
 class Source(Protocol):
-    """Where frequencies come from: live links, a bag, a simulated skin. A context manager.
+    """A source of frequencies: live links, a bag, or a simulated skin.
 
-    skin: which cubes `FrequencyRows.cube` counts. is_live: whether rows come as they are measured,
-    so that waiting for the next one takes time.
+    It is a context manager; iterating over it yields rows.
     """
 
     @property
-    def skin(self) -> Any: ...
+    def skin(self) -> Any:
+        """The skin whose cubes `FrequencyRows.cube` numbers."""
 
     @property
-    def is_live(self) -> bool: ...
+    def is_live(self) -> bool:
+        """Whether rows arrive as they are measured, so that the next one takes time."""
 
     def statistics(self) -> dict[str, object]:
-        """What was delivered and what was not, by name."""
+        """Return counts of delivered and lost data, by name."""
 
     def __iter__(self) -> Iterator[FrequencyRows]: ...
 

@@ -1,127 +1,190 @@
-"""Tensor algebra over rows. Stress (..., 6) in the order xx, yy, zz, yz, zx, xy, tension positive.
+"""Tensor algebra over rows: invariants, tractions, rotations and forces of stress tensors.
 
-Gradients are (..., 3, 3, 3), G_ijk = d(sigma_ij)/dx_k. Any unit unless said. Source: textbook
-continuum mechanics; rotations by transforms3d, quaternions in ROS order x, y, z, w.
+A stress (..., 6) has the components xx, yy, zz, yz, zx, xy (Voigt order), tension positive. A
+gradient is (..., 3, 3, 3) with G_ijk = d(sigma_ij)/dx_k. Where no unit is stated, any unit will do.
+
+Source: textbook continuum mechanics. Rotations are computed by transforms3d; quaternions have the
+order of ROS: x, y, z, w.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 from transforms3d import euler, quaternions
 
+from .arrays import Array, Real
 from .errors import CubeError
 from .modes import to_matrix, to_voigt
 
+_FIXED_AXES = "sxyz"  # transforms3d's name for roll, pitch and yaw as URDF and REP 103 define them
 
-def principal_stresses(stress: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal stresses (..., 3), largest first, and directions (..., 3, 3), one vector a row.
 
-    Rows with NaN give NaN. The sign of a direction is arbitrary.
+def principal_stresses(stress: Real) -> tuple[Array, Array]:
+    """Compute principal stresses and their directions.
+
+    Args:
+        stress: Stress (..., 6).
+
+    Returns:
+        Principal stresses (..., 3), the largest first, and unit vectors (..., 3, 3), one a row. The
+        sign of a direction is arbitrary. Rows with NaN give NaN.
     """
-    m = to_matrix(stress).astype(float)
-    finite = np.isfinite(m).all(axis=(-2, -1))
-    values, vectors = np.linalg.eigh(np.where(finite[..., None, None], m, 0))
-    values, directions = values[..., ::-1], np.swapaxes(vectors, -1, -2)[..., ::-1, :]
-    return np.where(finite[..., None], values, np.nan), np.where(
-        finite[..., None, None], directions, np.nan
+    matrices = to_matrix(stress).astype(float)
+    is_known = np.isfinite(matrices).all(axis=(-2, -1))
+    # LAPACK raises an error for NaN, so unknown rows are computed as zero and replaced below.
+    values, vectors = np.linalg.eigh(np.where(is_known[..., None, None], matrices, 0))
+    values = values[..., ::-1]
+    directions = np.swapaxes(vectors, -1, -2)[..., ::-1, :]
+    return (
+        np.where(is_known[..., None], values, np.nan),
+        np.where(is_known[..., None, None], directions, np.nan),
     )
 
 
-def invariants(stress: np.ndarray) -> np.ndarray:
-    """(..., 3): I1 = tr s, I2 = (I1^2 - tr s^2) / 2, I3 = det s; units Pa, Pa^2, Pa^3."""
+def invariants(stress: Real) -> Array:
+    """Compute the invariants (..., 3) of a stress (..., 6) in Pa.
+
+    They are I1 = tr s in Pa, I2 = (I1^2 - tr s^2) / 2 in Pa^2 and I3 = det s in Pa^3.
+    """
     xx, yy, zz, yz, zx, xy = np.moveaxis(np.asarray(stress), -1, 0)
+    first = xx + yy + zz
     second = xx * yy + yy * zz + zz * xx - yz**2 - zx**2 - xy**2
     third = xx * yy * zz + 2 * yz * zx * xy - xx * yz**2 - yy * zx**2 - zz * xy**2
-    return np.stack([xx + yy + zz, second, third], axis=-1)
+    return np.stack([first, second, third], axis=-1)
 
 
-def von_mises(stress: np.ndarray) -> np.ndarray:
-    """(...) sqrt(3/2 |deviator|^2), at least 0."""
+def von_mises(stress: Real) -> Array:
+    """Compute the von Mises stress (...), sqrt(3/2 |deviator|^2), of a stress (..., 6)."""
     xx, yy, zz, yz, zx, xy = np.moveaxis(np.asarray(stress), -1, 0)
     normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
-    return np.sqrt(normal / 2 + 3 * (yz**2 + zx**2 + xy**2))
+    shear = yz**2 + zx**2 + xy**2
+    result: Array = np.sqrt(normal / 2 + 3 * shear)
+    return result
 
 
-def traction(stress: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(..., 3) sigma n on planes with normals (..., 3), made unit vectors; CubeError for a zero
-    one."""
+def traction(stress: Real, normal: ArrayLike) -> Array:
+    """Compute the traction sigma n (..., 3) on planes.
+
+    Args:
+        stress: Stress (..., 6).
+        normal: Normals of the planes (..., 3) of any length but 0.
+
+    Raises:
+        CubeError: A normal has length 0.
+    """
     n = np.asarray(normal, dtype=float)
     length = np.linalg.norm(n, axis=-1, keepdims=True)
     if not np.all(length > 0):
         raise CubeError(
             f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal"
         )
-    return np.einsum("...ij,...j->...i", to_matrix(stress), n / length)
+    result: Array = np.einsum("...ij,...j->...i", to_matrix(stress), n / length)
+    return result
 
 
-def rotate_stress(stress: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """(..., 6) of R s R' : the stress in a frame of coordinates R x. NaN spreads."""
+def rotate_stress(stress: Real, rotation: Array) -> Array:
+    """Compute the stress R s R' (..., 6) in a frame with the coordinates R x. NaN spreads."""
     r = np.asarray(rotation, dtype=float)
     return to_voigt(r @ to_matrix(stress) @ np.swapaxes(r, -1, -2))
 
 
-def rotate_gradient(gradient: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """(..., 3, 3, 3) R_ia R_jb R_kc G_abc.
+def rotate_gradient(gradient: Array, rotation: Array) -> Array:
+    """Compute the gradient R_ia R_jb R_kc G_abc (..., 3, 3, 3) in a frame with the coordinates R x.
 
-    All 27 are needed: the nine normal gradients alone do not determine themselves in a turned
-    frame.
+    All 27 entries are needed, because the nine normal gradients in a rotated frame depend on
+    gradients of shear in the first frame.
     """
     r = np.asarray(rotation, dtype=float)
-    return np.einsum("...ia,...jb,...kc,...abc->...ijk", r, r, r, np.asarray(gradient))
+    g = np.asarray(gradient)
+    rotated: Array = np.einsum("...ia,...jb,...kc,...abc->...ijk", r, r, r, g)
+    return rotated
 
 
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll), rad, fixed axes as in URDF: cube coordinates to
-    parent's."""
-    return euler.euler2mat(roll, pitch, yaw, "sxyz")
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+    """Return Rz(yaw) Ry(pitch) Rx(roll) (3, 3) of angles in rad, fixed axes as in URDF.
+
+    It takes coordinates of the cube to those of its parent frame.
+    """
+    rotation: Array = euler.euler2mat(roll, pitch, yaw, _FIXED_AXES)
+    return rotation
 
 
-def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """(4,) x, y, z, w of rotation_from_rpy, w not negative."""
-    w, x, y, z = euler.euler2quat(roll, pitch, yaw, "sxyz")
-    return np.array([x, y, z, w]) * (1 if w >= 0 else -1)
+def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+    """Return the quaternion x, y, z, w (4,) of `rotation_from_rpy`, with w not negative."""
+    w, x, y, z = euler.euler2quat(roll, pitch, yaw, _FIXED_AXES)
+    # Both signs are the same rotation; choosing one makes equal rotations equal numbers.
+    sign = 1 if w >= 0 else -1
+    return np.array([x, y, z, w]) * sign
 
 
-def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """(4,) x, y, z, w of a rotation matrix (3, 3), w not negative."""
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """Return the quaternion x, y, z, w (4,) of a rotation matrix (3, 3), with w not negative."""
     w, x, y, z = quaternions.mat2quat(np.asarray(rotation, dtype=float))
     return np.array([x, y, z, w])
 
 
-def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) from x, y, z, w of any length but 0; CubeError for a zero or non-finite one."""
+def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Return the rotation matrix (3, 3) of a quaternion x, y, z, w of any length but 0.
+
+    Raises:
+        CubeError: The quaternion is zero or not finite.
+    """
     x, y, z, w = np.asarray(quaternion, dtype=float)
-    size = np.sqrt(x * x + y * y + z * z + w * w)
-    if not (np.isfinite(size) and size > 0):
+    length = np.sqrt(x * x + y * y + z * z + w * w)
+    if not (np.isfinite(length) and length > 0):
         raise CubeError(
-            f"quaternion {[x, y, z, w]} has length {size}; it must be finite and above 0"
+            f"quaternion {[x, y, z, w]} has length {length}; it must be finite and above 0"
         )
-    return quaternions.quat2mat([w, x, y, z])
+    rotation: Array = quaternions.quat2mat([w, x, y, z])
+    return rotation
 
 
-def rpy_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
-    """(3,) roll, pitch, yaw of a quaternion x, y, z, w; CubeError as rotation_from_quaternion."""
-    return np.array(euler.mat2euler(rotation_from_quaternion(quaternion), "sxyz"))
+def rpy_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Return roll, pitch and yaw (3,), in rad, of a quaternion x, y, z, w.
+
+    Raises:
+        CubeError: The quaternion is zero or not finite.
+    """
+    angles = euler.mat2euler(rotation_from_quaternion(quaternion), _FIXED_AXES)
+    return np.array(angles)
 
 
-def face_force(stress: np.ndarray, side: np.ndarray | float) -> np.ndarray:
-    """(N, 3) w^2 sigma n: the force in N on the square face +z of a reference side in m, in the
-    frame of stress (N, 6) Pa. Components that are not observed count as 0."""
-    return side**2 * np.nan_to_num(stress)[..., [4, 3, 2]]
+def face_force(stress: Real, side: Array | float) -> Array:
+    """Compute the force w^2 sigma n on a square in the plane of the face +z.
+
+    Args:
+        stress: Stress (N, 6), in Pa. Components that are not observed count as 0.
+        side: Side w of the square, in m.
+
+    Returns:
+        Force (N, 3) in the frame of the stress, in N.
+    """
+    zx_yz_zz = [4, 3, 2]
+    force: Array = side**2 * np.nan_to_num(stress)[..., zx_yz_zz]
+    return force
 
 
-def contact_wrench(
-    stress: np.ndarray, gradient: np.ndarray, side: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Force (N, 3) in N and torque (N, 3) in N m on the square face +z of a reference side in m.
+def contact_wrench(stress: Real, gradient: Real, side: float) -> tuple[Array, Array]:
+    """Compute force and torque on a square in the plane of the face +z.
 
         force  = w^2 sigma n
         torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0)
 
-    stress: (N, 6) Pa; gradient: (N, 9) Pa/m of the normal stresses, as in StressRows. The twist
-    needs gradients of shear, which pads of normal stress do not see, so it is 0. Components that
-    are not observed count as 0.
+    The torque about z needs gradients of shear, to which pads of normal stress do not respond, so
+    it is 0. Components that are not observed count as 0.
+
+    Args:
+        stress: Stress (N, 6), in Pa.
+        gradient: Gradients of the normal stresses (N, 9) as in `StressRows`, in Pa/m.
+        side: Side w of the square, in m.
+
+    Returns:
+        Force (N, 3) in N and torque (N, 3) in N m.
     """
-    g = np.nan_to_num(gradient)
-    torque = side**4 / 12 * np.stack([g[..., 7], -g[..., 6], np.zeros_like(g[..., 0])], axis=-1)
-    return face_force(stress, side), torque
+    known: Any = np.nan_to_num(gradient)
+    zz_x, zz_y = known[..., 6], known[..., 7]
+    direction = np.stack([zz_y, -zz_x, np.zeros_like(zz_x)], axis=-1)
+    return face_force(stress, side), side**4 / 12 * direction

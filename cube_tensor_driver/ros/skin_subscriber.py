@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ..config.parameters import Parameter
 from ..core.errors import CubeError, MessageError
-from ..core.newest import STALE_S, Newest
+from ..core.latest_stress import STALE_S, LatestStress
 from ..core.poses import CubePoses
 from ..messages.codec import stress_codec
 from ..messages.skin_info import cube_poses, geometry
@@ -41,7 +41,7 @@ class FollowedSkin:
 
     info: Any
     poses: CubePoses
-    newest: Newest
+    newest: LatestStress
     messages: int = 0
     stamp_ns: int = 0
 
@@ -71,7 +71,7 @@ class SkinSubscriber:
             self._node.destroy_subscription(subscription)
 
     def now(self) -> float:
-        """The time of the node's clock in s, which `Newest` is told."""
+        """The time of the node's clock in s, which `LatestStress` is told."""
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def _receive_info(self, info: SkinInfo) -> None:
@@ -79,7 +79,7 @@ class SkinSubscriber:
             self.skin.info = info
             return
         try:
-            skin = FollowedSkin(info, cube_poses(info), Newest(len(info.cubes)))
+            skin = FollowedSkin(info, cube_poses(info), LatestStress(len(info.cubes)))
             self._on_skin(skin)
         except CubeError as error:
             self._refuse(error)
@@ -124,7 +124,7 @@ class SkinSubscriberNode(CubeNode):
     def message(self, skin: FollowedSkin, health: np.ndarray) -> Any:
         """What to publish now: a message, or its bytes, or None for nothing.
 
-        health: (cubes,) as `Newest.health` gives it.
+        health: (cubes,) as `LatestStress.health` gives it.
         """
 
     def is_wanted(self, publisher: Any) -> bool:

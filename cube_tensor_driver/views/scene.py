@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.latest_stress import FINE
 from ..core.modes import COMPONENTS, STRESS
-from ..core.newest import FINE
 from ..core.poses import CubePoses
 from ..core.tensor import principal_stresses
 

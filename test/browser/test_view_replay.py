@@ -14,7 +14,7 @@ from cube_tensor_driver.browser import replay_client
 from cube_tensor_driver.browser.controls import ReplayControls
 from cube_tensor_driver.browser.replay_client import ReplayClient
 from cube_tensor_driver.browser.service_calls import WAIT_S, ServiceCalls
-from cube_tensor_driver.core.newest import STALE_S
+from cube_tensor_driver.core.latest_stress import STALE_S
 from cube_tensor_driver.msg import ReplayState
 from cube_tensor_driver.srv import SteerReplay
 

@@ -311,15 +311,15 @@ def test_a_residual_is_of_the_cube_and_has_hysteresis():
         )
 
     skin.play(2)
-    assert not skin.health.strained.any()
+    assert not skin.health.high_residual.any()
     skin.play(3, bend(50))
-    assert skin.health.strained.tolist() == [False, False, True, False, False, False]
+    assert skin.health.high_residual.tolist() == [False, False, True, False, False, False]
     skin.play(3, bend(15))  # 30 % of the rows: stays what it was
-    assert skin.health.strained[2]
+    assert skin.health.high_residual[2]
     skin.play(2)
-    assert not skin.health.strained.any()
+    assert not skin.health.high_residual.any()
     skin.play(3, bend(15))
-    assert not skin.health.strained.any()
+    assert not skin.health.high_residual.any()
 
 
 @pytest.mark.parametrize("first", [3, 5])

@@ -13,7 +13,7 @@ from conftest import samples, stamped
 from cube_tensor_driver.config.tare import read_tare, remove_tare, tare_path, write_tare
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import ConfigError, TareError
-from cube_tensor_driver.core.health.conditions import HOLD
+from cube_tensor_driver.core.health.diagnosis import HOLD_WINDOWS
 from cube_tensor_driver.core.health.drift import DriftTracker
 from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.health.statistics import WINDOW_S
@@ -256,7 +256,7 @@ def test_a_load_that_comes_and_goes_is_not_eaten():
 
     skin.play(200, touch, time_constant=10.0)
     np.testing.assert_allclose(skin.pipeline.rest_frequency, 100e3, rtol=3 * NOISE)
-    assert HOLD * WINDOW_S < 5
+    assert HOLD_WINDOWS * WINDOW_S < 5
 
 
 def test_file_round_trip_and_what_does_not_fit(tmp_path):

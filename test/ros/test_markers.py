@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from cube_tensor_driver.core.newest import DOUBTFUL, FAULTY, FINE, STALE, Newest
+from cube_tensor_driver.core.latest_stress import DOUBTFUL, FAULTY, FINE, STALE, LatestStress
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL
@@ -79,7 +79,7 @@ def test_automatic_range_rises_at_once_and_falls_slowly():
 
 
 def test_health_says_doubtful_no_tensor_and_stale():
-    newest = Newest(4)
+    newest = LatestStress(4)
     values = np.zeros((3, 15))
     newest.update(rows(np.zeros((4, 15)), cube=np.array([0, 1, 2, 9])), 10.0)  # cube 9 is not ours
     newest.update(rows(values[:1], PAD_FAULT, cube=np.array([1])), 10.5)
@@ -96,7 +96,7 @@ def test_health_says_doubtful_no_tensor_and_stale():
         FAULTY,
         STALE,
     ]
-    believed = newest.believed(newest.health(10.6, 1.0))
+    believed = newest.usable_values(newest.health(10.6, 1.0))
     assert np.isnan(believed).all(axis=1).tolist() == [False, False, True, True]
     crosses = scene.fault_crosses(places(4), newest.health(10.6, 1.0))
     assert (np.ptp(crosses[0], axis=1) == 0).all() and (
@@ -109,7 +109,7 @@ def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
     2 s to 4 s, nearly all rows have. It is shown after one window of such rows, and hidden after
     one without them."""
     n, random = 400, np.random.default_rng(4)
-    newest = Newest(n)
+    newest = LatestStress(n)
     for step in range(300):
         now, chance = step / 50, np.full(n, 0.01)
         chance[7] = 0.9 if 2 <= now < 4 else 0.01

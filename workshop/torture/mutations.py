@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cube_tensor_driver.core.health import health
-from cube_tensor_driver.core.health.conditions import Conditions
-from cube_tensor_driver.core.health.diagnosis import PadDiagnosis
+from cube_tensor_driver.core.health.diagnosis import Conditions, PadDiagnosis
 from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
@@ -275,7 +274,7 @@ def _keep_for_ever(original: Any, self: Any, found: np.ndarray, came: np.ndarray
 
 
 def _slow_windows() -> None:
-    health.WINDOW_S = 2.0
+    health.WINDOW_NS = 2_000_000_000
 
 
 def _use_bad_pads(original: Any, self: Any, rows: FrequencyRows, left_out: Any = None) -> Any:
@@ -354,8 +353,8 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
     "losses unseen": ("queues hold 0.1 s, and nobody counts what they drop", _short_queue),
     "blind": ("health finds and flags nothing", _around(Health, "update", _see_nothing)),
     "ghosts": ("health flags a sound pad", _around(Health, "update", _see_ghosts)),
-    "never stuck": ("stuck pads are not found", _around(PadDiagnosis, "_stuck", _never_found)),
-    "never noisy": ("noisy pads are not found", _around(PadDiagnosis, "_noisy", _never_found)),
+    "never stuck": ("stuck pads are not found", _around(PadDiagnosis, "_find_stuck", _never_found)),
+    "never noisy": ("noisy pads are not found", _around(PadDiagnosis, "_find_noisy", _never_found)),
     "no stuck bit": (
         "the status does not say that a pad is stuck",
         _stress(_columns(status=lambda status: status & ~np.uint16(STUCK))),

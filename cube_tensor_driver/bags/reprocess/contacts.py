@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import BagError
-from ...core.newest import STALE_S, Newest
+from ...core.latest_stress import STALE_S, LatestStress
 from ...core.rows import StressRows
 from ...messages.codec import Decoded
 from ...messages.contacts import contacts_message, traction_message
@@ -55,7 +55,7 @@ class ContactWriter:
         self._finder = contact_finder(
             self._wanted.settings, cube_poses(info), cube_calibrations(info)
         )
-        self._newest = Newest(len(info.cubes))
+        self._newest = LatestStress(len(info.cubes))
         self._geometry, self._frame_id = geometry(info), info.header.frame_id
 
     def write(
@@ -86,7 +86,7 @@ class ContactWriter:
     def _write(self, stamp_ns: int, recorded_ns: int) -> None:
         if self._finder is None:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
-        values = self._newest.believed(self._newest.health(stamp_ns * 1e-9, STALE_S))
+        values = self._newest.usable_values(self._newest.health(stamp_ns * 1e-9, STALE_S))
         contacts = self._finder.update(values, self._newest.left_out)
         message = contacts_message(make_message, stamp_ns, self._frame_id, contacts)
         self._writer.write(self._contacts, recorded_ns, serialise(message))

@@ -1,1 +1,1 @@
-"""Health of the pads: statistics, conditions, diagnosis, tare and drift of rest frequencies."""
+"""Health of the pads, and their rest frequencies: statistics, diagnosis, tare and drift."""

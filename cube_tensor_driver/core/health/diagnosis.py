@@ -1,4 +1,4 @@
-"""Diagnosis: which pads are stuck, noisy or drifting, and which cubes are still, by statistics.
+"""Diagnosis of pads from the statistics of a window, and how long a condition lasts.
 
 All arrays are (cubes, pads); nothing loops over cubes.
 """
@@ -7,111 +7,217 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..arrays import Array, Index, Mask, PadMasks, StatusBits
 from ..status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, SHORT, STUCK
 from .statistics import Window
 
+HOLD_WINDOWS = 3
+"""Number of windows without a condition after which the condition ends, so that it does not flicker
+while a pad has an intermittent contact."""
+
 MIN_COUNT = 20
-"""Rows in a window below which its statistics say nothing."""
-NOISY_ENTER, NOISY_LEAVE = 10.0, 5.0
-"""Times the calibration's noise and times the cube's other pads, to become noisy and to stay so."""
-JUMP = 60.0
-"""Times the usual noise to which a second difference is bounded: two of them in 20 rows stay below
-NOISY_ENTER."""
-STUCK_MOVING = 5.0
-"""Times its noise that the cube's pads must have moved before a pad that did not move is stuck."""
-STILL = 8.0
-"""Times its noise, peak to peak, within which a pad is still: noise alone spans 6 in 1000 rows."""
-RESIDUAL_ENTER, RESIDUAL_LEAVE = 0.5, 0.1
-"""Shares of a window's rows with a residual above its limit, for a cube to become strained and to
-stay so."""
+"""Minimum number of rows in a window for its statistics to be used."""
+
+NOISY_ENTER = 10.0
+"""Ratio of a pad's noise to its usual noise above which the pad becomes noisy.
+
+The usual noise is the larger of the calibration's noise and the median over the cube's pads.
+"""
+
+NOISY_LEAVE = 5.0
+"""Ratio of a noisy pad's noise to its usual noise below which the pad is no longer noisy."""
+
+MAX_SECOND_DIFFERENCE = 60.0
+"""Limit of a second difference in the noise, as a multiple of the usual noise.
+
+Two second differences of this size in `MIN_COUNT` rows are a noise below `NOISY_ENTER`, so one jump
+of the frequency does not make a pad noisy.
+"""
+
+STUCK_MIN_SPAN = 5.0
+"""Span of the other pads of a cube, as a multiple of their noise, above which a pad that shows a
+single value is stuck."""
+
+STILL_MAX_SPAN = 8.0
+"""Span (peak to peak) of a pad, as a multiple of its noise, below which the pad is still.
+
+Noise alone spans 6 in 1000 rows.
+"""
+
+RESIDUAL_ENTER = 0.5
+"""Share of a window's rows with a residual above its limit for a cube's residual to become high."""
+
+RESIDUAL_LEAVE = 0.1
+"""Share of a window's rows with a residual above its limit for a high residual to stay high."""
+
 DRIFT_LIMIT = 2e-4
-"""Of the rest frequency: how far one pad wanders while all are still before it is drifting."""
+"""Distance, relative to the rest frequency, that one pad of a still cube moves away from the others
+before it is drifting."""
+
+
+class Conditions:
+    """Present conditions of all pads; each lasts until `HOLD_WINDOWS` windows were without it.
+
+    Attributes:
+        state: Conditions of each pad (cubes, P), bits of `status.py`.
+        mask: Bit masks of the pads that are left out (cubes,).
+        status: Conditions of all pads of a cube together (cubes,).
+    """
+
+    def __init__(self, n_cubes: int, n_pads: int) -> None:
+        # Conditions found in the present window come first, then those of the windows before.
+        self._recent = np.zeros((HOLD_WINDOWS, n_cubes, n_pads), np.uint16)
+        self._pad_bit = np.uint32(1) << np.arange(n_pads, dtype=np.uint32)
+        self._since_collected = np.zeros((n_cubes, n_pads), np.uint16)
+        self._combine()
+
+    def add(self, cube: Index, bits: StatusBits) -> None:
+        """Add conditions (n, P) that were just found on cubes (n,)."""
+        # A pad that is broken for good brings nothing new in each row, and this saves the work.
+        if (bits & ~self._recent[0][cube]).any():
+            np.bitwise_or.at(self._recent[0], cube, bits)
+            self._combine()
+
+    def end_window(self, found: StatusBits, has_rows: Mask) -> None:
+        """End a window.
+
+        Args:
+            found: Conditions found in the window (cubes, P).
+            has_rows: Whether a cube had rows in the window (cubes,).
+        """
+        self._recent[0] |= found
+        self._combine()
+        # A cube without rows keeps its conditions, because silence does not show recovery.
+        self._recent[1:, has_rows] = self._recent[:-1, has_rows]
+        self._recent[0, has_rows] = 0
+
+    def collect(self) -> StatusBits:
+        """Return all conditions (cubes, P) since the last call, including the present ones."""
+        found: StatusBits = self._since_collected | self.state
+        self._since_collected = np.zeros_like(found)
+        return found
+
+    def _combine(self) -> None:
+        self.state: StatusBits = np.bitwise_or.reduce(self._recent, axis=0)
+        self._since_collected |= self.state
+        is_left_out = self.state & LEFT_OUT > 0
+        self.mask: PadMasks = (is_left_out * self._pad_bit).sum(axis=1, dtype=np.uint32)
+        self.status: StatusBits = np.bitwise_or.reduce(self.state, axis=1)
 
 
 class PadDiagnosis:
-    """Compares the windows of a skin with what its pads should do.
+    """Finds stuck, noisy and drifting pads, and still cubes, in the windows of a skin.
 
-    still: (cubes,) bool, nothing moved in the last window
-    noise: (cubes, P) Hz, the calibration's
-    bound: (cubes, P) Hz², to which the statistics of the next window cut squared second differences
+    Attributes:
+        still: Whether no usable pad of a cube moved in the last window (cubes,).
+        noise: Noise of each pad (cubes, P) as the calibration states it, in Hz.
+        bound: Limit of squared second differences in the next window (cubes, P), in Hz².
     """
 
-    def __init__(self, exists: np.ndarray) -> None:
-        """exists: (cubes, P) bool, which pads there are."""
+    def __init__(self, exists: Mask) -> None:
+        """Prepare the diagnosis of a skin.
+
+        Args:
+            exists: Whether a cube has this pad (cubes, P).
+        """
         self._exists = exists
-        self.still = np.zeros(len(exists), bool)
-        self._mean_at_rest = np.full(exists.shape, np.nan)  # since the cube is still
-        self._mean_before = self._mean_at_rest.copy()  # of the last window with data
+        self.still: Mask = np.zeros(len(exists), bool)
+        self._mean_at_rest = np.full(exists.shape, np.nan)  # NaN while the cube moves
+        self._mean_before = self._mean_at_rest.copy()  # mean of the last window with rows
 
-    def set_reference(self, rest_frequency: np.ndarray, noise: np.ndarray) -> None:
-        """Rest frequency and noise of the pads, (cubes, P) Hz, NaN where there is none."""
-        self._rest, self.noise = rest_frequency, noise
-        self.bound = _bound(noise)
+    def set_reference(self, rest_frequency: Array, noise: Array) -> None:
+        """Set rest frequency and noise of the pads (cubes, P), in Hz, NaN for missing pads."""
+        self._rest = rest_frequency
+        self.noise = noise
+        self.bound = _squared_bound(noise)
 
-    def examine(self, window: Window, state: np.ndarray) -> np.ndarray:
-        """(cubes, P) bits found in a window that ended; state: (cubes, P) bits known before it."""
-        enough = window.rows >= MIN_COUNT
+    def examine(self, window: Window, state: StatusBits) -> StatusBits:
+        """Find the conditions of a window that has ended.
+
+        Args:
+            window: Statistics of the window.
+            state: Conditions known before the window ended (cubes, P).
+
+        Returns:
+            Conditions found in the window (cubes, P).
+        """
+        has_enough_rows = window.rows >= MIN_COUNT
         span = window.highest - window.lowest
         found = np.zeros(state.shape, np.uint16)
-        with np.errstate(invalid="ignore"):
-            found[self._noisy(window, state)] |= NOISY
-            found[self._stuck(span, state)] |= STUCK
-            self._update_still(window, span, enough, state)
-            found[self._drifting(window)] |= DRIFT
-        return found * (enough[:, None] & self._exists)
+        with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad, or no rows
+            found[self._find_noisy(window, state)] |= NOISY
+            found[self._find_stuck(span, state)] |= STUCK
+            self._update_still(window, span, has_enough_rows, state)
+            found[self._find_drifting(window)] |= DRIFT
+        is_valid = has_enough_rows[:, None] & self._exists
+        valid: StatusBits = found * is_valid
+        return valid
 
-    def _noisy(self, window: Window, state: np.ndarray) -> np.ndarray:
+    def _find_noisy(self, window: Window, state: StatusBits) -> Mask:
+        # Vibration raises the noise of all pads of a cube, so the median is what is usual now.
         usual = np.fmax(self.noise, _lower_median(window.noise))
-        self.bound = _bound(usual)
+        self.bound = _squared_bound(usual)
         was_noisy = state & NOISY > 0
         limit = np.where(was_noisy, NOISY_LEAVE, NOISY_ENTER) * usual
-        # One that is noisy already stays so while a load moves it.
-        return (window.noise > limit) & (window.rough | was_noisy)
+        # A moving load looks like noise but is smooth. It must not end a noisy pad's condition.
+        is_noise = window.rough | was_noisy
+        noisy: Mask = (window.noise > limit) & is_noise
+        return noisy
 
-    def _stuck(self, span: np.ndarray, state: np.ndarray) -> np.ndarray:
-        others_moved = _lower_median(span / self.noise) > STUCK_MOVING
-        # A pad that comes and goes shows a single value now and then and is not stuck.
-        return (span == 0) & others_moved & (state & (OPEN | SHORT | RANGE) == 0)
+    def _find_stuck(self, span: Array, state: StatusBits) -> Mask:
+        others_moved = _lower_median(span / self.noise) > STUCK_MIN_SPAN
+        # A pad with an intermittent contact shows a single value now and then and is not stuck.
+        is_intermittent = state & (OPEN | SHORT | RANGE) > 0
+        stuck: Mask = (span == 0) & others_moved & ~is_intermittent
+        return stuck
 
     def _update_still(
-        self, window: Window, span: np.ndarray, enough: np.ndarray, state: np.ndarray
+        self, window: Window, span: Array, has_enough_rows: Mask, state: StatusBits
     ) -> None:
-        # A step that falls between two windows shows in neither.
-        jumped = np.abs(window.mean - self._mean_before) > STILL * self.noise
-        unmoved = (span < STILL * self.noise) & ~jumped
-        unused = (state & LEFT_OUT > 0) | ~self._exists
-        self.still = enough & (unmoved | unused).all(axis=1)
+        limit = STILL_MAX_SPAN * self.noise
+        # A step between two windows is visible in the span of neither.
+        jumped = np.abs(window.mean - self._mean_before) > limit
+        is_unmoved = (span < limit) & ~jumped
+        is_unused = (state & LEFT_OUT > 0) | ~self._exists
+        self.still = has_enough_rows & (is_unmoved | is_unused).all(axis=1)
         self._mean_before = np.where(np.isnan(window.mean), self._mean_before, window.mean)
 
-    def _drifting(self, window: Window) -> np.ndarray:
+    def _find_drifting(self, window: Window) -> Mask:
         moved = ~self.still & (window.rows > 0)
         self._mean_at_rest[moved] = np.nan
-        fresh = self.still[:, None] & np.isnan(self._mean_at_rest)
-        self._mean_at_rest[fresh] = window.mean[fresh]
-        wander = (window.mean - self._mean_at_rest) / self._rest
-        limit = np.maximum(DRIFT_LIMIT, STILL * self.noise / self._rest)
-        # What all pads do together is temperature or a load.
-        return np.abs(wander - _lower_median(wander)) > limit
+        has_come_to_rest = self.still[:, None] & np.isnan(self._mean_at_rest)
+        self._mean_at_rest[has_come_to_rest] = window.mean[has_come_to_rest]
+
+        shift = (window.mean - self._mean_at_rest) / self._rest
+        limit = np.maximum(DRIFT_LIMIT, STILL_MAX_SPAN * self.noise / self._rest)
+        # A shift that all pads share is temperature or a slow load, not a fault of one pad.
+        drifting: Mask = np.abs(shift - _lower_median(shift)) > limit
+        return drifting
 
 
-def still_strained(strained: np.ndarray, over: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(cubes,) bool: whose residual stayed above its limit, after a window.
+def has_high_residual(was_high: Mask, over_limit: Index, rows: Index) -> Mask:
+    """Decide, with hysteresis, which cubes have a high residual after a window.
 
-    strained: (cubes,) bool before it; over: (cubes,) how many of its rows (cubes,) had a residual
-    above the limit, as noise alone has in one of a thousand. Cubes without rows stay as they were.
+    Noise alone exceeds the limit in one row of a thousand, so a share of the rows decides. Cubes
+    without rows keep their state.
+
+    Args:
+        was_high: Whether the residual was high before the window (cubes,).
+        over_limit: Number of rows in the window with a residual above its limit (cubes,).
+        rows: Number of rows in the window (cubes,).
     """
-    limit = np.where(strained, RESIDUAL_LEAVE, RESIDUAL_ENTER)
-    return np.where(rows > 0, over > limit * rows, strained)
+    share = np.where(was_high, RESIDUAL_LEAVE, RESIDUAL_ENTER)
+    return np.where(rows > 0, over_limit > share * rows, was_high)
 
 
-def _bound(noise: np.ndarray) -> np.ndarray:
-    bound: np.ndarray = ((JUMP * noise) ** 2).astype(np.float32)
+def _squared_bound(noise: Array) -> Array:
+    bound: Array = ((MAX_SECOND_DIFFERENCE * noise) ** 2).astype(np.float32)
     return bound
 
 
-def _lower_median(values: np.ndarray) -> np.ndarray:
-    """(cubes, 1): the lower median over each cube's pads that have a value."""
-    ordered = np.sort(values, axis=1)  # NaN last
-    known = values.shape[1] - np.isnan(ordered).sum(axis=1)
-    middle = np.maximum((known - 1) // 2, 0)
-    return np.take_along_axis(ordered, middle[:, None], axis=1)
+def _lower_median(values: Array) -> Array:
+    """Return the lower median (cubes, 1) over the pads of each cube that have a value."""
+    ordered = np.sort(values, axis=1)  # NaN is sorted to the end
+    n_known = values.shape[1] - np.isnan(ordered).sum(axis=1)
+    place = np.maximum((n_known - 1) // 2, 0)
+    return np.take_along_axis(ordered, place[:, None], axis=1)

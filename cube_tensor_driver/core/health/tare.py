@@ -1,10 +1,10 @@
-"""Tare: take the present load as no load.
+"""Tare: take the present load of a cube as its unloaded state.
 
     f0 = mean(f) / factor(T)
 
-per pad, over the windows of `Health`; factor(T) is the calibration's temperature model. The mean is
-of data that are there already: nobody waits. A signal that moved a moment ago is refused, and so
-are data with a gap.
+per pad, over the last windows of `Health`; factor(T) is the temperature model of the calibration.
+The mean is of data that have already arrived, so nothing has to wait. A tare is refused if the
+signal moved during these windows, or if the data have a gap.
 """
 
 from __future__ import annotations
@@ -15,42 +15,68 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import Array, Index, Mask, pad_table
 from ..errors import TareError
 from ..pipeline import Pipeline
 from ..status import LEFT_OUT
 from .diagnosis import MIN_COUNT
-from .health import HISTORY, Health
+from .health import HISTORY_WINDOWS, Health
 from .statistics import WINDOW_S, Window
 
-MOVED = 12.0
-"""Times the calibration's noise, peak to peak, above which a pad moved: noise alone spans 9 in
-10000 rows."""
-NOISY = 4.0
-"""Times the calibration's noise above which a pad is too noisy for a rest frequency."""
-FAR = 0.2
-"""Of the calibration's rest frequency: beyond this it is a load or another cube, not rest."""
-JUMP_SPAN = 10.0
-"""Times its own noise beyond which a span is a jump: a jump raises the noise, too, but white noise
-does not span so much."""
+MAX_DURATION_S = HISTORY_WINDOWS * WINDOW_S
+"""Longest duration of a tare, in s: that of the windows which `Health` keeps."""
 
-GAP_S = 0.25
-"""What a load did in a longer gap is not known: data from before it are not the present load."""
-GAP_ROWS = 4.0
-"""Where rows come slowly, a gap is longer than so many of their intervals."""
+MAX_SPAN = 12.0
+"""Span (peak to peak) of a pad, as a multiple of the calibration's noise, above which it moves.
+
+Noise alone spans 9 in 10000 rows.
+"""
+
+MAX_NOISE = 4.0
+"""Noise of a pad, as a multiple of the calibration's noise, above which a mean is unreliable."""
+
+MAX_REST_CHANGE = 0.2
+"""Largest relative difference of a new rest frequency from that of the calibration.
+
+A larger one shows a load or another cube.
+"""
+
+JUMP_SPAN = 10.0
+"""Span of a pad, as a multiple of its own noise, above which the signal has jumped.
+
+A jump raises the noise as well, but white noise does not span so much. The span is then reported,
+and not the noise.
+"""
+
+MAX_GAP_S = 0.25
+"""Longest gap in the data, in s, over which the load counts as unchanged."""
+
+MAX_GAP_ROWS = 4.0
+"""Longest gap, as a multiple of the mean interval of the rows, where this is above `MAX_GAP_S`."""
 
 
 class _Means(NamedTuple):
-    """Of the chosen cubes over some windows, (cubes, P) Hz: mean, peak to peak, noise."""
+    """Statistics of the tared cubes over several windows.
 
-    frequency: np.ndarray
-    span: np.ndarray
-    noise: np.ndarray
+    Attributes:
+        frequency, span, noise: Mean, peak-to-peak span and noise (cubes, P), in Hz.
+    """
+
+    frequency: Array
+    span: Array
+    noise: Array
 
 
 class _Check(NamedTuple):
-    """A quantity (cubes, P) of each pad that must not be above its limit, and what to say then."""
+    """A quantity of each pad that must not exceed a limit.
 
-    values: np.ndarray
+    Attributes:
+        values: The quantity (cubes, P).
+        limit: Its limit.
+        problem, unit, fix: Words for the error message.
+    """
+
+    values: Array
     limit: float
     problem: str
     unit: str
@@ -59,38 +85,51 @@ class _Check(NamedTuple):
 
 def measure_rest(
     pipeline: Pipeline, health: Health, cubes: Sequence[int], duration: float, names: Sequence[str]
-) -> np.ndarray:
-    """Rest frequencies (all cubes, P) in Hz after a tare of `cubes`.
+) -> Array:
+    """Compute the rest frequencies that a tare sets.
 
-    duration: s of the newest data to average, in steps of WINDOW_S
-    names: of all cubes, for messages
-    Pads that are left out, and other cubes, keep their rest frequencies. TareError: a cube's signal
-    moves, is noisy, too short, or too far from its calibration, or none of its pads works.
+    Pads that are left out, and other cubes, keep their rest frequencies.
+
+    Args:
+        pipeline: Pipeline with the calibrations and the present rest frequencies.
+        health: Health with the last windows.
+        cubes: Numbers of the cubes to tare.
+        duration: Duration of the newest data to average, in s, in steps of `WINDOW_S`.
+        names: Names of all cubes, for messages.
+
+    Returns:
+        Rest frequencies of all cubes (cubes, P), in Hz.
+
+    Raises:
+        TareError: A cube's signal moves, is noisy, too short or too far from its calibration, or
+            none of its pads works.
     """
     chosen = np.asarray(cubes, dtype=int)
-    windows = _newest_windows(health, chosen, duration, names)
-    rest_before = pipeline.rest_frequency
-    used = (health.state[chosen] & LEFT_OUT == 0) & ~np.isnan(rest_before[chosen])
+    windows = _select_windows(health, chosen, duration, names)
+    result = pipeline.rest_frequency
+    works = health.state[chosen] & LEFT_OUT == 0
+    used = works & ~np.isnan(result[chosen])
     for cube in chosen[~used.any(axis=1)].tolist():
         raise TareError(f"cube {names[cube]}: no pad works; see the diagnostics")
-    with np.errstate(invalid="ignore"):
+
+    with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
         means = _average(windows, chosen)
         factor = pipeline.temperature_factor(chosen, health.temperature[chosen])
         rest = means.frequency / factor
-        checks = _checks(pipeline, health, chosen, rest, means)
+        checks = _list_checks(pipeline, health, chosen, rest, means)
     for check in checks:
-        _apply(check, used, chosen, pipeline, names)
-    result = rest_before
+        _apply_check(check, used, chosen, pipeline, names)
     result[chosen] = np.where(used, rest, result[chosen])
     return result
 
 
-def _newest_windows(
-    health: Health, chosen: np.ndarray, duration: float, names: Sequence[str]
+def _select_windows(
+    health: Health, chosen: Index, duration: float, names: Sequence[str]
 ) -> list[Window]:
-    """The windows to average. TareError: there are not enough data."""
-    if not 0 < duration <= HISTORY * WINDOW_S:
-        raise TareError(f"tare over {duration:g} s; allowed: above 0 to {HISTORY * WINDOW_S:g} s")
+    """Return the windows to average. TareError: there are not enough data."""
+    if not 0 < duration <= MAX_DURATION_S:
+        raise TareError(f"tare over {duration:g} s; allowed: above 0 to {MAX_DURATION_S:g} s")
+    # A duration such as 0.1 + 0.2 + 0.2 must not take another window for its last bit.
     count = math.ceil(duration / WINDOW_S - 1e-9)
     if len(health.history) < count:
         raise TareError(
@@ -98,107 +137,113 @@ def _newest_windows(
             f"tare takes {duration:g} s: wait"
         )
     windows = list(health.history)[-count:]
-    # A signal that moves in the window that is not over yet is refused, too.
-    newest = health.window()
-    if newest.rows.any():
-        windows.append(newest)
+    # A signal that moves in the present window, which has not ended, is refused, too.
+    present = health.window()
+    if present.rows.any():
+        windows.append(present)
+
     rows = np.array([window.rows[chosen] for window in windows])
-    too_few = (rows[:count] == 0).any(axis=0) | (rows.sum(axis=0) < MIN_COUNT)
-    for cube in chosen[too_few].tolist():
+    total = rows.sum(axis=0)
+    has_empty_window = (rows[:count] == 0).any(axis=0)
+    for cube in chosen[has_empty_window | (total < MIN_COUNT)].tolist():
         raise TareError(
             f"cube {names[cube]}: no data, or gaps in it, in the last {duration:g} s; see its link"
         )
-    _refuse_gaps(health, chosen, windows, rows.sum(axis=0), names)
+    _refuse_gaps(health, chosen, windows, total, names)
     return windows
 
 
 def _refuse_gaps(
-    health: Health,
-    chosen: np.ndarray,
-    windows: Sequence[Window],
-    rows: np.ndarray,
-    names: Sequence[str],
+    health: Health, chosen: Index, windows: Sequence[Window], rows: Index, names: Sequence[str]
 ) -> None:
-    """TareError: rows of a cube are too far apart in time to be averaged.
+    """Raise TareError if rows of a cube are too far apart in time to be averaged.
 
-    rows: (len(chosen),) how many of each cube there are in the windows.
+    Args:
+        health: Health, for the age of the newest rows.
+        chosen: Numbers of the cubes to tare.
+        windows: Windows to average.
+        rows: Number of rows of each of these cubes in the windows.
+        names: Names of all cubes.
     """
     before = [window.gap_before[chosen] for window in windows[1:]]
     within = [window.gap_within[chosen] for window in windows]
     gaps_s = 1e-9 * np.abs([*before, *within, health.age_ns[chosen]])
-    limit_s = np.maximum(GAP_S, GAP_ROWS * len(windows) * WINDOW_S / rows)
-    for at in np.flatnonzero((gaps_s > limit_s).any(axis=0)).tolist():
+    mean_interval_s = len(windows) * WINDOW_S / rows
+    limit_s = np.maximum(MAX_GAP_S, MAX_GAP_ROWS * mean_interval_s)
+    longest_s = gaps_s.max(axis=0)
+    for number in np.flatnonzero(longest_s > limit_s).tolist():
         raise TareError(
-            f"cube {names[chosen[at]]}: a gap of {gaps_s[:, at].max():.3g} s in the data to "
-            f"average, the limit is {limit_s[at]:.2g} s: wait until there are data after it"
+            f"cube {names[chosen[number]]}: a gap of {longest_s[number]:.3g} s in the data to "
+            f"average, the limit is {limit_s[number]:.2g} s: wait until there are data after it"
         )
 
 
-def _average(windows: Sequence[Window], chosen: np.ndarray) -> _Means:
+def _average(windows: Sequence[Window], chosen: Index) -> _Means:
+    """Average the windows, each weighted with its number of rows."""
     rows = np.array([window.rows[chosen] for window in windows])[:, :, None]
     mean = np.array([window.mean[chosen] for window in windows])
     variance = np.array([window.noise[chosen] for window in windows]) ** 2
-    # The first rows of a cube have no differences yet: the noise of their window is NaN.
-    with_noise = rows * np.isfinite(variance)
     highest = np.fmax.reduce([window.highest[chosen] for window in windows])
     lowest = np.fmin.reduce([window.lowest[chosen] for window in windows])
-    total = rows.sum(axis=0)
+
+    total = (np.where(rows > 0, mean, 0) * rows).sum(axis=0)
+    # The first rows of a cube have no differences yet, so the noise of their window is NaN.
+    rows_with_noise = rows * np.isfinite(variance)
+    total_variance = (np.nan_to_num(variance) * rows_with_noise).sum(axis=0)
+    n_with_noise = np.maximum(rows_with_noise.sum(axis=0), 1)
     return _Means(
-        frequency=(np.where(rows > 0, mean, 0) * rows).sum(axis=0) / total,
+        frequency=total / rows.sum(axis=0),
         span=highest - lowest,
-        noise=np.sqrt(
-            (np.nan_to_num(variance) * with_noise).sum(axis=0)
-            / np.maximum(with_noise.sum(axis=0), 1)
-        ),
+        noise=np.sqrt(total_variance / n_with_noise),
     )
 
 
-def _checks(
-    pipeline: Pipeline, health: Health, chosen: np.ndarray, rest: np.ndarray, means: _Means
-) -> tuple[_Check, ...]:
-    calibrated = np.full(rest.shape, np.nan)
-    for row, cube in zip(calibrated, chosen.tolist(), strict=True):
-        calibration = pipeline.calibrations[cube]
-        row[: calibration.layout.n_pads] = calibration.rest_frequency
-    known = health.noise[chosen]
+def _list_checks(
+    pipeline: Pipeline, health: Health, chosen: Index, rest: Array, means: _Means
+) -> list[_Check]:
+    calibrations = [pipeline.calibrations[cube] for cube in chosen.tolist()]
+    frequencies = [calibration.rest_frequency for calibration in calibrations]
+    calibrated = pad_table(frequencies, pipeline.n_pads, np.nan)
+    noise = health.noise[chosen]
     jumped = means.span > JUMP_SPAN * means.noise
-    return (
+    return [
         _Check(
-            np.where(jumped, 0, means.noise / known),
-            NOISY,
-            "is noisy",
-            "times its noise",
-            "look for loose leads and interference",
+            values=np.where(jumped, 0, means.noise / noise),
+            limit=MAX_NOISE,
+            problem="is noisy",
+            unit="times its noise",
+            fix="look for loose leads and interference",
         ),
         _Check(
-            means.span / known,
-            MOVED,
-            "moves",
-            "times its noise peak to peak",
-            "let it come to rest",
+            values=means.span / noise,
+            limit=MAX_SPAN,
+            problem="moves",
+            unit="times its noise peak to peak",
+            fix="let it come to rest",
         ),
         _Check(
-            100 * np.abs(rest - calibrated) / calibrated,
-            100 * FAR,
-            "is far from its calibration",
-            "%",
-            "take the load off, or calibrate the cube again",
+            values=100 * np.abs(rest - calibrated) / calibrated,
+            limit=100 * MAX_REST_CHANGE,
+            problem="is far from its calibration",
+            unit="%",
+            fix="take the load off, or calibrate the cube again",
         ),
-    )
+    ]
 
 
-def _apply(
-    check: _Check, used: np.ndarray, chosen: np.ndarray, pipeline: Pipeline, names: Sequence[str]
+def _apply_check(
+    check: _Check, used: Mask, chosen: Index, pipeline: Pipeline, names: Sequence[str]
 ) -> None:
-    """TareError that names the worst pad, if one of the used pads is above the limit."""
-    bad = used & ~(check.values <= check.limit)
-    if not bad.any():
+    """Raise TareError that names the worst pad, if one of the used pads exceeds the limit."""
+    # Written so that NaN exceeds every limit.
+    exceeds = used & ~(check.values <= check.limit)
+    if not exceeds.any():
         return
-    size = np.where(bad, np.nan_to_num(check.values, nan=np.inf), -1)
-    row, pad = np.unravel_index(np.argmax(size), size.shape)
+    excess = np.where(exceeds, np.nan_to_num(check.values, nan=np.inf), -1)
+    row, pad = np.unravel_index(np.argmax(excess), excess.shape)
     cube = int(chosen[row])
-    name = pipeline.calibrations[cube].layout.pads[pad]
+    pad_name = pipeline.calibrations[cube].layout.pads[pad]
     raise TareError(
-        f"cube {names[cube]}: pad {name} {check.problem}: {check.values[row, pad]:.3g} "
+        f"cube {names[cube]}: pad {pad_name} {check.problem}: {check.values[row, pad]:.3g} "
         f"{check.unit}, the limit is {check.limit:g}; {check.fix}"
     )

@@ -80,7 +80,7 @@ class CubeHealth:
             f"pads {word}": int(np.count_nonzero(self._health.state & bit))
             for bit, word in WORDS.items()
         }
-        counts["cubes with a residual"] = int(np.count_nonzero(self._health.strained))
+        counts["cubes with a residual"] = int(np.count_nonzero(self._health.high_residual))
         return {name: count for name, count in counts.items() if count}
 
     def _describe(

@@ -9,7 +9,7 @@ from geometry_msgs.msg import Point, Vector3
 from numpy.typing import NDArray
 from visualization_msgs.msg import Marker
 
-from ...core.newest import FINE, HEALTH
+from ...core.latest_stress import FINE, HEALTH_WORDS
 from ...core.poses import CubePoses
 from ...views import scene
 from .serialised import SerialisedMarkers
@@ -142,7 +142,7 @@ def legend_text(quantity: scene.Quantity, top: float, health: NDArray[np.integer
     low = -high if quantity.signed else 0
     label, unit = quantity.label.translate(PLAIN_LETTERS), quantity.unit.replace("σ", "sigma")
     states = []
-    for state, word in enumerate(HEALTH):
+    for state, word in enumerate(HEALTH_WORDS):
         count = np.count_nonzero(health == state)
         if count or state == FINE:
             states.append(f"{count} {word}")

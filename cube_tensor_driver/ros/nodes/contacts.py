@@ -57,7 +57,7 @@ class Contacts(SkinSubscriberNode):
         if finder is None or skin.messages == self._seen:
             return None
         self._seen = skin.messages
-        values, frame_id = skin.newest.believed(health), skin.info.header.frame_id
+        values, frame_id = skin.newest.usable_values(health), skin.info.header.frame_id
         contacts = finder.update(values, skin.newest.left_out)
         if self._traction is not None and self._traction_is_wanted():
             cloud = finder.cloud(values)

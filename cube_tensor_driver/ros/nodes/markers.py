@@ -79,7 +79,7 @@ class Markers(SkinSubscriberNode):
         self._ranges = Ranges()
 
     def message(self, skin: FollowedSkin, health: np.ndarray) -> bytes:
-        values, residual = skin.newest.believed(health), skin.newest.residual
+        values, residual = skin.newest.usable_values(health), skin.newest.residual
         shown = self._quantity.of(values, residual)
         ranges = self._ranges = self._follow(values, residual, shown)
         canvas = self._canvas
