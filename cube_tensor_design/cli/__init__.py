@@ -1,1 +1,1 @@
-"""The commands fem, study and paper."""
+"""The commands fem, study and paper: one file each, with arguments, work and display."""

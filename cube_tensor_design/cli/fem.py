@@ -1,4 +1,4 @@
-"""./cube fem: what pads see by finite elements, as tables, files and pictures."""
+"""./cube fem: the response of a cube's pads by finite elements, as tables, files and pictures."""
 
 from __future__ import annotations
 
@@ -8,123 +8,60 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cube_tensor_driver.cli.parser import Parser, number, positive
-from cube_tensor_driver.core.defaults import POISSONS_RATIO, YOUNGS_MODULUS
+from cube_tensor_driver.cli.parser import Parser
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rich.table import Table
+
     from cube_tensor_driver.core.layout import Layout
 
     from ..fem.body import Body
     from ..fem.fem import Response
+    from ..fem.model import Model
+    from ..studies.surface_study import SurfaceRow, SurfaceStudy
 
-STEEL_PA = 200e9
-UNEXPLAINED = 1e-3
-"""Part of the response that coefficients may leave out of a calibration; beyond it the whole matrix
-is written."""
-WRITTEN = ("json", "figures", "output", "influence")
-"""Options that change nothing in the result."""
+MAX_STRUCTURE_RESIDUAL = 1e-3
+"""Largest part of the response (relative, Frobenius norm) that the coefficients of a calibration
+may leave out. If more is left out, the calibration holds the whole matrix."""
+MAX_MODE_COLUMNS = 7
+"""Number of modes in one table of the matrix; more do not fit into 80 columns."""
+LABEL_WIDTH = 9
+"""Width of the first column of the matrix, in characters."""
+MIN_NUMBER_WIDTH = 7
+"""Width of a value of the matrix, in characters."""
+COLUMN_GAP = 2
+"""Space between two columns of a table, in characters."""
+MAX_COEFFICIENTS_SHOWN = 40
+"""Number of coefficients in the table of convergence; the file of --json has all."""
+MIN_SHOWN_SHARE = 0.05
+"""Share of the largest stress under a load below which no ratio is shown: it would be noise."""
 
 
 def arguments(parser: Parser) -> None:
     parser.add_argument(
-        "--3d",
-        dest="space",
-        action="store_true",
-        help="compute in space, for 24 pads: takes minutes and up to 6 GB, with --surface 11 GB",
+        "model",
+        nargs="?",
+        metavar="MODEL",
+        help="YAML file of geometry and material, or the name of a shipped one in config/fem "
+        "(default: a planar steel cube of 4 mm in a section of 60 x 11 mm)",
     )
     parser.add_argument(
         "--surface",
         action="store_true",
-        help="bond the lower face to rigid ground and compute what the pads see of forces on the "
-        "upper one, and what the cube says of balls there",
+        help="bond the lower face to rigid ground, and compute the influence functions of the "
+        "pads: their stress under forces on the upper face",
     )
-    parser.add_argument(
-        "--layout",
-        metavar="NAME",
-        help="quad, planar, cube, or a YAML file (default: planar; cube with --3d)",
+    parser.add_output(
+        "-o",
+        "--output",
+        help="write the calibration (.yaml), or with --surface the influence functions (.npz)",
     )
-    parser.add_argument(
-        "--symmetry",
-        metavar="G",
-        help="full, slab, mirrors or none (default: the first that the layout has)",
+    parser.add_output(
+        "--figures", kind="folder", help="write pictures of convergence, response and each load"
     )
-    parser.add_argument(
-        "--plane",
-        choices=["strain", "stress"],
-        help="plane strain or stress, of a layout in a plane (default: strain)",
-    )
-    parser.add_argument(
-        "--width",
-        type=positive,
-        default=60.0,
-        metavar="MM",
-        help="width of the body along x, in space also along y, mm (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--height",
-        type=positive,
-        default=11.0,
-        metavar="MM",
-        help="height of the body along z, mm (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--side",
-        type=positive,
-        default=4.0,
-        metavar="MM",
-        help="side of the cube, mm (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--x",
-        type=number,
-        default=0.0,
-        metavar="MM",
-        help="place of the cube's middle along x, from that of the body, mm (default: 0)",
-    )
-    parser.add_argument(
-        "--z",
-        type=number,
-        default=0.0,
-        metavar="MM",
-        help="the same along z, mm; off the middle a mesh is larger: in space twice for each of "
-        "the two (default: 0)",
-    )
-    parser.add_argument(
-        "--young",
-        type=positive,
-        default=YOUNGS_MODULUS,
-        metavar="PA",
-        help="Young's modulus of the body, Pa (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--poisson",
-        type=number,
-        default=POISSONS_RATIO,
-        metavar="NU",
-        help="Poisson's ratio of the body (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--rigid", action="store_true", help="take a rigid cube (default: steel, 200 GPa, 0.30)"
-    )
-    parser.add_argument(
-        "--pad",
-        metavar="half|MM",
-        help="width of the pads: the halves of each face, or mm (default: that of the layout)",
-    )
-    parser.add_argument(
-        "--pad-centre",
-        type=positive,
-        metavar="MM",
-        help="distance of the pads' centres from the middle of the face, mm "
-        "(default: 1 with --pad MM)",
-    )
-    parser.add_argument(
-        "--neglect",
-        nargs="+",
-        default=[],
-        metavar="MODE",
-        help="modes that the calibration takes as zero",
-    )
+    parser.add_json()
     parser.add_argument(
         "--meshes",
         type=int,
@@ -133,59 +70,67 @@ def arguments(parser: Parser) -> None:
         help="number of meshes; fewer need less memory and show less of the convergence "
         "(default: %(default)s)",
     )
-    parser.add_json()
-    parser.add_output(
-        "--figures", kind="folder", help="write pictures of convergence, response and each load"
-    )
-    parser.add_output("-o", "--output", kind="yaml", help="calibration file to write")
-    parser.add_output(
-        "--influence",
-        help="with --surface --3d: write what the pads see of forces on the surface, for the "
-        "contacts of a skin (.npz)",
-    )
 
 
 def run(options: argparse.Namespace) -> int:
+    from ..fem.model import read_model
+
+    model = read_model(options.model)
+    _check_output(options, model)
+    if options.surface:
+        _run_surface(options, model)
+    else:
+        _run_response(options, model)
+    return 0
+
+
+def _check_output(options: argparse.Namespace, model: Model) -> None:
+    """Raise ConfigError before any work if --output cannot hold what is computed."""
+    from cube_tensor_driver.config.output_files import check_yaml
+    from cube_tensor_driver.core.errors import ConfigError
+
+    path = options.output
+    if path is None:
+        return
+    if not options.surface:
+        check_yaml("-o", path)
+    elif path.suffix != ".npz":
+        raise ConfigError(
+            f"-o {path}: with --surface it is a file of influence functions, which ends in .npz; "
+            "name one, or leave out --surface for a calibration"
+        )
+    elif model.layout.planar:
+        raise ConfigError(
+            f"-o {path}: layout {model.layout.name!r} lies in a plane, and influence functions for "
+            "a skin are of a layout in space; take a model with layout: cube, or leave out -o"
+        )
+
+
+def _run_response(options: argparse.Namespace, model: Model) -> None:
+    """Compute, show and write the response matrix."""
     from cube_tensor_driver.config.output_files import write_json
-    from cube_tensor_driver.core.errors import ElasticError
-    from cube_tensor_driver.core.symmetry import default_modes, find_structure, largest_symmetry
     from cube_tensor_driver.views.terminal.interrupt import ends_at_once
     from cube_tensor_driver.views.terminal.output import progress_bar
 
     from ..fem.fem import compute_response
-    from ..terminal.fem import show_response
 
-    layout = padded_layout(options)
-    symmetry = options.symmetry or largest_symmetry(layout)
-    # Mistakes are named before any work.
-    find_structure(layout, symmetry)
-    default_modes(layout).index(options.neglect)
-    body = body_of(options, layout)
-
-    if options.influence is not None and not (options.surface and options.space):
-        raise ElasticError(
-            f"--influence {options.influence} is of a surface in space; add --surface --3d, or "
-            "leave it out"
-        )
-    if options.surface:
-        return run_surface(options, body, layout)
-
-    print(f"{describe(body, layout)}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
+    layout, symmetry = model.layout, model.symmetry
+    text = describe(model.body, layout)
+    print(f"{text}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
     with ends_at_once(), progress_bar() as report:
-        result = compute_response(body, layout, symmetry, options.meshes, report)
+        result = compute_response(model.body, layout, symmetry, options.meshes, report)
     show_response(result)
     if options.json is not None:
         write_json(options.json, result.to_dict())
     if options.figures is not None:
-        draw(result, options.figures)
+        _draw_response(result, options.figures)
     if options.output is not None:
-        write(options, result)
-    return 0
+        _write_calibration(options, model, result)
 
 
-def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
+def _run_surface(options: argparse.Namespace, model: Model) -> None:
+    """Compute, show and write the influence functions and what the cube measures under loads."""
     from cube_tensor_driver.config.output_files import write_json
-    from cube_tensor_driver.core.errors import ElasticError
     from cube_tensor_driver.mechanics.influence_file import write_influence
     from cube_tensor_driver.views.figures.style import save
     from cube_tensor_driver.views.terminal.interrupt import ends_at_once
@@ -193,16 +138,11 @@ def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
 
     from ..figures.influence import draw_influence
     from ..studies.surface_study import study_surface
-    from ..terminal.surface_study import show_surface
 
-    if options.output is not None:
-        raise ElasticError(
-            f"-o {options.output} is for a calibration, which --surface does not make; leave out "
-            "one of them, or write the tables with --json or --influence"
-        )
+    body, layout = model.body, model.layout
     print(f"{describe(body, layout)} on rigid ground; {layout.n_pads} pads", flush=True)
     with ends_at_once(), progress_bar() as report:
-        study = study_surface(body, layout, options.meshes, options.neglect, report)
+        study = study_surface(body, layout, options.meshes, model.neglect, report)
     show_surface(study)
     if options.json is not None:
         write_json(options.json, study.to_dict())
@@ -211,127 +151,45 @@ def run_surface(options: argparse.Namespace, body: Body, layout: Layout) -> int:
         picture = draw_influence(study.influence, layout, body.side / 2)
         save(picture, options.figures / "influence.png")
         print(f"picture in {options.figures}")
-    if options.influence is not None:
-        write_influence(options.influence, study.influence, command_of(options))
-        print(f"wrote {options.influence}")
-    return 0
-
-
-def padded_layout(options: argparse.Namespace) -> Layout:
-    """The layout with the pads that are asked for. ElasticError: they do not fit."""
-    from cube_tensor_driver.config.calibration import named_layout
-    from cube_tensor_driver.core.errors import ElasticError, LayoutError
-
-    from ..fem.body import strip_layout
-
-    layout = named_layout(options.layout or ("cube" if options.space else "planar"))
-    if options.space and layout.planar:
-        raise ElasticError(
-            f"layout {layout.name!r} lies in a plane; leave out --3d, or take --layout cube"
-        )
-    width_mm, centre_mm = pad_geometry(options, layout)
-    if centre_mm is None:
-        return layout
-    d0_mm = options.side / 2
-    try:
-        return strip_layout(layout, width_mm / d0_mm, centre_mm / d0_mm)
-    except LayoutError as error:
-        reach_mm = centre_mm + width_mm / 2
-        reason = str(error)
-        if reach_mm > d0_mm:
-            reason = f"they reach to {reach_mm:g} mm and the faces end at {d0_mm:g} mm"
-        raise ElasticError(
-            f"pads {width_mm:g} mm wide, {centre_mm:g} mm from the middle of their faces: "
-            f"{reason}; change --pad or --pad-centre"
-        ) from None
-
-
-def pad_geometry(options: argparse.Namespace, layout: Layout) -> tuple[float, float | None]:
-    """Width of the pads and distance of their centres from the middle of the face, mm.
-
-    None: neither is asked for, they stay where the layout has them.
-    """
-    from cube_tensor_driver.core.errors import ElasticError
-
-    d0_mm, centre_mm = options.side / 2, options.pad_centre
-    if options.pad is None:
-        return layout.pad_size * d0_mm, centre_mm
-    if options.pad == "half":
-        if centre_mm not in (None, d0_mm / 2):
-            raise ElasticError(
-                f"--pad half sets the pads' centres; leave out --pad-centre {centre_mm:g}"
-            )
-        return d0_mm, d0_mm / 2
-    try:
-        width_mm = float(options.pad)
-    except ValueError:
-        width_mm = math.nan
-    if not 0 < width_mm < math.inf:
-        raise ElasticError(f"--pad is {options.pad!r}; it must be half, or a width in mm above 0")
-    return width_mm, 1.0 if centre_mm is None else centre_mm
-
-
-def body_of(options: argparse.Namespace, layout: Layout) -> Body:
-    """ElasticError: no such body can be computed."""
-    from cube_tensor_driver.core.errors import ElasticError
-
-    from ..fem.body import Body
-
-    if options.plane is not None and not layout.planar:
-        raise ElasticError(
-            f"--plane {options.plane} is for layouts in a plane; "
-            f"{layout.name!r} is computed in space"
-        )
-    return Body(
-        width=options.width * 1e-3,
-        depth=options.width * 1e-3,
-        height=options.height * 1e-3,
-        side=options.side * 1e-3,
-        young=options.young,
-        poisson=options.poisson,
-        cube_young=math.inf if options.rigid else STEEL_PA,
-        plane=options.plane or "strain",
-        x=options.x * 1e-3,
-        z=options.z * 1e-3,
-    )
+    if options.output is not None:
+        write_influence(options.output, study.influence, _command(options))
+        print(f"wrote {options.output}")
 
 
 def describe(body: Body, layout: Layout) -> str:
+    """Return one line about the cube, its body and its place."""
     lengths = [body.width, body.height]
     plane = f", plane {body.plane}"
     if not layout.planar:
         lengths.insert(1, body.depth)
         plane = ""
     size = " x ".join(f"{1e3 * length:g}" for length in lengths)
-    cube = "rigid" if math.isinf(body.cube_young) else "steel"
+    cube = "steel"
+    if math.isinf(body.cube_young):
+        cube = "rigid"
+    elif body.cube_young != type(body).cube_young:
+        cube = f"{body.cube_young / 1e9:g} GPa"
     where = ""
     if body.x or body.z:
-        where = f", {1e3 * body.x:g} mm along x and {1e3 * body.z:g} mm along z off its middle"
+        where = f", {1e3 * body.x:g} mm along x and {1e3 * body.z:g} mm along z off its centre"
     law = f"E {body.young / 1e6:g} MPa, nu {body.poisson:g}{plane}"
     return f"{cube} cube of {1e3 * body.side:g} mm in a body of {size} mm{where} ({law})"
 
 
-def command_of(options: argparse.Namespace) -> str:
-    """The command line that computes the same, without what is default and what it writes."""
-    parser = Parser()
-    arguments(parser)
+def _command(options: argparse.Namespace) -> str:
+    """Return the command line that computes the same, without its outputs."""
     words = ["./cube", "fem"]
-    for name, default in vars(parser.parse_args([])).items():
-        value = getattr(options, name)
-        if value == default or name in (*WRITTEN, "outputs"):
-            continue
-        words.append("--3d" if name == "space" else f"--{name.replace('_', '-')}")
-        if isinstance(value, float):
-            words.append(f"{value:g}")
-        elif isinstance(value, list):
-            words += value
-        elif value is not True:
-            words.append(str(value))
+    if options.model is not None:
+        words.append(options.model)
+    if options.surface:
+        words.append("--surface")
+    if options.meshes != 3:
+        words += ["--meshes", str(options.meshes)]
     return shlex.join(words)
 
 
-def draw(result: Response, folder: Path) -> None:
-    """Pictures of convergence and response, and of the loads of a layout in a plane."""
+def _draw_response(result: Response, folder: Path) -> None:
+    """Draw convergence and response, and the loads of a layout in a plane."""
     from cube_tensor_driver.views.figures.style import save
 
     from ..figures.deformation import draw_loads
@@ -342,24 +200,25 @@ def draw(result: Response, folder: Path) -> None:
     save(draw_convergence(result), folder / "convergence.png")
     save(draw_response(result), folder / "response.png")
     if result.layout.planar:
-        loads = draw_loads(result.layout, mode_deformations(result.body, result.layout))
-        save(loads, folder / "loads.png")
+        deformations = mode_deformations(result.body, result.layout)
+        save(draw_loads(result.layout, deformations), folder / "loads.png")
     print(f"pictures in {folder}")
 
 
-def write(options: argparse.Namespace, result: Response) -> None:
-    """The calibration file, with what it holds and does not hold in its first lines."""
+def _write_calibration(options: argparse.Namespace, model: Model, result: Response) -> None:
+    """Write the calibration; its first lines say what is computed and what is a placeholder."""
     from cube_tensor_driver.config.calibration import write_calibration
 
     from ..fem.fem import calibration_from_fem
 
-    command = command_of(options)
-    whole = result.structure_residual > UNEXPLAINED
+    command = _command(options)
+    needs_matrix = result.structure_residual > MAX_STRUCTURE_RESIDUAL
     calibration = calibration_from_fem(
-        result, whole_matrix=whole, neglect=options.neglect, source=f"computed by {command}"
+        result, needs_matrix, model.neglect, source=f"computed by {command}"
     )
-    strongest = float(abs(result.matrix[:, result.modes.index("zz")]).max())
-    crushing_kpa = calibration.modulus.max() / strongest / 1e3
+    # A pad is crushed where its stress reaches the modulus of its foam.
+    largest = float(abs(result.matrix[:, result.modes.index("zz")]).max())
+    crushing_kpa = calibration.modulus.max() / largest / 1e3
     lines = [
         f"Made by: {command} -o {options.output}",
         f"The response is computed: {describe(result.body, result.layout)}.",
@@ -368,12 +227,118 @@ def write(options: argparse.Namespace, result: Response) -> None:
         f"With this modulus a uniform sigma_zz of -{crushing_kpa:.3g} kPa crushes a pad, which is"
         " where its law ends.",
     ]
-    if options.neglect:
+    if model.neglect:
         lines.append(
             "The modes under neglect must be small: too few pads to tell them from the others."
         )
     write_calibration(options.output, calibration, "\n".join(lines))
-    what = f"calibration {calibration.id}"
-    if whole:
-        what += f", with the whole matrix: symmetry {result.symmetry} does not explain it"
-    print(f"wrote {options.output}: {what}")
+    text = f"wrote {options.output}: calibration {calibration.id}"
+    if needs_matrix:
+        text += f", with the whole matrix: symmetry {result.symmetry} does not explain it"
+    print(text)
+
+
+def show_response(result: Response) -> None:
+    """Print the matrix, the coefficients on each mesh, and what they leave unexplained."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    column = COLUMN_GAP + max(MIN_NUMBER_WIDTH, *(len(name) for name in result.modes))
+    fitting = (console.width - LABEL_WIDTH) // column
+    count = max(1, min(MAX_MODE_COLUMNS, fitting))
+    for start in range(0, len(result.modes), count):
+        console.print(_matrix_table(result, start, count))
+    console.print(_convergence_table(result))
+    hidden = len(result.coefficients) - MAX_COEFFICIENTS_SHOWN
+    if hidden > 0:
+        console.print(f"and {hidden} coefficients more, in the --json file")
+    console.print(
+        f"symmetry {result.symmetry} leaves {100 * result.structure_residual:.3g} % "
+        "of the response unexplained; "
+        f"rank {result.rank} of {len(result.modes)}; "
+        f"unobservable: {', '.join(result.unobservable) or 'nothing'}; "
+        f"{result.seconds:.1f} s",
+        soft_wrap=True,
+    )
+
+
+def _matrix_table(result: Response, start: int, count: int) -> Table:
+    """Return the table of pads by `count` modes; the first one has the title of all."""
+    title = "response, Pa per Pa; below, what the symmetry does not explain"
+    names = result.modes[start : start + count]
+    table = new_table("" if start else title, "pad", names)
+    modes = slice(start, start + len(names))
+    for number, (pad, row) in enumerate(zip(result.layout.pads, result.matrix, strict=True), 1):
+        label = f"V{number} {pad}" if result.layout.planar else pad
+        is_last = number == result.layout.n_pads
+        table.add_row(label, *(format_number(value, 4) for value in row[modes]), end_section=is_last)
+    table.add_row("left, %", *(f"{100 * result.mode_residual[name]:.2f}" for name in names))
+    return table
+
+
+def _convergence_table(result: Response) -> Table:
+    """Return the table of the coefficients on each mesh."""
+    meshes = result.convergence
+    unknowns = [str(mesh["unknowns"]) for mesh in meshes]
+    title = "coefficients on meshes with these numbers of unknowns"
+    table = new_table(title, "unknowns", [*unknowns, "last step"])
+    names = list(result.coefficients)[:MAX_COEFFICIENTS_SHOWN]
+    for name in names:
+        values = [mesh["coefficients"][name] for mesh in meshes]
+        step = ""
+        if len(values) > 1 and values[-2]:
+            step = f"{100 * abs(values[-1] / values[-2] - 1):.2g} %"
+        numbers = (f"{value:.5f}" for value in values)
+        table.add_row(name, *numbers, step, end_section=name == names[-1])
+    changes = [mesh["change"] for mesh in meshes]
+    shown = ["" if change is None else f"{100 * change:.2g} %" for change in changes]
+    table.add_row("change to the next", *shown)
+    table.add_row("seconds", *(f"{mesh['seconds']:.1f}" for mesh in meshes))
+    return table
+
+
+def show_surface(study: SurfaceStudy) -> None:
+    """Print for each load the measured stress, the true one, and their ratio where it is large."""
+    from rich.console import Console
+
+    is_plane = study.layout.planar
+    names = list(study.rows[0].measured)
+    heads = [
+        f"{name} {column}" for name in names for column in ("measured", "true", "ratio")
+    ]
+    table = new_table(
+        f"stress in kPa under {'1 N/mm' if is_plane else '1 N'}: measured by the cube, and true",
+        "load",
+        ["width, mm", "beside, mm", *heads],
+    )
+    # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.
+    unit, digits = (1.0, 1) if is_plane else (1e3, 2)
+    for row in study.rows:
+        cells = [cell for name in names for cell in _surface_cells(row, name, unit, digits)]
+        table.add_row(row.load, f"{1e3 * row.width:g}", f"{1e3 * row.offset:g}", *cells)
+    Console(highlight=False).print(table)
+
+
+def _surface_cells(row: SurfaceRow, name: str, unit: float, digits: int) -> tuple[str, str, str]:
+    """Return measured stress, true stress and their ratio, empty where the true one is small."""
+    measured, true = row.measured[name], row.true[name]
+    largest = max(abs(value) for value in row.true.values())
+    ratio = f"{measured / true:.2f}" if abs(true) > MIN_SHOWN_SHARE * largest else ""
+    return format_number(measured / unit, digits), format_number(true / unit, digits), ratio
+
+
+def new_table(title: str, first: str, columns: Iterable[str]) -> Table:
+    """Return an empty table with a first column of names and columns of numbers."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column(first)
+    for name in columns:
+        table.add_column(name, justify="right")
+    return table
+
+
+def format_number(value: float, digits: int) -> str:
+    """Format a number with this many digits after the point; -0 becomes 0."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"

@@ -1,4 +1,4 @@
-"""./cube paper: all pictures and numbers of docs/paper.md but those of the study."""
+"""./cube paper: the pictures and numbers of docs/paper.md, except those of the study."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""The body in which a cube sits, what of it can be computed, and its meshes."""
+"""The body in which a cube sits, the checks of what can be computed, and its meshes."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import skfem
@@ -14,11 +14,17 @@ from cube_tensor_driver.core.defaults import HALF_SIDE, POISSONS_RATIO, YOUNGS_M
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import Layout
 
-from .mesh import block, sections
+from .mesh import mesh_box, mesh_section
 
 
 class BrickSizes(NamedTuple):
-    """Size of a brick on a face and at an edge of the cube, in d0, and growth away from it."""
+    """Sizes of the bricks of one mesh.
+
+    Attributes:
+        face: Size of a brick on a face of the cube, in d0.
+        edge: Size of a brick at an edge of the cube, in d0.
+        growth: Ratio of the sizes of two neighbouring bricks, away from the cube.
+    """
 
     face: float
     edge: float
@@ -30,24 +36,36 @@ BRICK_SIZES = (
     BrickSizes(0.25, 0.2, 2.0),
     BrickSizes(0.25, 0.1, 1.5),
 )
-"""Of the meshes in space, coarse to fine."""
-_LARGEST_BRICK = 2.0
-"""Of a body on ground, d0: where forces on its surface act, its field is not linear."""
-_CLOSEST_EDGES = 1e-3
-"""Smallest distance of two pad edges, d0."""
+"""Sizes of the bricks of the three meshes in space, from coarse to fine."""
+MAX_BRICK_ON_GROUND = 2.0
+"""Largest brick of a body on ground, in d0. Where forces act on its surface the field is not
+linear, so bricks must stay small far away from the cube, too."""
+MIN_EDGE_DISTANCE = 1e-3
+"""Smallest distance of two pad edges that a mesh resolves, in d0."""
+MIN_BODY_RATIO = 1.1
+"""Smallest ratio of the body's width, depth and height to the cube's side."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A box of elastomer with a cube bonded in it; lengths in m, moduli in Pa.
+    """A box of elastomer with a cube bonded in it.
 
-    width, depth, height: along x, y and z (depth in 3-D only); side: of the cube
-    young, poisson: of the body
-    cube_young, cube_poisson: of the cube; cube_young = inf makes it rigid
-    plane: "strain" or "stress", for layouts in a plane
-    x, z: where the cube's middle is, from that of the body
-    ground: the lower face is bonded to rigid ground
-    Raises ElasticError when no such body can be computed.
+    Attributes:
+        width: Length along x, in m.
+        depth: Length along y, in m; for layouts in space only.
+        height: Length along z, in m.
+        side: Side of the cube, in m.
+        young: Young's modulus of the elastomer, in Pa.
+        poisson: Poisson's ratio of the elastomer.
+        cube_young: Young's modulus of the cube, in Pa; infinity makes it rigid.
+        cube_poisson: Poisson's ratio of the cube.
+        plane: "strain" or "stress", for layouts in a plane.
+        x: Position of the cube's centre along x relative to the body's centre, in m.
+        z: The same along z.
+        ground: Whether the lower face is bonded to rigid ground.
+
+    Raises:
+        ElasticError: No such body can be computed.
     """
 
     width: float = 60e-3
@@ -76,94 +94,132 @@ class Body:
                     "the elements do not lock, but at 0.5 pressure is no longer a function of "
                     "strain"
                 )
+        min_length = MIN_BODY_RATIO * self.side
         for name in ("width", "depth", "height"):
-            if not getattr(self, name) > 1.1 * self.side:
+            length = getattr(self, name)
+            if not length > min_length:
                 raise ElasticError(
                     f"the cube's side is {self.side * 1e3:g} mm but the body's {name} is "
-                    f"{getattr(self, name) * 1e3:g} mm; the body must be at least 1.1 times as "
+                    f"{length * 1e3:g} mm; the body must be at least {MIN_BODY_RATIO:g} times as "
                     "large"
                 )
         for name, across in (("x", "width"), ("z", "height")):
-            value, most = getattr(self, name), (getattr(self, across) - 1.1 * self.side) / 2
-            if not abs(value) <= most:
+            offset = getattr(self, name)
+            max_offset = (getattr(self, across) - min_length) / 2
+            if not abs(offset) <= max_offset:
                 raise ElasticError(
-                    f"the cube is {value * 1e3:g} mm off the body's middle along {name}; within "
-                    f"this {across} it can be {most * 1e3:g} mm off at most"
+                    f"the cube is {offset * 1e3:g} mm off the body's centre along {name}; within "
+                    f"this {across} it can be {max_offset * 1e3:g} mm off at most"
                 )
         if self.plane not in ("strain", "stress"):
             raise ElasticError(f"plane is {self.plane!r}; it must be 'strain' or 'stress'")
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain types for JSON; None stands for infinity."""
+        return {name: None if value == np.inf else value for name, value in vars(self).items()}
+
 
 def strip_layout(layout: Layout, width: float, centre: float = 0.5) -> Layout:
-    """The same layout with pads of another width and distance from the middle of their face, in d0.
+    """Return the layout with pads of another width at another distance from their face's centre.
 
-    width = 1, centre = 0.5 are the halves of each face. Raises LayoutError when a pad leaves its
-    face.
+    Args:
+        layout: Layout whose pads keep their faces and directions.
+        width: Width of the pads, in d0.
+        centre: Distance of a pad's centre from the centre of its face, in d0. A width of 1 and a
+            distance of 0.5 are the halves of each face.
+
+    Raises:
+        LayoutError: A pad leaves its face.
     """
     normals = layout.normals
     across = layout.positions - normals
     length = np.linalg.norm(across, axis=1, keepdims=True)
+    # A pad in the middle of its face has no direction and stays there.
     directions = across / np.where(length > 0, length, 1.0)
     return Layout(layout.name, normals + centre * directions, normals, width)
 
 
 def field_axes(layout: Layout) -> tuple[int, ...]:
-    """The axes of a layout's problem: x and z in a plane, all in space."""
+    """Return the axes of a layout's problem: x and z in a plane, all three in space."""
     return (0, 2) if layout.planar else (0, 1, 2)
 
 
 def check_pads(body: Body, layout: Layout) -> None:
-    """Raise ElasticError when pads of one face share area.
+    """Raise ElasticError when two pads of one face share area.
 
     Square pads overlap when they are less than their side apart along both axes.
     """
     mm = 1e3 * body.side / 2
     size = layout.pad_size
     for i, j in itertools.combinations(range(layout.n_pads), 2):
-        gap = np.abs(layout.positions[i] - layout.positions[j]).max()
-        same_face = np.array_equal(layout.normals[i], layout.normals[j])
-        if same_face and gap < size * (1 - 1e-9):
+        distance = np.abs(layout.positions[i] - layout.positions[j]).max()
+        is_same_face = np.array_equal(layout.normals[i], layout.normals[j])
+        if is_same_face and distance < size * (1 - 1e-9):
             raise ElasticError(
                 f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {mm * size:g} mm wide, "
-                f"{mm * gap:g} mm apart; make them narrower or move them apart"
+                f"{mm * distance:g} mm apart; make them narrower or move them apart"
             )
 
 
 def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
-    """Mesh of the body about the cube's middle, lengths in d0; level 0 is the coarsest, 2 the
-    finest. Where the body is its own mirror image it is the positive part.
+    """Mesh the body about the cube's centre.
 
-    Raises ElasticError when the edges of pads are too close to each other for it.
+    Along an axis where the body is its own mirror image, only the positive part is meshed.
+
+    Args:
+        body: The body.
+        layout: Pads, at whose edges elements end.
+        level: 0 is the coarsest mesh, 2 the finest.
+
+    Returns:
+        A mesh with lengths in d0.
+
+    Raises:
+        ElasticError: Edges of pads are too close to each other.
     """
     axes = list(field_axes(layout))
-    half = np.array([body.width, body.depth, body.height])[axes] / body.side
-    place = np.array([body.x, 0.0, body.z])[axes] / (body.side / 2)
-    whole = (place != 0) | (body.ground & (np.array(axes) == 2))
     stops = _pad_edges(layout)
-    steps = np.diff(np.unique([0.0, *stops[stops < 1], 1.0]))
-    if steps.min() < _CLOSEST_EDGES:
-        mm = 1e3 * body.side / 2
-        raise ElasticError(
-            f"pad edges are {mm * steps.min():.2g} mm apart and the mesh resolves "
-            f"{mm * _CLOSEST_EDGES:g} mm; make the pads wider, or move their edges together or "
-            "apart"
-        )
-    lower, upper = np.where(whole, half + place, 0.0).tolist(), (half - place).tolist()
+    _check_edges(stops, body.side / 2)
+
+    half = np.array([body.width, body.depth, body.height])[axes] / body.side
+    offset = np.array([body.x, 0.0, body.z])[axes] / (body.side / 2)
+    # The ground is on one side only, so it breaks the mirror along z.
+    no_mirror = (offset != 0) | (body.ground & (np.array(axes) == 2))
+    lower = np.where(no_mirror, half + offset, 0.0).tolist()
+    upper = (half - offset).tolist()
+
     if layout.planar:
-        return sections(lower, upper, stops, level)
+        return mesh_section(lower, upper, stops, level)
     sizes = BRICK_SIZES[level]
-    largest = _LARGEST_BRICK if body.ground else np.inf
-    return block(upper, stops, sizes.face, sizes.edge, sizes.growth, lower, largest)
+    return mesh_box(
+        lower,
+        upper,
+        stops,
+        size=sizes.face,
+        smallest=sizes.edge,
+        growth=sizes.growth,
+        largest=MAX_BRICK_ON_GROUND if body.ground else np.inf,
+    )
 
 
 def _pad_edges(layout: Layout) -> Array:
-    """Distances of pad edges from the middle of their faces, d0, sorted."""
+    """Return the distances of pad edges from the centres of their faces, in d0, sorted."""
     half = layout.pad_size / 2
-    edges = [
-        abs(float(position[k]) + s)
-        for position, normal in zip(layout.positions, layout.normals, strict=True)
-        for k in field_axes(layout)
-        for s in (-half, half)
-        if normal[k] == 0
-    ]
+    edges = []
+    for position, normal in zip(layout.positions, layout.normals, strict=True):
+        for axis in field_axes(layout):
+            if normal[axis] == 0:
+                edges += [abs(position[axis] - half), abs(position[axis] + half)]
     return np.unique(np.round(edges, 9))
+
+
+def _check_edges(stops: Array, half_side: float) -> None:
+    """Raise ElasticError when two edges are closer than the mesh resolves."""
+    distance = np.diff(np.unique([0.0, *stops[stops < 1], 1.0])).min()
+    if distance < MIN_EDGE_DISTANCE:
+        mm = 1e3 * half_side
+        raise ElasticError(
+            f"pad edges are {mm * distance:.2g} mm apart and the mesh resolves "
+            f"{mm * MIN_EDGE_DISTANCE:g} mm; make the pads wider, or move their edges together or "
+            "apart"
+        )

@@ -1,6 +1,6 @@
-"""Stress in a layer under forces on lines along y: plane strain.
+"""Stress in a layer under forces on lines along y, which is a state of plane strain.
 
-The transfer functions T(k) of layer.py, for waves along x, of both ways::
+With the transfer functions T(k) of layer.py for waves along x of both signs, the modes at x are::
 
     modes(x) = int T(k) exp(-i k x) dk / (2 pi)
 """
@@ -13,19 +13,31 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
 
-_WAVES = 4000
-_GREATEST = 30.0
-"""Points in k, and wavenumber times depth at the last one: the field has decayed by exp(-30)."""
+WAVES = 4000
+"""Number of wavenumbers of the integral."""
+MAX_WAVENUMBER = 30.0
+"""Largest wavenumber times depth. The field has decayed there by exp(-30)."""
 
 
 def line_load(layer: Layer, x: Array, depth: float, scale: float) -> Array:
-    """(7, m, 2) amplitudes of the modes PLANE at z = -depth, x = 0 under forces along x and z.
+    """Return the plane modes at one point of a layer under unit line loads along x and z.
 
-    x: (m,) m, where the forces act. 1/m: Pa under 1 N/m; gradients are times scale (m).
+    Args:
+        layer: The layer.
+        x: (m,) positions of the line loads relative to the point, in m.
+        depth: Depth of the point, in m.
+        scale: Length that gradients are multiplied with, in m.
+
+    Returns:
+        (7, m, 2) amplitudes of the modes `PLANE`, in Pa under 1 N/m.
     """
-    k = (np.arange(_WAVES) + 0.5) * _GREATEST / depth / _WAVES
+    k = (np.arange(WAVES) + 0.5) * MAX_WAVENUMBER / depth / WAVES
     transfer = layer.transfer(k, 0 * k, depth)[:, :, [0, 2]]
     rows = transfer[:, [FIELD.index(name) for name in PLANE.names]]
-    rows[:, [name not in ("zz", "zx", "xx") for name in PLANE.names]] *= scale
-    wave = np.exp(-1j * np.outer(x, k)) * ((k[1] - k[0]) / np.pi)
+    is_gradient = ["_" in name for name in PLANE.names]
+    rows[:, is_gradient] *= scale
+
+    # Waves of both signs are conjugate, so twice the real part of one half is the integral.
+    step = k[1] - k[0]
+    wave = np.exp(-1j * np.outer(x, k)) * (step / np.pi)
     return np.moveaxis(np.tensordot(wave, rows, axes=1).real, 0, 1)

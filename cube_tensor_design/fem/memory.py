@@ -1,4 +1,4 @@
-"""Is there enough memory for a mesh? Asked before any work."""
+"""A check, before any work, that the solver of a mesh fits into the memory."""
 
 from __future__ import annotations
 
@@ -9,41 +9,46 @@ import skfem
 
 from cube_tensor_driver.core.errors import ElasticError
 
-_FIXED_BYTES = 3e8
-"""Memory whatever the mesh: with less, SuperLU was seen to hang."""
-_BYTES_PER_CORNER = {2: 3e5, 3: 8e5}
-"""Memory of the response's solver at the peak, per corner of an element, by dimension; measured."""
+FIXED_BYTES = 3e8
+"""Memory in bytes that is needed for any mesh. With less, SuperLU was seen to hang."""
+BYTES_PER_CORNER = {2: 3e5, 3: 8e5}
+"""Peak memory of the solver in bytes per corner of an element, by dimension; measured."""
 
 
 def check_memory(grid: skfem.Mesh, bytes_per_corner: float | None = None) -> None:
-    """Raise ElasticError when a mesh needs more memory than is available.
+    """Raise ElasticError when the solver needs more memory than is available.
 
-    bytes_per_corner: by default what the response's solver needs. SuperLU must not run into a
-    limit: it may look for memory for ever.
+    This is asked before any work, because SuperLU may look for memory for ever near a limit.
+
+    Args:
+        grid: The mesh.
+        bytes_per_corner: Peak memory per corner of an element, by default `BYTES_PER_CORNER`.
     """
-    per_corner = bytes_per_corner or _BYTES_PER_CORNER[int(grid.dim())]
-    need = _FIXED_BYTES + grid.nvertices * per_corner
-    have = available_memory()
-    if have is not None and need > have:
+    per_corner = bytes_per_corner or BYTES_PER_CORNER[int(grid.dim())]
+    needed = FIXED_BYTES + grid.nvertices * per_corner
+    available = available_memory()
+    if available is not None and needed > available:
         raise ElasticError(
-            f"this needs about {need / 1e9:.2g} GB of memory and {max(have, 0.0) / 1e9:.2g} GB "
-            "are available; ask for fewer meshes or wider pads, or give it more"
+            f"this needs about {needed / 1e9:.2g} GB of memory and "
+            f"{max(available, 0.0) / 1e9:.2g} GB are available; ask for fewer meshes or wider "
+            "pads, or give it more"
         )
 
 
 def available_memory() -> float | None:
-    """Bytes that this process may still take, of the machine and of its own limit.
+    """Return the bytes that this process may still take, limited by the machine and by ulimit.
 
-    None where that is unknown.
+    Returns:
+        None where that is unknown, which is everywhere but on Linux. Nothing is refused then.
     """
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        (available,) = (line for line in lines if line.startswith("MemAvailable"))
-        free = 1024.0 * float(available.split()[1])
+        (line,) = (line for line in lines if line.startswith("MemAvailable"))
+        free = 1024.0 * float(line.split()[1])
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return free
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         return min(free, float(limit - resource.getpagesize() * pages))
     except (OSError, ValueError):
-        return None  # not Linux: nothing is known, so nothing is refused
+        return None

@@ -1,6 +1,6 @@
-"""Meshes of a box with a cube |x_k| <= 1 in it, of the positive part where a mirror allows that.
+"""Meshes of a box with a cube |x_k| <= 1 in it, or of the positive part where a mirror allows that.
 
-Lengths are in d0. The stress is infinite at the corner (in space, the edges) of the cube, so
+Lengths are in d0. The stress is infinite at the corner (in space, at the edges) of the cube, so
 elements shrink towards it. Elements end at the edges of pads. Meshes are symmetric under exchange
 of axes where the box and the pads are.
 """
@@ -13,126 +13,150 @@ from itertools import pairwise
 
 import numpy as np
 import skfem
-from numpy.typing import NDArray
 
-from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.arrays import Array, Index
 
-_NEAR = 1.5
-"""What the cube adds to the stress has decayed at this distance from its faces, d0."""
-_FAR_GROWTH = 3.0
-_DIRECTIONS = np.array(
+DECAY_DISTANCE = 1.5
+"""Distance from the cube's faces, in d0, at which the stress that the cube adds has decayed. Beyond
+it a linear field needs no fine mesh, and bricks grow by `FAR_GROWTH`."""
+FAR_GROWTH = 3.0
+"""Ratio of the sizes of two neighbouring bricks beyond `DECAY_DISTANCE`."""
+SECTION_GROWTH = 2.0
+"""Ratio of the sizes of two neighbouring triangles away from the cube."""
+RING_HALF_SIDE = 0.5
+"""Half side of the largest ring of triangles around the cube's corner, in d0."""
+_RING_POINTS = np.array(
     [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float
 )
+"""Points of a ring around the origin, anticlockwise; those with an odd number are corners."""
 
 
-def section(
+def mesh_quarter(
     half: Sequence[float],
     stops: Iterable[float],
     level: int = 1,
     smallest: float = 1e-8,
     largest: float = np.inf,
-    ring: float = 0.5,
+    ring: float = RING_HALF_SIDE,
 ) -> skfem.MeshTri:
-    """Triangles on [0, half[0]] x [0, half[1]], in rings around the cube's corner (1, 1).
+    """Mesh [0, half[0]] x [0, half[1]] with triangles in rings around the cube's corner (1, 1).
 
-    stops: pad edges on [0, 1]
-    level: 0 is coarse, 1 has twice as many rings, each further one cuts all triangles in four
-    smallest: size of the last ring over the first; what the rings leave out at 1e-8 is less than
-    1e-4 of any entry of the response
-    largest: the longest side of a triangle away from the cube
-    ring: the half side of the first ring, or less where it does not fit
+    Args:
+        half: Half width and half height of the section.
+        stops: Pad edges on [0, 1].
+        level: 0 is coarse, 1 has twice as many rings, each further one cuts all triangles in four.
+        smallest: Ratio of the last ring's size to the first one's. What the rings leave out at 1e-8
+            is less than 1e-4 of any entry of the response.
+        largest: Longest side of a triangle away from the cube.
+        ring: Half side of the first ring, which is smaller where this does not fit.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     rho = min(ring, 1.0 - inner[-1], *(h - 1.0 for h in half))
-    face = np.append(_inner(inner, 1.0 - rho, 0.5), 1.0)
-    lines = [np.concatenate([face, _outer(1.0 + rho, h, rho, 2.0, largest)]) for h in half]
+    face = np.append(_split(inner, 1.0 - rho, 0.5), 1.0)
+    lines = []
+    for end in half:
+        outer = _grow_to(1.0 + rho, end, rho, SECTION_GROWTH, largest)
+        lines.append(np.concatenate([face, outer]))
+
     base = skfem.MeshTri.init_tensor(*lines)
-    away = np.any(np.abs(base.p[:, base.t].mean(axis=1) - 1.0) > rho, axis=0)
+    from_corner = np.abs(base.p[:, base.t].mean(axis=1) - 1.0)
+    outside_rings = np.any(from_corner > rho, axis=0)
     ring_points, ring_triangles = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
     points = np.concatenate([base.p.T, ring_points])
-    triangles = np.concatenate([base.t.T[away], ring_triangles + base.p.shape[1]])
-    mesh = _joined(points.T, triangles.T)
+    triangles = np.concatenate([base.t.T[outside_rings], ring_triangles + base.p.shape[1]])
+    mesh = _merge_points(points.T, triangles.T)
     return mesh.refined(level - 1) if level > 1 else mesh
 
 
-def sections(
+def mesh_section(
     lower: Sequence[float], upper: Sequence[float], stops: Iterable[float], level: int
 ) -> skfem.MeshTri:
-    """The same on [-lower[0], upper[0]] x [-lower[1], upper[1]].
+    """Mesh [-lower[0], upper[0]] x [-lower[1], upper[1]] as `mesh_quarter` meshes a quarter.
 
-    Where `lower` is 0, there is the positive part only.
+    Where `lower` is 0, only the positive part is meshed.
     """
     stops = list(stops)
-    present = [h for h in (*lower, *upper) if h > 0]
-    ring = min(0.5, *(h - 1.0 for h in present))
-    sides = [((1, u), (-1, l)) if l > 0 else ((1, u),) for l, u in zip(lower, upper, strict=True)]
-    return _glued(
-        [
-            (section((x, z), stops, level, ring=ring), (sx, sz))
-            for (sx, x), (sz, z) in itertools.product(*sides)
-        ]
-    )
+    ring = min(RING_HALF_SIDE, *(h - 1.0 for h in (*lower, *upper) if h > 0))
+    # The sign and the length of each half that is meshed, along each axis.
+    sides = []
+    for below, above in zip(lower, upper, strict=True):
+        sides.append([(1, above), (-1, below)] if below > 0 else [(1, above)])
+    parts = []
+    for (sign_x, x), (sign_z, z) in itertools.product(*sides):
+        parts.append((mesh_quarter((x, z), stops, level, ring=ring), (sign_x, sign_z)))
+    return _join_quarters(parts)
 
 
-def mirrored(quarter: skfem.MeshTri) -> skfem.MeshTri:
-    """All of the section from its positive quarter."""
-    return _glued([(quarter, signs) for signs in itertools.product((1, -1), repeat=2)])
+def mirror_quarter(quarter: skfem.MeshTri) -> skfem.MeshTri:
+    """Return the mesh of the whole section from that of its positive quarter."""
+    return _join_quarters([(quarter, signs) for signs in itertools.product((1, -1), repeat=2)])
 
 
-def _glued(parts: Sequence[tuple[skfem.MeshTri, tuple[int, ...]]]) -> skfem.MeshTri:
-    """One mesh of quarters, each with the signs of its axes, which share their edges' points."""
+def _join_quarters(parts: Sequence[tuple[skfem.MeshTri, tuple[int, ...]]]) -> skfem.MeshTri:
+    """Return one mesh of quarters, each with the signs of its axes, that share their edges."""
     points: list[Array] = []
-    triangles: list[NDArray[np.int64]] = []
+    triangles: list[Index] = []
     first = 0
     for quarter, signs in parts:
         points.append(quarter.p * np.array(signs)[:, None])
         triangles.append(quarter.t + first)
         first += quarter.nvertices
-    return _joined(np.concatenate(points, axis=1), np.concatenate(triangles, axis=1))
+    return _merge_points(np.concatenate(points, axis=1), np.concatenate(triangles, axis=1))
 
 
-def _joined(points: Array, triangles: NDArray[np.int64]) -> skfem.MeshTri:
-    """A mesh of points (2, n) of which some are the same, and triangles (3, m)."""
-    # As complex numbers: np.unique of rows (axis=0) swallows Ctrl-C. + 0.0: no negative zeros.
-    unique, inverse = np.unique(
-        (points + 0.0).T[triangles.T.ravel()] @ [1, 1j], return_inverse=True
-    )
+def _merge_points(points: Array, triangles: Index) -> skfem.MeshTri:
+    """Return a mesh of points (2, n), some of which are equal, and triangles (3, m)."""
+    # The points are complex numbers here, because np.unique of rows (axis=0) swallows Ctrl-C.
+    # Adding 0.0 turns -0.0 into 0.0.
+    corners = (points + 0.0).T[triangles.T.ravel()] @ [1, 1j]
+    unique, inverse = np.unique(corners, return_inverse=True)
     return skfem.MeshTri(np.array([unique.real, unique.imag]), inverse.reshape(-1, 3).T.copy())
 
 
-def block(
-    half: Sequence[float],
+def mesh_box(
+    lower: Sequence[float],
+    upper: Sequence[float],
     stops: Iterable[float],
+    *,
     size: float,
     smallest: float,
     growth: float,
-    lower: Sequence[float] = (0.0, 0.0, 0.0),
     largest: float = np.inf,
 ) -> skfem.MeshHex:
-    """Bricks on the product of [-lower[k], half[k]]: `size` on a face, `smallest` at the cube's
-    edges, `largest` far away.
+    """Mesh the product of the intervals [-lower[k], upper[k]] with bricks.
 
-    Away from the cube they grow by the factor `growth`. Where the cube's part of the stress has
-    decayed, a linear field needs no fine mesh: there they grow faster.
+    Away from the cube bricks grow by the factor `growth`, and faster where the stress that the cube
+    adds has decayed.
+
+    Args:
+        lower: Length on the negative side of each axis; 0 where there is a mirror.
+        upper: Length on the positive side of each axis.
+        stops: Pad edges on [0, 1].
+        size: Size of a brick on a face of the cube.
+        smallest: Size of a brick at an edge of the cube.
+        growth: Ratio of the sizes of two neighbouring bricks.
+        largest: Size of a brick far away from the cube.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
-    fine = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
-    face = np.concatenate([_inner(inner, inner[-1], size), fine[1:]])
+    to_edge = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
+    face = np.concatenate([_split(inner, inner[-1], size), to_edge[1:]])
 
-    def line(h: float) -> Array:
-        near = 1.0 + _graded(min(h - 1.0, _NEAR), smallest, growth)
-        far = _outer(near[-1], h, near[-1] - near[-2], _FAR_GROWTH, largest)
+    def half_line(end: float) -> Array:
+        near = 1.0 + _graded(min(end - 1.0, DECAY_DISTANCE), smallest, growth)
+        far = _grow_to(near[-1], end, near[-1] - near[-2], FAR_GROWTH, largest)
         return np.concatenate([face, near[1:], far[1:]])
 
-    lines = [
-        np.concatenate([-line(l)[:0:-1], line(h)]) if l > 0 else line(h)
-        for l, h in zip(lower, half, strict=True)
-    ]
+    lines = []
+    for below, above in zip(lower, upper, strict=True):
+        line = half_line(above)
+        if below > 0:
+            line = np.concatenate([-half_line(below)[:0:-1], line])
+        lines.append(line)
     return skfem.MeshHex.init_tensor(*lines)
 
 
-def _inner(stops: Sequence[float], end: float, size: float) -> Array:
-    """Points through all stops to the end, no further apart than size."""
+def _split(stops: Sequence[float], end: float, size: float) -> Array:
+    """Return points through all stops to the end, at most `size` apart."""
     stops = sorted({*stops, end})
     points = [np.array([stops[0]])]
     for a, b in pairwise(stops):
@@ -141,42 +165,43 @@ def _inner(stops: Sequence[float], end: float, size: float) -> Array:
     return np.concatenate(points)
 
 
-def _outer(start: float, end: float, first: float, growth: float, largest: float) -> Array:
-    """Points from start to end, both included; steps grow from about `first` up to `largest`."""
+def _grow_to(start: float, end: float, first: float, growth: float, largest: float) -> Array:
+    """Return points from start to end inclusive, in steps from about `first` up to `largest`."""
     if start == end:
         return np.array([start])
     points = start + _graded(end - start, first * growth, growth)
-    return points if np.isinf(largest) else _inner(points.tolist(), end, largest)
+    return points if np.isinf(largest) else _split(points.tolist(), end, largest)
 
 
 def _graded(length: float, first: float, growth: float) -> Array:
-    """Points 0 ... length; steps grow by the same factor, starting at or below `first`."""
-    n = max(1, int(np.ceil(np.log1p(length * (growth - 1.0) / first) / np.log(growth) - 1e-9)))
+    """Return points from 0 to length in steps that grow by one factor, from `first` or less."""
+    # The geometric series of n steps from `first` must reach the length.
+    exact = np.log1p(length * (growth - 1.0) / first) / np.log(growth)
+    n = max(1, int(np.ceil(exact - 1e-9)))
     steps = growth ** np.arange(n, dtype=float)
     points = np.concatenate([[0.0], np.cumsum(steps)]) * (length / steps.sum())
-    points[-1] = length
+    points[-1] = length  # free of rounding
     return points
 
 
-def _rings(rho: float, ratio: float, smallest: float) -> tuple[Array, NDArray[np.int64]]:
-    """Points (n, 2) and triangles (m, 3): rings of eight trapezoids about (1, 1).
+def _rings(rho: float, ratio: float, smallest: float) -> tuple[Array, Index]:
+    """Return points (n, 2) and triangles (m, 3) of rings of eight trapezoids about (1, 1).
 
-    Each ring is the one before it times `ratio`; the first has the half side `rho`.
+    Each ring is the one before it times `ratio`; the first one has the half side `rho`.
     """
     n = int(np.ceil(np.log(smallest) / np.log(ratio)))
     radii = rho * ratio ** np.arange(n + 1)
-    around = 1.0 + np.multiply.outer(radii, _DIRECTIONS).reshape(-1, 2)
+    around = 1.0 + np.multiply.outer(radii, _RING_POINTS).reshape(-1, 2)
     points = np.concatenate([around, [[1.0, 1.0]]])
     triangles = []
     for outer in range(0, 8 * n, 8):  # number of the ring's first point
         inner = outer + 8
-        for middle in range(0, 8, 2):  # of a side; its neighbours are corners
-            for corner in ((middle + 1) % 8, (middle - 1) % 8):
+        for side in range(0, 8, 2):  # a point in the middle of a side, between two corners
+            for corner in ((side + 1) % 8, (side - 1) % 8):
                 # Cut the trapezoid along its shorter diagonal.
-                triangles += [
-                    (outer + middle, outer + corner, inner + corner),
-                    (outer + middle, inner + corner, inner + middle),
-                ]
+                triangles.append((outer + side, outer + corner, inner + corner))
+                triangles.append((outer + side, inner + corner, inner + side))
+    # The last ring is closed by triangles to the corner of the cube itself.
     last = 8 * n
     triangles += [(last + j, last + (j + 1) % 8, len(points) - 1) for j in range(8)]
     return points, np.array(triangles)

@@ -23,7 +23,7 @@ from cube_tensor_driver.core.layout import LAYOUTS, Layout
 
 from ..fem.body import Body
 from ..fem.memory import check_memory
-from ..fem.mesh import mirrored, section
+from ..fem.mesh import mesh_quarter, mirror_quarter
 from ..fem.pads import face_weights
 from ..fem.solid import lame
 from .material import Material
@@ -356,13 +356,13 @@ def _bench_mesh(body: Body, layout: Layout, cube: bool, size: float) -> skfem.Me
     stops = np.unique(np.round([across - half_pad, across + half_pad], 9))
     top = body.height / 2 / half_side
     half = [body.width / 2 / half_side, top]
-    quarter = section(half, stops, 1, smallest=0.3, largest=size)
+    quarter = mesh_quarter(half, stops, 1, smallest=0.3, largest=size)
     quarter = _refined(quarter, lambda x, z: (z > top - 0.9) & (x < 6.0))
     # Here rods stretch the surface most.
     quarter = _refined(quarter, lambda x, z: (z > top - 0.25) & (x < 2.4))
     for _ in range(CUBE_REFINEMENTS if cube else 0):
         quarter = _refined(quarter, lambda x, z: np.abs(np.maximum(x, z) - 1.15) < 0.15)
-    return mirrored(quarter)
+    return mirror_quarter(quarter)
 
 
 def _refined(

@@ -1,15 +1,15 @@
-"""What a cube in a layer on rigid ground says of balls on the surface, against the field there.
+"""What a cube in a layer on rigid ground measures of balls on the surface, against the true stress.
 
 A response matrix R is that of a body loaded on all its sides. In a layer the surface and the ground
-are near, and the field is curved. So the stress that a cube says differs from that of the layer
-without it, even where nothing is measured wrong. With the influence functions g (influence.py) of
-the pads in the layer and the traction t of a ball, pads see p = int g . t and the cube says::
+are near, and the field is curved. So the stress that a cube measures differs from that of the layer
+without the cube, even if the pads are exact. With the influence functions g (influence.py) of the
+pads in the layer and the traction t of a ball, the pads have the stress p, and the cube measures s::
 
-    said = R^+ p
+    p = int g . t,        s = R^+ p
 
-Traction is Hertz's (K. L. Johnson, Contact Mechanics (1985), 4.2): in a plane over a strip, in
-space over a disc, along z where the ball presses and along x where it rubs. The field without the
-cube is that of layer.py.
+The traction is Hertz's (K. L. Johnson, Contact Mechanics (1985), 4.2): over a strip for a layout in
+a plane, over a disc in space. It acts along z where the ball presses and along x where it rubs. The
+true stress is that of layer.py.
 """
 
 from __future__ import annotations
@@ -35,49 +35,63 @@ from ..fem.fem import compute_response
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 
-Progress = Callable[[int, int, str], None]
-
 WIDTHS = (2e-3, 5e-3, 10e-3, 20e-3)
-"""Of the contacts, m; those that fit onto the body are computed."""
+"""Widths of the contacts, in m. Those that do not fit onto the body are left out."""
 COMPONENTS = ("zz", "zx")
-"""What is compared, where the layout sees it."""
+"""Stress components that are compared, where the layout observes them."""
 LOADS = {"press": (-1, -1.0), "rub": (0, 1.0)}
-"""Axis and sign of the force: a ball presses against z and rubs along x."""
-_ACROSS = 41
-"""Points across a contact: its force is then right to a hundredth."""
+"""Axis and sign of the force by the name of the load: a ball presses against z and rubs along x."""
+POINTS_ACROSS = 41
+"""Number of point forces across a contact. With them its force is right to a hundredth."""
+MAX_LEAK = 1e-6
+"""Largest deviation from 1 of a component's own entry in R^+ R. Beyond it the pads confuse the
+component with others, and it is not compared."""
 
 
-class Said(NamedTuple):
-    """Of one load.
+class SurfaceRow(NamedTuple):
+    """Result for one load.
 
-    load: press or rub; width: of the contact, place: of its middle along x from the cube's, m
-    said, there: stress by component, Pa under 1 N along the load's axis; in a plane under 1 N/m
+    Attributes:
+        load: Name in `LOADS`.
+        width: Width of the contact, in m.
+        offset: Distance of its centre from the cube's centre along x, in m.
+        measured: Stress by component that the cube measures, in Pa under 1 N along the load's axis;
+            for a layout in a plane under 1 N/m.
+        true: The same of the layer without the cube.
     """
 
     load: str
     width: float
-    place: float
-    said: dict[str, float]
-    there: dict[str, float]
+    offset: float
+    measured: dict[str, float]
+    true: dict[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain types for JSON."""
+        return {
+            "load": self.load,
+            "width": self.width,
+            "place": self.offset,
+            "said": self.measured,
+            "there": self.true,
+        }
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceStudy:
-    """influence: of the pads of the cube in the layer; rows: one for each load."""
+    """Influence functions of the pads of a cube in a layer, and one row for each load."""
 
     body: Body
     layout: Layout
     influence: Influence
-    rows: tuple[Said, ...]
+    rows: tuple[SurfaceRow, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types for JSON."""
+        """Return plain types for JSON."""
         return {
-            "body": {
-                name: None if value == np.inf else value for name, value in vars(self.body).items()
-            },
+            "body": self.body.to_dict(),
             "layout": self.layout.to_dict(),
-            "rows": [row._asdict() for row in self.rows],
+            "rows": [row.to_dict() for row in self.rows],
             "place": self.influence.place.tolist(),
             "pads": self.influence.pads.tolist(),
         }
@@ -88,17 +102,23 @@ def study_surface(
     layout: Layout,
     meshes: int = 3,
     neglect: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> SurfaceStudy:
-    """The study for a body, whose lower face is taken as bonded to rigid ground, on the last of
-    1 to 3 meshes.
+    """Compare measured and true stress under balls above the cube and beside it.
 
-    neglect: modes that the cube takes as zero. progress is called before every stage and at the
-    end. Raises ElasticError when no contact of WIDTHS fits onto the body, the layout sees none of
-    COMPONENTS, pads overlap, or the mesh does not fit into memory.
+    Args:
+        body: The body; its lower face is taken as bonded to rigid ground.
+        layout: Pads of the cube.
+        meshes: Number of meshes, 1 to 3; the last one gives the result.
+        neglect: Modes that the cube takes as zero.
+        progress: Called as progress(stage, stages, name) before every stage and at the end.
+
+    Raises:
+        ElasticError: No contact of `WIDTHS` fits onto the body, the layout observes none of
+            `COMPONENTS`, pads overlap, or the mesh does not fit into memory.
     """
-    places = (0.0, body.side)
-    reach = body.width / 2 - abs(body.x) - places[-1]
+    offsets = (0.0, body.side)
+    reach = body.width / 2 - abs(body.x) - offsets[-1]
     widths = [width for width in WIDTHS if width / 2 <= reach]
     if not widths:
         raise ElasticError(
@@ -112,61 +132,89 @@ def study_surface(
             progress(stage, len(stages) - 1, stages[stage])
 
     report(0)
-    inverse = _inverse(body, layout, meshes, neglect)
+    inverse = _inverse_rows(body, layout, meshes, neglect)
     report(1)
     influence = compute_influence(replace(body, ground=True), layout, meshes - 1)
+
     rows = []
-    for (load, (axis, sign)), width, place in itertools.product(LOADS.items(), widths, places):
-        points, parts = hertz(width / 2, 1 if layout.planar else 2)
-        points[:, 0] += place
+    for load, width, offset in itertools.product(LOADS, widths, offsets):
+        axis, sign = LOADS[load]
+        points, parts = hertz_points(width / 2, 1 if layout.planar else 2)
+        points[:, 0] += offset
         pads = influence.at(points)[:, :, axis] @ (sign * parts)
-        said = {name: float(row @ pads) for name, row in inverse.items()}
-        field = _field(body, layout, width, place, points, parts)[:, axis]
-        there = {name: sign * float(field[COMPONENTS.index(name)]) for name in inverse}
-        rows.append(Said(load, width, place, said, there))
+        measured = {name: float(row @ pads) for name, row in inverse.items()}
+        if layout.planar:
+            field = _true_stress_in_plane(body, points[:, 0], parts)
+        else:
+            field = _true_stress_in_space(body, width, offset)
+        true = {name: sign * float(field[name][axis]) for name in inverse}
+        rows.append(SurfaceRow(load, width, offset, measured, true))
     report(2)
     return SurfaceStudy(body, layout, influence, tuple(rows))
 
 
-def _inverse(body: Body, layout: Layout, meshes: int, neglect: Sequence[str]) -> dict[str, Array]:
-    """The rows (P,) of R^+ of the components that the pads tell from all others, by name."""
+def _inverse_rows(
+    body: Body, layout: Layout, meshes: int, neglect: Sequence[str]
+) -> dict[str, Array]:
+    """Return, by component, the row (P,) of R^+ where the pads tell it from all other modes."""
     response = compute_response(body, layout, largest_symmetry(layout), meshes)
     names = [name for name in response.modes if name not in neglect]
     matrix = response.matrix[:, [response.modes.index(name) for name in names]]
     inverse = np.linalg.pinv(matrix)
-    told = np.abs(np.diag(inverse @ matrix) - 1) < 1e-6
-    rows = {name: inverse[k] for k, name in enumerate(names) if told[k] and name in COMPONENTS}
+    own_entry = np.diag(inverse @ matrix)
+    observed = {
+        name: inverse[k] for k, name in enumerate(names) if abs(own_entry[k] - 1) < MAX_LEAK
+    }
+    rows = {name: observed[name] for name in COMPONENTS if name in observed}
     if not rows:
         raise ElasticError(
             f"layout {layout.name!r} tells none of {', '.join(COMPONENTS)} from the other modes; "
-            "take one with more pads, or --neglect modes that are small"
+            "take one with more pads, or list modes that are small under neglect"
         )
-    return {name: rows[name] for name in COMPONENTS if name in rows}
+    return rows
 
 
-def _field(
-    body: Body, layout: Layout, width: float, place: float, points: Array, parts: Array
-) -> Array:
-    """(COMPONENTS, 2 or 3) stress at the cube's middle without it, under unit force along each
-    axis."""
-    depth = body.height / 2 - body.z
-    if layout.planar:
-        # Plane stress is plane strain of another ratio.
-        poisson = body.poisson if body.plane == "strain" else body.poisson / (1 + body.poisson)
-        modes = line_load(Layer(body.height, poisson), points[:, 0], depth, body.side / 2)
-        return np.stack([parts @ modes[PLANE.names.index(name)] for name in COMPONENTS])
-    kernels = Kernels(Layer(body.height, body.poisson), depth, body.side / 2)
-    field = kernels.field(np.array([[-place, 0.0]]), width / 2)[0]
-    return np.stack([field[FIELD.index(name)] for name in COMPONENTS])
+def _true_stress_in_plane(body: Body, x: Array, parts: Array) -> dict[str, Array]:
+    """Return, by component, the stress (2,) at the cube's centre under unit line loads.
 
-
-def hertz(radius: float, dim: int) -> tuple[Array, Array]:
-    """Points (n, dim) m from the middle of a contact and the parts (n,) of its force there.
-
-    dim: 1 a strip, 2 a disc; the pressure falls with the root of 1 - (r / radius)^2.
+    Args:
+        body: The body without the cube.
+        x: (n,) positions of the line loads, in m.
+        parts: (n,) shares of the load.
     """
-    line = (2 * np.arange(_ACROSS) + 1) / _ACROSS - 1
+    poisson = body.poisson
+    if body.plane == "stress":
+        # Plane stress is plane strain of a material with this ratio.
+        poisson = body.poisson / (1 + body.poisson)
+    modes = line_load(Layer(body.height, poisson), x, _depth(body), body.side / 2)
+    return {name: parts @ modes[PLANE.names.index(name)] for name in COMPONENTS}
+
+
+def _true_stress_in_space(body: Body, width: float, offset: float) -> dict[str, Array]:
+    """Return, by component, the stress (3,) at the cube's centre under a ball's unit force."""
+    kernels = Kernels(Layer(body.height, body.poisson), _depth(body), body.side / 2)
+    field = kernels.field(np.array([[-offset, 0.0]]), width / 2)[0]
+    return {name: field[FIELD.index(name)] for name in COMPONENTS}
+
+
+def _depth(body: Body) -> float:
+    """Return the depth of the cube's centre below the surface, in m."""
+    return body.height / 2 - body.z
+
+
+def hertz_points(radius: float, dim: int) -> tuple[Array, Array]:
+    """Return point forces of a Hertzian contact, whose pressure falls as sqrt(1 - (r/radius)^2).
+
+    Args:
+        radius: Half width of the strip, or radius of the disc, in m.
+        dim: 1 for a strip, 2 for a disc.
+
+    Returns:
+        Points (n, dim) in m from the contact's centre, and the share (n,) of the force on each.
+    """
+    line = (2 * np.arange(POINTS_ACROSS) + 1) / POINTS_ACROSS - 1
     points = np.stack(np.meshgrid(*[line] * dim), axis=-1).reshape(-1, dim)
-    inside = 1 - (points**2).sum(axis=1)
-    points, pressure = points[inside > 0], np.sqrt(inside[inside > 0])
-    return radius * points, pressure / pressure.sum()
+    square = 1 - (points**2).sum(axis=1)
+    is_inside = square > 0
+    pressure = np.sqrt(square[is_inside])
+    return radius * points[is_inside], pressure / pressure.sum()

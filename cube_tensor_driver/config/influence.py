@@ -23,8 +23,8 @@ def find_influence(name: str) -> Path:
             return path
     names = ", ".join(sorted(path.stem for path in shipped.glob("*.npz")))
     raise ConfigError(
-        f"no influence functions {name!r}; name a file that ./cube fem --surface --3d made, or one "
-        f"of the shipped: {names}"
+        f"no influence functions {name!r}; name a file that ./cube fem MODEL --surface -o FILE.npz "
+        f"made, or one of the shipped: {names}"
     )
 
 

@@ -175,7 +175,7 @@ CONTACTS = (
         "influence",
         "",
         "For the method inverse, what the pads measure of forces on the surface: the name of a "
-        "shipped table, or a file of `./cube fem --surface --influence`. Then depth, thickness and "
+        "shipped table, or a file of `./cube fem MODEL --surface`. Then depth, thickness and "
         "poisson are those of the table. Empty: cubes count as points.",
         problem=influence_problem,
     ),

@@ -77,11 +77,11 @@ def read_influence(path: Path) -> Influence:
         influence = _parse(_load_arrays(data))
         _check(influence)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; make it with ./cube fem --surface --3d") from None
+        raise ConfigError(f"{path}: no such file; make it with ./cube fem MODEL --surface") from None
     except (CubeError, *_READ_ERRORS) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise ConfigError(
-            f"{path}: {reason}; make the file again with ./cube fem --surface --3d --influence"
+            f"{path}: {reason}; make the file again with ./cube fem MODEL --surface -o FILE.npz"
         ) from None
     return influence
 

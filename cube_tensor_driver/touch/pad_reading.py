@@ -66,7 +66,7 @@ def _pads(influence: Influence, calibration: Calibration) -> list[int]:
         raise ElasticError(
             f"the influence functions are of a cube of {1e3 * side:g} mm and calibration "
             f"{calibration.id} of one of {2e3 * calibration.half_side:g} mm; make them again with "
-            f"./cube fem --surface --side {2e3 * calibration.half_side:g}"
+            f"./cube fem MODEL --surface, with side: {2 * calibration.half_side:g} in the model"
         )
     found = []
     for name, position, normal in zip(mine.pads, mine.positions, mine.normals, strict=True):
@@ -76,7 +76,7 @@ def _pads(influence: Influence, calibration: Calibration) -> list[int]:
         if apart[nearest] > _SAME or abs(given.pad_size - mine.pad_size) > _SAME:
             raise ElasticError(
                 f"the influence functions have no pad like {name} of layout {mine.name!r}; make "
-                "them again with ./cube fem --surface for this layout"
+                "them again with ./cube fem MODEL --surface for this layout"
             )
         found.append(nearest)
     return found

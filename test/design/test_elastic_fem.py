@@ -183,7 +183,7 @@ def test_rigid_disc_converges_to_the_closed_form(poisson):
 @pytest.mark.parametrize("cube", [None, lame(6e5, 0.3)], ids=["rigid", "elastic"])
 def test_nothing_holds_the_cube(cube):
     """What the mirrors and the pin leave free must balance: no net force or couple on the cube."""
-    body = Solid(mesh.section((15.0, 2.75), (0.0, 1.0)), lame(1.0, 0.48), cube)
+    body = Solid(mesh.mesh_quarter((15.0, 2.75), (0.0, 1.0)), lame(1.0, 0.48), cube)
     x, c = body.positions, body.component
     stress = np.array([[0.0, 1.0], [1.0, 0.0]])
     gradient = np.zeros((2, 2, 2))
@@ -247,7 +247,7 @@ def test_the_default_is_right():
     body, layout = Body(), LAYOUTS["planar"]
     default = read_calibration(ROOT / "config" / "calibration" / "planar_slab.yaml").response
     finer = Solid(
-        mesh.section((15.0, 2.75), (0.3, 0.7), 3, smallest=0.01),
+        mesh.mesh_quarter((15.0, 2.75), (0.3, 0.7), 3, smallest=0.01),
         lame(1.0, 0.48),
         lame(200e9 / 0.3e6, 0.3),
     )
@@ -287,11 +287,14 @@ def coarse(monkeypatch):
 @pytest.fixture(scope="module")
 def bricks():
     """A small solid with two equal axes."""
-    return Solid(mesh.block((3.0, 3.0, 2.5), (0.2, 0.7), 1.0, 0.3, 6.0), lame(1.0, 0.48), None)
+    grid = mesh.mesh_box(
+        (0.0, 0.0, 0.0), (3.0, 3.0, 2.5), (0.2, 0.7), size=1.0, smallest=0.3, growth=6.0
+    )
+    return Solid(grid, lame(1.0, 0.48), None)
 
 
 def test_bricks_are_the_stretched_unit_cube(bricks):
-    part = bricks._part(np.arange(bricks.basis.mesh.nelements) % 3 > 0)
+    part = bricks._restrict(np.arange(bricks.basis.mesh.nelements) % 3 > 0)
     whole, fast = stiffness(part, (2.0, 0.3)), brick_stiffness(part, (2.0, 0.3))
     assert abs(whole - fast).max() < 1e-12 * abs(whole).max()
 

@@ -41,7 +41,7 @@ ELSEWHERE = {
     "./cube check socket://127.0.0.1:5331": (
         "test_firmware.test_hubs_keep_every_rule_on_real_lines"
     ),
-    "./cube fem --surface --3d --rigid --width 80 --meshes 2 --influence mine.npz": (
+    "./cube fem cube_11mm --surface --meshes 2 -o mine.npz": (
         "test_elastic_command.test_pads_under_loads_on_the_surface"
     ),
     "./cube record -o run1": "test_bags_ros.test_recorded_is_published_and_reprocessed_is_live",

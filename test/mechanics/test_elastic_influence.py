@@ -108,10 +108,10 @@ def test_a_small_cube_says_what_is_there():
     errors = []
     for side in (1e-3, 0.5e-3):
         study = study_surface(Body(width=120e-3, side=side), PLANAR, meshes=2)
-        largest = [max(map(abs, row.there.values())) for row in study.rows]
+        largest = [max(map(abs, row.true.values())) for row in study.rows]
         errors.append(
             [
-                {name: abs(row.said[name] - row.there[name]) / most for name in row.said}
+                {name: abs(row.measured[name] - row.true[name]) / most for name in row.measured}
                 for row, most in zip(study.rows, largest, strict=True)
             ]
         )
@@ -122,4 +122,4 @@ def test_a_small_cube_says_what_is_there():
     for load, largest_one, other in (("press", "zz", "zx"), ("rub", "zx", "zz")):
         (row,) = (row for row in study.rows if row[:3] == (load, 20e-3, 0.0))
         sign = -1 if load == "press" else 1
-        assert sign * row.said[largest_one] > 10 > 1e4 * abs(row.said[other])
+        assert sign * row.measured[largest_one] > 10 > 1e4 * abs(row.measured[other])

@@ -158,7 +158,7 @@ def test_in_the_field_a_cube_without_a_pad_counts_as_missing(influence):
 
 
 def test_influence_functions_of_other_cubes_are_refused(influence):
-    with pytest.raises(ElasticError, match=r"cube of 4 mm and calibration .* of 3 mm.*--side 3"):
+    with pytest.raises(ElasticError, match=r"cube of 4 mm and calibration .* of 3 mm.*side: 0.003"):
         read_pads(influence, [replace(CUBE, half_side=1.5e-3)])
     layout = replace(LAYOUTS["planar"], pad_size=0.3)
     with pytest.raises(ElasticError, match=r"no pad like .* of layout 'planar'"):
@@ -207,7 +207,7 @@ def test_a_file_that_is_none(changes, words, tmp_path):
     path.write_bytes(b"PK but no more" if changes is None else damaged(whole, **changes))
     with pytest.raises(ConfigError, match=words) as error:
         read_influence(path)
-    assert str(path) in str(error.value) and "--influence" in str(error.value)
+    assert str(path) in str(error.value) and "--surface" in str(error.value)
 
 
 def test_a_name_that_is_none():

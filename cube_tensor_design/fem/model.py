@@ -1,0 +1,172 @@
+"""Model files of `./cube fem`: geometry, material and layout of one cube in its body.
+
+A model is a YAML file in SI units. Every key may be left out; `config/fem/planar_slab.yaml` lists
+all keys with their defaults, and docs/build.md describes them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cube_tensor_driver.config.calibration import named_layout
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.schema import TEXT, Schema, list_of, mapping, real
+from cube_tensor_driver.config.yaml import read_yaml
+from cube_tensor_driver.core.errors import ConfigError, CubeError, ElasticError, LayoutError
+from cube_tensor_driver.core.layout import Layout
+from cube_tensor_driver.core.symmetry import default_modes, find_structure, largest_symmetry
+
+from .body import Body, strip_layout
+
+DEFAULT_LAYOUT = "planar"
+"""Layout of a model that names none."""
+
+_LENGTH = real("a length in m greater than 0", exclusiveMinimum=0)
+_OFFSET = real("a distance in m")
+_YOUNG = real("a Young's modulus in Pa greater than 0", exclusiveMinimum=0)
+_POISSON = real("a Poisson's ratio of at least 0 and below 0.5", minimum=0, exclusiveMaximum=0.5)
+_MODES = list_of(TEXT, "names of modes") | {"minItems": 0, "description": "a list of modes"}
+_RIGID = {"type": "boolean", "description": "true or false"}
+_SYMMETRY = {
+    "enum": ["full", "slab", "mirrors", "none"],
+    "description": "full, slab, mirrors or none",
+}
+_PLANE = {"enum": ["strain", "stress"], "description": "strain or stress"}
+_BODY = {
+    "width": _LENGTH,
+    "depth": _LENGTH,
+    "height": _LENGTH,
+    "young": _YOUNG,
+    "poisson": _POISSON,
+}
+_CUBE = {
+    "side": _LENGTH,
+    "rigid": _RIGID,
+    "young": _YOUNG,
+    "poisson": _POISSON,
+    "x": _OFFSET,
+    "z": _OFFSET,
+}
+_PADS = {"width": _LENGTH, "centre": _LENGTH}
+_SCHEMA = Schema(
+    mapping(
+        (),
+        {
+            "layout": TEXT,
+            "symmetry": _SYMMETRY,
+            "plane": _PLANE,
+            "neglect": _MODES,
+            "body": mapping((), _BODY),
+            "cube": mapping((), _CUBE),
+            "pads": mapping((), _PADS),
+        },
+    )
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What `./cube fem` computes.
+
+    Attributes:
+        body: Box of elastomer with the cube in it.
+        layout: Pads of the cube.
+        symmetry: Group whose coefficients describe the response.
+        neglect: Names of modes that the calibration takes as zero.
+    """
+
+    body: Body
+    layout: Layout
+    symmetry: str
+    neglect: tuple[str, ...]
+
+
+def find_model(name: str) -> Path:
+    """Return the path of a model: a shipped one by its name, or else a file.
+
+    Raises:
+        ConfigError: There is neither. The message lists the shipped models.
+    """
+    shipped = package_data() / "config" / "fem"
+    for path in (shipped / f"{name}.yaml", Path(name)):
+        if path.is_file():
+            return path
+    names = ", ".join(sorted(path.stem for path in shipped.glob("*.yaml")))
+    raise ConfigError(f"no model {name!r}; name a YAML file, or one of the shipped: {names}")
+
+
+def read_model(name: str | None) -> Model:
+    """Read and check a model; without a name, take the default of every key.
+
+    Raises:
+        ConfigError: There is no such model, a key is unknown or a value is not allowed. The
+            message is one line with the file and the key.
+    """
+    if name is None:
+        return _build_model({}, Path())
+    path = find_model(name)
+    data = read_yaml(path) or {}
+    for _, mistake in _SCHEMA.mistakes(data):
+        raise ConfigError(f"{path}: {mistake}")
+    try:
+        return _build_model(data, path.parent)
+    except CubeError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
+    """Build the model of checked values; layout files are looked up in `folder`."""
+    name = str(data.get("layout", DEFAULT_LAYOUT))
+    is_file = name.endswith((".yaml", ".yml"))
+    layout = named_layout(str(folder / name) if is_file else name)
+    if "plane" in data and not layout.planar:
+        raise ElasticError(
+            f"plane is {data['plane']!r}, which is for layouts in a plane; "
+            f"{layout.name!r} is computed in space, so leave the key out"
+        )
+
+    body = _build_body(data)
+    layout = _place_pads(layout, data.get("pads", {}), body.side / 2)
+    symmetry = data.get("symmetry") or largest_symmetry(layout)
+    neglect = tuple(data.get("neglect", ()))
+    # Both raise an error for a name that does not fit the layout, before any work.
+    find_structure(layout, symmetry)
+    default_modes(layout).index(neglect)
+    return Model(body, layout, symmetry, neglect)
+
+
+def _build_body(data: Mapping[str, Any]) -> Body:
+    """Build the body from the tables `body` and `cube`; what they leave out has Body's default."""
+    values = dict(data.get("body", {}))
+    # A body without a depth is square seen from above.
+    values.setdefault("depth", values.get("width", Body.depth))
+    cube = dict(data.get("cube", {}))
+    if cube.pop("rigid", False):
+        cube["young"] = math.inf
+    for key, value in cube.items():
+        values[f"cube_{key}" if key in ("young", "poisson") else key] = value
+    if "plane" in data:
+        values["plane"] = data["plane"]
+    return Body(**values)
+
+
+def _place_pads(layout: Layout, pads: Mapping[str, float], half_side: float) -> Layout:
+    """Return the layout with the pads' width and centre distance (m) that the model asks for."""
+    if not pads:
+        return layout
+    width = pads.get("width", layout.pad_size * half_side)
+    # Rounding makes 0.4 of 0.0008 / 0.002, so that the pads of a built-in layout stay its own.
+    size = round(width / half_side, 12)
+    try:
+        if "centre" not in pads:
+            return Layout(layout.name, layout.positions, layout.normals, size)
+        return strip_layout(layout, size, round(pads["centre"] / half_side, 12))
+    except LayoutError as error:
+        raise ElasticError(
+            f"pads of {1e3 * width:g} mm: {error}, on a cube whose faces end at "
+            f"{1e3 * half_side:g} mm from their centre; change pads.width or pads.centre"
+        ) from None

@@ -1,1 +1,0 @@
-"""Tables and progress of the design commands."""
