@@ -271,7 +271,9 @@ def _matrix_table(result: Response, start: int, count: int) -> Table:
     for number, (pad, row) in enumerate(zip(result.layout.pads, result.matrix, strict=True), 1):
         label = f"V{number} {pad}" if result.layout.planar else pad
         is_last = number == result.layout.n_pads
-        table.add_row(label, *(format_number(value, 4) for value in row[modes]), end_section=is_last)
+        table.add_row(
+            label, *(format_number(value, 4) for value in row[modes]), end_section=is_last
+        )
     table.add_row("left, %", *(f"{100 * result.mode_residual[name]:.2f}" for name in names))
     return table
 
@@ -303,9 +305,7 @@ def show_surface(study: SurfaceStudy) -> None:
 
     is_plane = study.layout.planar
     names = list(study.rows[0].measured)
-    heads = [
-        f"{name} {column}" for name in names for column in ("measured", "true", "ratio")
-    ]
+    heads = [f"{name} {column}" for name in names for column in ("measured", "true", "ratio")]
     table = new_table(
         f"stress in kPa under {'1 N/mm' if is_plane else '1 N'}: measured by the cube, and true",
         "load",

@@ -3,7 +3,7 @@
 A response matrix R is that of a body loaded on all its sides. In a layer the surface and the ground
 are near, and the field is curved. So the stress that a cube measures differs from that of the layer
 without the cube, even if the pads are exact. With the influence functions g (influence.py) of the
-pads in the layer and the traction t of a ball, the pads have the stress p, and the cube measures s::
+pads in the layer and the traction t of a ball, the stress p of the pads and the measured s are::
 
     p = int g . t,        s = R^+ p
 

@@ -77,7 +77,9 @@ def read_influence(path: Path) -> Influence:
         influence = _parse(_load_arrays(data))
         _check(influence)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; make it with ./cube fem MODEL --surface") from None
+        raise ConfigError(
+            f"{path}: no such file; make it with ./cube fem MODEL --surface"
+        ) from None
     except (CubeError, *_READ_ERRORS) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise ConfigError(

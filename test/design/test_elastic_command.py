@@ -408,10 +408,7 @@ def test_an_interrupted_write_leaves_the_old_calibration(tmp_path, monkeypatch):
     saved = tmp_path / "cube.yaml"
     saved.write_text("old")
     monkeypatch.setattr(Path, "replace", interrupt)
-    assert (
-        cli.main(["fem", "--meshes", "1", "-o", str(saved)])
-        == 130
-    )
+    assert cli.main(["fem", "--meshes", "1", "-o", str(saved)]) == 130
     assert saved.read_text() == "old"
 
 
