@@ -44,6 +44,8 @@ ROS = (
     "lifecycle_msgs",
     "rcl_interfaces",
     "rclpy",
+    "ros2bag",
+    "rosbag2_storage_mcap",
     "rosgraph_msgs",
     "rosidl_default_generators",
     "rosidl_default_runtime",
@@ -58,6 +60,16 @@ needs_bloom = pytest.mark.skipif(
     not (shutil.which("bloom-generate") and shutil.which("rosdep")),
     reason="needs bloom-generate and rosdep: pipx install --include-deps bloom",
 )
+
+
+def dependencies() -> set[str]:
+    """Return the rosdep keys that package.xml names."""
+    elements = ElementTree.parse(ROOT / "package.xml").getroot()
+    return {element.text for element in elements if element.tag.endswith("depend")}
+
+
+def test_every_dependency_has_a_rosdep_key():
+    assert dependencies() <= {*UBUNTU, *ROS}
 
 
 def test_package_xml_is_in_order():
@@ -129,8 +141,10 @@ def test_bloom_makes_the_debian_files(farm, tmp_path, distro):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     asked = set(re.findall(r"[a-z][a-z0-9-]+", debian("control")))
-    of_ros = {f"ros-{distro}-{name.replace('_', '-')}" for name in ROS}
-    assert {*UBUNTU, *of_ros} <= asked
+    named = {
+        f"ros-{distro}-{key.replace('_', '-')}" if key in ROS else key for key in dependencies()
+    }
+    assert named <= asked
     assert debian("changelog").startswith(
         f"ros-{distro}-cube-tensor-driver ({version}-0{UBUNTU_OF[distro]})"
     )
