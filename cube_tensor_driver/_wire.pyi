@@ -1,7 +1,6 @@
 """The wire in C: native/python_wire.c. device/wire/native.py says whether it is there."""
 
 from collections.abc import Callable
-from typing import Any
 
 class Decoder:
     """Bytes in, frames out: cube_decoder of native/cube_wire.h."""
@@ -31,15 +30,3 @@ def place_rows(samples: list[bytes], stamps_ns: list[int], n_pads: int, memory: 
     °C, frequency (N, n_pads) float32 in Hz; NaN where it is unknown or the cube has no such pad.
     memory: of exactly that size, N (20 + 4 n_pads) bytes.
     """
-
-class Follower:
-    """The usual samples of a link: native/cube_follow.h, for device/scans/follower.py."""
-
-    def lend(self, *values: float) -> None:
-        """Those of `LentSteps` and of `LentLine`."""
-    def follow(self, samples: list[bytes], arrival_ns: int) -> list[int] | None:
-        """Stamps of decoded SAMPLEs that arrived together; None: nothing has changed."""
-    def take_back(
-        self,
-    ) -> tuple[list[int], tuple[int, int, float, float, float, bool], tuple[Any, ...]] | None:
-        """Device times of the samples that were followed, and the values now; None: not lent."""

@@ -7,7 +7,6 @@
 #define Py_LIMITED_API 0x030A0000
 #include <Python.h>
 
-#include "cube_follow.h"
 #include "cube_wire.h"
 
 #include <errno.h>
@@ -429,119 +428,6 @@ static PyObject *place_rows(PyObject *module, PyObject *args) {
     Py_RETURN_NONE;
 }
 
-/* ------------------------------------------------------------------------------ Follower ------ */
-
-/* is_lent: Python's values are here. */
-typedef struct {
-    PyObject_HEAD
-    cube_follower follower;
-    bool is_lent;
-} Follower;
-
-static PyObject *follower_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
-    (void)keywords;
-    if (!PyArg_ParseTuple(args, ":Follower"))
-        return NULL;
-    return ((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
-}
-
-static void follower_dealloc(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(object);
-    Py_DECREF(type);
-}
-
-static PyObject *follower_lend(PyObject *object, PyObject *args) {
-    Follower *self = (Follower *)object;
-    cube_follower f = {.count = 0};
-    int is_due;
-    if (!PyArg_ParseTuple(
-            args, "ILdddpLLdddLLLLdddd:lend", &f.sequence, &f.device_us, &f.period_us, &f.due_us,
-            &f.lag_us, &is_due, &f.first_us, &f.first_ns, &f.offset_ns, &f.drift,
-            &f.stamp_offset_ns, &f.newest_ns, &f.arrival_ns, &f.stamp_ns, &f.bucket_end_ns,
-            &f.jitter_ns, &f.least_ns, &f.earliest_ns, &f.delay_ns))
-        return NULL;
-    f.is_due = is_due;
-    self->follower = f;
-    self->is_lent = true;
-    Py_RETURN_NONE;
-}
-
-static PyObject *follower_take_back(PyObject *object, PyObject *nothing) {
-    (void)nothing;
-    Follower *self = (Follower *)object;
-    const cube_follower *f = &self->follower;
-    if (!self->is_lent)
-        Py_RETURN_NONE;
-    self->is_lent = false;
-    PyObject *times = PyList_New((Py_ssize_t)f->count);
-    for (unsigned i = 0; times != NULL && i < f->count; i++) {
-        PyObject *time = PyLong_FromLongLong(f->taken_us[i]);
-        if (time == NULL || PyList_SetItem(times, (Py_ssize_t)i, time) < 0)
-            Py_CLEAR(times);
-    }
-    if (times == NULL)
-        return NULL;
-    return Py_BuildValue(
-        "(N(ILdddN)(LLdddLLLLdddd))", times, f->sequence, f->device_us, f->period_us, f->due_us,
-        f->lag_us, PyBool_FromLong(f->is_due), f->first_us, f->first_ns, f->offset_ns, f->drift,
-        f->stamp_offset_ns, f->newest_ns, f->arrival_ns, f->stamp_ns, f->bucket_end_ns,
-        f->jitter_ns, f->least_ns, f->earliest_ns, f->delay_ns);
-}
-
-static PyObject *follower_follow(PyObject *object, PyObject *args) {
-    Follower *self = (Follower *)object;
-    PyObject *raws;
-    long long arrival_ns;
-    if (!PyArg_ParseTuple(args, "O!L:follow", &PyList_Type, &raws, &arrival_ns))
-        return NULL;
-    Py_ssize_t n = PyList_Size(raws);
-    if (!self->is_lent || n > (Py_ssize_t)CUBE_FOLLOWED)
-        Py_RETURN_NONE;
-    uint32_t sequence[CUBE_FOLLOWED];
-    uint64_t device_us[CUBE_FOLLOWED];
-    int64_t stamp_ns[CUBE_FOLLOWED];
-    for (Py_ssize_t i = 0; i < n; i++) {
-        cube_frame frame;
-        if (!get_bytes(PyList_GetItem(raws, i), &frame.raw, &frame.size))
-            return NULL;
-        if (!cube_parse_sample(&frame) || frame.as.sample.first_cube != 0)
-            Py_RETURN_NONE;
-        sequence[i] = frame.as.sample.sequence;
-        device_us[i] = frame.as.sample.device_us;
-    }
-    if (!cube_follow(&self->follower, sequence, device_us, (size_t)n, arrival_ns, stamp_ns))
-        Py_RETURN_NONE;
-    PyObject *stamps = PyList_New(n);
-    for (Py_ssize_t i = 0; stamps != NULL && i < n; i++) {
-        PyObject *stamp = PyLong_FromLongLong(stamp_ns[i]);
-        if (stamp == NULL || PyList_SetItem(stamps, i, stamp) < 0)
-            Py_CLEAR(stamps);
-    }
-    return stamps;
-}
-
-static PyMethodDef follower_methods[] = {
-    {"lend", follower_lend, METH_VARARGS, NULL},
-    {"take_back", follower_take_back, METH_NOARGS, NULL},
-    {"follow", follower_follow, METH_VARARGS, NULL},
-    {NULL, NULL, 0, NULL},
-};
-
-static PyType_Slot follower_slots[] = {
-    {Py_tp_new, follower_new},
-    {Py_tp_dealloc, follower_dealloc},
-    {Py_tp_methods, follower_methods},
-    {0, NULL},
-};
-
-static PyType_Spec follower_spec = {
-    .name = "cube_tensor_driver._wire.Follower",
-    .basicsize = sizeof(Follower),
-    .flags = Py_TPFLAGS_DEFAULT,
-    .slots = follower_slots,
-};
-
 /* ------------------------------------------------------------------------------ module -------- */
 
 static PyMethodDef functions[] = {
@@ -560,10 +446,7 @@ PyMODINIT_FUNC PyInit__wire(void) {
     if (made == NULL)
         return NULL;
     decoder_type = (PyTypeObject *)PyType_FromSpec(&decoder_spec);
-    PyObject *follower_type = PyType_FromSpec(&follower_spec);
-    if (decoder_type == NULL || PyModule_AddObject(made, "Decoder", (PyObject *)decoder_type) < 0 ||
-        follower_type == NULL ||
-        PyModule_AddObject(made, "Follower", follower_type) < 0) {
+    if (decoder_type == NULL || PyModule_AddObject(made, "Decoder", (PyObject *)decoder_type) < 0) {
         Py_DECREF(made);
         return NULL;
     }

@@ -17,13 +17,12 @@ from dataclasses import dataclass, field
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
 from ..core.status import STAMP
-from .clock.clock import ClockMap
-from .clock.host import HostClockWatch
+from .clock.hub_clock import HubClock
+from .clock.steps import HostClockWatch
 from .links.link import Link, LinkConfig, LinkState
 from .links.link_log import LinkLog, Log
 from .links.reader import LinkFrames, Reader
 from .scans.cube_table import CubeAddress
-from .scans.follower import Follower
 from .scans.row_account import RowAccount, RowCounts
 from .scans.scan import MakeRows, ScanBuilder, empty_rows
 from .scans.sequence import Account, Arrival
@@ -69,16 +68,13 @@ class _LinkRecord:
     """
 
     account: Account = field(default_factory=Account)
-    clock: ClockMap = field(default_factory=ClockMap)
+    clock: HubClock = field(default_factory=HubClock)
     problems: list[str] = field(default_factory=list)
     contradictions: list[str] = field(default_factory=list)
     events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     logged_version: int | None = None
     hub_changes: int = 0
     was_open: bool = False
-
-    def __post_init__(self) -> None:
-        self.follower = Follower(self.account, self.clock)
 
 
 class LiveLinks:
@@ -185,8 +181,6 @@ class LiveLinks:
         if self._reader is None:
             return []
         with self._taking:
-            for record in self._records:
-                record.follower.take_back()
             return [
                 self._report(link, record, log)
                 for link, record, log in zip(
@@ -205,12 +199,10 @@ class LiveLinks:
                 # Bytes that were read just before the clock was set have the old time.
                 if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
                     arrival_ns += step_ns
-                samples = [frame for frame in frames if isinstance(frame, Sample)]
-                for sample in samples:
-                    self._rows.received += sample.shape[0]
+                for frame in frames:
+                    if isinstance(frame, Sample):
+                        self._rows.received += frame.n_cubes
                 try:
-                    if len(samples) == len(frames) and self._follow(link, arrival_ns, samples):
-                        continue
                     # A round trip during which the clock was set says nothing.
                     self._take(link, arrival_ns, frames, 0 if step_ns else asked_ns)
                 except Exception as error:  # noqa: BLE001  (the rows of other links go on)
@@ -226,25 +218,15 @@ class LiveLinks:
         text = f"the host's clock was set by {1e-9 * step_ns:+.6g} s: stamps follow it at once"
         self._log.warning(text)
         for record in self._records:
-            record.follower.take_back()
             record.clock.shift(step_ns)
             record.clock.problems.add(text)
         if self._reader is not None:
             self._reader.forget_questions()
         return now_ns, step_ns
 
-    def _follow(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> bool:
-        """Give samples to the scans if all of them are usual; whether they are."""
-        stamps_ns = self._records[link].follower.follow(samples, arrival_ns)
-        if stamps_ns is None:
-            return False
-        self._scans.add(link, samples, stamps_ns)
-        return True
-
     def _take(self, link: int, arrival_ns: int, frames: Sequence[Frame], asked_ns: int) -> None:
         """Count the frames of a link and give their samples to the scans."""
         record = self._records[link]
-        record.follower.take_back()
         samples: list[Sample] = []
         for frame in frames:
             if isinstance(frame, Sample):
@@ -261,12 +243,11 @@ class LiveLinks:
                 self._learn_cubes(link, frame)
             elif isinstance(frame, Time):
                 if asked_ns:
-                    record.clock.answer(asked_ns, frame.device_us, arrival_ns)
+                    record.clock.add_answer(asked_ns, frame.device_us, arrival_ns)
             elif isinstance(frame, Stats):
                 record.account.stats(frame)
                 record.contradictions = record.account.contradictions()
         self._give(link, arrival_ns, samples)
-        record.follower.lend()
 
     def _give(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
         """Samples of one run of a hub, which arrived together, to the scans."""

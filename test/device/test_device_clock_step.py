@@ -14,8 +14,7 @@ from test_device_clock import BASE_S, EPOCH_NS, random_delays, stalls, usb_burst
 
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.chain import LiveLinks
-from cube_tensor_driver.device.clock.clock import JUMPED, ClockMap
-from cube_tensor_driver.device.clock.hub import STANDS_STILL
+from cube_tensor_driver.device.clock.hub_clock import CLOCK_SET, CLOCK_STANDS_STILL, HubClock
 from cube_tensor_driver.device.links.link import LinkConfig
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
@@ -38,7 +37,7 @@ class Run:
     def __init__(self, delay, true_s: NDArray[np.float64], device_us: NDArray, seed: int) -> None:
         arrival_s = np.maximum.accumulate(delay(true_s, np.random.default_rng(seed)))
         arrival_ns = EPOCH_NS + np.rint(arrival_s * 1e9).astype(np.int64)
-        self.clock = ClockMap()
+        self.clock = HubClock()
         stamps, doubt, named = [], [], []
         edges = [0, *(np.flatnonzero(np.diff(arrival_ns) > 100_000) + 1), len(true_s)]
         for start, stop in pairwise(edges):
@@ -87,7 +86,7 @@ def test_a_step_of_the_hubs_clock_is_named_and_rows_until_then_are_in_doubt(
     # Half a millisecond is as much as another sample's delay may move the line.
     assert run.error_ms[after & ~run.in_doubt].max() < run.usual_ms() + 0.5
     assert not run.in_doubt[true_s > AT_S + 2 * SEEN_S].any()
-    assert run.clock.problems == {JUMPED} and run.clock.resets == 1
+    assert run.clock.problems == {CLOCK_SET} and run.clock.resets == 1
     assert abs(run.clock.drift_ppm - 50) < 5
 
 
@@ -116,7 +115,7 @@ def test_loss_disorder_gaps_and_the_wrap_of_numbers_raise_no_doubt() -> None:
     true_s = np.arange(6000) / 300
     device_us = device_times(true_s)
     arrival_s = np.maximum.accumulate(random_delays(true_s[order], random))
-    clock = ClockMap()
+    clock = HubClock()
     for k, arrived_s in zip(order.tolist(), arrival_s.tolist(), strict=True):
         number = (k - 1000) % (1 << 32)
         arrival_ns = EPOCH_NS + round(1e9 * arrived_s)
@@ -136,7 +135,7 @@ def test_rows_of_a_clock_that_stands_still_are_in_doubt_until_it_goes_on(rate) -
     # Less than 5 ms could be anything.
     assert run.in_doubt[still & (true_s >= AT_S + 0.005)].all()
     assert run.error_ms[~run.in_doubt & (true_s < AT_S + 2)].max() < 5
-    assert STANDS_STILL in run.clock.problems
+    assert CLOCK_STANDS_STILL in run.clock.problems
     assert not run.in_doubt[true_s > AT_S + 2 + SEEN_S].any()
 
 

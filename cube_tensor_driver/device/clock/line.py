@@ -1,13 +1,19 @@
-"""The line below all points (device time, arrival) of one hub.
+"""The straight line from one hub's clock to the host's, bounded by round trips.
 
-arrival = device time + offset + drift · device time + delay
+    arrival = device time + offset + drift * device time + delay
 
-The delay (buffers, USB polling, the scheduler) is never negative. So the line that touches the
-points from below is the clock, and the height of a point above it is its delay. Of each second, a
-bucket, only the earliest point is kept. The line is the edge of the lower convex hull of these
-points over their mean device time: of all lines below the points it has the smallest mean distance
-to them (Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
-measurements", INFOCOM 1999).
+The delay of a sample (buffers, USB polling, the scheduler) is never negative, so the line that
+touches the points (device time, arrival) from below is the clock, and the height of a point above
+it is its delay. Only the earliest point of each second is kept. The line is the edge of the lower
+convex hull of these points over their mean device time: of all lines below the points it has the
+smallest mean distance to them (Moon, Skelly, Towsley, "Estimation and removal of clock skew from
+network delay measurements", INFOCOM 1999).
+
+Arrivals alone cannot separate the smallest delay from the offset. A question and its answer can,
+because the hub read its clock between them: each round trip bounds the offset from both sides (F.
+Cristian, "Probabilistic clock synchronization", Distributed Computing 3, 1989). All bounds hold at
+once. The centre between the highest lower bound and the lowest upper bound is right if the line is
+as slow in both directions, and never wrong by more than half their distance.
 """
 
 from __future__ import annotations
@@ -15,130 +21,210 @@ from __future__ import annotations
 import math
 from collections import deque
 from itertools import pairwise
+from typing import NamedTuple
 
 BUCKET_NS = 1_000_000_000
-"""Length of a bucket, of which the earliest point is kept."""
-WINDOW = 120
-"""Buckets kept: two minutes."""
-DRIFT_AFTER = 5
-"""Buckets before drift is estimated. Over a shorter time, delay looks like drift."""
-FIRST_GUESS = 1e-4
-"""Drift is 0 to within this as long as it is not known: crystals are that good."""
+"""Length of the intervals, in ns, of each of which the earliest point is kept."""
+MAX_BUCKETS = 120
+"""Number of intervals kept, together two minutes."""
+MIN_BUCKETS_FOR_DRIFT = 5
+"""Number of intervals before drift is estimated. Over a shorter time, delay looks like drift."""
+UNKNOWN_DRIFT = 1e-4
+"""Bound of the drift before it is estimated. Crystals are better than that."""
 MAX_DRIFT = 1e-3
-"""No two clocks differ by more. A steeper line comes from a stall."""
-STEP_NS = 20e6
-"""If all points lie further above the line, one of the clocks was set. USB bursts take 16 ms."""
-FALL_NS = 4e6
-"""If a point lies further below the line, one of the clocks was set: no delay is negative. A step
-of 5 ms shows, with 1 ms for the line's own error."""
-STEP_BUCKETS = 2
-"""It must last for so many buckets, because a stall looks the same at first."""
-SMOOTHING = 64
-"""Points over which the jitter is averaged."""
+"""Largest credible drift between two clocks. A steeper line comes from a pause of the host."""
+MAX_RISE_NS = 20e6
+"""Height above the line, in ns, beyond which all points of an interval show that a clock was set.
+Bursts over USB delay samples by 16 ms."""
+MAX_FALL_NS = 4e6
+"""Depth below the line, in ns, that shows that a clock was set, because no delay is negative. Steps
+of 5 ms are found, with 1 ms for the error of the line itself."""
+MIN_BUCKETS_HIGH = 2
+"""Number of successive intervals above `MAX_RISE_NS` that show that a clock was set. One interval
+may be a pause of the host."""
+JITTER_POINTS = 64
+"""Number of points over which the jitter is averaged."""
+MAX_ROUND_TRIPS = 64
+"""Number of round trips that are kept, about one minute."""
+MAX_COMMON_DELAY_NS = 1e9
+"""Longest credible delay, in ns, that all samples have beyond that of the answers."""
+
+
+class ClockRoundTrip(NamedTuple):
+    """Bounds of the offset from one question for the hub's time.
+
+    Attributes:
+        device_ns: The hub's clock, as answered.
+        low_ns: Host time minus device time when the question was sent.
+        high_ns: Host time minus device time when the answer came.
+    """
+
+    device_ns: float
+    low_ns: float
+    high_ns: float
 
 
 class ClockLine:
-    """Bounded memory; amortised constant time for each point.
+    """The clock line of one hub, fitted in bounded memory and amortised constant time per point.
 
-    A point is (device time, arrival - device time), both in ns since the first point.
+    All times are in ns since the first point.
 
-    offset, drift: the line is offset + drift · device time
-    jitter_ns: mean height of the last points above it
-    bucket_end: arrival at which the bucket that is being filled ends
-    least, earliest: least height in this bucket, inf if it is empty; the point that has it
+    Attributes:
+        drift: Slope of the line; positive if host time runs faster.
+        offset: Arrival minus device time of the line below all points, at device time 0.
+        bounded_offset: The same without the smallest delay, as far as round trips bound it.
+        error_bound: Largest possible error of `bounded_offset`; None without round trips.
+        jitter_ns: Mean height of the newest points above the line.
     """
 
     def __init__(self) -> None:
         self.drift = 0.0
         self.jitter_ns = 0.0
-        self.begin()
+        self.restart()
 
-    def begin(self) -> None:
-        """Forget all points. Drift is kept as a first guess."""
-        self.offset = 0.0
-        self.bucket_end = BUCKET_NS
-        self.least = self._last_least = math.inf
-        self.earliest = (0.0, 0.0)
-        self._points: deque[tuple[float, float]] = deque(maxlen=WINDOW)
-        self._fallen = 0.0  # how far the line fell in this bucket
-        self._n_high = 0  # buckets in a row with all points above the line by more than STEP_NS
+    def restart(self) -> None:
+        """Discard all points and round trips. The drift is kept as a first guess."""
+        self.offset = self.bounded_offset = 0.0
+        self.error_bound: float | None = None
+        self._bucket_end = BUCKET_NS
+        self._bucket_height = self._previous_height = math.inf
+        self._earliest = (0.0, 0.0)
+        self._points: deque[tuple[float, float]] = deque(maxlen=MAX_BUCKETS)
+        self._round_trips: deque[ClockRoundTrip] = deque(maxlen=MAX_ROUND_TRIPS)
+        self._trip_offset = math.inf
+        self._fall = 0.0
+        self._n_high = 0
 
     def __len__(self) -> int:
-        """How many points are kept, one of each full bucket."""
+        """Return the number of points kept, one for each full interval."""
         return len(self._points)
 
     @property
-    def usual(self) -> float:
-        """The least height of late, ns; 0 as long as nobody knows it."""
-        least = min(self.least, self._last_least)
-        return least if math.isfinite(least) else 0.0
+    def recent_min_height(self) -> float:
+        """Smallest height of a point since the previous interval began; 0 before the first."""
+        height = min(self._bucket_height, self._previous_height)
+        return height if math.isfinite(height) else 0.0
 
-    @property
-    def drift_uncertainty(self) -> float:
-        """How far the drift may be off."""
-        if len(self._points) < DRIFT_AFTER:
-            return FIRST_GUESS
-        span = self._points[-1][0] - self._points[0][0]
-        return min(FIRST_GUESS, self.jitter_ns / span) if span > 0 else FIRST_GUESS
+    def height(self, device_ns: float, arrival_ns: float) -> float:
+        """Return the height of a point above the line, which is its delay."""
+        return arrival_ns - device_ns - self.offset - self.drift * device_ns
 
-    def height(self, point: tuple[float, float]) -> float:
-        """Of a point above the line, ns."""
-        t, delay = point
-        return delay - self.offset - self.drift * t
+    def add(self, device_ns: float, arrival_ns: int) -> bool:
+        """Add a point: lower the line if the point is below it, and fit it after each interval.
 
-    def add(self, point: tuple[float, float]) -> bool:
-        """Lower the line to a point if need be. Whether one of the clocks was set before it."""
-        height = self.height(point)
+        Returns:
+            Whether the point shows that one of the clocks was set.
+        """
+        height = self.height(device_ns, arrival_ns)
         was_set = False
         if height < 0:
-            # Before the first bucket is full, the line falls because the least delay is not known.
-            self._fallen -= height if self._points else 0.0
-            was_set = self._fallen > FALL_NS or -height > STEP_NS
-            if was_set:
-                self._fallen = 0.0
-                self._points.clear()
-            self.offset += height
+            was_set = self._lower(height)
             height = 0.0
-            self.least = math.inf
-        self.jitter_ns += (height - self.jitter_ns) / SMOOTHING
-        if height < self.least:
-            self.least, self.earliest = height, point
+        self.jitter_ns += (height - self.jitter_ns) / JITTER_POINTS
+        if height < self._bucket_height:
+            self._bucket_height = height
+            self._earliest = (device_ns, arrival_ns - device_ns)
+        if arrival_ns >= self._bucket_end:
+            was_set = self._fit(arrival_ns) or was_set
         return was_set
 
-    def close_bucket(self, arrival: int) -> bool:
-        """Fit the line to the earliest points of all buckets, and begin a bucket. Whether one of
-        the clocks was set some buckets ago."""
-        self._n_high = self._n_high + 1 if self.height(self.earliest) > STEP_NS else 0
-        was_set = self._n_high >= STEP_BUCKETS
+    def add_round_trip(self, trip: ClockRoundTrip) -> bool:
+        """Bound the offset by a round trip.
+
+        Returns:
+            Whether the answer is consistent with the samples; otherwise it is not used.
+        """
+        line = self.offset + self.drift * trip.device_ns
+        if trip.low_ns > line + MAX_FALL_NS or trip.high_ns < line - MAX_COMMON_DELAY_NS:
+            return False
+        self._round_trips.append(trip)
+        self._intersect_bounds()
+        return True
+
+    def discard_round_trips_after(self, arrival_ns: float) -> None:
+        """Discard the round trips whose answer came after `arrival_ns`."""
+        trips = self._round_trips
+        while trips and trips[-1].device_ns + trips[-1].high_ns > arrival_ns:
+            trips.pop()
+        self._intersect_bounds()
+
+    def _lower(self, height: float) -> bool:
+        """Lower the line to a point at a negative height; return whether a clock was set."""
+        # In the first interval the line falls because the smallest delay is not known yet.
+        self._fall -= height if self._points else 0.0
+        was_set = self._fall > MAX_FALL_NS or -height > MAX_RISE_NS
+        if was_set:
+            self._fall = 0.0
+            self._points.clear()
+        self.offset += height
+        self._bucket_height = math.inf
+        self._set_bounded_offset()
+        return was_set
+
+    def _fit(self, arrival_ns: int) -> bool:
+        """Fit the line to the earliest points of all intervals and begin the next interval.
+
+        Returns:
+            Whether one of the clocks was set some intervals ago.
+        """
+        device_ns, delay = self._earliest
+        height = delay - self.offset - self.drift * device_ns
+        self._n_high = self._n_high + 1 if height > MAX_RISE_NS else 0
+        was_set = self._n_high >= MIN_BUCKETS_HIGH
         if was_set:
             self._n_high = 0
             self._points.clear()
-        self._points.append(self.earliest)
+        self._points.append(self._earliest)
         points = sorted(self._points)
-        if len(points) >= DRIFT_AFTER:
-            self.drift = min(max(_middle_slope(points), -MAX_DRIFT), MAX_DRIFT)
-        self.offset = min(delay - self.drift * t for t, delay in points)
-        self.bucket_end = arrival + BUCKET_NS
-        self._fallen = 0.0
-        self._last_least, self.least = self.least, math.inf
+        if len(points) >= MIN_BUCKETS_FOR_DRIFT:
+            self.drift = min(max(_slope_at_centre(points), -MAX_DRIFT), MAX_DRIFT)
+        self.offset = min(delay - self.drift * device_ns for device_ns, delay in points)
+        self._bucket_end = arrival_ns + BUCKET_NS
+        self._fall = 0.0
+        self._previous_height, self._bucket_height = self._bucket_height, math.inf
+        self._intersect_bounds()
         return was_set
 
+    def _drift_error(self) -> float:
+        """Return the largest error that the estimated drift may have."""
+        if len(self._points) < MIN_BUCKETS_FOR_DRIFT:
+            return UNKNOWN_DRIFT
+        span = self._points[-1][0] - self._points[0][0]
+        return min(UNKNOWN_DRIFT, self.jitter_ns / span) if span > 0 else UNKNOWN_DRIFT
 
-def _middle_slope(points: list[tuple[float, float]]) -> float:
-    """Slope of the edge of the lower convex hull over the mean x.
+    def _intersect_bounds(self) -> None:
+        """Find the offset that the newest consistent round trips allow."""
+        low, high = -math.inf, math.inf
+        drift_error = self._drift_error()
+        for trip in reversed(self._round_trips):
+            drifted = self.drift * trip.device_ns
+            age = abs(self._round_trips[-1].device_ns - trip.device_ns)
+            next_low = max(low, trip.low_ns - drifted - drift_error * age)
+            next_high = min(high, trip.high_ns - drifted + drift_error * age)
+            if next_low > next_high:
+                break  # A clock was set between the round trips: the earlier ones are void.
+            low, high = next_low, next_high
+        self._trip_offset = (low + high) / 2 if self._round_trips else math.inf
+        self.error_bound = (high - low) / 2 if self._round_trips else None
+        self._set_bounded_offset()
 
-    points: (x, y), at least two, sorted.
-    """
+    def _set_bounded_offset(self) -> None:
+        """Move the offset towards that of the round trips, as delays are never negative."""
+        self.bounded_offset = min(self.offset, self._trip_offset)
+
+
+def _slope_at_centre(points: list[tuple[float, float]]) -> float:
+    """Return the slope of the lower convex hull at the mean x of at least two sorted points."""
     hull: list[tuple[float, float]] = []
     for x, y in points:
         while len(hull) > 1:
             (x0, y0), (x1, y1) = hull[-2:]
             if (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0):
-                break  # the last point lies below the line to the new one
+                break  # The last point lies below the line to the new one.
             hull.pop()
         hull.append((x, y))
-    middle = sum(x for x, _ in points) / len(points)
+    centre = sum(x for x, _ in points) / len(points)
     for (x0, y0), (x1, y1) in pairwise(hull):
-        if x1 >= middle and x1 > x0:
+        if x1 >= centre and x1 > x0:
             return (y1 - y0) / (x1 - x0)
     return 0.0

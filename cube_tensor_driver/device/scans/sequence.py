@@ -108,20 +108,6 @@ class SequenceTracker:
         self.counters.out_of_order += 1
         return self._deliver(number, device_us, Arrival.LATE)
 
-    @property
-    def last(self) -> tuple[int, int] | None:
-        """Number (u32) and device time of the newest sample, if it was the last one too."""
-        if self._seen and self._seen[-1] == (self._next - 1, self._newest_us):
-            return (self._next - 1) % _WRAP, self._newest_us
-        return None
-
-    def count_next(self, times_us: Sequence[int]) -> None:
-        """Samples came in order after `last`, at these device times."""
-        first, self._next = self._next, self._next + len(times_us)
-        self._seen.extend(zip(range(first, self._next), times_us, strict=True))
-        self._newest_us = times_us[-1]
-        self.counters.delivered += len(times_us)
-
     def count_missing(self, taken: int) -> None:
         """The hub has taken so many samples (u32): those that have not come by now are missing."""
         ahead = self._ahead(taken)
@@ -205,16 +191,6 @@ class Account:
             tracker = self._trackers[frame.first_cube] = SequenceTracker()
         self.received += 1
         return tracker.update(frame.sequence, frame.device_us)
-
-    def lend(self) -> tuple[int, int] | None:
-        """Number and device time of the last sample, if all is known that the next needs."""
-        tracker = self._trackers.get(0)
-        return None if tracker is None or len(self._trackers) > 1 else tracker.last
-
-    def take_back(self, times_us: Sequence[int]) -> None:
-        """Samples came in order after those of `lend`, at these device times."""
-        self.received += len(times_us)
-        self._trackers[0].count_next(times_us)
 
     def stats(self, frame: Stats) -> None:
         """Compare with the hub's own count."""
