@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.reconstructor import Verdicts
+from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..core.status import WORDS
 from ..messages.codec import SECOND
@@ -54,7 +54,7 @@ class VerdictReader:
         self._parts: deque[_Part] = deque()
         self._unread = self._read()
 
-    def of(self, rows: FrequencyRows) -> Verdicts:
+    def of(self, rows: FrequencyRows) -> RecordedHealth:
         """The verdicts about rows, which their cubes and stamps identify."""
         known = np.zeros(len(rows), bool)
         left_out = np.zeros(len(rows), np.uint32)
@@ -64,14 +64,14 @@ class VerdictReader:
                 if np.array_equal(part.stamp_ns, rows.stamp_ns) and np.array_equal(
                     part.cube, rows.cube
                 ):
-                    return Verdicts(np.ones(len(rows), bool), part.left_out, part.status)
+                    return RecordedHealth(np.ones(len(rows), bool), part.left_out, part.status)
                 at, same = _find(part, rows)
                 known |= same
                 left_out[same] = part.left_out[at[same]]
                 status[same] = part.status[at[same]]
                 if known.all():
                     break
-        return Verdicts(known, left_out, status)
+        return RecordedHealth(known, left_out, status)
 
     def _near(self, begin_ns: int, end_ns: int) -> Iterator[_Part]:
         """Stress of a time. The bag is read on only as far as the caller asks for more."""

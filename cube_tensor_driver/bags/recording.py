@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..config.skin import Skin, SkinCube, SkinLink
 from ..core.calibration import Calibration
 from ..core.errors import BagError, MessageError
-from ..core.reconstructor import Verdicts
+from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
 from ..messages.codec import SECOND
@@ -66,7 +66,7 @@ class Recording:
         """The settings under which the rows of one message were reconstructed."""
         return self.settings[int(self.number_at(rows.stamp_ns.max(initial=0)))]
 
-    def verdicts(self, rows: FrequencyRows) -> Verdicts:
+    def verdicts(self, rows: FrequencyRows) -> RecordedHealth:
         """What was found bad of rows when they were recorded. Fastest in the order of recording."""
         return self._verdicts.of(rows)
 

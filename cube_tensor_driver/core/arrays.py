@@ -30,7 +30,7 @@ def pad_table(values: Sequence[Array], n_pads: int, fill: float) -> Array:
     Cubes of one skin may have different numbers of pads. The places of pads that a cube does not
     have are set to `fill`.
     """
-    table = np.full((len(values), n_pads), fill)
+    table = np.full((len(values), n_pads), fill, dtype=float)
     for row, value in zip(table, values, strict=True):
         row[: len(value)] = value
     return table

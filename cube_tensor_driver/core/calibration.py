@@ -1,4 +1,4 @@
-"""Calibration: what turns a cube's frequencies into stress, as one frozen value with an id."""
+"""Calibration: the frozen values that turn the frequencies of a cube into stress, with an id."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .arrays import Array
 from .defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, HALF_SIDE, REST_FREQUENCY
 from .errors import CalibrationError, LayoutError, SymmetryError
 from .layout import LAYOUTS, Layout, find_layout
@@ -20,42 +21,55 @@ from .response import illustrative_coefficients, response
 from .symmetry import Structure, default_modes, find_structure
 
 SCHEMA = 1
+"""Version of the format of calibration files."""
+
+MAX_UID = 2**64 - 1
+"""Largest unique id of a cube: the protocol carries 8 bytes."""
+
+PAD_QUANTITIES = ("rest_frequency", "noise", "modulus", "gain", "beta")
+"""Names of the attributes that have one value per pad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What is known about one cube, or about all cubes of a kind.
+    """Properties of one cube, or of all cubes of a kind.
 
-    layout: its pads
-    symmetry: the group that its coefficients respect
-    coefficients: {name: value} in Pa per Pa, see symmetry.Structure; or instead
-    matrix: (P, M) the whole response before gains; exactly one of the two is given
-    gain: (P,) sensitivity of a pad relative to the symmetric response, 1 on average
-    beta: (P,) parasitic over active capacitance at rest
-    modulus: (P,) E in Pa
-    rest_frequency: (P,) Hz without load, at the reference of the temperature model
-    noise: (P,) standard deviation of a pad's stress, Pa
-    half_side: d0, m
-    covariance: (K, K) of the coefficients, if known
-    temperature: model of f0(T), if known
-    neglect: names of modes stated to be zero, so that fewer pads can recover the others
-    uid: of the cube; None: it holds for any cube
-    created: ISO 8601 time
-    source: what it was made from
-    One number may be given for a (P,) field. CalibrationError says what is wrong.
+    One number may be given for an attribute (P,); it then holds for all P pads.
+
+    Attributes:
+        layout: Layout of the pads.
+        rest_frequency: Frequency without load (P,), in Hz, at the reference of `temperature`.
+        noise: Standard deviation of a pad's stress (P,), in Pa.
+        modulus: Modulus E of a pad's foam (P,), in Pa.
+        half_side: Half side d0 of the cube, in m.
+        symmetry: Name of the symmetry group that the coefficients respect.
+        coefficients: Values by name, in Pa per Pa, see `symmetry.Structure`.
+        matrix: Response (P, M) without gains, in Pa per Pa. Exactly one of `coefficients` and
+            `matrix` is given.
+        gain: Sensitivity of a pad relative to the symmetric response (P,), 1 on average.
+        beta: Ratio of the parasitic to the active capacitance at rest (P,).
+        covariance: Covariance (K, K) of the coefficients, if it is known.
+        temperature: Model of the rest frequency over temperature, if it is known.
+        neglect: Names of modes that are stated to be zero, so that fewer pads determine the others.
+        uid: Unique id of the cube. None means that the calibration holds for any cube.
+        created: Time of creation, ISO 8601.
+        source: Origin of the values.
+
+    Raises:
+        CalibrationError: A value is invalid; the message names it.
     """
 
     layout: Layout
-    rest_frequency: np.ndarray
-    noise: np.ndarray
-    modulus: np.ndarray
+    rest_frequency: Array
+    noise: Array
+    modulus: Array
     half_side: float
     symmetry: str = "full"
     coefficients: Mapping[str, float] | None = None
-    matrix: np.ndarray | None = None
-    gain: np.ndarray = field(default_factory=lambda: np.array(1.0))
-    beta: np.ndarray = field(default_factory=lambda: np.array(0.0))
-    covariance: np.ndarray | None = None
+    matrix: Array | None = None
+    gain: Array = field(default_factory=lambda: np.array(1.0))
+    beta: Array = field(default_factory=lambda: np.array(0.0))
+    covariance: Array | None = None
     temperature: TemperatureModel | None = None
     neglect: tuple[str, ...] = ()
     uid: int | None = None
@@ -63,93 +77,129 @@ class Calibration:
     source: str = ""
 
     def __post_init__(self) -> None:
-        def put(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
-        for name in _PER_PAD:
-            put(name, self._per_pad(name))
-        put("half_side", _number(self.half_side, "half_side"))
+        for name in PAD_QUANTITIES:
+            self._set(name, self._read_pad_quantity(name))
+        self._set("half_side", _read_number(self.half_side, "half_side"))
         if self.half_side <= 0:
             raise CalibrationError(f"half_side is {self.half_side} m; it must be above 0")
         try:
-            modes, structure = self.modes, self.structure
-            modes.index(self.neglect)
+            structure = self.structure
+            self.modes.index(self.neglect)
         except (LayoutError, SymmetryError) as error:
             raise CalibrationError(f"calibration: {error}") from error
-        put("neglect", tuple(self.neglect))
-        if (self.coefficients is None) == (self.matrix is None):
+        self._set("neglect", tuple(self.neglect))
+        self._read_response(structure)
+        self._check_temperature()
+        self._check_uid()
+
+    def __repr__(self) -> str:
+        owner = "any cube" if self.uid is None else f"cube {self.uid:#018x}"
+        source = self.source or "unknown source"
+        return f"Calibration({self.id}, layout {self.layout.name!r}, {owner}, {source})"
+
+    def _set(self, name: str, value: Any) -> None:
+        """Replace a given value by the checked one, although the class is frozen for its users."""
+        object.__setattr__(self, name, value)
+
+    def _read_pad_quantity(self, name: str) -> Array:
+        """Return a quantity with one value per pad (P,), checked and read-only."""
+        n_pads = self.layout.n_pads
+        array = _read_array(getattr(self, name), None, name)
+        if array.shape not in ((), (n_pads,)):
             raise CalibrationError(
-                "a calibration holds either coefficients or a matrix; found "
-                f"{'neither' if self.matrix is None else 'both'}"
+                f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n_pads} pads: "
+                f"give one number or {n_pads}"
+            )
+        lowest = array.min()
+        may_be_zero = name == "beta"
+        if lowest < 0 or (lowest == 0 and not may_be_zero):
+            limit = "at least" if may_be_zero else "above"
+            raise CalibrationError(f"{name} holds {lowest:g}; it must be {limit} 0")
+        per_pad: Array = np.broadcast_to(array, (n_pads,)).copy()
+        per_pad.flags.writeable = False
+        return per_pad
+
+    def _read_response(self, structure: Structure) -> None:
+        """Check coefficients, matrix and covariance against the structure of the response."""
+        if (self.coefficients is None) == (self.matrix is None):
+            found = "neither" if self.matrix is None else "both"
+            raise CalibrationError(
+                f"a calibration holds either coefficients or a matrix; found {found}"
             )
         if self.coefficients is not None:
-            response(structure, _coefficients(self.coefficients))  # raises when it does not fit
-            put("coefficients", {name: float(self.coefficients[name]) for name in structure.names})
+            coefficients = _read_coefficients(self.coefficients)
+            response(structure, coefficients)  # raises an error if they do not fit
+            ordered = {name: coefficients[name] for name in structure.names}
+            self._set("coefficients", ordered)
         else:
-            put("matrix", _array(self.matrix, (self.layout.n_pads, modes.n_modes), "matrix"))
+            shape = (self.layout.n_pads, structure.modes.n_modes)
+            self._set("matrix", _read_array(self.matrix, shape, "matrix"))
         if self.covariance is not None:
-            k = structure.n_coefficients
-            put("covariance", _array(self.covariance, (k, k), "covariance"))
-        if (
-            self.temperature is not None
-            and len(self.temperature.coefficients) != self.layout.n_pads
-        ):
+            square = (structure.n_coefficients, structure.n_coefficients)
+            self._set("covariance", _read_array(self.covariance, square, "covariance"))
+
+    def _check_temperature(self) -> None:
+        if self.temperature is None:
+            return
+        n_lists = len(self.temperature.coefficients)
+        if n_lists != self.layout.n_pads:
             raise CalibrationError(
-                f"temperature has {len(self.temperature.coefficients)} lists of coefficients; "
+                f"temperature has {n_lists} lists of coefficients; "
                 f"layout {self.layout.name!r} has {self.layout.n_pads} pads"
             )
-        if self.uid is not None and (
-            isinstance(self.uid, bool) or not isinstance(self.uid, int) or not 0 <= self.uid < 2**64
-        ):
+
+    def _check_uid(self) -> None:
+        if self.uid is None:
+            return
+        # True and False are integers in Python, but never an id.
+        is_integer = isinstance(self.uid, int) and not isinstance(self.uid, bool)
+        if not is_integer or not 0 <= self.uid <= MAX_UID:
             raise CalibrationError(
                 f"uid is {self.uid!r}; it must be a whole number from 0 to 2^64 - 1"
             )
 
-    def _per_pad(self, name: str) -> np.ndarray:
-        n, value = self.layout.n_pads, getattr(self, name)
-        array = _array(value, None, name)
-        if array.shape not in ((), (n,)):
-            raise CalibrationError(
-                f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n} pads: "
-                f"give one number or {n}"
-            )
-        low = 0.0 if name == "beta" else np.nextafter(0, 1)
-        if np.any(array < low):
-            raise CalibrationError(
-                f"{name} holds {array.min():g}; it must be {'at least' if low == 0 else 'above'} 0"
-            )
-        array = np.broadcast_to(array, (n,)).copy()
-        array.flags.writeable = False
-        return array
-
     @property
     def modes(self) -> Modes:
+        """The M modes of the layout."""
         return default_modes(self.layout)
 
     @property
     def structure(self) -> Structure:
+        """The response matrices that the symmetry allows."""
         return find_structure(self.layout, self.symmetry)
 
     @cached_property
-    def response(self) -> np.ndarray:
-        """(P, M) Pa per Pa with the gains in: measured pad stresses are response @ state."""
-        a = (
-            self.matrix
-            if self.coefficients is None
-            else response(self.structure, self.coefficients)
-        )
-        result = self.gain[:, None] * a
+    def response(self) -> Array:
+        """Response (P, M) including the gains, in Pa per Pa: pad stresses are response @ state."""
+        if self.coefficients is not None:
+            matrix = response(self.structure, self.coefficients)
+        else:
+            matrix = np.asarray(self.matrix)
+        result: Array = self.gain[:, None] * matrix
         result.flags.writeable = False
         return result
 
     @cached_property
     def id(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of the content in canonical JSON."""
-        text = json.dumps(self._content(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        """First 16 hexadecimal digits of the SHA-256 hash of the content in canonical JSON."""
+        text = json.dumps(
+            self._content(),
+            sort_keys=True,
+            separators=(",", ":"),
+            allow_nan=False,
+        )
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def check(self, layout: Layout | None = None, uid: int | None = None) -> None:
-        """Raises CalibrationError when this was made for another layout or another cube."""
+        """Check that the calibration belongs to a cube.
+
+        Args:
+            layout: Layout of the cube, if it is known.
+            uid: Unique id of the cube, if it is known.
+
+        Raises:
+            CalibrationError: It was made for another layout or another cube.
+        """
         if layout is not None and not self.layout.same_as(layout):
             raise CalibrationError(
                 f"calibration {self.id} is for layout {self.layout.name!r} "
@@ -163,12 +213,13 @@ class Calibration:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types, the id first; from_dict gives the same calibration back."""
+        """Return the calibration in plain types, the id first; `from_dict` reads them."""
         return {"id": self.id, **self._content()}
 
     def _content(self) -> dict[str, Any]:
-        known = LAYOUTS.get(self.layout.name)
-        is_built_in = known is not None and known.same_as(self.layout)
+        """Return everything but the id in plain types; values that are not given are left out."""
+        built_in = LAYOUTS.get(self.layout.name)
+        is_built_in = built_in is not None and built_in.same_as(self.layout)
         content: dict[str, Any] = {
             "schema": SCHEMA,
             "layout": self.layout.name if is_built_in else self.layout.to_dict(),
@@ -176,46 +227,32 @@ class Calibration:
         }
         for item in fields(self):
             value = getattr(self, item.name)
-            if item.name in content or value is None or (item.name == "neglect" and not value):
-                continue
-            if item.name in _PER_PAD:
-                value = value.tolist() if np.ptp(value) else float(value[0])
-            elif isinstance(value, np.ndarray):
-                value = value.tolist()
-            elif isinstance(value, TemperatureModel):
-                value = value.to_dict()
-            elif isinstance(value, tuple):
-                value = list(value)
-            content[item.name] = dict(value) if isinstance(value, Mapping) else value
+            is_given = value is not None and not (item.name == "neglect" and not value)
+            if is_given and item.name not in content:
+                content[item.name] = _to_plain(value, item.name in PAD_QUANTITIES)
         return content
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Calibration:
-        """A calibration from plain types. CalibrationError names the wrong key, type, shape or id.
+        """Construct a calibration from plain types.
 
-        An id must match the content. Without one the content is accepted as it is: a calibration
-        that somebody begins by hand.
+        An id must match the content. Content without an id is accepted, so that a calibration can
+        be started by hand.
+
+        Raises:
+            CalibrationError: A key, type, shape or the id is wrong; the message names it.
         """
         if not isinstance(data, Mapping):
             raise CalibrationError(f"a calibration is a table; found {data!r}")
-        allowed = {item.name for item in fields(cls)}
-        needed = {"layout", "rest_frequency", "noise", "modulus", "half_side", "schema"}
-        unknown, missing = set(data) - allowed - {"id", "schema"}, needed - set(data)
-        if unknown or missing:
-            raise CalibrationError(
-                f"calibration: unknown keys {sorted(map(str, unknown))}, missing keys "
-                f"{sorted(missing)}; allowed are {', '.join(sorted(allowed | {'id', 'schema'}))}"
-            )
-        if data["schema"] != SCHEMA:
-            raise CalibrationError(
-                f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}"
-            )
-        values = {key: value for key, value in data.items() if key in allowed}
+        attributes = {item.name for item in fields(cls)}
+        _check_keys(data, attributes)
+        values = {key: value for key, value in data.items() if key in attributes}
         layout, neglect = values["layout"], values.get("neglect", ())
-        model = values.get("temperature")
-        is_table = isinstance(layout, Mapping)
         try:
-            values["layout"] = Layout.from_dict(layout) if is_table else find_layout(layout)
+            if isinstance(layout, Mapping):
+                values["layout"] = Layout.from_dict(layout)
+            else:
+                values["layout"] = find_layout(layout)
         except LayoutError as error:
             raise CalibrationError(f"calibration: {error}") from error
         if isinstance(neglect, str) or not isinstance(neglect, Sequence):
@@ -223,12 +260,14 @@ class Calibration:
                 f"calibration: neglect is {neglect!r}; it must be a list of names of modes"
             )
         values["neglect"] = tuple(neglect)
-        values["temperature"] = None if model is None else TemperatureModel.from_dict(model)
+        if values.get("temperature") is not None:
+            values["temperature"] = TemperatureModel.from_dict(values["temperature"])
         for key in ("symmetry", "created", "source"):
             if not isinstance(values.get(key, ""), str):
                 raise CalibrationError(f"calibration: {key} is {values[key]!r}; it must be text")
+
         calibration = cls(**values)
-        if "id" in data and data["id"] != calibration.id:
+        if data.get("id", calibration.id) != calibration.id:
             raise CalibrationError(
                 f"calibration: the id says {data['id']!r} but the content gives "
                 f"{calibration.id!r}: it was edited by hand or damaged. Restore the file, or "
@@ -237,46 +276,87 @@ class Calibration:
         return calibration
 
 
-_PER_PAD = ("rest_frequency", "noise", "modulus", "gain", "beta")
-
-
 def illustrative(
     layout_name: str, neglect: Sequence[str] = (), uid: int | None = None
 ) -> Calibration:
-    """The illustrative calibration of a built-in layout, for demonstrations: no cube was measured
-    for it."""
+    """Return the illustrative calibration of a built-in layout.
+
+    It is for demonstrations: its values are plausible, but no cube was measured for them.
+
+    Args:
+        layout_name: Name of the layout.
+        neglect: Names of modes that are stated to be zero.
+        uid: Unique id of the cube; None means any cube.
+    """
     layout = find_layout(layout_name)
+    # The four pads of quad lie on two opposite faces, so z differs from x and y.
     symmetry = "slab" if layout_name == "quad" else "full"
+    structure = find_structure(layout, symmetry)
     return Calibration(
         layout=layout,
         symmetry=symmetry,
         neglect=tuple(neglect),
         uid=uid,
         half_side=HALF_SIDE,
-        coefficients=illustrative_coefficients(find_structure(layout, symmetry)),
+        coefficients=illustrative_coefficients(structure),
         rest_frequency=np.array(REST_FREQUENCY),
         beta=np.array(BETA),
         modulus=np.array(FOAM_MODULUS),
+        # The slope dv/df at rest is E (1 + beta) / f0.
         noise=np.array(FOAM_MODULUS * (1 + BETA) * FREQUENCY_NOISE),
         source="illustrative",
     )
 
 
-def _number(value: Any, name: str) -> float:
-    return float(_array(value, (), name))
+def _check_keys(data: Mapping[str, Any], attributes: set[str]) -> None:
+    """Raise CalibrationError if keys are missing or unknown, or the schema is another."""
+    allowed = attributes | {"id", "schema"}
+    required = {"layout", "rest_frequency", "noise", "modulus", "half_side", "schema"}
+    unknown, missing = set(data) - allowed, required - set(data)
+    if unknown or missing:
+        raise CalibrationError(
+            f"calibration: unknown keys {sorted(map(str, unknown))}, missing keys "
+            f"{sorted(missing)}; allowed are {', '.join(sorted(allowed))}"
+        )
+    if data["schema"] != SCHEMA:
+        raise CalibrationError(
+            f"calibration: schema {data['schema']!r}; this version reads schema {SCHEMA}"
+        )
 
 
-def _coefficients(value: Any) -> Mapping[str, float]:
+def _to_plain(value: Any, is_per_pad: bool) -> Any:
+    """Return an attribute in types that JSON has."""
+    if is_per_pad and not np.ptp(value):
+        return float(value[0])
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, TemperatureModel):
+        return value.to_dict()
+    if isinstance(value, tuple):
+        return list(value)
+    return dict(value) if isinstance(value, Mapping) else value
+
+
+def _read_number(value: Any, name: str) -> float:
+    return float(_read_array(value, (), name))
+
+
+def _read_coefficients(value: Any) -> dict[str, float]:
     if not isinstance(value, Mapping):
         raise CalibrationError(
             f"coefficients is {value!r}; it must be a table of names and numbers"
         )
-    return {name: _number(item, f"coefficient {name!r}") for name, item in value.items()}
+    return {name: _read_number(item, f"coefficient {name!r}") for name, item in value.items()}
 
 
-def _array(value: Any, shape: tuple[int, ...] | None, name: str) -> np.ndarray:
+def _read_array(value: Any, shape: tuple[int, ...] | None, name: str) -> Array:
+    """Return numbers as a read-only array of a shape (None: of any shape).
+
+    Raises:
+        CalibrationError: There is something else than finite numbers, or the shape is another.
+    """
     if not isinstance(value, np.ndarray):
-        # numpy would make numbers of some of these.
+        # numpy converts texts and truth values to numbers; in a file they are mistakes.
         items = np.asarray(value, dtype=object).ravel()
         if any(isinstance(item, (str, bool)) or item is None for item in items):
             raise CalibrationError(

@@ -15,8 +15,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import Array
 from .errors import SymmetryError
@@ -36,14 +38,17 @@ FIELD_SIZE = 9 + 27
 
 _VOIGT_INDICES = tuple((AXES.index(name[0]), AXES.index(name[1])) for name in STRESS)
 
+Float = TypeVar("Float", bound=np.floating[Any])
 
-def to_matrix(stress: Array) -> Array:
+
+def to_matrix(stress: NDArray[Float]) -> NDArray[Float]:
     """Return symmetric matrices (..., 3, 3) of components (..., 6) in Voigt order."""
     s = np.asarray(stress)
-    return s[..., [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
+    matrix: NDArray[Float] = s[..., [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
+    return matrix
 
 
-def to_voigt(matrix: Array) -> Array:
+def to_voigt(matrix: NDArray[Float]) -> NDArray[Float]:
     """Return components (..., 6), in Voigt order, of symmetric matrices (..., 3, 3)."""
     m = np.asarray(matrix)
     return np.stack([m[..., i, j] for i, j in _VOIGT_INDICES], axis=-1)

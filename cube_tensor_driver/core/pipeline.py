@@ -1,12 +1,13 @@
-"""Pipeline: rows of frequencies in, rows of stress out, without a loop over rows or cubes.
+"""Pipeline: rows of frequencies to rows of stress, without a loop over rows or cubes.
 
-One table per calibration holds a stacked matrix: 15 rows that give the components, then the
-whitened null-space rows of the residual. Rows with all pads good are one pad law and one matrix
-product per calibration. Rows with bad pads are done again with the estimator of their mask, one
-product per distinct (calibration, mask). Nothing that a row holds raises an error.
+Each calibration has a table with a stacked matrix: 15 rows that give the components, then the
+whitened null-space rows of the residual. Rows whose pads are all good need the pad law and one
+matrix product per calibration. Rows with bad pads are computed again with the estimator for their
+set of pads, with one product per distinct pair of calibration and bit mask. Whatever the numbers in
+a row are, they raise no error.
 
-The bits of a row do not depend on how many scans are processed with it: products are made scan by
-scan, because the last bit of a matrix product may depend on its shape.
+The bits of a row do not depend on the number of scans that are processed with it. Therefore
+products are formed scan by scan, because the last bit of a matrix product may depend on its shape.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .arrays import AnyArray, Array, Index, Mask, PadMasks, Real, Times, pad_table
 from .calibration import Calibration
 from .errors import CalibrationError, CubeError, LayoutError
 from .estimator import FALSE_ALARM, Estimator, chi2_limit, make_estimator
@@ -26,70 +28,123 @@ from .pattern import PatternCache, count_repeats
 from .rows import FrequencyRows, StressRows
 from .status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 
-N = len(COMPONENTS)
-MASKS_KEPT = 1024
-"""Estimators of pad masks remembered at a time."""
-BETA_FLOOR = 1e-12
-"""So that every pad has a highest frequency; changes the law by 1e-12 of a strain."""
-LOWEST_MARGIN = 1e-6
-"""Some roundings of float32."""
-FEW_CALIBRATIONS = 8
-"""Up to so many: a product for each. More: one einsum for all that have as many pads."""
+N_COMPONENTS = len(COMPONENTS)
+
+MAX_CACHED_MASKS = 1024
+"""Number of estimators, one per calibration and set of pads, that are kept in memory."""
+
+MIN_BETA = 1e-12
+"""Smallest ratio of parasitic to active capacitance that the pad law is computed with.
+
+With it every pad has a highest frequency. It changes the strain by 1e-12.
+"""
+
+LOWEST_STRESS_MARGIN = 1e-6
+"""Relative margin, a few roundings of float32, within which a pad stress is close to that of f = 0.
+
+Such rows are examined again, pad by pad.
+"""
+
+MAX_SEPARATE_PRODUCTS = 8
+"""Up to this many different calibrations, each gets its own matrix product (BLAS). With more, one
+einsum over all cubes with the same number of pads is faster."""
 
 
 class _Table(NamedTuple):
-    """An estimator laid out for rows: (15 + D, P) matrix on v / stiffness, scaled residual rows."""
+    """An estimator in the form in which rows are computed.
 
-    matrix: np.ndarray
-    limit: float  # of the residual
+    Attributes:
+        matrix: Map (15 + D, P) from v / stiffness to components and scaled residual rows.
+        limit: Limit of the residual.
+        observed: Bit mask of the observed components.
+    """
+
+    matrix: Real
+    limit: float
     observed: int
 
 
 class _Block(NamedTuple):
     """Rows of a scan that share a product.
 
-    matrix: (pads, 15 + D), or (pads, recovered, rows) where each row has its own calibration.
+    Attributes:
+        rows: Places of the rows in the scan.
+        pads: Number of pads of each row.
+        matrix: Matrix (pads, 15 + D) for all rows, or (pads, recovered, rows) where each row has
+            its own calibration.
     """
 
-    rows: slice | np.ndarray
+    rows: slice | Index
     pads: int
-    matrix: np.ndarray
+    matrix: Real
 
 
 class _Pattern(NamedTuple):
-    """What depends on the cube indices of a scan alone."""
+    """Quantities that depend only on the cube numbers of a scan of N rows.
 
-    unknown: np.ndarray  # (N,) bool: the skin has no such cube
-    group: np.ndarray  # (N,) which calibration
-    rest: np.ndarray  # (N, P) Hz
-    highest: np.ndarray  # (N, P) Hz, highest frequency of the law
-    lowest_v: float  # v that f = 0 gives, of the row where it is highest
-    n_pads: int  # pads of all rows
+    Attributes:
+        unknown: Whether the skin has no such cube (N,).
+        group: Number of the calibration (N,).
+        rest: Rest frequencies (N, P), in Hz.
+        highest: Highest frequencies of the pad law (N, P), in Hz.
+        lowest_v: Largest value of v, over all pads, that the frequency 0 gives.
+        n_pads: Number of pads of all rows.
+        blocks: Products that give the components.
+        limit: Limits of the residual (N,).
+        observed: Bit masks of the observed components (N,).
+    """
+
+    unknown: Mask
+    group: Index
+    rest: Real
+    highest: Real
+    lowest_v: float
+    n_pads: int
     blocks: list[_Block]
-    limit: np.ndarray  # (N,) of the residual
-    observed: np.ndarray  # (N,)
+    limit: Array
+    observed: AnyArray
 
 
 class _PadLaw(NamedTuple):
     """Pads of B scans of N rows after the pad law.
 
-    v: (B, N, P) pad stress / stiffness; bad pads are 0; pads that a cube does not have are NaN, or
-        0 where any pad is bad
-    bad: (B, N) bits of bad pads, None where there are none
-    no_temperature: (B, N) bool, rows whose temperature is needed and unknown, None without a model
+    Attributes:
+        pattern: Pattern of a scan.
+        v: Pad stresses divided by the stiffness (B, N, P). Bad pads are 0. Pads that a cube does
+            not have are NaN, or 0 if any pad is bad.
+        bad: Bit masks of the bad pads (B, N); None if there are none.
+        no_temperature: Rows whose temperature is needed and unknown (B, N); None if no calibration
+            has a temperature model.
     """
 
     pattern: _Pattern
-    v: np.ndarray
-    bad: np.ndarray | None
-    no_temperature: np.ndarray | None
+    v: Real
+    bad: Times | None
+    no_temperature: Mask | None
 
 
 class Pipeline:
-    """Cubes 0 .. len(calibrations) - 1; layouts may differ, rows are as wide as the widest."""
+    """Computes the stress of the cubes of one skin.
 
-    def __init__(self, calibrations: Sequence[Calibration], dtype=np.float64) -> None:
-        """CubeError: dtype is not float32 or float64. CalibrationError: there are no cubes."""
+    Cubes may have different layouts. Rows are as wide as the largest number of pads.
+
+    Attributes:
+        calibrations: Calibration of each cube.
+        n_pads: Largest number of pads of a cube, P.
+        dtype: Precision of the computation.
+    """
+
+    def __init__(self, calibrations: Sequence[Calibration], dtype: type = np.float64) -> None:
+        """Prepare the matrices of all calibrations.
+
+        Args:
+            calibrations: Calibration of each cube.
+            dtype: np.float32 or np.float64.
+
+        Raises:
+            CubeError: The precision is another.
+            CalibrationError: There are no cubes.
+        """
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.float32, np.float64):
             raise CubeError(f"pipeline: dtype {self.dtype}; use float32 or float64")
@@ -97,195 +152,270 @@ class Pipeline:
             raise CalibrationError("pipeline: no calibrations; give one per cube")
         self.calibrations = tuple(calibrations)
         self.n_pads = max(c.layout.n_pads for c in self.calibrations)
-        # Cubes with the same calibration are a group.
-        by_id = {c.id: c for c in reversed(self.calibrations)}
-        self._groups = tuple(by_id.values())
-        number = {key: i for i, key in enumerate(by_id)}
-        self._group = np.array([number[c.id] for c in self.calibrations])
-        beta = [np.maximum(c.beta, BETA_FLOOR) for c in self._groups]
-        self._beta = self._per_pad(beta, 1)
-        self._stiffness = (
-            self._per_pad([c.modulus for c in self._groups], 0) * (1 + self._beta) / self._beta
-        )
-        self._exists = self._per_pad([np.ones(c.layout.n_pads) for c in self._groups], 0) > 0
-        self._thermal = np.array([c.temperature is not None for c in self._groups])
-        self._any_thermal = bool(self._thermal.any())
-        self._estimator = lru_cache(maxsize=MASKS_KEPT)(self._make_estimator)
-        self._table = lru_cache(maxsize=MASKS_KEPT)(self._make_table)
-        groups = range(len(self._groups))
-        self._n_residual = max(self._estimator(group, 0).dof for group in groups) or 1
-        full = [self._make_table(group, 0) for group in groups]
-        self._matrices = np.array([table.matrix for table in full])
-        self._recovered = np.flatnonzero(~np.isnan(self._matrices).all(axis=(0, 2)))
-        self._limits = np.array([table.limit for table in full], dtype=self.dtype)
-        self._observed = np.array([table.observed for table in full], dtype=np.uint16)
-        self._patterns = PatternCache(self._make_pattern, len(self.calibrations))
-        self.rest_frequency = self._per_pad([c.rest_frequency for c in self.calibrations], np.nan)
 
-    def _per_pad(self, values: Sequence[np.ndarray], missing: float) -> np.ndarray:
-        padded = [
-            np.pad(value, (0, self.n_pads - len(value)), constant_values=missing)
-            for value in values
-        ]
-        return np.array(padded)
+        # Cubes with equal calibrations form a group, whose matrices exist once.
+        by_id = {c.id: c for c in reversed(self.calibrations)}
+        numbers = {key: number for number, key in enumerate(by_id)}
+        self._groups = tuple(by_id.values())
+        self._group = np.array([numbers[c.id] for c in self.calibrations])
+        self._beta = pad_table(
+            [np.maximum(c.beta, MIN_BETA) for c in self._groups], self.n_pads, fill=1
+        )
+        modulus = pad_table([c.modulus for c in self._groups], self.n_pads, fill=0)
+        self._stiffness = modulus * (1 + self._beta) / self._beta
+        pad_counts = np.array([c.layout.n_pads for c in self._groups])
+        self._exists: Mask = np.arange(self.n_pads) < pad_counts[:, None]
+        self._is_thermal = np.array([c.temperature is not None for c in self._groups])
+        self._any_thermal = bool(self._is_thermal.any())
+
+        self._estimator = lru_cache(maxsize=MAX_CACHED_MASKS)(self._make_estimator)
+        self._table = lru_cache(maxsize=MAX_CACHED_MASKS)(self._make_table)
+        groups = range(len(self._groups))
+        # At least one residual row, so that there is a place for its NaN.
+        self._n_residual = max(self._estimator(group, 0).dof for group in groups) or 1
+        tables = [self._make_table(group, 0) for group in groups]
+        self._matrices = np.array([table.matrix for table in tables])
+        is_recovered = ~np.isnan(self._matrices).all(axis=(0, 2))
+        self._recovered = np.flatnonzero(is_recovered)
+        self._limits = np.array([table.limit for table in tables], dtype=self.dtype)
+        self._observed = np.array([table.observed for table in tables], dtype=np.uint16)
+        self._patterns = PatternCache(self._make_pattern, len(self.calibrations))
+        rest = [c.rest_frequency for c in self.calibrations]
+        self.rest_frequency = pad_table(rest, self.n_pads, fill=np.nan)
+
+    def __repr__(self) -> str:
+        return (
+            f"Pipeline({len(self.calibrations)} cubes, {len(self._groups)} calibrations, "
+            f"{self.n_pads} pads, {self.dtype})"
+        )
 
     @property
-    def rest_frequency(self) -> np.ndarray:
-        """(cubes, P) in Hz at the reference temperature, NaN where a cube has no such pad; set by
-        tare. LayoutError, CubeError: another shape, or a value that is not finite and above 0."""
-        return self._rest.copy()
+    def rest_frequency(self) -> Array:
+        """Rest frequencies (cubes, P), in Hz, at the reference temperature; a tare sets them.
+
+        They are NaN where a cube has no such pad. Setting them raises LayoutError for a wrong
+        shape, and CubeError for values that are not finite and above 0.
+        """
+        rest: Array = self._rest.copy()
+        return rest
 
     @rest_frequency.setter
-    def rest_frequency(self, value: np.ndarray) -> None:
+    def rest_frequency(self, value: Array) -> None:
         rest = np.array(value, dtype=float)
         exists = self._exists[self._group]
         if rest.shape != exists.shape:
             raise LayoutError(
                 f"rest_frequency has shape {rest.shape}; this skin needs {exists.shape}"
             )
-        if not np.all(rest[exists] > 0) or not np.all(np.isfinite(rest[exists])):
+        existing = rest[exists]
+        if not np.all(existing > 0) or not np.all(np.isfinite(existing)):
             raise CubeError(
-                f"rest_frequency holds {rest[exists].min():g} Hz; "
+                f"rest_frequency holds {existing.min():g} Hz; "
                 "every pad's must be finite and above 0"
             )
         self._rest = np.where(exists, rest, np.nan)
         self._patterns.clear()
 
-    def temperature_factor(self, cube: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-        """(N, P) f0(T) / f0 of rows; 1 without a model or a temperature. Tare divides by it."""
+    def temperature_factor(self, cube: Index, temperature: Real) -> Array:
+        """Return f0(T) / f0 (N, P) of rows; 1 without a model or a temperature.
+
+        Args:
+            cube: Numbers of the cubes (N,).
+            temperature: Temperatures (N,), in °C.
+        """
         return self._factor(self._group[cube], np.asarray(temperature, dtype=float))
 
-    def process(self, rows: FrequencyRows, left_out: np.ndarray | None = None) -> StressRows:
-        """Stress of N rows: of one scan, or of several scans of the same cubes one after the other.
+    def process(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> StressRows:
+        """Compute the stress of N rows.
 
-        left_out: (N,) bits of pads that are not used; None: those that the device reports broken.
-        LayoutError: arrays of the wrong shape. All else that a row can hold ends in its status.
+        Args:
+            rows: Rows of one scan, or of several scans of the same cubes one after the other.
+            left_out: Bit masks of pads that are not used (N,). None stands for the pads that the
+                device reports as broken.
+
+        Raises:
+            LayoutError: Arrays have the wrong shape. Every other problem of a row becomes a bit of
+                its status.
         """
         if left_out is None:
             left_out = rows.pad_fault
         with np.errstate(all="ignore", divide="raise"):
             law = self._apply_law(rows, left_out)
             pattern, v, bad = law.pattern, law.v, law.bad
-            out = self._products(pattern, v)
+            out = self._multiply(pattern, v)
             limit = pattern.limit
             observed = np.concatenate([pattern.observed] * len(v))
             if bad is not None:
                 limit = np.tile(pattern.limit, (len(v), 1))
                 self._correct_bad_rows(pattern, v, bad, out, limit, observed)
             residual = self._residual(out)
-            over = (residual > limit).ravel()
-        status = over * np.uint16(RESIDUAL)
+            is_over_limit = (residual > limit).ravel()
+
+        status = is_over_limit * np.uint16(RESIDUAL)
         if bad is not None:
-            left_out = (left_out | bad.ravel()).astype(np.uint32)
-            status[bad.ravel() != 0] |= PAD_FAULT
+            bad = bad.ravel()
+            left_out = (left_out | bad).astype(np.uint32)
+            status[bad != 0] |= PAD_FAULT
             status[observed == 0] |= INVALID
         if law.no_temperature is not None:
             status[law.no_temperature.ravel()] |= TEMPERATURE
         status |= rows.status & np.uint16(STAMP)
-        out = out.reshape(-1, out.shape[2])
+        components = out.reshape(-1, out.shape[2])
         return StressRows(
             cube=rows.cube,
             sequence=rows.sequence,
             stamp_ns=rows.stamp_ns,
-            stress=out[:, : len(STRESS)],
-            gradient=out[:, len(STRESS) : N],
+            stress=components[:, : len(STRESS)],
+            gradient=components[:, len(STRESS) : N_COMPONENTS],
             residual=residual.ravel(),
             status=status,
             observed=observed,
             left_out=left_out,
         )
 
-    def _products(self, pattern: _Pattern, v: np.ndarray) -> np.ndarray:
-        """(B, N, 15 + D) components and residual rows of v (B, N, P)."""
-        if len(pattern.blocks) == 1 and pattern.blocks[0].matrix.ndim == 2:
-            return v[:, :, : pattern.blocks[0].pads] @ pattern.blocks[0].matrix
-        out = np.full((*v.shape[:2], N + self._n_residual), np.nan, dtype=self.dtype)
+    def _multiply(self, pattern: _Pattern, v: Real) -> Real:
+        """Compute components and residual rows (B, N, 15 + D) of v (B, N, P)."""
+        first = pattern.blocks[0] if len(pattern.blocks) == 1 else None
+        if first is not None and first.matrix.ndim == 2:
+            product: Real = v[:, :, : first.pads] @ first.matrix
+            return product
+        out = np.full((*v.shape[:2], N_COMPONENTS + self._n_residual), np.nan, dtype=self.dtype)
         for rows, pads, matrix in pattern.blocks:
             if matrix.ndim == 2:
                 out[:, rows] = v[:, rows, :pads] @ matrix
             else:
                 part = out[:, rows]
-                of_pads = np.ascontiguousarray(v[:, rows, :pads].transpose(2, 0, 1))
-                part[:, :, self._recovered] = np.einsum("pin,pbn->bni", matrix, of_pads)
+                # Pads come first, so that the inner loop of einsum runs over neighbours in memory.
+                by_pad = np.ascontiguousarray(v[:, rows, :pads].transpose(2, 0, 1))
+                part[:, :, self._recovered] = np.einsum("pin,pbn->bni", matrix, by_pad)
                 out[:, rows] = part
         return out
 
     def _correct_bad_rows(
         self,
         pattern: _Pattern,
-        v: np.ndarray,
-        bad: np.ndarray,
-        out: np.ndarray,
-        limit: np.ndarray,
-        observed: np.ndarray,
+        v: Real,
+        bad: Times,
+        out: Real,
+        limit: Array,
+        observed: AnyArray,
     ) -> None:
-        """Do rows with bad pads again, with the estimator of their mask; rows of unknown cubes are
-        NaN. Writes into out (B, N, 15 + D), limit (B, N) and observed (B N,)."""
-        flat, flat_limit = out.reshape(-1, out.shape[2]), limit.reshape(-1)
+        """Compute rows with bad pads again, with the estimator for their good pads.
+
+        Rows of unknown cubes become NaN.
+
+        Args:
+            pattern: Pattern of a scan.
+            v: Pad stresses divided by the stiffness (B, N, P).
+            bad: Bit masks of the bad pads (B, N).
+            out: Components and residual rows (B, N, 15 + D), which are changed.
+            limit: Limits of the residual (B, N), which are changed.
+            observed: Bit masks of the observed components (B N,), which are changed.
+        """
+        flat_out = out.reshape(-1, out.shape[2])
+        flat_limit = limit.reshape(-1)
         flat_v = v.reshape(-1, self.n_pads)
-        for group, bits, chosen in _distinct(np.tile(pattern.group, len(v)), bad.ravel()):
-            table = self._table(group, bits)
-            # Row by row: the last bit of a product for all may depend on how many there are.
-            flat[chosen] = np.matmul(table.matrix, flat_v[chosen][:, :, None])[:, :, 0]
-            flat_limit[chosen], observed[chosen] = table.limit, table.observed
+        groups = np.tile(pattern.group, len(v))
+        for group, mask, rows in _group_by_mask(groups, bad.ravel()):
+            table = self._table(group, mask)
+            # Row by row: the last bit of one product for all rows may depend on their number.
+            product = np.matmul(table.matrix, flat_v[rows][:, :, None])
+            flat_out[rows] = product[:, :, 0]
+            flat_limit[rows] = table.limit
+            observed[rows] = table.observed
         out[:, pattern.unknown] = np.nan
         observed.reshape(len(v), -1)[:, pattern.unknown] = 0
 
-    def _residual(self, out: np.ndarray) -> np.ndarray:
-        """(B, N) of components and residual rows (B, N, 15 + D)."""
-        rest = out[:, :, N:]
+    def _residual(self, out: Real) -> Real:
+        """Compute the residuals (B, N) of components and residual rows (B, N, 15 + D)."""
+        rest = out[:, :, N_COMPONENTS:]
         if self._n_residual == 1:
             return np.abs(rest[:, :, 0])
-        residual: np.ndarray = np.sqrt(np.einsum("bnd,bnd->bn", rest, rest))
+        residual: Real = np.sqrt(np.einsum("bnd,bnd->bn", rest, rest))
         return residual
 
-    def pad_stress(self, rows: FrequencyRows, left_out: np.ndarray | None = None) -> np.ndarray:
-        """(N, P) pad stresses in Pa as the law gives them, before gains; NaN for bad and missing
-        pads."""
-        group, unknown, pads, bad = self._pads(rows, left_out)
-        missing = ~self._exists[group] | unknown[:, None] | _bits(bad, self.n_pads)
-        return np.where(missing, np.nan, pads)
+    def pad_stress(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Array:
+        """Compute pad stresses (N, P), in Pa, by the pad law without gains.
 
-    def suspects(self, rows: FrequencyRows, left_out: np.ndarray | None = None) -> np.ndarray:
-        """(N, P) bool, pads of which one alone explains a bad residual; see Estimator.suspects."""
-        groups, unknown, pads, bad = self._pads(rows, left_out)
-        result = np.zeros(pads.shape, dtype=bool)
-        for group, bits, chosen in _distinct(groups, bad, also_good=True):
-            n = self._groups[group].layout.n_pads
-            result[chosen, :n] = self._estimator(group, bits).suspects(pads[chosen, :n])
+        They are NaN for bad pads, and for pads that the cube does not have.
+        """
+        group, unknown, stress, bad = self._apply_law_by_row(rows, left_out)
+        is_missing = ~self._exists[group] | unknown[:, None] | _unpack_bits(bad, self.n_pads)
+        return np.where(is_missing, np.nan, stress)
+
+    def suspects(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Mask:
+        """Find the pads (N, P) that, broken alone, explain a high residual.
+
+        `Estimator.suspects` states the rule.
+        """
+        groups, unknown, stress, bad = self._apply_law_by_row(rows, left_out)
+        result = np.zeros(stress.shape, dtype=bool)
+        for group, mask, chosen in _group_by_mask(groups, bad, also_good=True):
+            n_pads = self._groups[group].layout.n_pads
+            estimator = self._estimator(group, mask)
+            result[chosen, :n_pads] = estimator.suspects(stress[chosen, :n_pads])
         return result & ~unknown[:, None]
 
-    def _pads(
-        self, rows: FrequencyRows, left_out: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of each row: group (N,), whether its cube is unknown (N,), pad stresses (N, P) in Pa,
-        bits of bad pads (N,)."""
+    def _apply_law_by_row(
+        self, rows: FrequencyRows, left_out: PadMasks | None
+    ) -> tuple[Index, Mask, Array, Times]:
+        """Apply the pad law to N rows.
+
+        Returns:
+            Group of each row (N,), whether its cube is unknown (N,), its pad stresses (N, P) in Pa,
+            and the bit mask of its bad pads (N,).
+        """
+        if left_out is None:
+            left_out = rows.pad_fault
         with np.errstate(all="ignore", divide="raise"):
-            law = self._apply_law(rows, rows.pad_fault if left_out is None else left_out)
+            law = self._apply_law(rows, left_out)
         scans = len(law.v)
-        group, unknown = np.tile(law.pattern.group, scans), np.tile(law.pattern.unknown, scans)
+        group = np.tile(law.pattern.group, scans)
+        unknown = np.tile(law.pattern.unknown, scans)
         bad = np.zeros(len(group), np.int64) if law.bad is None else law.bad.ravel()
-        return group, unknown, law.v.reshape(-1, self.n_pads) * self._stiffness[group], bad
+        stress = law.v.reshape(-1, self.n_pads) * self._stiffness[group]
+        return group, unknown, stress, bad
 
-    def matrix(self, cube: int, left_out: int = 0) -> np.ndarray:
-        """(15, P) one cube's components in Pa and Pa/m from its pads' stresses in Pa; NaN where
-        unobserved, 0 for pads that are left out (bits)."""
+    def matrix(self, cube: int, left_out: int = 0) -> Array:
+        """Return the map (15, P) from a cube's pad stresses in Pa to its components.
+
+        Args:
+            cube: Number of the cube.
+            left_out: Bit mask of pads that are not used.
+
+        Returns:
+            Rows in Pa per Pa for stresses and in Pa/m per Pa for gradients; NaN for components that
+            are not observed. Columns of pads that are left out are 0.
+        """
+        estimator, scale = self._find_estimator(cube, left_out)
+        return estimator.matrix * scale[:, None]
+
+    def covariance(self, cube: int, left_out: int = 0) -> Array:
+        """Return the covariance (15, 15) of a cube's components due to the noise of its pads.
+
+        Args:
+            cube: Number of the cube.
+            left_out: Bit mask of pads that are not used.
+
+        Returns:
+            Products of Pa for stresses and Pa/m for gradients; NaN for components that are not
+            observed.
+        """
+        estimator, scale = self._find_estimator(cube, left_out)
+        return estimator.covariance * np.outer(scale, scale)
+
+    def _find_estimator(self, cube: int, left_out: int) -> tuple[Estimator, Array]:
+        """Return the estimator of a cube, and the unit (15,) of its components."""
         group = int(self._group[cube])
-        mask = int(left_out) & int(_mask(self._exists[group]))
-        return np.asarray(self._estimator(group, mask).matrix * self._scale(group)[:, None])
+        # Bits of pads that the cube does not have would only fill the cache.
+        mask = int(left_out) & int(_pack_bits(self._exists[group]))
+        return self._estimator(group, mask), self._scale(group)
 
-    def covariance(self, cube: int, left_out: int = 0) -> np.ndarray:
-        """(15, 15) of one cube's components from its pads' noise, in Pa and Pa/m; NaN where
-        unobserved."""
-        group = int(self._group[cube])
-        scale = self._scale(group)
-        mask = int(left_out) & int(_mask(self._exists[group]))
-        return self._estimator(group, mask).covariance * np.outer(scale, scale)
+    def _apply_law(self, rows: FrequencyRows, left_out: PadMasks) -> _PadLaw:
+        """Apply the pad law in three passes: v = E (1 + beta) / beta (f - f0) / (f_highest - f).
 
-    def _apply_law(self, rows: FrequencyRows, left_out: np.ndarray) -> _PadLaw:
-        """The law of oscillator.py in three passes: v = E (1 + beta) / beta (f - f0) / (top - f).
-
-        Several scans of the same rising cubes become as many in the result; others are one scan.
+        Several scans of the same rising cube numbers become as many scans in the result; rows in
+        another order become one scan.
         """
         f = np.asarray(rows.frequency, dtype=self.dtype)
         if f.ndim != 2 or f.shape != (len(rows), self.n_pads):
@@ -296,138 +426,162 @@ class Pipeline:
         pattern = self._patterns.get(rows.cube)
         n = len(pattern.group)
         count = len(rows) // n if n else 1
-        # numpy is faster with two axes.
+        # numpy is faster with two axes than with three.
         f = f.reshape((n, self.n_pads) if count == 1 else (count, n, self.n_pads))
-        rest, highest, no_temperature = pattern.rest, pattern.highest, None
+        rest, highest = pattern.rest, pattern.highest
+        no_temperature = None
         if self._any_thermal:
-            known = np.asarray(rows.temperature, dtype=float).reshape(count, n)
-            no_temperature = self._thermal[pattern.group] & ~np.isfinite(known)
-            factor = self._factor(pattern.group, known)
-            rest, highest = (
-                (rest * factor).astype(self.dtype),
-                (highest * factor).astype(self.dtype),
-            )
+            temperature = np.asarray(rows.temperature, dtype=float).reshape(count, n)
+            no_temperature = self._is_thermal[pattern.group] & ~np.isfinite(temperature)
+            factor = self._factor(pattern.group, temperature)
+            rest = (rest * factor).astype(self.dtype)
+            highest = (highest * factor).astype(self.dtype)
         v = f - rest
-        below = highest - f
-        reported = np.count_nonzero(left_out) > 0
+        below_highest = highest - f
+        any_reported = np.count_nonzero(left_out) > 0
         try:
-            v /= below
-            # v falls with f down to 0 and is below -1 beyond the highest frequency: one comparison
-            # finds all that is outside the law.
-            full = f.size == count * pattern.n_pads
-            within = n > 0 and full and v.min() > pattern.lowest_v
-        except FloatingPointError:  # f is the highest frequency
-            within = False
+            v /= below_highest
+            # v falls with f down to f = 0 and is below -1 beyond the highest frequency, so one
+            # comparison of the minimum finds all frequencies outside the law.
+            is_full = f.size == count * pattern.n_pads
+            is_within = n > 0 and is_full and v.min() > pattern.lowest_v
+        except FloatingPointError:  # f equals the highest frequency
+            is_within = False
         v = v.reshape(count, n, self.n_pads)
-        if within and not reported:
+        if is_within and not any_reported:
             return _PadLaw(pattern, v, None, no_temperature)
-        # NaN, Inf and frequencies outside the law's range all fail one of the two comparisons.
-        good = ((f > 0) & (below > 0)).reshape(v.shape)
-        if np.count_nonzero(good) == count * pattern.n_pads and not reported:
+
+        # NaN, Inf and frequencies outside the range of the law all fail one of the comparisons.
+        is_good = ((f > 0) & (below_highest > 0)).reshape(v.shape)
+        if np.count_nonzero(is_good) == count * pattern.n_pads and not any_reported:
             return _PadLaw(pattern, v, None, no_temperature)
-        if reported:
-            good &= ~_bits(np.asarray(left_out).reshape(count, n), self.n_pads)
-        v[~good] = 0
-        bad = _mask(self._exists[pattern.group] & ~good)
+        if any_reported:
+            by_scan = np.asarray(left_out).reshape(count, n)
+            is_good &= ~_unpack_bits(by_scan, self.n_pads)
+        v[~is_good] = 0
+        bad = _pack_bits(self._exists[pattern.group] & ~is_good)
         return _PadLaw(pattern, v, bad, no_temperature)
 
-    def _make_pattern(self, cube: np.ndarray) -> _Pattern:
-        """Of one scan; several scans of the same cubes have the pattern of one of them."""
+    def _make_pattern(self, cube: AnyArray) -> _Pattern:
+        """Compute the pattern of one scan; several scans of the same cubes share the first's."""
         repeats = count_repeats(cube)
         if repeats > 1:
             return self._patterns.get(cube[: len(cube) // repeats])
         unknown = (cube < 0) | (cube >= len(self.calibrations))
-        index = np.where(unknown, 0, cube).astype(int)
-        group, rest = self._group[index], self._rest[index]
+        known_cube = np.where(unknown, 0, cube).astype(int)
+        group, rest = self._group[known_cube], self._rest[known_cube]
         highest = highest_frequency(rest, self._beta[group])
-        lowest_v = float(np.fmax.reduce(-rest / highest, axis=None, initial=-1.0)) * (
-            1 - LOWEST_MARGIN
-        )
-        # One pad more than there are where a cube is unknown: such a scan never counts as full and
-        # is always corrected, where its row becomes NaN.
+        # At f = 0, v is -f0 / f_highest.
+        lowest_v = float(np.fmax.reduce(-rest / highest, axis=None, initial=-1.0))
+        # A scan with an unknown cube has one pad more than there are, so that it never counts as
+        # full and is always corrected, which sets the row of the unknown cube to NaN.
         n_pads = int(np.count_nonzero(self._exists[group])) + int(unknown.any())
         return _Pattern(
             unknown=unknown,
             group=group,
             rest=rest.astype(self.dtype),
             highest=highest.astype(self.dtype),
-            lowest_v=lowest_v,
+            lowest_v=lowest_v * (1 - LOWEST_STRESS_MARGIN),
             n_pads=n_pads,
-            blocks=self._blocks(group),
+            blocks=self._make_blocks(group),
             limit=self._limits[group],
             observed=self._observed[group],
         )
 
-    def _blocks(self, group: np.ndarray) -> list[_Block]:
-        few = len(self._groups) <= FEW_CALIBRATIONS
+    def _make_blocks(self, group: Index) -> list[_Block]:
+        """Divide a scan into products, by calibration or (if these are many) by number of pads."""
+        is_separate = len(self._groups) <= MAX_SEPARATE_PRODUCTS
         n_pads = self._exists.sum(axis=1)[group]
-        shared = group if few else n_pads
+        shared = group if is_separate else n_pads
         blocks = []
         for value in np.unique(shared).tolist():
             index = np.flatnonzero(shared == value)
-            neighbours = index[-1] - index[0] + 1 == len(index)
-            rows = slice(int(index[0]), int(index[-1]) + 1) if neighbours else index
-            pads = int(n_pads[index[0]])
-            if few:
+            first, last = int(index[0]), int(index[-1])
+            # A slice makes no copies.
+            rows = slice(first, last + 1) if last - first + 1 == len(index) else index
+            pads = int(n_pads[first])
+            if is_separate:
                 matrix = self._matrices[value, :, :pads].T
             else:
-                own = self._matrices[:, self._recovered][group[index], :, :pads]
-                matrix = own.transpose(2, 1, 0)
+                recovered = self._matrices[:, self._recovered]
+                matrix = recovered[group[index], :, :pads].transpose(2, 1, 0)
             blocks.append(_Block(rows, pads, np.ascontiguousarray(matrix)))
         return blocks
 
-    def _factor(self, group: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    def _factor(self, group: Index, temperature: Array) -> Array:
+        """Return f0(T) / f0 (..., P) of rows of these groups (N,) at temperatures (..., N)."""
         factor = np.ones((*temperature.shape, self.n_pads))
         for number, calibration in enumerate(self._groups):
             if calibration.temperature is not None:
                 rows = (group == number) & np.isfinite(temperature)
-                warm = calibration.temperature.factor(temperature[rows])
-                factor[rows, : calibration.layout.n_pads] = warm
+                own = calibration.temperature.factor(temperature[rows])
+                factor[rows, : calibration.layout.n_pads] = own
         return factor
 
-    def _scale(self, group: int) -> np.ndarray:
-        """(15,) of components: gradients are solved for in units of the half side."""
-        return np.where(np.arange(N) < len(STRESS), 1, 1 / self._groups[group].half_side)
+    def _scale(self, group: int) -> Array:
+        """Return the unit (15,) of the components: gradients are solved for times d0."""
+        is_stress = np.arange(N_COMPONENTS) < len(STRESS)
+        return np.where(is_stress, 1, 1 / self._groups[group].half_side)
 
     def _make_estimator(self, group: int, mask: int) -> Estimator:
-        c = self._groups[group]
-        bad = np.flatnonzero(_bits(mask, c.layout.n_pads))
-        return make_estimator(c.response, c.noise, c.modes, bad, c.neglect)
+        calibration = self._groups[group]
+        missing = np.flatnonzero(_unpack_bits(mask, calibration.layout.n_pads))
+        return make_estimator(
+            calibration.response,
+            calibration.noise,
+            calibration.modes,
+            missing,
+            calibration.neglect,
+        )
 
     def _make_table(self, group: int, mask: int) -> _Table:
-        estimator, n = self._estimator(group, mask), self._groups[group].layout.n_pads
-        matrix = np.zeros((N + self._n_residual, self.n_pads))
-        matrix[:N, :n] = estimator.matrix * self._scale(group)[:, None]
-        matrix[N:, :n] = np.nan
-        # A mask that lowers the rank by more than a pad could have more null rows.
+        estimator = self._estimator(group, mask)
+        n_pads = self._groups[group].layout.n_pads
+        matrix = np.zeros((N_COMPONENTS + self._n_residual, self.n_pads))
+        matrix[:N_COMPONENTS, :n_pads] = estimator.matrix * self._scale(group)[:, None]
+        matrix[N_COMPONENTS:, :n_pads] = np.nan
+        # A mask that lowers the rank by more than the pads it removes could have more null rows.
         null = estimator.null[: self._n_residual]
         dof = len(null)
         limit = np.nan
         if dof:
-            matrix[N:, :n] = 0
-            matrix[N : N + dof, :n] = null / np.sqrt(dof)
+            matrix[N_COMPONENTS:, :n_pads] = 0
+            matrix[N_COMPONENTS : N_COMPONENTS + dof, :n_pads] = null / np.sqrt(dof)
             limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof)
         matrix *= self._stiffness[group]
-        return _Table(matrix.astype(self.dtype, order="F"), limit, int(_mask(estimator.observed)))
+        observed = int(_pack_bits(estimator.observed))
+        return _Table(matrix.astype(self.dtype, order="F"), limit, observed)
 
 
-def _bits(mask: np.ndarray | int, count: int) -> np.ndarray:
-    """(..., count) bool from bit masks."""
-    bits: np.ndarray = (np.asarray(mask, dtype=np.int64)[..., None] >> np.arange(count)) & 1 > 0
+def _unpack_bits(mask: AnyArray | int, count: int) -> Mask:
+    """Return the lowest bits (..., count) of bit masks."""
+    shifted = np.asarray(mask, dtype=np.int64)[..., None] >> np.arange(count)
+    bits: Mask = shifted & 1 > 0
     return bits
 
 
-def _mask(bits: np.ndarray) -> np.ndarray:
-    """The inverse of _bits."""
-    return bits @ (np.int64(1) << np.arange(bits.shape[-1]))
+def _pack_bits(bits: Mask) -> Times:
+    """Return bit masks of bits (..., count), the inverse of `_unpack_bits`."""
+    weights = np.int64(1) << np.arange(bits.shape[-1])
+    masks: Times = bits @ weights
+    return masks
 
 
-def _distinct(
-    group: np.ndarray, mask: np.ndarray, also_good: bool = False
-) -> Iterator[tuple[int, int, np.ndarray]]:
-    """(group, mask, rows) of each distinct pair with a bad pad; of those without one, too, if
-    also_good."""
+def _group_by_mask(
+    group: Index, mask: Times, also_good: bool = False
+) -> Iterator[tuple[int, int, Index]]:
+    """Collect the rows of each distinct pair of group and bit mask of bad pads.
+
+    Args:
+        group: Groups (N,).
+        mask: Bit masks (N,).
+        also_good: Whether rows without bad pads are collected, too.
+
+    Yields:
+        Group, mask and row numbers.
+    """
     rows = np.arange(len(mask)) if also_good else np.flatnonzero(mask)
+    # Masks have 32 bits, so group and mask fit into one integer that can be sorted.
     pairs, which = np.unique(group[rows] << 32 | mask[rows], return_inverse=True)
     order = np.argsort(which, kind="stable")
     ends = np.searchsorted(which[order], np.arange(len(pairs) + 1))

@@ -1,8 +1,8 @@
-"""Reconstructor: the program's one idea, frequencies in, stress out.
+"""Reconstructor: from rows of frequencies to rows of stress, the central step of the program.
 
-It holds what lies between them: the health of pads, the pipeline, the residual, drift, tare and
-status. It has no clock, no I/O, no threads and no ROS: time is what the rows say. The node, a bag
-that is processed again, the demo's check and a notebook all use it, and all get the same bits.
+It combines the health of the pads, the pipeline, drift and tare. It has no clock, no input or
+output, no threads and no ROS: time is what the rows state. The node, reprocessing of a bag, the
+check of the demo and a notebook all use it, and all get the same bits.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Array, Mask, PadMasks, StatusBits
 from .calibration import Calibration
 from .errors import TareError
 from .health.drift import DriftTracker
@@ -22,25 +22,26 @@ from .pipeline import Pipeline
 from .rows import FrequencyRows, StressRows
 
 
-class Verdicts(NamedTuple):
-    """What was decided about rows when they were recorded.
+class RecordedHealth(NamedTuple):
+    """The health of pads that was found when N rows were recorded.
 
-    known: (N,) bool, whether the recording says so
-    left_out: (N,) uint32, bits of the pads that were not used
-    status: (N,) uint16, bits of status.py about the pads of the row's cube
+    Attributes:
+        known: Whether the recording states it (N,).
+        left_out: Bit masks of the pads that were not used (N,).
+        status: Conditions of the pads of the row's cube (N,), bits of `status.py`.
     """
 
-    known: NDArray[np.bool_]
-    left_out: NDArray[np.uint32]
-    status: NDArray[np.uint16]
+    known: Mask
+    left_out: PadMasks
+    status: StatusBits
 
-    def select(self, chosen: Any) -> Verdicts:
-        """Those of the rows that an index, a slice or a mask chooses."""
-        return Verdicts(self.known[chosen], self.left_out[chosen], self.status[chosen])
+    def select(self, chosen: Any) -> RecordedHealth:
+        """Return that of the rows that an index, a slice or a mask chooses."""
+        return RecordedHealth(self.known[chosen], self.left_out[chosen], self.status[chosen])
 
 
-class SkinLike(Protocol):
-    """A skin, as far as reconstruction goes: a name and a calibration for each cube."""
+class CalibratedSkin(Protocol):
+    """A skin that has a name and a calibration for each cube."""
 
     @property
     def names(self) -> Sequence[str]: ...
@@ -50,18 +51,28 @@ class SkinLike(Protocol):
 
 
 class Reconstructor:
-    """Makes stress of the frequencies of one skin. Not for two threads at a time.
+    """Computes stress from the frequencies of one skin. It is not safe to use in two threads.
 
-    pipeline, health: what it is made of, to look at
-    names: of the cubes, for messages
-    drift_time: s, time constant with which rest frequencies follow slow drift; 0: never
-    rest_changes: how often rest frequencies have changed
+    Attributes:
+        pipeline: Pipeline from frequencies to stress.
+        health: Health of the pads.
+        names: Names of the cubes, for messages.
+        drift_time: Time constant with which rest frequencies follow slow drift, in s. With 0 they
+            do not follow.
+        rest_changes: Number of changes of the rest frequencies so far.
     """
 
-    def __init__(self, skin: SkinLike | Sequence[Calibration], dtype: type = np.float32) -> None:
-        """skin: a skin, or the calibrations of its cubes in order.
+    def __init__(
+        self, skin: CalibratedSkin | Sequence[Calibration], dtype: type = np.float32
+    ) -> None:
+        """Prepare the reconstruction of a skin.
 
-        CalibrationError: there are no cubes.
+        Args:
+            skin: The skin, or the calibrations of its cubes in order.
+            dtype: Precision of the computation, np.float32 or np.float64.
+
+        Raises:
+            CalibrationError: There are no cubes.
         """
         if isinstance(skin, Sequence):
             calibrations = list(skin)
@@ -73,33 +84,42 @@ class Reconstructor:
         self.health = Health(self.pipeline)
         self.drift_time = 0.0
         self.rest_changes = 0
-        self._calibrated = self.pipeline.rest_frequency
+        self._calibrated_rest = self.pipeline.rest_frequency
         self._drift = DriftTracker(self.pipeline, self.health)
+
+    def __repr__(self) -> str:
+        drift = f"drift in {self.drift_time:g} s" if self.drift_time else "no drift"
+        return f"Reconstructor({self.pipeline!r}, {drift}, {self.rest_changes} changes of rest)"
 
     @property
     def calibrations(self) -> tuple[Calibration, ...]:
+        """Calibration of each cube."""
         return self.pipeline.calibrations
 
     @property
-    def rest_frequency(self) -> NDArray[np.float64]:
-        """(cubes, P) Hz of pads without load; NaN where a cube has no such pad.
+    def rest_frequency(self) -> Array:
+        """Frequencies of the pads without load (cubes, P), in Hz; NaN where a cube has no such pad.
 
-        Setting it raises LayoutError or CubeError for what cannot be rest frequencies.
+        Setting them raises LayoutError for a wrong shape, and CubeError for impossible values.
         """
         return self.pipeline.rest_frequency
 
     @rest_frequency.setter
-    def rest_frequency(self, value: NDArray[np.float64]) -> None:
+    def rest_frequency(self, value: Array) -> None:
         self.pipeline.rest_frequency = value
         self.health.refresh()
         self.rest_changes += 1
 
-    def process(self, rows: FrequencyRows, recorded: Verdicts | None = None) -> StressRows:
-        """Stress of rows: of one scan, or of several scans one after the other.
+    def process(self, rows: FrequencyRows, recorded: RecordedHealth | None = None) -> StressRows:
+        """Reconstruct the stress of rows.
 
-        recorded: verdicts about pads that replace those made now, where they are known.
-        LayoutError: the rows have cubes or pads that the skin does not have. All else that a row
-        can hold ends in its status.
+        Args:
+            rows: Rows of one scan, or of several scans one after the other.
+            recorded: Health of the pads that replaces the one found now, where it is known.
+
+        Raises:
+            LayoutError: The rows have cubes or pads that the skin does not have. Every other
+                problem of a row becomes a bit of its status.
         """
         windows = self.health.closed
         left_out, pad_status = self.health.update(rows)
@@ -109,44 +129,57 @@ class Reconstructor:
         stress = self.pipeline.process(rows, left_out)
         self.health.count_residuals(rows.cube, stress.status)
         stress.status[:] |= pad_status
-        if self.drift_time and self.health.closed != windows and self._drift.step(self.drift_time):
+
+        # The drift is tracked after the rows, so that they all see the same rest frequencies.
+        has_closed_window = self.health.closed != windows
+        if self.drift_time and has_closed_window and self._drift.step(self.drift_time):
             self.rest_changes += 1
         return stress
 
     __call__ = process
 
-    def process_known(self, rows: FrequencyRows, recorded: Verdicts) -> StressRows:
-        """As `process`, of rows whose verdicts are all known. Health does not see them, which saves
-        two fifths of the time of reading and reconstructing a bag."""
+    def process_known(self, rows: FrequencyRows, recorded: RecordedHealth) -> StressRows:
+        """Reconstruct the stress of rows whose recorded health is known for all of them.
+
+        `Health` does not examine the rows, which saves two fifths of the time that reading and
+        reconstructing a bag takes.
+        """
         stress = self.pipeline.process(rows, recorded.left_out)
         stress.status[:] |= recorded.status
         return stress
 
-    def covariance(self, cube: int, left_out: int = 0) -> NDArray[np.float64]:
-        """(15, 15) of the components of a cube, from the noise of its pads; see Pipeline."""
+    def covariance(self, cube: int, left_out: int = 0) -> Array:
+        """Return the covariance (15, 15) of a cube's components; see `Pipeline.covariance`."""
         return self.pipeline.covariance(cube, left_out)
 
-    def tare(
-        self, cubes: Sequence[int] | None = None, duration: float = 1.0
-    ) -> NDArray[np.float64]:
-        """Take the present load of cubes (None: of all) as no load; returns the rest frequencies.
+    def tare(self, cubes: Sequence[int] | None = None, duration: float = 1.0) -> Array:
+        """Take the present load of cubes as their unloaded state.
 
-        duration: s of the newest data to average. TareError: the signal moves, is noisy, too short
-        or too far from the calibration; nothing is changed then.
+        Args:
+            cubes: Numbers of the cubes; None means all.
+            duration: Duration of the newest data to average, in s.
+
+        Returns:
+            The new rest frequencies of all cubes (cubes, P), in Hz.
+
+        Raises:
+            TareError: The signal moves, is noisy, too short or too far from the calibration. In
+                this case nothing is changed.
         """
         chosen = range(len(self.names)) if cubes is None else cubes
         self.rest_frequency = self.measure_rest(chosen, duration)
         return self.rest_frequency
 
-    def measure_rest(self, cubes: Sequence[int], duration: float) -> NDArray[np.float64]:
-        """What `tare` would set: (cubes, P) Hz. TareError as there."""
+    def measure_rest(self, cubes: Sequence[int], duration: float) -> Array:
+        """Return the rest frequencies (cubes, P), in Hz, that `tare` would set, without setting
+        them. TareError: as in `tare`."""
         if not len(cubes):
             raise TareError("tare of no cube; name one, or leave the list out for all")
         return measure_rest(self.pipeline, self.health, cubes, duration, self.names)
 
     def clear_tare(self, cubes: Sequence[int] | None = None) -> None:
-        """Use the calibrations' rest frequencies again, of cubes (None: of all)."""
+        """Return to the rest frequencies of the calibrations, for some cubes or (None) for all."""
         chosen = slice(None) if cubes is None else list(cubes)
         rest = self.rest_frequency
-        rest[chosen] = self._calibrated[chosen]
+        rest[chosen] = self._calibrated_rest[chosen]
         self.rest_frequency = rest

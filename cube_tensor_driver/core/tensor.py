@@ -9,13 +9,11 @@ order of ROS: x, y, z, w.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 from transforms3d import euler, quaternions
 
-from .arrays import Array, Real
+from .arrays import AnyArray, Array, Real
 from .errors import CubeError
 from .modes import to_matrix, to_voigt
 
@@ -81,14 +79,16 @@ def traction(stress: Real, normal: ArrayLike) -> Array:
         raise CubeError(
             f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal"
         )
-    result: Array = np.einsum("...ij,...j->...i", to_matrix(stress), n / length)
+    matrices: AnyArray = to_matrix(stress)
+    result: Array = np.einsum("...ij,...j->...i", matrices, n / length)
     return result
 
 
 def rotate_stress(stress: Real, rotation: Array) -> Array:
     """Compute the stress R s R' (..., 6) in a frame with the coordinates R x. NaN spreads."""
     r = np.asarray(rotation, dtype=float)
-    return to_voigt(r @ to_matrix(stress) @ np.swapaxes(r, -1, -2))
+    rotated: Array = r @ to_matrix(stress) @ np.swapaxes(r, -1, -2)
+    return to_voigt(rotated)
 
 
 def rotate_gradient(gradient: Array, rotation: Array) -> Array:
@@ -163,7 +163,8 @@ def face_force(stress: Real, side: Array | float) -> Array:
         Force (N, 3) in the frame of the stress, in N.
     """
     zx_yz_zz = [4, 3, 2]
-    force: Array = side**2 * np.nan_to_num(stress)[..., zx_yz_zz]
+    traction: AnyArray = np.nan_to_num(stress)[..., zx_yz_zz]
+    force: Array = side**2 * traction
     return force
 
 
@@ -184,7 +185,7 @@ def contact_wrench(stress: Real, gradient: Real, side: float) -> tuple[Array, Ar
     Returns:
         Force (N, 3) in N and torque (N, 3) in N m.
     """
-    known: Any = np.nan_to_num(gradient)
+    known: AnyArray = np.nan_to_num(gradient)
     zz_x, zz_y = known[..., 6], known[..., 7]
     direction = np.stack([zz_y, -zz_x, np.zeros_like(zz_x)], axis=-1)
     return face_force(stress, side), side**4 / 12 * direction

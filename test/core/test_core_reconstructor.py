@@ -7,7 +7,7 @@ import numpy as np
 from conftest import stamped
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.health.statistics import WindowStatistics
-from cube_tensor_driver.core.reconstructor import Reconstructor, Verdicts
+from cube_tensor_driver.core.reconstructor import Reconstructor, RecordedHealth
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import PAD_FAULT, SHORT, STAMP, STUCK
 
@@ -49,13 +49,13 @@ def test_doubt_of_a_stamp_goes_with_the_row():
     rows = FrequencyRows.of(np.arange(2), frequencies(), status=doubt)
     reconstruct = Reconstructor([CALIBRATION] * 2)
     assert reconstruct(rows).status.tolist() == [STAMP, STAMP | PAD_FAULT | SHORT]
-    recorded = Verdicts(np.ones(2, bool), np.zeros(2, np.uint32), np.zeros(2, np.uint16))
+    recorded = RecordedHealth(np.ones(2, bool), np.zeros(2, np.uint32), np.zeros(2, np.uint16))
     assert reconstruct.process_known(rows, recorded).status.tolist()[0] == STAMP
 
 
 def test_recorded_verdicts_replace_those_made_now_where_they_are_known():
     rows = stamped(np.arange(2), frequencies(), 0, 0)
-    recorded = Verdicts(
+    recorded = RecordedHealth(
         np.array([True, False]), np.array([1 << 5, 0], np.uint32), np.array([STUCK, 0], np.uint16)
     )
     stress = Reconstructor([CALIBRATION] * 2).process(rows, recorded)

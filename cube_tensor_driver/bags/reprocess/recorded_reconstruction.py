@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...core.reconstructor import Reconstructor, Verdicts
+from ...core.reconstructor import Reconstructor, RecordedHealth
 from ...core.rows import FrequencyRows
 from ..recording import Settings
 from ..source import open_bag
@@ -31,7 +31,7 @@ class RecordedReconstruction:
         """Close the bag."""
         self._source.bag.close()
 
-    def verdicts(self, rows: FrequencyRows, reconstructor: Reconstructor) -> Verdicts:
+    def verdicts(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
         """The verdicts about the rows of one message. Sets the reconstructor's rest frequencies to
         those of their time."""
         settings = self._source.recording.settings_at(rows)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Array, Index, Mask, PadMasks, StatusBits
+from ..arrays import Array, Index, Mask, PadMasks, Real, StatusBits
 from ..status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, SHORT, STUCK
 from .statistics import Window
 
@@ -164,7 +164,7 @@ class PadDiagnosis:
         noisy: Mask = (window.noise > limit) & is_noise
         return noisy
 
-    def _find_stuck(self, span: Array, state: StatusBits) -> Mask:
+    def _find_stuck(self, span: Real, state: StatusBits) -> Mask:
         others_moved = _lower_median(span / self.noise) > STUCK_MIN_SPAN
         # A pad with an intermittent contact shows a single value now and then and is not stuck.
         is_intermittent = state & (OPEN | SHORT | RANGE) > 0
@@ -172,7 +172,7 @@ class PadDiagnosis:
         return stuck
 
     def _update_still(
-        self, window: Window, span: Array, has_enough_rows: Mask, state: StatusBits
+        self, window: Window, span: Real, has_enough_rows: Mask, state: StatusBits
     ) -> None:
         limit = STILL_MAX_SPAN * self.noise
         # A step between two windows is visible in the span of neither.
@@ -215,7 +215,7 @@ def _squared_bound(noise: Array) -> Array:
     return bound
 
 
-def _lower_median(values: Array) -> Array:
+def _lower_median(values: Real) -> Real:
     """Return the lower median (cubes, 1) over the pads of each cube that have a value."""
     ordered = np.sort(values, axis=1)  # NaN is sorted to the end
     n_known = values.shape[1] - np.isnan(ordered).sum(axis=1)

@@ -298,7 +298,7 @@ class Health:
         is_reported &= self._exists[cube]
         self._conditions.add(cube, is_reported * np.uint16(REPORTED))
 
-    def _make_pattern(self, cube: Index) -> _Pattern:
+    def _make_pattern(self, cube: AnyArray) -> _Pattern:
         if len(cube) and not 0 <= int(cube.min()) <= int(cube.max()) < len(self._exists):
             raise self._misfit(cube, (len(cube), self._exists.shape[1]))
         repeats = count_repeats(cube)
@@ -315,7 +315,7 @@ class Health:
             n_pads=int(self._exists[cubes].sum()),
         )
 
-    def _misfit(self, cube: Index, shape: tuple[int, ...]) -> LayoutError:
+    def _misfit(self, cube: AnyArray, shape: tuple[int, ...]) -> LayoutError:
         n_cubes, n_pads = self._exists.shape
         return LayoutError(
             f"frequencies of shape {shape} for cubes up to {max(cube, default=0)}; this skin has "
@@ -323,7 +323,7 @@ class Health:
         )
 
 
-def _split_into_scans(cube: Index) -> list[Index]:
+def _split_into_scans(cube: AnyArray) -> list[Index]:
     """Split rows of cubes (N,) in any order into parts, each of several scans of the same cubes.
 
     The first scan has the first row of each cube, the second scan the second row of each, and so

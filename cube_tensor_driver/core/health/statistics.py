@@ -121,7 +121,8 @@ class WindowStatistics:
     def last(self) -> Single:
         """Newest frequency of each pad (cubes, P), in Hz."""
         self._add_waiting()
-        return self._last
+        last: Single = self._last
+        return last
 
     @property
     def newest_ns(self) -> Times:
@@ -132,7 +133,8 @@ class WindowStatistics:
     @property
     def bound(self) -> Single:
         """Largest term of the noise (cubes, P), in Hz²."""
-        return self._bound
+        bound: Single = self._bound
+        return bound
 
     @bound.setter
     def bound(self, value: Array) -> None:
