@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.bags.read import typestore
-from cube_tensor_driver.bags.write import BagWriter, quality
+from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.calibration import calibration_text
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline

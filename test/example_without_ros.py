@@ -41,7 +41,7 @@ def main() -> None:
     assert not Path(ctd.__file__).is_relative_to(CHECKOUT), "this is the checkout, install it"
     assert importlib.util.find_spec("rclpy") is None, "this is an environment with ROS"
     skin = ctd.read_skin(SKIN)
-    with ctd.open_bag(CHECKOUT / "test" / "data" / "bag_v2") as source:
+    with ctd.open_bag(CHECKOUT / "test" / "data" / "bag") as source:
         example(source)
     with ctd.simulate(skin) as source:
         example(source)

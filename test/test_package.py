@@ -159,7 +159,7 @@ KEYS = {
         "distributed",
         "dask",
         "mcap",
-        "lz4",
+        "zstandard",
         "websockets",
     )
 )

@@ -1,91 +1,88 @@
-"""Bags (rosbag2 folders, or one .mcap or .db3 file) read without ROS. Whatever is wrong with a bag
-is a `BagError`."""
+"""Bags (a rosbag2 folder, or one .mcap or .db3 file) read without ROS.
+
+Whatever is wrong with a bag is reported as a `BagError` of one line.
+"""
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import lru_cache, partial
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
+import zstandard
+from mcap.exceptions import McapError
 from numpy.typing import NDArray
-from rosbags.interfaces import Connection, MessageDefinitionFormat
-from rosbags.rosbag2 import ReaderError
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import TypesysError, get_types_from_msg
 
-from ..config.package_data import package_data
-from ..core.errors import BagError, CubeError, MessageError
+from ..core.arrays import AnyArray
+from ..core.errors import BagError, ConfigError, MessageError
 from ..core.rows import FrequencyRows, StressRows
-from ..messages.codec import (
-    SHAPE_AT,
-    Decoded,
-    MessageCodec,
-    frequency_codec,
-    frequency_codec_2,
-    stress_codec,
-    stress_codec_1,
-)
-from ..messages.types import FREQUENCIES, PACKAGE, STRESS
-from .mcap import BagReader
-from .rosbags_storage import Sqlite3Error, Typestore, ZstdError
+from ..messages.codec import SHAPE_AT, Decoded, MessageCodec, frequency_codec, stress_codec
+from ..messages.types import FREQUENCIES, PACKAGE
+from .mcap_file import McapReader
+from .metadata import SUFFIXES, BagFiles, Connection, merge_connections, read_metadata, typestore
+from .sqlite_file import SqliteReader
 
-VERSIONS = (1, 2, 3)
-"""Versions of SkinInfo that this package reads."""
-TOGETHER, TOGETHER_BYTES = 64, 1 << 19
-"""Most messages that are decoded at once: the cost of calling numpy no longer counts, and they fit
-the cache."""
-# What rosbags and the libraries below it let through where bytes are not what they should be.
-DAMAGE = (
-    ReaderError,
+VERSION = 3
+"""Version of this package's messages that can be read: ``SkinInfo.VERSION``."""
+
+MAX_BATCH_MESSAGES = 64
+"""Largest number of messages decoded at once. With more, the cost of calling numpy no longer
+matters."""
+MAX_BATCH_ROWS = 1 << 13
+"""Largest number of rows decoded at once, so that they fit the processor's cache (82 bytes per row
+of stress). The limit is in rows, so that batches of frequencies and of stress begin and end with
+the same samples, and one need not be searched in the other."""
+
+MAX_MESSAGE_BYTES = 64 << 20
+"""Largest size of one message after decompression; an image of 4096 x 4096 pixels in colour has
+48 MB."""
+
+LAST_NS = (1 << 63) - 1
+"""Time, in ns since the epoch, that no message of a bag reaches."""
+
+Stamps = NDArray[np.int64]
+"""Times in ns since the epoch."""
+
+READ_ERRORS = (
+    McapError,
+    sqlite3.Error,
+    zstandard.ZstdError,
     SerdeError,
     TypesysError,
-    Sqlite3Error,
-    ZstdError,
+    ConfigError,
     struct.error,
     ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-    ArithmeticError,
-    MemoryError,
-    EOFError,
-    RuntimeError,
+    KeyError,
+    OverflowError,
 )
+"""What the libraries raise where the bytes of a file are damaged.
+
+`struct.error`, `ValueError` and `OverflowError` come from numbers, texts and lengths that cannot
+be, `KeyError` from a channel, schema or type that the file does not define.
+"""
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a folder, or named like the file of a bag; it may be damaged."""
-    return path.is_dir() or path.suffix in (".mcap", ".db3")
+    """Return whether a path is a folder or has a name like a storage file. It may be damaged."""
+    return path.is_dir() or path.suffix in SUFFIXES.values()
 
 
 @contextmanager
-def damage(path: Path) -> Iterator[None]:
-    """Turns what libraries raise about the bag `path` into a BagError; a CubeError passes."""
+def report_damage(path: Path) -> Iterator[None]:
+    """Turn the libraries' errors about the bag `path` into a BagError of one line."""
     try:
         yield
-    except CubeError:
-        raise
-    except FileNotFoundError as error:
-        if path.is_dir() and not (path / "metadata.yaml").exists():
-            raise BagError(
-                f"{path}: no metadata.yaml: no bag, or a recording that was cut off; "
-                f"./cube bag repair {path} makes the latter readable"
-            ) from None
-        raise BagError(
-            f"{path}: {error.strerror or 'no such file or folder'}; name a bag"
-        ) from None
     except OSError as error:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
-    except DAMAGE as error:
-        if path.is_file() and path.suffix not in (".mcap", ".db3"):
-            raise BagError(
-                f"{path}: no bag; name the folder of a bag, or a file that ends in .mcap or .db3"
-            ) from None
+    except READ_ERRORS as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
             f"{path}: damaged, or no bag ({text[:200]}); "
@@ -93,29 +90,45 @@ def damage(path: Path) -> Iterator[None]:
         ) from None
 
 
-@lru_cache
-def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy and of this package, as they are today."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types: dict[str, Any] = {}
-    for path in sorted((package_data() / "msg").glob("*.msg")):
-        types |= get_types_from_msg(path.read_text(), f"{PACKAGE}/msg/{path.stem}")
-    store.register(types)
-    return store
+def open_storage(path: Path) -> McapReader | SqliteReader:
+    """Open one storage file for reading.
+
+    Raises:
+        BagError: It is missing, damaged, or not a storage file.
+    """
+    if not path.exists():
+        raise BagError(f"{path}: no such file or folder; name a bag")
+    if not path.is_file():
+        # Opening a pipe would wait for a writer, and a device has no end.
+        raise BagError(f"{path}: no regular file; name a bag")
+    if path.suffix not in SUFFIXES.values():
+        raise BagError(
+            f"{path}: no bag; name the folder of a bag, or a file that ends in "
+            f"{' or '.join(SUFFIXES.values())}"
+        )
+    with report_damage(path):
+        return McapReader(path) if path.suffix == SUFFIXES["mcap"] else SqliteReader(path)
 
 
 def make_message(kind: str, **fields: Any) -> Any:
-    """A message of the bag library from its type and its fields."""
+    """Make a message of the library rosbags from its type and its fields."""
     return typestore().types[kind](**fields)
 
 
 def serialise(message: Any) -> bytes:
-    """The bytes (CDR) of a message that `make_message` made, or that was read from a bag."""
+    """Return the bytes (CDR) of a message that `make_message` made or `Bag.decode` read."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
 class Entry(NamedTuple):
-    """A message of a bag: topic, type, when it was recorded in ns, serialised bytes."""
+    """A message of a bag.
+
+    Attributes:
+        topic: Name of its topic.
+        msgtype: Its type.
+        time_ns: Time at which it was recorded, in ns since the epoch.
+        data: Serialised message (CDR).
+    """
 
     topic: str
     msgtype: str
@@ -124,12 +137,31 @@ class Entry(NamedTuple):
 
 
 class Bag:
-    """A bag open for reading; a context. Types are read as the bag itself defines them."""
+    """A bag open for reading; a context manager.
+
+    Attributes:
+        path: Folder or file of the bag.
+        connections: Topics of the bag; empty until it is open.
+        start_ns: Time at which the earliest message was recorded, in ns since the epoch.
+        end_ns: Time at which the latest message was recorded.
+    """
 
     def __init__(self, path: Path) -> None:
+        """Find the files of a bag without opening them.
+
+        Raises:
+            BagError: There is no bag.
+        """
         self.path = path
-        with damage(path):
-            self._reader = BagReader(path)
+        self.connections: list[Connection] = []
+        self.start_ns = self.end_ns = 0
+        self._bag_files = read_metadata(path) if path.is_dir() else BagFiles([path], "")
+        self._files: list[McapReader | SqliteReader] = []
+        self._opened = ExitStack()
+
+    def __repr__(self) -> str:
+        topics = ", ".join(f"{one.topic} ({one.msgcount})" for one in self.connections)
+        return f"Bag({str(self.path)!r}: {topics or 'closed'})"
 
     def __enter__(self) -> Bag:
         self.open()
@@ -139,36 +171,42 @@ class Bag:
         self.close()
 
     def open(self) -> None:
-        """BagError: damaged."""
-        with damage(self.path):
-            self._reader.open()
-            self._types = self._own_types()
+        """Open the files.
+
+        Raises:
+            BagError: A file is missing or damaged, or has another version of the messages.
+        """
+        try:
+            for path in self._unpacked_paths():
+                file = open_storage(path)
+                self._opened.callback(file.close)
+                self._files.append(file)
+            summaries = [file.summary for file in self._files]
+            self.connections = merge_connections(summary.connections for summary in summaries)
+            self._check_definitions()
+        except BaseException:
+            self.close()
+            raise
+        used = [summary for summary in summaries if summary.msgcount]
+        self.start_ns = min((summary.start_ns for summary in used), default=0)
+        self.end_ns = max((summary.end_ns for summary in used), default=0)
 
     def close(self) -> None:
-        self._reader.close()
-
-    @property
-    def connections(self) -> list[Connection]:
-        return self._reader.connections
-
-    @property
-    def start_ns(self) -> int:
-        """When the earliest message was recorded."""
-        return self._reader.start_time
-
-    @property
-    def end_ns(self) -> int:
-        """When the latest message was recorded."""
-        return self._reader.end_time - 1
+        """Close the files; a second time does nothing."""
+        self._opened.close()
+        self._files.clear()
+        self.connections = []
 
     def topics(self, msgtype: str) -> list[str]:
-        """Topics of a type."""
-        return sorted(
-            {connection.topic for connection in self.connections if connection.msgtype == msgtype}
-        )
+        """Return the topics of a type, sorted."""
+        return sorted({one.topic for one in self.connections if one.msgtype == msgtype})
 
     def skin(self) -> str:
-        """The prefix of the skin's topics, which ends in /. BagError: no skin, or several."""
+        """Return the prefix of the skin's topics, which ends in "/".
+
+        Raises:
+            BagError: The bag has no skin, or several.
+        """
         names = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
         if not names:
             raise BagError(f"{self.path}: no topic of {FREQUENCIES}; record frequencies and info")
@@ -185,54 +223,38 @@ class Bag:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[Entry]:
-        """Messages from start_ns until before stop_ns, of some topics or all, in the order of
-        recording."""
+        """Read messages in the order of recording.
+
+        Args:
+            topics: Names of the topics; None: all.
+            start_ns: Time of the first message; None: from the beginning.
+            stop_ns: Time before which the last message was recorded; None: to the end.
+
+        Raises:
+            BagError: The bag is damaged.
+        """
         for connection, time_ns, data in self._messages(topics, start_ns, stop_ns):
             yield Entry(connection.topic, connection.msgtype, time_ns, data)
 
-    def _messages(
-        self, topics: set[str] | None, start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        wanted = [c for c in self.connections if topics is None or c.topic in topics]
-        if not wanted:
-            return
-        count = 0
-        with damage(self.path):
-            for message in self._reader.messages(wanted, start_ns, stop_ns):
-                count += 1
-                yield message
-        # A name damaged in one place only makes rosbags leave messages out without a word.
-        promised = sum(connection.msgcount for connection in wanted)
-        if start_ns is None and stop_ns is None and count != promised:
-            names = ", ".join(sorted({connection.topic for connection in wanted}))
-            raise BagError(
-                f"{self.path}: damaged: {count} messages on {names}, the bag says {promised}; "
-                f"./cube bag repair {self.path} may help"
-            )
-
-    @property
-    def version(self) -> int:
-        """Of this package's messages, as the bag defines them."""
-        if self._lacks(STRESS, "left_out"):
-            return 1
-        return 2 if self._lacks(FREQUENCIES, "status") else max(VERSIONS)
-
-    def _lacks(self, msgtype: str, field: str) -> bool:
-        """Whether the bag defines a type, and without this field."""
-        _, fields = self._types.fielddefs.get(msgtype, ((), ()))
-        return bool(fields) and all(name != field for name, _ in fields)
-
     def decode(self, entry: Entry) -> Any:
-        """The message. BagError: its bytes do not fit its type."""
-        with damage(self.path):
-            return self._types.deserialize_cdr(entry.data, entry.msgtype)
+        """Return the message of an entry.
+
+        Raises:
+            BagError: Its bytes do not fit its type.
+        """
+        with report_damage(self.path):
+            return typestore().deserialize_cdr(entry.data, entry.msgtype)
 
     def fields(self, msgtype: str) -> list[tuple[str, Any]]:
-        """Name and kind (as rosbags describes it) of a type's fields; none of an unknown type."""
-        return list(self._types.fielddefs.get(msgtype, ((), ()))[1])
+        """Return name and kind (in rosbags' form) of a type's fields; none if it is unknown."""
+        return list(typestore().fielddefs.get(msgtype, ((), ()))[1])
 
     def infos(self, topic: str) -> list[Any]:
-        """The SkinInfo messages of a topic. BagError: none, or a version that cannot be read."""
+        """Return the SkinInfo messages of a topic.
+
+        Raises:
+            BagError: There is none, or one of another version.
+        """
         infos = [self.decode(entry) for entry in self.entries({topic})]
         if not infos:
             raise BagError(
@@ -240,53 +262,74 @@ class Bag:
                 f"mean; record {topic} too"
             )
         for info in infos:
-            if info.version not in VERSIONS:
-                older = "older than" if info.version < min(VERSIONS) else "newer than"
-                raise BagError(
-                    f"{self.path}: {topic} has version {info.version}, {older} what this "
-                    f"package reads ({', '.join(map(str, VERSIONS))}); use the package it was "
-                    "recorded with, or a newer one"
-                )
+            if info.version != VERSION:
+                self._refuse_version(f"{topic} has version {info.version}")
         return infos
 
-    def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], NDArray[np.int64]]]:
-        """The frequencies on a topic in the order of recording, and when they were recorded, (M,)
-        ns.
+    def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Stamps]]:
+        """Read frequencies in the order of recording.
 
-        Messages of one shape that follow each other come together, at most `TOGETHER`. BagError: a
-        message contradicts itself.
+        Messages of the same shape that follow each other come together.
+
+        Yields:
+            M messages, and (M,) when each was recorded, in ns.
+
+        Raises:
+            BagError: The bag is damaged, or a message contradicts itself.
         """
-        codec = frequency_codec if self.version > 2 else frequency_codec_2
-        return self._decoded(topic, codec, codec.decode)
+        return self._decoded(topic, frequency_codec, frequency_codec.decode)
 
-    def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], NDArray[np.int64]]]:
-        """As `frequencies`, of a topic with stress."""
-        codec = stress_codec if self.version > 1 else stress_codec_1
-        return self._decoded(topic, codec, codec.decode)
+    def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Stamps]]:
+        """Read stress as `frequencies` reads frequencies."""
+        return self._decoded(topic, stress_codec, stress_codec.decode)
 
-    def stress_columns(self, topic: str, names: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-        """As `stress`, but only `stamp_ns` and the named columns. Not of version 1."""
+    def stress_columns(self, topic: str, names: Sequence[str]) -> Iterator[list[AnyArray]]:
+        """Read `stamp_ns` and the named columns of stress, which is faster than all of `stress`."""
         decode = partial(stress_codec.decode_columns, names)
         for columns, _ in self._decoded(topic, stress_codec, decode):
             yield columns
 
+    def _messages(
+        self, topics: set[str] | None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Read messages file by file and count them."""
+        wanted = {one.topic for one in self.connections if topics is None or one.topic in topics}
+        is_packed = self._bag_files.compression == "message"
+        begin_ns = 0 if start_ns is None else start_ns
+        end_ns = LAST_NS if stop_ns is None else stop_ns
+        count = 0
+        with report_damage(self.path):
+            for file in self._files:
+                for connection, time_ns, data in file.messages(wanted, begin_ns, end_ns):
+                    count += 1
+                    yield connection, time_ns, _decompress(data) if is_packed else data
+
+        # Damage to the name of a topic or to the number of a channel only makes messages disappear.
+        promised = sum(one.msgcount for one in self.connections if one.topic in wanted)
+        if start_ns is None and stop_ns is None and count != promised:
+            raise BagError(
+                f"{self.path}: damaged: {count} messages on {', '.join(sorted(wanted))}, the bag "
+                f"says {promised}; ./cube bag repair {self.path} may help"
+            )
+
     def _decoded(
         self, topic: str, codec: MessageCodec[Any], decode: Callable[..., Any]
-    ) -> Iterator[tuple[Any, NDArray[np.int64]]]:
-        """What `decode` makes of messages of one shape, and when they were recorded."""
+    ) -> Iterator[tuple[Any, Stamps]]:
+        """Decode messages of one shape together, and say when they were recorded."""
         waiting: list[bytes] = []
         times_ns: list[int] = []
-        size = most = 0
+        size = limit = 0
         shape = b""
         try:
             for _, time_ns, data in self._messages({topic}):
-                together = len(data) == size and data.startswith(shape, SHAPE_AT)
-                if len(waiting) >= most or not together:
+                has_same_shape = len(data) == size and data.startswith(shape, SHAPE_AT)
+                if len(waiting) >= limit or not has_same_shape:
                     if waiting:
                         yield decode(*waiting), np.array(times_ns)
                     waiting, times_ns = [], []
                     size, shape = len(data), codec.shape_bytes(data)
-                    most = max(1, min(TOGETHER, TOGETHER_BYTES // max(1, size)))
+                    rows = int.from_bytes(shape[-4:], "little")
+                    limit = max(1, min(MAX_BATCH_MESSAGES, MAX_BATCH_ROWS // max(1, rows)))
                 waiting.append(data)
                 times_ns.append(time_ns)
             if waiting:
@@ -294,16 +337,49 @@ class Bag:
         except MessageError as error:
             raise BagError(f"{self.path}: {topic}: {error}") from None
 
-    def _own_types(self) -> Typestore:
-        types: dict[str, Any] = {}
-        for connection in self.connections:
-            if (
-                connection.msgdef.format == MessageDefinitionFormat.MSG
-                and connection.msgtype.startswith(PACKAGE)
+    def _unpacked_paths(self) -> Sequence[Path]:
+        """Return the storage files, decompressed into a temporary folder if they are compressed."""
+        if self._bag_files.compression != "file":
+            return self._bag_files.paths
+        folder = Path(self._opened.enter_context(TemporaryDirectory()))
+        unpacked = []
+        for path in self._bag_files.paths:
+            unpacked.append(folder / path.name.removesuffix(".zstd"))
+            with (
+                report_damage(path),
+                path.open("rb") as source,
+                unpacked[-1].open("wb") as destination,
             ):
-                types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
-        if not types:
-            return typestore()
-        store = get_typestore(Stores.ROS2_JAZZY)
-        store.register({name: types[name] for name in types if name.startswith(PACKAGE)})
-        return store
+                zstandard.ZstdDecompressor().copy_stream(source, destination)
+        return unpacked
+
+    def _check_definitions(self) -> None:
+        """Compare the definitions of this package's messages in the bag with those of today."""
+        for one in self.connections:
+            if not one.msgtype.startswith(PACKAGE) or not one.definition:
+                continue
+            with report_damage(self.path):
+                definitions = get_types_from_msg(one.definition, one.msgtype)
+            for name, (_, fields) in definitions.items():
+                today = typestore().fielddefs.get(name)
+                if name.startswith(PACKAGE) and (today is None or fields != today[1]):
+                    self._refuse_version(f"{one.topic} has another definition of {name}")
+
+    def _refuse_version(self, difference: str) -> None:
+        raise BagError(
+            f"{self.path}: {difference}; this package reads version {VERSION} of its messages: "
+            "use the version of the package that recorded the bag"
+        )
+
+
+def _decompress(data: bytes) -> bytes:
+    """Decompress a message that rosbag2 compressed.
+
+    Raises:
+        zstandard.ZstdError, ValueError: It is damaged, or larger than `MAX_MESSAGE_BYTES`.
+    """
+    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+        message = reader.read(MAX_MESSAGE_BYTES + 1)
+    if len(message) > MAX_MESSAGE_BYTES:
+        raise ValueError(f"a compressed message has more than {MAX_MESSAGE_BYTES} bytes")
+    return bytes(message)

@@ -47,8 +47,7 @@ class VerdictReader:
     def __init__(self, bag: Bag, topic: str) -> None:
         self._bag = bag
         self._topic = topic.removesuffix("frequencies") + "stress"
-        # Stress of version 1 does not say which pads were left out.
-        self._available = bag.version > 1 and self._topic in bag.topics(STRESS)
+        self._available = self._topic in bag.topics(STRESS)
         self._asked_ns = 0
         self._newest_ns = 0
         self._parts: deque[_Part] = deque()

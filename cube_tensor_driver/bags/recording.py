@@ -17,7 +17,7 @@ from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
 from ..messages.codec import SECOND
 from ..messages.skin_info import cube_calibrations
-from .read import Bag, damage
+from .read import Bag
 from .recorded_verdicts import VerdictReader
 
 
@@ -44,8 +44,10 @@ class Recording:
     def __init__(self, bag: Bag, topic: str) -> None:
         self._bag = bag
         self.infos = sorted(skin_infos(bag, topic), key=stamp_ns)
-        with damage(bag.path):
+        try:
             self.settings = [settings_of(info) for info in self.infos]
+        except MessageError as error:
+            raise BagError(f"{bag.path}: {error}") from None
         self._since_ns = np.array([stamp_ns(info) for info in self.infos])
         self._verdicts = VerdictReader(bag, topic)
 
@@ -99,19 +101,16 @@ def stamp_ns(info: Any) -> int:
 
 
 def settings_of(info: Any) -> Settings:
-    """The settings that a SkinInfo describes. BagError: they contradict each other."""
-    try:
-        calibrations = cube_calibrations(info)
-    except MessageError as error:
-        raise BagError(str(error)) from None
+    """The settings that a SkinInfo describes. MessageError: they contradict each other."""
+    calibrations = cube_calibrations(info)
     if not calibrations:
-        raise BagError(f"info of the skin {info.name}: it has no cubes")
+        raise MessageError(f"info of the skin {info.name}: it has no cubes")
     widest = max(calibration.layout.n_pads for calibration in calibrations)
     rest = np.full((len(calibrations), widest), np.nan)
     for row, cube, calibration in zip(rest, info.cubes, calibrations, strict=True):
         layout = calibration.layout
         if len(cube.rest_frequency) != layout.n_pads:
-            raise BagError(
+            raise MessageError(
                 f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} "
                 f"rest frequencies, its layout {layout.name} has {layout.n_pads} pads"
             )

@@ -1,13 +1,12 @@
-"""Recordings that were cut off (killed, disk full, power lost) made readable again, where they
-are.
+"""Recordings that were cut off (killed, disk full, power lost) made readable again, where they are.
 
-An mcap file is a sequence of records. A chunk record with its index records is complete or it is
+An MCAP file is a sequence of records. A chunk with the index records behind it is complete or it is
 not. What follows the last complete one is cut off, and the summary that readers look for is written
-again. An sqlite3 file undoes by itself what was not committed.
+again. An SQLite file undoes by itself what was not committed.
 
-The records themselves are read and written by the library `mcap`. Its StreamReader is not used: it
-trusts the lengths inside a record, so behind the first damaged one it finds nothing any more. Here
-the next record begins where the length in front of the record says.
+The library's StreamReader is not used to find the records: it trusts the lengths inside a record,
+so behind the first damaged record it finds nothing any more. Here the next record begins where the
+length in front of the record says.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ import shutil
 import sqlite3
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
+from zlib import crc32
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
@@ -32,6 +31,7 @@ from mcap.records import (
     DataEnd,
     Footer,
     McapRecord,
+    Message,
     MessageIndex,
     Metadata,
     MetadataIndex,
@@ -39,25 +39,36 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from mcap.summary import Summary
 
-from ..config.yaml import to_yaml
 from ..core.errors import BagError
-from .read import DAMAGE, Bag, damage
-from .rosbags_storage import decompress
-from .unpack import check_size
-from .write import SUFFIXES, describe, describe_file, move_up, write_metadata
+from .mcap_file import (
+    CHECKSUM_BYTES,
+    MAGIC,
+    ROSBAG2,
+    McapReader,
+    read_chunk_records,
+    rosbag2_metadata,
+    summarise,
+)
+from .metadata import FILE_NAME, SUFFIXES, FileSummary, write_metadata
+from .read import READ_ERRORS, open_storage, report_damage
 
-MAGIC = b"\x89MCAP0\r\n"
 REST = ".rest"
-SALVAGE_ERRORS = (*DAMAGE, McapError)
-"""What the libraries raise where bytes are not what they should be."""
-_HEAD = struct.Struct("<BQ")
-"""Of a record: its opcode, and the length of what follows."""
+"""Suffix of the file that keeps what was cut off."""
+
+_RECORD_HEAD = struct.Struct("<BQ")
+"""What precedes each record: its opcode, and the length of the record."""
 
 
 class Repaired(NamedTuple):
-    """What a repair did: messages that can be read, bytes that were cut off, chunks left out as
-    damaged."""
+    """What a repair did.
+
+    Attributes:
+        messages: Number of messages that can be read.
+        cut: Number of bytes that were cut off.
+        damaged: Number of chunks that were left out as damaged.
+    """
 
     messages: int
     cut: int
@@ -65,11 +76,14 @@ class Repaired(NamedTuple):
 
 
 def repair(path: Path, keep_rest: bool = True) -> Repaired:
-    """Make a bag readable: a folder, or one file of it.
+    """Make a bag readable.
 
-    keep_rest: put what is cut off into a file beside it, ending in .rest.
+    Args:
+        path: Folder of the bag, or one of its files.
+        keep_rest: Whether to keep what is cut off in a file beside it, ending in `REST`.
 
-    BagError: no bag, no complete message in it, or it cannot be written.
+    Raises:
+        BagError: There is no bag, it has no complete message, or it cannot be written.
     """
     if path.is_dir():
         return _repair_folder(path, keep_rest)
@@ -78,132 +92,159 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
             f"{path}: no bag; name the folder of a bag, or a file that ends in "
             f"{' or '.join(SUFFIXES.values())}"
         )
-    if (path.parent / "metadata.yaml").exists():
-        # It says of each file what the file holds.
+    if (path.parent / FILE_NAME).exists():
+        # metadata.yaml describes each file, so it has to be written again, too.
         return _repair_folder(path.parent, keep_rest)
-    with damage(path):
-        cut, damaged = _repair_file(path, keep_rest)
-        if not path.exists():
-            raise BagError(f"{path}: no complete message in it; nothing can be read")
-        with Bag(path) as bag:
-            return Repaired(sum(one.msgcount for one in bag.connections), cut, damaged)
+    cut, damaged = _repair_file(path, keep_rest)
+    if not path.exists():
+        raise BagError(f"{path}: no complete message in it; nothing can be read")
+    return Repaired(_summary(path).msgcount, cut, damaged)
 
 
 def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
+    """Repair all files of a bag and describe them in metadata.yaml."""
     cut = damaged = 0
-    with damage(folder):
-        # While it is written a file stands in a folder of its own name, whatever the bag's folder
-        # is called by now.
-        written = [path for suffix in SUFFIXES.values() for path in folder.glob(f"*/*{suffix}")]
-        for part in {path.parent for path in written if path.parent.name == path.stem}:
-            move_up(part)
-        for path in [path for suffix in SUFFIXES.values() for path in folder.glob(f"*{suffix}")]:
-            one_cut, one_damaged = _repair_file(path, keep_rest)
-            cut, damaged = cut + one_cut, damaged + one_damaged
-    if not any(path.suffix in SUFFIXES.values() for path in folder.iterdir()):
+    for path in _storage_files(folder):
+        one_cut, one_damaged = _repair_file(path, keep_rest)
+        cut, damaged = cut + one_cut, damaged + one_damaged
+    paths = _storage_files(folder)  # without those in which nothing was complete
+    storages = [name for name, suffix in SUFFIXES.items() if any(p.suffix == suffix for p in paths)]
+    if not storages:
         raise BagError(
             f"{folder}: no .mcap or .db3 file with a complete message in it; nothing can be read"
         )
-    return Repaired(write_metadata(folder), cut, damaged)
+    if len(storages) > 1:
+        raise BagError(f"{folder}: .mcap beside .db3 files; move one kind to another folder")
+    summaries = [_summary(path) for path in paths]
+    write_metadata(folder, storages[0], summaries)
+    return Repaired(sum(summary.msgcount for summary in summaries), cut, damaged)
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    """Return the storage files of a folder in the order in which they were written."""
+
+    def number(path: Path) -> tuple[int, str]:
+        digits = path.stem.rpartition("_")[2]  # name_2 was written before name_10
+        return int(digits) if digits.isdigit() else 0, path.name
+
+    paths = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
+    return sorted(paths, key=number)
+
+
+def _summary(path: Path) -> FileSummary:
+    with closing(open_storage(path)) as file:
+        return file.summary
 
 
 def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
-    """Make one storage file readable; returns bytes cut off and chunks left out."""
-    if path.suffix == SUFFIXES["mcap"]:
-        return _seal(path, keep_rest)
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("SELECT count(*) FROM messages")
-    return 0, 0
+    """Make one storage file readable; an MCAP file without a complete chunk is removed.
+
+    Returns:
+        Number of bytes cut off, and of chunks left out.
+    """
+    with report_damage(path):
+        if path.suffix == SUFFIXES["mcap"]:
+            return _repair_mcap(path, keep_rest)
+        with closing(sqlite3.connect(path)) as database:
+            database.execute("SELECT count(*) FROM messages")
+        return 0, 0
 
 
-def _seal(path: Path, keep_rest: bool) -> tuple[int, int]:
-    """Cut an mcap file behind its last complete chunk and write its summary; returns bytes cut off
-    and chunks left out."""
+def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
+    """Cut an MCAP file behind its last complete chunk and write its summary."""
     size = path.stat().st_size
-    with path.open("r+b") as bio:
-        bio.seek(max(-len(MAGIC), -size), 2)
-        complete = bio.read() == MAGIC and size > 2 * len(MAGIC)
-        salvaged = _Salvaged(bio)
-        if complete and not salvaged.damaged:
+    is_complete = _has_summary(path)
+    with path.open("r+b") as stream:
+        salvaged = _Salvaged(stream)
+        if is_complete and not salvaged.damaged:
             return 0, 0
-        if keep_rest and not complete and size > salvaged.end:
-            bio.seek(salvaged.end)
+        if keep_rest and not is_complete and size > salvaged.end:
+            stream.seek(salvaged.end)
             with path.with_name(path.name + REST).open("wb") as rest:
-                shutil.copyfileobj(bio, rest)
-        if salvaged.chunks:
-            bio.seek(salvaged.end)
-            bio.truncate()
-            salvaged.write_summary(bio, path.name)
-    if not salvaged.chunks:
+                shutil.copyfileobj(stream, rest)
+        if salvaged.index.chunk_indexes:
+            stream.seek(salvaged.end)
+            stream.truncate()
+            _write_summary(stream, path.name, salvaged)
+    if not salvaged.index.chunk_indexes:
         path.unlink()
-    return 0 if complete else size - salvaged.end, salvaged.damaged
+    return 0 if is_complete else size - salvaged.end, salvaged.damaged
+
+
+def _has_summary(path: Path) -> bool:
+    """Return whether an MCAP file has a summary that can be read."""
+    try:
+        McapReader(path).close()
+    except READ_ERRORS:
+        return False
+    return True
 
 
 class _Salvaged:
-    """All complete chunks of an mcap file.
+    """All complete chunks of an MCAP file.
 
-    schemas, channels: by id; chunks: as the summary has them; counts: messages of each channel
-    end: where the last complete chunk ends; damaged: how many were left out
+    Attributes:
+        index: Schemas, channels and chunks, as the summary has them.
+        counts: Number of messages of each channel.
+        end: Offset at which the last complete chunk ends, with its index records.
+        damaged: Number of records that were left out.
     """
 
-    def __init__(self, bio: BinaryIO) -> None:
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.chunks: list[ChunkIndex] = []
+    def __init__(self, stream: BinaryIO) -> None:
+        """Read all records of a file.
+
+        Raises:
+            BagError: The file does not begin as an MCAP file.
+        """
+        self.index = Summary()
         self.counts: Counter[int] = Counter()
         self.end = self.damaged = 0
-        bio.seek(0)
-        if bio.read(len(MAGIC)) != MAGIC:
-            name = getattr(bio, "name", "")
-            raise BagError(f"{name}: does not begin as an mcap file does; nothing can be read")
-        self._open: tuple[ChunkIndex, Counter[int]] | None = None
-        for opcode, start, content in _records(bio):
+        self._open_chunk: ChunkIndex | None = None
+        self._open_counts: Counter[int] = Counter()
+        stream.seek(0)
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise BagError(
+                f"{stream.name}: does not begin as an MCAP file does; nothing can be read"
+            )
+        for opcode, start, content in _records(stream):
             if opcode == Opcode.HEADER:
-                self.end = bio.tell()
+                self.end = stream.tell()
             elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 break
             try:
                 self._take(opcode, start, content)
-            except SALVAGE_ERRORS:
-                self._open = None
+            except READ_ERRORS:
+                self._open_chunk = None
                 self.damaged += 1
 
     def _take(self, opcode: int, start: int, content: bytes) -> None:
-        """A record of the file. SALVAGE_ERRORS: it is damaged."""
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._learn(opcode, content)
-        elif opcode == Opcode.CHUNK:
-            self._open = self._read_chunk(start, content)
-        elif opcode == Opcode.MESSAGE_INDEX and self._open is not None:
-            chunk, counts = self._open
-            index: MessageIndex = _parse(MessageIndex.read, content)
-            if len(index.records) != counts[index.channel_id]:
-                raise ValueError("an index has another number of messages than its chunk")
-            chunk.message_index_offsets[index.channel_id] = start
-            if chunk.message_index_offsets.keys() == counts.keys():
-                self.end = start + _HEAD.size + len(content)
-                begin = chunk.chunk_start_offset + chunk.chunk_length
-                chunk.message_index_length = self.end - begin
-                self.chunks.append(chunk)
-                self.counts += counts
-                self._open = None
+        """Take in one record of the file.
 
-    def _read_chunk(self, start: int, content: bytes) -> tuple[ChunkIndex, Counter[int]]:
-        """A chunk without its indexes, and its messages per channel. SALVAGE_ERRORS: its checksum
-        is wrong, or what is in it is not records."""
+        Raises:
+            READ_ERRORS: It is damaged.
+        """
+        if opcode == Opcode.SCHEMA:
+            self._learn(_parse(Schema.read, content))
+        elif opcode == Opcode.CHANNEL:
+            self._learn(_parse(Channel.read, content))
+        elif opcode == Opcode.CHUNK:
+            self._begin_chunk(start, content)
+        elif opcode == Opcode.MESSAGE_INDEX and self._open_chunk is not None:
+            self._add_message_index(start, content)
+
+    def _begin_chunk(self, start: int, content: bytes) -> None:
+        """Read a chunk, which is complete only with the index of each of its channels."""
+        self._open_chunk = None
         chunk: Chunk = _parse(Chunk.read, content)
-        check_size("a chunk", max(chunk.uncompressed_size, len(content)))
-        inside = decompress(
-            chunk.data, chunk.compression, chunk.uncompressed_size, chunk.uncompressed_crc
-        )
         counts: Counter[int] = Counter()
-        for opcode, _, data in _records(BytesIO(inside)):
-            if opcode == Opcode.MESSAGE:
-                counts[int.from_bytes(data[:2], "little")] += 1
+        for record in read_chunk_records(chunk):
+            if isinstance(record, Message):
+                counts[record.channel_id] += 1
             else:
-                self._learn(opcode, data)
-        index = ChunkIndex(
-            chunk_length=_HEAD.size + len(content),
+                self._learn(record)
+        self._open_counts = counts
+        self._open_chunk = ChunkIndex(
+            chunk_length=_RECORD_HEAD.size + len(content),
             chunk_start_offset=start,
             compression=chunk.compression,
             compressed_size=len(chunk.data),
@@ -213,76 +254,92 @@ class _Salvaged:
             message_start_time=chunk.message_start_time,
             uncompressed_size=chunk.uncompressed_size,
         )
-        return index, counts
 
-    def _learn(self, opcode: int, content: bytes) -> None:
-        """A schema or a channel; the first of each id counts."""
-        if opcode == Opcode.SCHEMA:
-            schema: Schema = _parse(Schema.read, content)
-            self.schemas.setdefault(schema.id, schema)
-        elif opcode == Opcode.CHANNEL:
-            channel: Channel = _parse(Channel.read, content)
-            self.channels.setdefault(channel.id, channel)
+    def _add_message_index(self, start: int, content: bytes) -> None:
+        """Take in the index of one channel of the chunk before it."""
+        chunk, counts = self._open_chunk, self._open_counts
+        index: MessageIndex = _parse(MessageIndex.read, content)
+        if chunk is None or len(index.records) != counts[index.channel_id]:
+            raise ValueError("an index has another number of messages than its chunk")
+        chunk.message_index_offsets[index.channel_id] = start
+        if chunk.message_index_offsets.keys() == counts.keys():
+            self.end = start + _RECORD_HEAD.size + len(content)
+            chunk_end = chunk.chunk_start_offset + chunk.chunk_length
+            chunk.message_index_length = self.end - chunk_end
+            self.index.chunk_indexes.append(chunk)
+            self.counts += counts
+            self._open_chunk = None
 
-    def write_summary(self, bio: BinaryIO, name: str) -> None:
-        """Everything that follows the data of a complete file."""
-        begin_ns = min(chunk.message_start_time for chunk in self.chunks)
-        end_ns = max(chunk.message_end_time for chunk in self.chunks)
-        messages = self.counts.total()
-        # rosbag2 takes its topics from the summary; without the other keys it reads nothing.
-        said = describe("mcap", [describe_file(name, begin_ns, end_ns, messages)], [])
-        metadata = _bytes_of(Metadata("rosbag2", {"serialized_metadata": to_yaml(said)}))
-        metadata_index = MetadataIndex(bio.tell(), len(metadata), "rosbag2")
-        statistics = Statistics(
-            attachment_count=0,
-            channel_count=len(self.channels),
-            channel_message_counts=dict(sorted(self.counts.items())),
-            chunk_count=len(self.chunks),
-            message_count=messages,
-            message_end_time=end_ns,
-            message_start_time=begin_ns,
-            metadata_count=1,
-            schema_count=len(self.schemas),
-        )
-        bio.write(metadata)
-        bio.write(_bytes_of(DataEnd(0)))
-        summary_start = bio.tell()
-        offsets = []
-        groups: list[tuple[Opcode, list[Any]]] = [
-            (Opcode.SCHEMA, list(self.schemas.values())),
-            (Opcode.CHANNEL, list(self.channels.values())),
-            (Opcode.CHUNK_INDEX, self.chunks),
-            (Opcode.METADATA_INDEX, [metadata_index]),
-            (Opcode.STATISTICS, [statistics]),
-        ]
-        for opcode, records in groups:
-            group = b"".join(map(_bytes_of, records))
-            offsets.append(SummaryOffset(opcode, bio.tell(), len(group)))
-            bio.write(group)
-        offsets_start = bio.tell()
-        bio.write(b"".join(map(_bytes_of, offsets)))
-        bio.write(_bytes_of(Footer(summary_start, offsets_start, 0)))
-        bio.write(MAGIC)
+    def _learn(self, record: object) -> None:
+        """Take in a schema or a channel; the first of each number counts."""
+        if isinstance(record, Schema):
+            self.index.schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self.index.channels.setdefault(record.id, record)
 
 
-def _records(bio: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
-    """Opcode, place and content of each record, until the file ends before a record does."""
-    start = bio.tell()
-    size = bio.seek(0, 2)
-    bio.seek(start)
-    while size - start >= _HEAD.size:
-        opcode, length = _HEAD.unpack(bio.read(_HEAD.size))
-        if length > size - start - _HEAD.size:
+def _write_summary(stream: BinaryIO, name: str, salvaged: _Salvaged) -> None:
+    """Write everything that follows the chunks of a complete file."""
+    index, chunks = salvaged.index, salvaged.index.chunk_indexes
+    index.statistics = statistics = Statistics(
+        attachment_count=0,
+        channel_count=len(index.channels),
+        channel_message_counts=dict(sorted(salvaged.counts.items())),
+        chunk_count=len(chunks),
+        message_count=salvaged.counts.total(),
+        message_end_time=max(chunk.message_end_time for chunk in chunks),
+        message_start_time=min(chunk.message_start_time for chunk in chunks),
+        metadata_count=1,
+        schema_count=len(index.schemas),
+    )
+    # rosbag2 takes its topics from the summary, but reads nothing without this record.
+    metadata = Metadata(ROSBAG2, rosbag2_metadata(summarise(name, index)))
+    metadata_index = MetadataIndex(stream.tell(), len(_bytes_of([metadata])), ROSBAG2)
+    stream.write(_bytes_of([metadata, DataEnd(0)]))
+
+    summary_start = stream.tell()
+    groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+        (Opcode.SCHEMA, list(index.schemas.values())),
+        (Opcode.CHANNEL, list(index.channels.values())),
+        (Opcode.CHUNK_INDEX, chunks),
+        (Opcode.METADATA_INDEX, [metadata_index]),
+        (Opcode.STATISTICS, [statistics]),
+    ]
+    summary = b""
+    offsets: list[McapRecord] = []
+    for opcode, records in groups:
+        group = _bytes_of(records)
+        offsets.append(SummaryOffset(opcode, summary_start + len(summary), len(group)))
+        summary += group
+    offsets_start = summary_start + len(summary)
+    summary += _bytes_of(offsets)
+    # The checksum covers the summary and the footer up to the checksum itself.
+    footer = _bytes_of([Footer(summary_start, offsets_start, 0)])[:-CHECKSUM_BYTES]
+    checksum = struct.pack("<I", crc32(summary + footer))
+    stream.write(summary + footer + checksum + MAGIC)
+
+
+def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
+    """Yield opcode, offset and content of each record, until the file ends before a record does."""
+    start = stream.tell()
+    size = stream.seek(0, 2)
+    stream.seek(start)
+    while size - start >= _RECORD_HEAD.size:
+        opcode, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
+        if length > size - start - _RECORD_HEAD.size:
             return
-        yield opcode, start, bio.read(length)
-        start += _HEAD.size + length
+        yield opcode, start, stream.read(length)
+        start += _RECORD_HEAD.size + length
 
 
 def _parse(read: Callable[[ReadDataStream], Any], content: bytes) -> Any:
+    """Parse the content of a record."""
     return read(ReadDataStream(BytesIO(content)))
 
 
-def _bytes_of(record: McapRecord) -> bytes:
+def _bytes_of(records: Sequence[McapRecord]) -> bytes:
+    """Return records as bytes, one after the other."""
     builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]

@@ -45,7 +45,7 @@ class _Field(NamedTuple):
     width: int
 
 
-_FREQUENCIES_2 = (
+_FREQUENCIES = (
     _Field("cube", "<u2", 1),
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
@@ -53,9 +53,9 @@ _FREQUENCIES_2 = (
     _Field("frequency", "<f4", PADS),
     _Field("temperature", "<f4", 1),
     _Field("pad_fault", "<u4", 1),
+    _Field("status", "<u2", 1),
 )
-_FREQUENCIES = (*_FREQUENCIES_2, _Field("status", "<u2", 1))
-_STRESS_1 = (
+_STRESS = (
     _Field("cube", "<u2", 1),
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
@@ -64,8 +64,8 @@ _STRESS_1 = (
     _Field("residual", "<f4", 1),
     _Field("status", "<u2", 1),
     _Field("observed", "<u2", 1),
+    _Field("left_out", "<u4", 1),
 )
-_STRESS = (*_STRESS_1, _Field("left_out", "<u4", 1))
 
 
 class _Shape(NamedTuple):
@@ -207,33 +207,27 @@ class MessageCodec(Generic[AnyRows]):
         return buffer.data(stamp_ns)
 
     def encode_many(
-        self, rows: AnyRows, stamp_ns: NDArray[np.int64], frame_id: bytes, before: int = 0
-    ) -> NDArray[np.uint8]:
-        """(M, before + size) M messages of one shape, each behind `before` zero bytes.
+        self, rows: AnyRows, stamp_ns: NDArray[np.int64], frame_id: bytes
+    ) -> list[bytes]:
+        """M messages of one shape.
 
         rows: of all of them, message after message; stamp_ns: (M,) of their headers.
         """
         count = len(stamp_ns)
         pads = rows.frequency.shape[1] if isinstance(rows, FrequencyRows) else 0
         layout = self._layout(_Shape(len(frame_id), len(rows) // count, pads))
-        made = np.zeros((count, before + layout.record.itemsize), np.uint8)
-        record = np.ndarray(count, layout.record, made.data, before, made.strides[:1])
+        record = np.zeros(count, layout.record)
         self.write_constants(record, layout, frame_id)
         record["sec"], record["nanosec"] = np.divmod(stamp_ns, SECOND)
         record["time_offset"] = rows.stamp_ns.reshape(count, -1) - stamp_ns[:, None]
         for name in ("cube", "sequence", *self._values):
             record[name] = getattr(rows, name).reshape(record[name].shape)
-        return made
+        return [one.tobytes() for one in record]
 
     def make_rows(self, record: NDArray[Any], stamp_ns: NDArray[np.int64]) -> AnyRows:
         """The rows of records (M,): views of a single one, copies of several."""
         columns: list[NDArray[Any]] = [_flat(record, "cube"), _flat(record, "sequence"), stamp_ns]
         columns += [_flat(record, name) for name in self._values]
-        # The last field of older versions is missing.
-        if self._fields is _STRESS_1:
-            columns.append(np.zeros(len(stamp_ns), np.uint32))
-        elif self._fields is _FREQUENCIES_2:
-            columns.append(np.zeros(len(stamp_ns), np.uint16))
         return self._rows(*columns)
 
     def write_constants(self, record: NDArray[Any], layout: _Layout, frame_id: bytes) -> None:
@@ -372,20 +366,4 @@ def _aligned(place: int) -> int:
 
 
 frequency_codec = MessageCodec("SkinFrequencies", FrequencyRows, _FREQUENCIES)
-frequency_codec_2 = MessageCodec("SkinFrequencies, version 2", FrequencyRows, _FREQUENCIES_2)
-"""Of versions 1 and 2, which have no status: it reads as 0."""
 stress_codec = MessageCodec("SkinStress", StressRows, _STRESS)
-stress_codec_1 = MessageCodec("SkinStress, version 1", StressRows, _STRESS_1)
-"""Of version 1, which has no left_out: it reads as 0."""
-
-
-def upgrade_frequencies(data: bytes) -> bytes:
-    """A serialised SkinFrequencies of version 1 or 2 in today's version. MessageError: damaged."""
-    old = frequency_codec_2.decode(data)
-    return frequency_codec.encode(old.rows, old.frame_id, int(old.stamp_ns[0]))
-
-
-def upgrade_stress(data: bytes) -> bytes:
-    """A serialised SkinStress of version 1 in today's version. MessageError: damaged."""
-    old = stress_codec_1.decode(data)
-    return stress_codec.encode(old.rows, old.frame_id, int(old.stamp_ns[0]))

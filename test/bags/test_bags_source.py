@@ -12,7 +12,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, frequencies_of, info_of, loads, make_bag
 
-from cube_tensor_driver.bags.read import typestore
+from cube_tensor_driver.bags.metadata import typestore
 from cube_tensor_driver.bags.reprocess.job import reconstruct
 from cube_tensor_driver.bags.reprocess.recorded_reconstruction import RecordedReconstruction
 from cube_tensor_driver.bags.source import open_bag

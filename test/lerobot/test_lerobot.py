@@ -16,7 +16,8 @@ import pytest
 from bag_maker import START_NS, header, make_bag, message
 from PIL import Image
 
-from cube_tensor_driver.bags.read import Bag, typestore
+from cube_tensor_driver.bags.metadata import typestore
+from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, make_table, reprocess
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main

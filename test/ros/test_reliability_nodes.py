@@ -337,7 +337,7 @@ def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
     """Each topic and service of each node, as SROS 2 names them, and nothing that no node has."""
     for name in ("markers", "contacts"):
         stage.children.start(Process(name, f"cube_tensor_driver.ros.nodes.{name}"))
-    bag = str(ROOT / "test" / "data" / "bag_v2")
+    bag = str(ROOT / "test" / "data" / "bag")
     for name, *arguments in (
         ("view", "view", "--port", str(free_port())),
         ("recorder", "record", "-o", str(tmp_path / "bag")),

@@ -114,13 +114,13 @@ def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
     from distributed import Client
 
     try:
-        client = Client(scheduler, timeout="5s")
+        client = Client(scheduler, timeout="5s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"--scheduler {scheduler}: {error}; name a running scheduler, tcp://host:8786"
         ) from None
     with client:
-        yield client.get_executor()
+        yield client.get_executor()  # type: ignore[no-untyped-call]
 
 
 def useful_workers(wanted: int | None, jobs: int) -> int:

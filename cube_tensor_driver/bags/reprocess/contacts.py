@@ -16,8 +16,9 @@ from ...messages.contacts import contacts_message, traction_message
 from ...messages.skin_info import cube_calibrations, cube_poses, geometry
 from ...messages.types import CONTACTS, TRACTION
 from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
+from ..metadata import quality
 from ..read import make_message, serialise
-from ..write import BagWriter, quality
+from ..write import BagWriter
 
 
 @dataclass(frozen=True)

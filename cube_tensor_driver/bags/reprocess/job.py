@@ -25,12 +25,12 @@ from ...core.reconstructor import Reconstructor
 from ...core.rows import StressRows
 from ...messages.codec import stress_codec
 from ...messages.types import FREQUENCIES, INFO, STRESS
-from ..mcap import HEAD
-from ..read import VERSIONS, Bag, serialise
+from ..metadata import quality
+from ..read import Bag, serialise
 from ..recording import Settings, stamp_ns
 from ..source import BagSource, Segment
 from ..tables import TableWriter
-from ..write import BagWriter, quality
+from ..write import BagWriter
 from .contacts import ContactsOverTime, ContactWriter
 
 if TYPE_CHECKING:
@@ -153,10 +153,9 @@ def _write_bag(
             touched = None if contacts is None else ContactWriter(writer, skin, contacts)
             for segment, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):
                 messages = segment.messages
-                records = stress_codec.encode_many(
-                    stress, messages.stamp_ns, messages.frame_id, before=HEAD
-                )
-                writer.write_many(f"{skin}stress", segment.recorded_ns, records)
+                encoded = stress_codec.encode_many(stress, messages.stamp_ns, messages.frame_id)
+                for time_ns, data in zip(segment.recorded_ns.tolist(), encoded, strict=True):
+                    writer.write(f"{skin}stress", time_ns, data)
                 if touched is not None:
                     touched.set_up(infos[segment.number])
                     touched.write(stress, messages, segment.recorded_ns)
@@ -314,7 +313,6 @@ def _infos(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
         ]
         yield replace(
             info,
-            version=max(VERSIONS),
             sender="reconstruction",
             cubes=cubes,
             calibration_ids=list(first),

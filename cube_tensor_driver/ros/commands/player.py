@@ -14,8 +14,7 @@ from rosgraph_msgs.msg import Clock
 
 from ...bags.read import Bag, Entry
 from ...core.errors import BagError
-from ...messages.codec import upgrade_frequencies, upgrade_stress
-from ...messages.types import FREQUENCIES, PACKAGE, STRESS
+from ...messages.types import PACKAGE
 from ..messages import SECOND, message_class
 from .recorder import DEPTH
 
@@ -156,24 +155,19 @@ class Player:
         return self._bag.start_ns + round(position * SECOND)
 
     def _add(self, topic: str, connection: Any) -> None:
-        offered = connection.ext.offered_qos_profiles
-        latched = bool(offered) and all(
-            one.durability.value == DurabilityPolicy.TRANSIENT_LOCAL for one in offered
-        )
-        best_effort = bool(offered) and any(
-            one.reliability.value == ReliabilityPolicy.BEST_EFFORT for one in offered
-        )
         profile = QoSProfile(
             depth=DEPTH,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL
+            if connection.is_latched
+            else DurabilityPolicy.VOLATILE,
             reliability=ReliabilityPolicy.BEST_EFFORT
-            if best_effort
+            if connection.is_best_effort
             else ReliabilityPolicy.RELIABLE,
         )
         self._publishers[topic] = self._node.create_publisher(
             message_class(topic, connection.msgtype), topic, profile
         )
-        if latched:
+        if connection.is_latched:
             self._latched.add(topic)
 
     def _once(self, start_ns: int) -> None:
@@ -222,10 +216,5 @@ class Player:
             self._clock.publish(Clock(clock=Time(sec=bag_ns // SECOND, nanosec=bag_ns % SECOND)))
 
     def _publish(self, entry: Entry) -> None:
-        data, version = entry.data, self._bag.version
-        if entry.msgtype == FREQUENCIES and version < 3:
-            data = upgrade_frequencies(data)
-        elif entry.msgtype == STRESS and version < 2:
-            data = upgrade_stress(data)
-        self._publishers[entry.topic].publish(data)
+        self._publishers[entry.topic].publish(entry.data)
         self.published += 1

@@ -13,7 +13,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from ...bags.write import BagWriter, quality
+from ...bags.metadata import quality
+from ...bags.write import BagWriter
 from ...core.errors import BagError
 from ..messages import message_class
 

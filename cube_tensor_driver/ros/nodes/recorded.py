@@ -29,7 +29,7 @@ def open_recording(path: Path, until: ExitStack) -> RecordedReconstruction | Non
     except ModuleNotFoundError as error:
         raise BagError(
             f"config: {path} is a bag, and reading it needs the Python package {error.name}: "
-            "pip install 'rosbags>=0.11,<0.12' 'mcap>=1.2,<2' lz4"
+            "pip install 'rosbags>=0.11,<0.12' 'mcap>=1.6,<2' zstandard"
         ) from None
 
     recorded = RecordedReconstruction(path)

@@ -1,0 +1,297 @@
+"""MCAP files of bags, read and written with the library mcap.
+
+An MCAP file is a sequence of chunks, each with a checksum, and a summary at the end that says which
+topics there are and where each chunk is. A chunk is read as a whole: this costs one step per chunk
+instead of several per message. Source of the format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
+from functools import lru_cache
+from io import SEEK_END, BytesIO
+from operator import itemgetter
+from pathlib import Path
+from typing import BinaryIO
+from zlib import crc32
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.records import Chunk, Footer, Message
+from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
+from mcap.writer import CompressionType, Writer
+
+from ..config.yaml import parse_yaml, to_yaml
+from .metadata import Connection, FileSummary, QosProfile, bag_information
+
+MAGIC = b"\x89MCAP0\r\n"
+"""The first and last bytes of a complete file."""
+
+RECORD_HEAD_BYTES = 9
+"""Size of what precedes each record: the opcode (1 byte) and the length of the record (8 bytes)."""
+
+CHUNK_BYTES = 1 << 18
+"""Size at which the writer closes a chunk. At 256 kB a chunk fits the processor's cache, and little
+is lost with the last one when the process is killed."""
+
+MAX_CHUNK_BYTES = 256 << 20
+"""Largest chunk, in bytes, that is read. rosbag2 closes a chunk after 0.8 MB, or after the message
+behind; a larger size is damage, and memory for it should not even be requested."""
+
+CACHED_CHUNKS = 4
+"""Number of chunks kept in memory. Frequencies and stress are read side by side, each by an
+iterator of its own, from the same chunks."""
+
+ROSBAG2 = "rosbag2"
+"""Name of the metadata record that rosbag2 reads."""
+
+_FOOTER_BYTES = RECORD_HEAD_BYTES + 20
+CHECKSUM_BYTES = 4
+
+StoredMessage = tuple[int, int, int, bytes]
+"""Time in ns, offset of the chunk in the file, channel, serialised message."""
+
+
+class McapReader:
+    """An MCAP file open for reading.
+
+    Attributes:
+        summary: What the file holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a file and read its summary.
+
+        Raises:
+            OSError, McapError, ValueError, struct.error: The file cannot be read, or is damaged.
+        """
+        self._stream = path.open("rb")
+        try:
+            _check_summary(self._stream)
+            self._stream.seek(0)
+            index = SeekingReader(
+                self._stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
+            ).get_summary()
+            if index is None or index.statistics is None:
+                raise McapError("the file has no summary")
+            largest = max((chunk.uncompressed_size for chunk in index.chunk_indexes), default=0)
+            if largest > MAX_CHUNK_BYTES:
+                raise McapError(f"a chunk of {largest} bytes, the limit is {MAX_CHUNK_BYTES}")
+        except BaseException:
+            self._stream.close()
+            raise
+        self._index = index
+        self._connections = _connections(index)
+        self._load_chunk = lru_cache(CACHED_CHUNKS)(self._read_chunk)
+        self.summary = summarise(path.name, index)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+    def messages(
+        self, topics: Collection[str], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Read messages in the order of their times.
+
+        Args:
+            topics: Names of the topics.
+            start_ns: Time of the first message, in ns.
+            stop_ns: Time before which the last message lies.
+
+        Yields:
+            The topic, the time in ns and the serialised message.
+        """
+        channels = {
+            number: connection
+            for number, connection in self._connections.items()
+            if connection.topic in topics
+        }
+        if not self._index.chunk_indexes:
+            yield from self._unindexed_messages(channels, start_ns, stop_ns)
+            return
+        for time_ns, _, channel, data in self._in_order(channels, start_ns, stop_ns):
+            if channel in channels and start_ns <= time_ns < stop_ns:
+                yield channels[channel], time_ns, data
+
+    def _in_order(
+        self, channels: Collection[int], start_ns: int, stop_ns: int
+    ) -> Iterator[StoredMessage]:
+        """Read the chunks that matter and merge messages of chunks whose times overlap."""
+        chunks = [
+            chunk
+            for chunk in self._index.chunk_indexes
+            if start_ns <= chunk.message_end_time
+            and chunk.message_start_time < stop_ns
+            # Without message indexes a chunk does not say which channels it has.
+            and not (
+                chunk.message_index_offsets
+                and chunk.message_index_offsets.keys().isdisjoint(channels)
+            )
+        ]
+        pending: Sequence[StoredMessage] = ()
+        chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
+        for chunk in chunks:
+            # No later chunk has a message before this chunk's first.
+            ready = bisect_left(pending, chunk.message_start_time, key=itemgetter(0))
+            yield from pending[:ready]
+            loaded = self._load_chunk(chunk.chunk_start_offset, chunk.chunk_length)
+            waiting = pending[ready:]
+            # Time and place decide, so that the order does not depend on where chunks end.
+            pending = sorted([*waiting, *loaded], key=itemgetter(0, 1)) if waiting else loaded
+        yield from pending
+
+    def _read_chunk(self, offset: int, length: int) -> Sequence[StoredMessage]:
+        """Read one chunk.
+
+        Returns:
+            Its messages in the order of their times.
+        """
+        self._stream.seek(offset + RECORD_HEAD_BYTES)
+        # A length inside the record may be damaged: then it ends with the record, not the memory.
+        record = BytesIO(self._stream.read(length - RECORD_HEAD_BYTES))
+        chunk = Chunk.read(ReadDataStream(record))
+        messages = [
+            (one.log_time, offset, one.channel_id, one.data)
+            for one in read_chunk_records(chunk)
+            if isinstance(one, Message)
+        ]
+        messages.sort(key=itemgetter(0))
+        return messages
+
+    def _unindexed_messages(
+        self, channels: dict[int, Connection], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Read a file without index (rosbag2's preset ``fastwrite``) in the order of writing."""
+        self._stream.seek(0)
+        reader = NonSeekingReader(
+            self._stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
+        )
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.id in channels and start_ns <= message.log_time < stop_ns:
+                yield channels[channel.id], message.log_time, message.data
+
+
+class McapWriter:
+    """A new MCAP file of a bag."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file.
+
+        Raises:
+            OSError: It exists, or cannot be created.
+        """
+        self._stream = path.open("xb")
+        self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.NONE)
+        self._writer.start("ros2", library="cube_tensor_driver")
+        self._schemas: dict[str, int] = {}
+
+    def add_topic(
+        self, topic: str, msgtype: str, definition: str, qos: Sequence[QosProfile]
+    ) -> int:
+        """Add a topic.
+
+        Returns:
+            The number by which `write` knows it.
+        """
+        if msgtype not in self._schemas:
+            text = definition.encode()
+            self._schemas[msgtype] = self._writer.register_schema(msgtype, "ros2msg", text)
+        about = {"offered_qos_profiles": to_yaml(list(qos)) if qos else ""}
+        return self._writer.register_channel(topic, "cdr", self._schemas[msgtype], about)
+
+    def write(self, channel: int, time_ns: int, data: bytes) -> None:
+        """Add a serialised message that was received at a time, in ns."""
+        self._writer.add_message(channel, time_ns, data, time_ns)
+
+    def flush(self) -> None:
+        """Hand all messages to the system: a chunk can be repaired once it is complete."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self, summary: FileSummary) -> None:
+        """Complete the file.
+
+        Args:
+            summary: What the file holds.
+        """
+        self.flush()
+        self._writer.add_metadata(ROSBAG2, rosbag2_metadata(summary))
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.close()
+
+    def abort(self) -> None:
+        """Close the file as it is."""
+        # Bytes that did not fit the disk would fail again.
+        with suppress(OSError):
+            self._stream.close()
+
+
+def read_chunk_records(chunk: Chunk) -> list[object]:
+    """Decompress a chunk and read its records.
+
+    Raises:
+        McapError, ValueError, struct.error: The chunk is damaged.
+    """
+    try:
+        return list(breakup_chunk(chunk, validate_crc=True))
+    except RuntimeError as error:  # lz4 reports damage so
+        raise McapError(str(error)) from None
+
+
+def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
+    """Describe a file in the words of rosbag2, which looks for this where metadata.yaml is lost."""
+    return {"serialized_metadata": to_yaml(bag_information("mcap", [file]))}
+
+
+def summarise(name: str, index: Summary) -> FileSummary:
+    """Describe the file `name` by its summary section."""
+    times = index.statistics
+    return FileSummary(
+        name,
+        list(_connections(index).values()),
+        times.message_start_time if times else 0,
+        times.message_end_time if times else 0,
+    )
+
+
+def _connections(index: Summary) -> dict[int, Connection]:
+    """Return the topics of a file by the numbers of their channels."""
+    counts = index.statistics.channel_message_counts if index.statistics else {}
+    found = {}
+    for number, channel in sorted(index.channels.items()):
+        schema = index.schemas.get(channel.schema_id)
+        has_text = schema is not None and schema.encoding == "ros2msg"
+        found[number] = Connection(
+            channel.topic,
+            schema.name if schema else "",
+            schema.data.decode() if schema and has_text else "",
+            parse_yaml(channel.metadata.get("offered_qos_profiles") or "[]", channel.topic),
+            counts.get(number, 0),
+        )
+    return found
+
+
+def _check_summary(stream: BinaryIO) -> None:
+    """Compare the summary with its checksum, which the library does not check.
+
+    Raises:
+        McapError: The file is cut off, or its summary is damaged.
+    """
+    size = stream.seek(0, SEEK_END)
+    tail_start = size - len(MAGIC) - _FOOTER_BYTES
+    stream.seek(max(0, tail_start))
+    tail = stream.read()
+    if tail_start < 0 or not tail.endswith(MAGIC):
+        raise McapError("the file does not end as an MCAP file does")
+    footer = Footer.read(ReadDataStream(BytesIO(tail[RECORD_HEAD_BYTES:])))
+    if not footer.summary_crc:  # the program that wrote the file made none
+        return
+    # The checksum covers the summary and the footer up to the checksum itself.
+    stream.seek(footer.summary_start)
+    checked_bytes = size - len(MAGIC) - CHECKSUM_BYTES - footer.summary_start
+    if crc32(stream.read(max(0, checked_bytes))) != footer.summary_crc:
+        raise McapError("the summary does not have its checksum")

@@ -1,0 +1,251 @@
+"""The description of a bag in metadata.yaml, and of each of its topics.
+
+The format is that of rosbag2, version 9. Message types, and the hashes that identify them, come
+from the library rosbags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from ..config.package_data import package_data
+from ..config.yaml import read_yaml, write_yaml
+from ..core.errors import BagError, ConfigError
+from ..messages.types import PACKAGE
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+FILE_NAME = "metadata.yaml"
+METADATA_VERSION = 9
+"""Version of the format that rosbag2 of ROS 2 Jazzy writes."""
+
+SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
+"""Suffix of the files of each storage format, by rosbag2's name of the format."""
+
+_UNLIMITED = {"sec": 9223372036, "nsec": 854775807}
+"""Largest duration that fits 64 bits of nanoseconds: DDS's value for "no limit"."""
+
+QosProfile = dict[str, Any]
+"""A quality of service profile with rosbag2's keys, so that a replay can offer the same."""
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A recorded topic.
+
+    Attributes:
+        topic: Name of the topic.
+        msgtype: Type of its messages, such as ``std_msgs/msg/String``.
+        definition: Text of the type's definition, with those of the types in it; "" if the bag does
+            not contain it.
+        qos: Quality of service profiles that its publishers offered.
+        msgcount: Number of messages.
+    """
+
+    topic: str
+    msgtype: str
+    definition: str
+    qos: Sequence[QosProfile] = ()
+    msgcount: int = 0
+
+    @property
+    def is_latched(self) -> bool:
+        """Whether all publishers kept their last messages for late subscribers."""
+        return bool(self.qos) and all(
+            profile.get("durability") in ("transient_local", 1) for profile in self.qos
+        )
+
+    @property
+    def is_best_effort(self) -> bool:
+        """Whether a publisher did not repeat messages that were lost."""
+        return any(profile.get("reliability") in ("best_effort", 2) for profile in self.qos)
+
+
+@dataclass(frozen=True)
+class FileSummary:
+    """What one storage file holds.
+
+    Attributes:
+        name: Name of the file in the bag's folder.
+        connections: Its topics.
+        start_ns: Time of its earliest message, in ns since the epoch.
+        end_ns: Time of its latest message.
+    """
+
+    name: str
+    connections: Sequence[Connection]
+    start_ns: int
+    end_ns: int
+
+    @property
+    def msgcount(self) -> int:
+        """Number of messages in the file."""
+        return sum(connection.msgcount for connection in self.connections)
+
+
+@dataclass(frozen=True)
+class BagFiles:
+    """The storage files that a metadata.yaml names.
+
+    Attributes:
+        paths: The files in the order of recording.
+        compression: "file" or "message" where rosbag2 compressed whole files or single messages
+            (zstd), else "".
+    """
+
+    paths: Sequence[Path]
+    compression: str
+
+
+def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) -> QosProfile:
+    """Describe a quality of service.
+
+    Args:
+        latched: Whether late subscribers get the last messages (durability TRANSIENT_LOCAL).
+        reliable: Whether lost messages are sent again.
+        depth: Number of messages that a publisher keeps.
+    """
+    return {
+        "history": "keep_last",
+        "depth": depth,
+        "reliability": "reliable" if reliable else "best_effort",
+        "durability": "transient_local" if latched else "volatile",
+        "deadline": dict(_UNLIMITED),
+        "lifespan": dict(_UNLIMITED),
+        "liveliness": "automatic",
+        "liveliness_lease_duration": dict(_UNLIMITED),
+        "avoid_ros_namespace_conventions": False,
+    }
+
+
+@lru_cache
+def typestore() -> Typestore:
+    """Return the message types of ROS 2 Jazzy and of this package, as they are today."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for path in sorted((package_data() / "msg").glob("*.msg")):
+        types |= get_types_from_msg(path.read_text(), f"{PACKAGE}/msg/{path.stem}")
+    store.register(types)
+    return store
+
+
+def type_hash(msgtype: str, definition: str) -> str:
+    """Return ROS 2's hash (REP 2011) of a type; "" if its definition cannot be read."""
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(definition, msgtype))
+        return store.hash_rihs01(msgtype)
+    except (TypesysError, SerdeError, KeyError):
+        return ""
+
+
+def read_metadata(folder: Path) -> BagFiles:
+    """Read which storage files a bag's folder has.
+
+    Raises:
+        BagError: There is no metadata.yaml, or it is damaged.
+    """
+    path = folder / FILE_NAME
+    if not path.is_file():
+        raise BagError(
+            f"{folder}: no {FILE_NAME}: no bag, or a recording that was cut off; "
+            f"./cube bag repair {folder} makes the latter readable"
+        )
+    try:
+        about = read_yaml(path)["rosbag2_bagfile_information"]
+        names = about["relative_file_paths"]
+        mode = str(about.get("compression_mode") or "").lower()
+        # Some versions of rosbag2 put the name of the folder in front.
+        paths = [folder / Path(name).name for name in names]
+    except (ConfigError, KeyError, TypeError, AttributeError) as error:
+        raise BagError(
+            f"{path}: damaged ({error}); ./cube bag repair {folder} writes it again"
+        ) from None
+    return BagFiles(paths, "" if mode == "none" else mode)
+
+
+def write_metadata(folder: Path, storage: str, files: Sequence[FileSummary]) -> None:
+    """Write metadata.yaml of a bag whose storage files are complete."""
+    try:
+        information = bag_information(storage, files)
+        write_yaml(folder / FILE_NAME, {"rosbag2_bagfile_information": information})
+    except ConfigError as error:
+        raise BagError(str(error)) from None
+
+
+def bag_information(storage: str, files: Sequence[FileSummary]) -> dict[str, Any]:
+    """Describe storage files as metadata.yaml does; rosbag2 requires every key.
+
+    Args:
+        storage: Storage format, a key of `SUFFIXES`.
+        files: The files in the order of recording, at least one.
+    """
+    # A file without messages has no times.
+    used = [file for file in files if file.msgcount] or files[:1]
+    start_ns = min(file.start_ns for file in used)
+    end_ns = max(file.end_ns for file in used)
+    return {
+        "version": METADATA_VERSION,
+        "storage_identifier": storage,
+        **_time_span(start_ns, end_ns),
+        "message_count": sum(file.msgcount for file in files),
+        "topics_with_message_count": [
+            _topic_information(connection)
+            for connection in merge_connections(file.connections for file in files)
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file.name for file in files],
+        "files": [
+            {
+                "path": file.name,
+                **_time_span(file.start_ns, file.end_ns),
+                "message_count": file.msgcount,
+            }
+            for file in files
+        ],
+        "custom_data": None,
+        "ros_distro": "rosbags",
+    }
+
+
+def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connection]:
+    """Join the topics of several files: each once, with the messages of all files."""
+    merged: dict[tuple[str, str], Connection] = {}
+    for connections in of_files:
+        for one in connections:
+            key = one.topic, one.msgtype
+            count = one.msgcount + (merged[key].msgcount if key in merged else 0)
+            first = merged.get(key, one)
+            merged[key] = Connection(one.topic, one.msgtype, first.definition, first.qos, count)
+    return list(merged.values())
+
+
+def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
+    """Describe a span of time with rosbag2's keys."""
+    return {
+        "starting_time": {"nanoseconds_since_epoch": start_ns},
+        "duration": {"nanoseconds": max(0, end_ns - start_ns)},
+    }
+
+
+def _topic_information(connection: Connection) -> dict[str, Any]:
+    """Describe a topic with rosbag2's keys."""
+    return {
+        "topic_metadata": {
+            "name": connection.topic,
+            "type": connection.msgtype,
+            "serialization_format": "cdr",
+            "offered_qos_profiles": list(connection.qos),
+            "type_description_hash": type_hash(connection.msgtype, connection.definition),
+        },
+        "message_count": connection.msgcount,
+    }

@@ -1,0 +1,193 @@
+"""SQLite files of bags (.db3), read and written with Python's sqlite3."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from ..config.yaml import parse_yaml, to_yaml
+from .metadata import (
+    METADATA_VERSION,
+    Connection,
+    FileSummary,
+    QosProfile,
+    bag_information,
+    type_hash,
+)
+
+_TABLES = """
+CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
+CREATE TABLE metadata(
+  id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL
+);
+CREATE TABLE topics(
+  id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+  serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL,
+  type_description_hash TEXT NOT NULL
+);
+CREATE TABLE message_definitions(
+  id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL,
+  encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL
+);
+CREATE TABLE messages(
+  id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
+  data BLOB NOT NULL
+);
+CREATE INDEX timestamp_idx ON messages (timestamp ASC);
+INSERT INTO schema(schema_version, ros_distro) VALUES (4, 'rosbags');
+"""
+"""The tables as rosbag2 of ROS 2 Jazzy creates them (version 4)."""
+
+
+class SqliteReader:
+    """An SQLite file open for reading.
+
+    Attributes:
+        summary: What the file holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a file and read which topics it has.
+
+        Raises:
+            sqlite3.Error: The file cannot be read, or is damaged.
+        """
+        # "immutable" also reads from a folder in which SQLite cannot create its lock files.
+        uri = f"{path.resolve().as_uri()}?immutable=1"
+        self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        try:
+            self._connections = self._read_connections()
+            (span,) = self._database.execute("SELECT min(timestamp), max(timestamp) FROM messages")
+        except BaseException:
+            self._database.close()
+            raise
+        connections = list(self._connections.values())
+        self.summary = FileSummary(path.name, connections, span[0] or 0, span[1] or 0)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+    def messages(
+        self, topics: Collection[str], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Read messages in the order of their times; arguments as in `McapReader.messages`."""
+        numbers = [
+            number for number, connection in self._connections.items() if connection.topic in topics
+        ]
+        places = ",".join("?" * len(numbers))
+        rows = self._database.execute(
+            f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places})"
+            " AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
+            [*numbers, start_ns, stop_ns],
+        )
+        for number, time_ns, data in rows:
+            # A column has no type of its own: damage can change that of a value.
+            if not isinstance(time_ns, int) or not isinstance(data, bytes):
+                raise sqlite3.DatabaseError("a message has values of other types")
+            yield self._connections[number], time_ns, data
+
+    def _read_connections(self) -> dict[int, Connection]:
+        """Read the topics by their numbers."""
+        # Older versions of rosbag2 had neither profiles nor definitions.
+        has_qos = "offered_qos_profiles" in self._columns("topics")
+        definitions: dict[str, str] = {}
+        if self._columns("message_definitions"):
+            definitions = dict(
+                self._database.execute(
+                    "SELECT topic_type, encoded_message_definition FROM message_definitions"
+                    " WHERE encoding = 'ros2msg'"
+                )
+            )
+        counts = dict(
+            self._database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id")
+        )
+        qos_column = "offered_qos_profiles" if has_qos else "''"
+        topics = self._database.execute(f"SELECT id, name, type, {qos_column} FROM topics")
+        return {
+            number: Connection(
+                topic,
+                msgtype,
+                definitions.get(msgtype, ""),
+                parse_yaml(qos or "[]", topic),
+                counts.get(number, 0),
+            )
+            for number, topic, msgtype, qos in topics
+        }
+
+    def _columns(self, table: str) -> set[str]:
+        """Return the names of a table's columns; none where there is no such table."""
+        return {row[1] for row in self._database.execute(f"PRAGMA table_info({table})")}
+
+
+class SqliteWriter:
+    """A new SQLite file of a bag."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file.
+
+        Raises:
+            sqlite3.Error: It cannot be created.
+        """
+        # A recorder adds topics in one thread and messages in another, one at a time.
+        self._database = sqlite3.connect(path, check_same_thread=False)
+        self._database.executescript(_TABLES)
+        self._types: set[str] = set()
+        self._topics = 0
+
+    def add_topic(
+        self, topic: str, msgtype: str, definition: str, qos: Sequence[QosProfile]
+    ) -> int:
+        """Add a topic.
+
+        Returns:
+            The number by which `write` knows it.
+        """
+        digest = type_hash(msgtype, definition)
+        if msgtype not in self._types:
+            self._types.add(msgtype)
+            self._database.execute(
+                "INSERT INTO message_definitions(topic_type, encoding, encoded_message_definition,"
+                " type_description_hash) VALUES (?, 'ros2msg', ?, ?)",
+                (msgtype, definition, digest),
+            )
+        self._topics += 1
+        profiles = to_yaml(list(qos)) if qos else ""
+        self._database.execute(
+            "INSERT INTO topics VALUES (?, ?, ?, 'cdr', ?, ?)",
+            (self._topics, topic, msgtype, profiles, digest),
+        )
+        return self._topics
+
+    def write(self, channel: int, time_ns: int, data: bytes) -> None:
+        """Add a serialised message that was received at a time, in ns."""
+        self._database.execute(
+            "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)",
+            (channel, time_ns, data),
+        )
+
+    def flush(self) -> None:
+        """Hand all messages to the system."""
+        self._database.commit()
+
+    def finish(self, summary: FileSummary) -> None:
+        """Complete the file.
+
+        Args:
+            summary: What the file holds.
+        """
+        information = to_yaml(bag_information("sqlite3", [summary]))
+        self._database.execute(
+            "INSERT INTO metadata(metadata_version, metadata) VALUES (?, ?)",
+            (METADATA_VERSION, information),
+        )
+        self._database.commit()
+        self._database.close()
+
+    def abort(self) -> None:
+        """Close the file without the messages that were not handed over."""
+        with suppress(sqlite3.Error):
+            self._database.rollback()
+        self._database.close()
