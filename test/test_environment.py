@@ -336,16 +336,27 @@ def test_no_python_is_said_with_the_way_out(tmp_path):
     assert "no Python 3.10 to 3.13 found" in done.stderr and "sudo apt install" in done.stderr
 
 
-def test_a_command_whose_library_is_missing_names_it():
-    """rosbags has no rosdep key: whoever needs bags on a ROS machine installs it by hand."""
-    script = """
+@pytest.mark.parametrize(
+    ("module", "words", "remedy"),
+    [
+        ("rosbags", ["bag", "info", "."], "pip install rosbags\n"),
+        ("rich", ["bag", "info", "."], "pip install rich, or sudo apt install python3-rich\n"),
+        (
+            "matplotlib",
+            ["plot", "x", "-o", "x.png"],
+            "pip install matplotlib, or sudo apt install python3-matplotlib\n",
+        ),
+        ("rclpy", ["topics"], "run it as ./cube, or source a workspace"),
+    ],
+)
+def test_a_command_whose_library_is_missing_names_it(module, words, remedy):
+    """Only some commands need these libraries, so a robot may be without them."""
+    script = f"""
 import sys
-sys.modules["rosbags"] = None
+sys.modules[{module!r}] = None
 from cube_tensor_driver.cli.main import main
-sys.exit(main(["bag", "info", "."]))
+sys.exit(main({words}))
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, **CAPTURED)
-    assert done.returncode == 1
-    assert "needs the Python module rosbags, which is not there: pip install rosbags\n" in (
-        done.stderr
-    )
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert remedy in done.stderr

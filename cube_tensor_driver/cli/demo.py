@@ -1,4 +1,4 @@
-"""./cube demo: simulated hubs, driver and reconstruction, checked against the simulated load."""
+"""./cube demo: run simulated hubs, driver and reconstruction, and compare them with the load."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 from .parser import Parser, count, not_negative, positive, sample_rate
 
-MEASURE_S = 10.0
-"""How long a demo that measures runs."""
+DEFAULT_DURATION_S = 10.0
+"""Duration, in seconds, of a demo that measures and is given no --duration."""
 
 
 def arguments(parser: Parser) -> None:
@@ -58,7 +58,7 @@ def arguments(parser: Parser) -> None:
         type=positive,
         metavar="S",
         help="end after S seconds and print the figures (default: until Ctrl-C; "
-        f"{MEASURE_S:g} with --headless, --json or --figure)",
+        f"{DEFAULT_DURATION_S:g} with --headless, --json or --figure)",
     )
     parser.add_argument("--headless", action="store_true", help="show no live table")
     parser.add_argument(
@@ -73,22 +73,14 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..demo.demo import run_demo
+    from dataclasses import fields
 
-    duration = options.duration
-    if duration is None and (options.headless or options.json or options.figure):
-        duration = MEASURE_S
+    from ..demo.demo import DemoSettings, run_demo
+
+    measures = options.headless or options.json or options.figure
+    if options.duration is None and measures:
+        options.duration = DEFAULT_DURATION_S
+    # Every setting is an option of the same name.
     return run_demo(
-        config=options.config,
-        cubes=options.cubes,
-        load=options.load,
-        mujoco=options.mujoco,
-        rate=options.rate,
-        noise=options.noise,
-        imperfections=options.imperfections,
-        duration=duration,
-        headless=options.headless,
-        view=options.view,
-        json_path=options.json,
-        figure=options.figure,
+        DemoSettings(**{field.name: getattr(options, field.name) for field in fields(DemoSettings)})
     )

@@ -21,9 +21,46 @@ from .table import COMMANDS, GROUPS, PACKAGES
 
 PROGRAM = "./cube"
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells count."""
+
+RESEND_S = 0.01
+"""Time, in seconds, after which a lost Ctrl-C is sent again."""
+
+WHEELS = {
+    "PIL": "pillow",
+    "serial": "pyserial",
+    "skfem": "scikit-fem",
+    "yaml": "pyyaml",
+}
+"""Name of a module -> name of its package on PyPI, where they differ."""
+
+DEBIAN_PACKAGES = {
+    "PIL": "python3-pil",
+    "jsonschema": "python3-jsonschema",
+    "lz4": "python3-lz4",
+    "matplotlib": "python3-matplotlib",
+    "numpy": "python3-numpy",
+    "psutil": "python3-psutil",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
+    "serial": "python3-serial",
+    "transforms3d": "python3-transforms3d",
+    "websockets": "python3-websockets",
+    "yaml": "python3-yaml",
+}
+"""Name of a module -> its package in Debian and Ubuntu, where there is one."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns its exit code. SystemExit: help, the version or a usage error."""
+    """Run a command and return its exit code.
+
+    Args:
+        arguments: The words of the command; None: those of this process.
+
+    Raises:
+        SystemExit: Help or the version was printed, or the usage is wrong.
+    """
     options = parse(sys.argv[1:] if arguments is None else arguments)
     from ..core.errors import CubeError
 
@@ -34,22 +71,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"cube: {error}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
-        # Not every command needs every library; those without a rosdep key are installed by hand.
-        module = (error.name or "").split(".")[0]
-        print(
-            f"cube: this command needs the Python module {module}, which is not there: "
-            f"pip install {module}",
-            file=sys.stderr,
-        )
+        # Libraries that only some commands need are not installed with the package.
+        print(f"cube: {missing_module_text(error.name or '')}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
+
+
+def missing_module_text(name: str) -> str:
+    """Return what to install where a module is missing, as one line."""
+    module = name.partition(".")[0]
+    needs = f"this command needs the Python module {module}, which is not installed: "
+    if module in ("rclpy", __package__.partition(".")[0]) or module.endswith("_msgs"):
+        needs = f"this command needs ROS 2, and {name} is not there: "
+        return f"{needs}run it as ./cube, or source a workspace in which the package was built"
+    text = f"{needs}pip install {WHEELS.get(module, module)}"
+    if module in DEBIAN_PACKAGES:
+        text += f", or sudo apt install {DEBIAN_PACKAGES[module]}"
+    return text
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """The options of a command; its function is options.run.
+    """Return the options of a command; its function is `options.run`.
 
-    Needs the standard library only. SystemExit: help, the version or a usage error, said by now.
+    It needs the standard library only.
+
+    Raises:
+        SystemExit: Help or the version was printed, or the usage is wrong.
     """
     words = list(arguments)
     if words[:1] == ["help"]:
@@ -64,13 +112,18 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def command_parser(name: str) -> Parser:
-    """SystemExit: there is no such command."""
+    """Return the parser of a command.
+
+    Raises:
+        SystemExit: There is no such command.
+    """
     if name.startswith("--distro"):
         Parser(prog=PROGRAM).error("--distro is an option of ./cube in a checkout")
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
         close = nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
         Parser(prog=PROGRAM).error(f"unknown {kind} {name}; {close}")
+
     package = PACKAGES.get(name, __package__.partition(".")[0])
     try:
         module = importlib.import_module(f"{package}.cli.{name}")
@@ -87,7 +140,7 @@ def command_parser(name: str) -> Parser:
 
 
 def help_text() -> str:
-    """All commands in groups, as wide as the terminal."""
+    """Return the list of all commands in groups, as wide as the terminal."""
     width = columns()
     indent = max(map(len, COMMANDS)) + 4
     lines = [
@@ -110,7 +163,11 @@ def help_text() -> str:
 
 
 def version() -> str:
-    """Of package.xml in a checkout and an install space, of the metadata where pip installed it."""
+    """Return the version of the package.
+
+    In a checkout and in an install space package.xml states it; where pip installed the package
+    without its data, the metadata do.
+    """
     from importlib import metadata
 
     from ..config.package_data import package_data
@@ -118,18 +175,19 @@ def version() -> str:
 
     try:
         text = (package_data() / "package.xml").read_text(encoding="utf-8")
-        return re.findall(r"<version>(.+?)</version>", text)[0]
+        return str(re.findall(r"<version>(.+?)</version>", text)[0])
     except (ConfigError, OSError, IndexError):
         return metadata.version("cube_tensor_driver")
 
 
 def interrupt_again(lost: Any) -> None:
-    """sys.unraisablehook: sends SIGINT again.
+    """Send SIGINT again where Python has lost it; a value for `sys.unraisablehook`.
 
-    A Ctrl-C that arrives in a destructor or at the end of an import would be lost.
+    Python drops the KeyboardInterrupt of a Ctrl-C that arrives in a destructor or at the end of an
+    import.
     """
     if lost.exc_type is KeyboardInterrupt:
-        # At once it would be lost in here.
-        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+        # Sent at once, it would arrive in this hook and be lost as well.
+        threading.Timer(RESEND_S, os.kill, (os.getpid(), signal.SIGINT)).start()
     else:
         sys.__unraisablehook__(lost)

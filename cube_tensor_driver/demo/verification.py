@@ -1,21 +1,23 @@
-"""What simulated hubs sent, compared with what arrived.
+"""Comparison of what simulated hubs sent with what arrived.
 
-Demo and bench collect what arrives in `Arrivals` and `compare` it with the sample log at the end.
-Counts are in rows: one cube, one sample. Torture checks more: `workshop/judge/`.
+Demo and bench collect what arrives in `Arrivals`, and `compare` it with the sample log at the end.
+Counts are rows: one cube, one sample. Torture checks more, see `workshop/judge/`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.skin import Skin
+from ..core.arrays import AnyArray, Array, Index, Mask
 from ..core.rows import FrequencyRows, StressRows
 from ..simulation.cubes import hub_cubes
 from ..simulation.sample_log import NEVER
+
+NS_TO_MS = 1e-6
 
 
 class Taken(Protocol):
@@ -26,21 +28,26 @@ class Taken(Protocol):
 
     def rows_taken(self, start_ns: int, end_ns: int) -> int: ...
 
-    def taken_ns(
-        self, cube: NDArray[Any], sequence: NDArray[Any], stamp_ns: NDArray[Any]
-    ) -> NDArray[np.int64]: ...
+    def taken_ns(self, cube: AnyArray, sequence: AnyArray, stamp_ns: AnyArray) -> Index: ...
 
 
 class Arrivals:
     """Collects which rows arrive and when.
 
-    row_count: (cubes of the skin,) rows that a kept row of each cube stands for; rows of cubes with
-        0 are not kept. `one_per_hub` keeps rows of the first cube of each hub, where whole samples
-        arrive or are lost and memory or time counts; else all rows are kept.
-    rows: that arrived, kept or not
+    Attributes:
+        row_count: (cubes,) number of rows that a kept row of each cube stands for; rows of cubes
+            with 0 are not kept.
+        rows: Number of rows that arrived, kept or not.
     """
 
     def __init__(self, skin: Skin, *, one_per_hub: bool = False) -> None:
+        """Start with nothing.
+
+        Args:
+            skin: The skin whose rows arrive.
+            one_per_hub: Keep only rows of the first cube of each hub. It saves memory and time
+                where whole samples of a hub arrive or are lost.
+        """
         self.row_count = np.ones(len(skin.cubes), np.int64)
         if one_per_hub:
             self.row_count[:] = 0
@@ -48,64 +55,72 @@ class Arrivals:
                 members = hub.skin_cubes
                 self.row_count[members[0]] = len(members)
         self.rows = 0
-        self._all_kept = not one_per_hub
-        self._parts: list[tuple[NDArray[np.int64], ...]] = []
+        self._keeps_all = not one_per_hub
+        self._parts: list[tuple[Index, ...]] = []
 
-    def keeps(self, cube: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """(N,) whether a row of each of these cubes is kept."""
-        return self.row_count[cube] > 0
+    def keeps(self, cube: AnyArray) -> Mask:
+        """Return, for each of these cubes (N,), whether its rows are kept."""
+        return np.asarray(self.row_count[cube] > 0)
 
     def add(self, rows: FrequencyRows | StressRows, received_ns: int = 0) -> None:
-        """Rows that arrived at received_ns of the wall clock; 0 where latency is not asked for."""
+        """Add rows that arrived at `received_ns` of the wall clock.
+
+        Args:
+            rows: The rows of one message.
+            received_ns: Time of arrival; 0 where the latency is not asked for.
+        """
         self.rows += len(rows)
         cube, sequence, stamp_ns = rows.cube, rows.sequence, rows.stamp_ns
-        if not self._all_kept:
+        if not self._keeps_all:
             kept = self.keeps(cube)
             cube, sequence, stamp_ns = cube[kept], sequence[kept], stamp_ns[kept]
-        # Copies, because rows may be views of a whole message.
+        # `astype` copies: the rows may be views of a message whose memory is used again.
         part = (cube.astype(np.int64), sequence.astype(np.int64), stamp_ns.astype(np.int64))
         self._parts.append((*part, np.full(len(cube), received_ns)))
 
-    def columns(self) -> tuple[NDArray[np.int64], ...]:
-        """cube, sequence, stamp_ns and received_ns (N,) of all rows that were kept, in order."""
+    def columns(self) -> tuple[Index, ...]:
+        """Return cube, sequence, stamp_ns and received_ns (N,) of the rows kept, in order."""
         if not self._parts:
             return tuple(np.empty((4, 0), np.int64))
-        # Joined parts stay joined: whoever asks again does not pay again.
+        # The joined parts are stored, so that the next call does not join them again.
         self._parts = [tuple(np.concatenate(column) for column in zip(*self._parts, strict=True))]
         return self._parts[0]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was sent and received of the samples taken in a span of time.
+    """What was sent and received of the samples that were taken in a span of time.
 
-    sent: rows of samples that the hubs took
-    received: rows of them that arrived, each counted once
-    taken_ns: (N,) of each row kept in `Arrivals`, as `SampleLog.taken_ns`
-    first: (K,) which of those arrived first of each row of the span
-    latency_ms, stamp_error_ms: (K,) of these rows, from the sample to its arrival, and between the
-        sample and its stamp
+    Attributes:
+        sent: Number of rows of the samples that the hubs took.
+        received: Number of these rows that arrived; repeated ones count once.
+        taken_ns: (N,) time at which each row kept in `Arrivals` was taken, or `NEVER`.
+        first: (K,) indices into these N of the first arrival of each row of the span.
+        latency_ms: (K,) time from the sample to its arrival, in ms.
+        stamp_error_ms: (K,) absolute difference between the sample's time and its stamp, in ms.
     """
 
     sent: int
     received: int
-    taken_ns: NDArray[np.int64]
-    first: NDArray[np.int64]
-    latency_ms: NDArray[np.float64]
-    stamp_error_ms: NDArray[np.float64]
+    taken_ns: Index
+    first: Index
+    latency_ms: Array
+    stamp_error_ms: Array
 
     @property
     def missing(self) -> int:
-        """Rows sent that did not arrive."""
+        """Number of rows that were sent and did not arrive."""
         return self.sent - self.received
 
 
 def compare(log: Taken, arrivals: Arrivals, start_ns: int, end_ns: int) -> Comparison:
-    """Compare what arrived with what was taken from start_ns to before end_ns of the wall clock."""
+    """Compare what arrived with what was taken from `start_ns` to before `end_ns` (wall clock)."""
     cube, sequence, stamp_ns, received_ns = arrivals.columns()
     taken_ns = log.taken_ns(cube, sequence, stamp_ns)
-    rows = np.flatnonzero((taken_ns != NEVER) & (taken_ns >= start_ns) & (taken_ns < end_ns))
-    # Cube and time in one number: sequence numbers are given again after a restart.
+    in_span = (taken_ns != NEVER) & (taken_ns >= start_ns) & (taken_ns < end_ns)
+    rows = np.flatnonzero(in_span)
+
+    # A row is identified by cube and time, because numbers are given again after a restart.
     since_us = (taken_ns[rows] - log.start_time_ns) // 1000
     key = since_us * len(arrivals.row_count) + cube[rows]
     first = rows[np.sort(np.unique(key, return_index=True)[1])]
@@ -114,11 +129,11 @@ def compare(log: Taken, arrivals: Arrivals, start_ns: int, end_ns: int) -> Compa
         received=int(arrivals.row_count[cube[first]].sum()),
         taken_ns=taken_ns,
         first=first,
-        latency_ms=1e-6 * (received_ns[first] - taken_ns[first]),
-        stamp_error_ms=1e-6 * np.abs(stamp_ns[first] - taken_ns[first]),
+        latency_ms=NS_TO_MS * (received_ns[first] - taken_ns[first]),
+        stamp_error_ms=NS_TO_MS * np.abs(stamp_ns[first] - taken_ns[first]),
     )
 
 
-def percentile(values: NDArray[np.float64], percent: float) -> float:
-    """Rounded to 1e-3; NaN of no values."""
+def percentile(values: Array, percent: float) -> float:
+    """Return a percentile, rounded to 1e-3; NaN if there are no values."""
     return round(float(np.percentile(values, percent)), 3) if len(values) else float("nan")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -42,9 +41,3 @@ def node_session(name: str) -> Iterator[tuple[Node, Any]]:
             node.destroy_node()
     finally:
         rclpy.try_shutdown()
-
-
-def on_stop_signal(stop: Callable[[], None]) -> None:
-    """Call `stop` when Ctrl-C, SIGTERM or the end of the terminal asks the process to end."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stop())

@@ -25,7 +25,8 @@ from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.demo.running import Usage, end_simulator, observing, report
+from cube_tensor_driver.demo.running import end_simulator, observing, report
+from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.demo.verification import Arrivals, Taken, compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinStress

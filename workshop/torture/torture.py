@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from cube_tensor_driver.core.errors import ConfigError
-from cube_tensor_driver.demo.running import interruption, report
+from cube_tensor_driver.demo.running import report
 from cube_tensor_driver.processes.domain import own_domain
+from cube_tensor_driver.processes.stop_signals import stop_event
 from cube_tensor_driver.views.terminal.output import progress_bar
 
 from ..judge.verdict import judge
@@ -54,7 +55,7 @@ def run_torture(*, duration: float, seed: int = 0, json_path: Path | None = None
     """Torture a skin for `duration` s with the mix of faults of a seed, and print the figures;
     returns the exit code, 0 when all figures are as they must be. CubeError: something does not
     start."""
-    result = torture(duration, seed, interruption())
+    result = torture(duration, seed, stop_event())
     report(result, json_path)
     broken = failures(result)
     if broken:
@@ -70,7 +71,7 @@ def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) ->
     names = list(MUTATIONS) if name == "all" else [name]
     if not set(names) <= set(MUTATIONS):
         raise ConfigError(f"--mutate {name!r}, allowed: all, {', '.join(MUTATIONS)}")
-    interruption()  # ends the torture, whose error comes here
+    stop_event()  # ends the torture, whose error comes here
     results: dict[str, dict[str, Any]] = {}
     with progress_bar() as progress:
         for number, name in enumerate(names):
@@ -97,7 +98,7 @@ def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) ->
 def _mutated_torture(name: str, seed: int) -> dict[str, Any]:
     """All figures of the torture of one mutation."""
     duration = RESTARTED_S if MUTATIONS[name].needs_restart else MUTATED_S
-    return torture(duration, seed, interruption(), name)
+    return torture(duration, seed, stop_event(), name)
 
 
 def failures(result: dict[str, Any]) -> list[str]:

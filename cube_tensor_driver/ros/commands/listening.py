@@ -18,8 +18,9 @@ from ...core.errors import CubeError, MessageError
 from ...core.rows import StressRows
 from ...messages.codec import stress_codec
 from ...msg import SkinInfo, SkinStress, StressTensorStamped
+from ...processes.stop_signals import on_stop_signal
 from ..messages import message_class, to_ns
-from ..session import node_session, on_stop_signal
+from ..session import node_session
 from .asking import STEP_S, discover, domain_text, spin
 from .recording import resolve_topics
 

@@ -15,7 +15,8 @@ from rclpy.node import Node
 from ...bags.repair import repair
 from ...bags.write import BagWriter
 from ...core.errors import BagError, ConfigError
-from ..session import node_session, on_stop_signal
+from ...processes.stop_signals import stop_event
+from ..session import node_session
 from .recorder import Recorder
 
 FIND_S, SPIN_S, SHOW_S = 0.2, 0.05, 1.0
@@ -44,13 +45,6 @@ def record(
         names = resolve_topics(node, topics)
         bag = BagWriter(folder, storage, max_bytes, max_seconds)
         return fill(bag, node, executor, names, stop=stop, duration=duration, show=show)
-
-
-def stop_event() -> threading.Event:
-    """Set by the signals that ask the process to end."""
-    stop = threading.Event()
-    on_stop_signal(stop.set)
-    return stop
 
 
 def fill(

@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 from ...bags.read import Bag
 from ...core.errors import BagError
-from ..session import node_session, on_stop_signal
+from ...processes.stop_signals import on_stop_signal
+from ..session import node_session
 from .player import Player
 from .replay_control import ReplayControl
 

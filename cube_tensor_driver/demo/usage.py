@@ -1,0 +1,45 @@
+"""Processor time and memory of the processes of a skin."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+import psutil
+
+from ..processes.children import Children
+
+BYTES_PER_MB = 2**20
+
+
+class Usage:
+    """What processes use of the machine; processor time is counted from the construction on."""
+
+    def __init__(self, children: Children, names: Iterable[str]) -> None:
+        """names: of the processes to look at."""
+        self._processes = {name: psutil.Process(children.pid(name)) for name in names}
+        self._start_s = time.monotonic()
+        self._start_cpu_s = self._cpu_seconds()
+
+    def cpu_percent(self) -> dict[str, float]:
+        """Return the mean load that each process puts on one core, in percent."""
+        elapsed_s = time.monotonic() - self._start_s
+        return {
+            name: 100 * (cpu_s - self._start_cpu_s[name]) / elapsed_s
+            for name, cpu_s in self._cpu_seconds().items()
+        }
+
+    def memory_mb(self) -> dict[str, float]:
+        """Return the resident memory of each process, in MiB."""
+        return {
+            name: process.memory_info().rss / BYTES_PER_MB
+            for name, process in self._processes.items()
+        }
+
+    def threads(self) -> dict[str, int]:
+        """Return the number of threads of each process."""
+        return {name: process.num_threads() for name, process in self._processes.items()}
+
+    def _cpu_seconds(self) -> dict[str, float]:
+        times = {name: process.cpu_times() for name, process in self._processes.items()}
+        return {name: float(time.user + time.system) for name, time in times.items()}

@@ -1,0 +1,283 @@
+"""What the demo does while its processes run: a live table, and figures of what arrives."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from diagnostic_msgs.msg import DiagnosticArray
+
+from ..config.load_script import read_script
+from ..config.output_files import write_json
+from ..config.skin import Skin, read_skin
+from ..core.errors import CubeError, MessageError
+from ..messages.codec import frequency_codec, stress_codec
+from ..msg import SkinFrequencies, SkinStress
+from ..processes.children import Children
+from ..ros.node import queue
+from ..simulation.imperfections import read_imperfections
+from ..simulation.load import AnyLoad, Load, default_script
+from ..views.terminal.live_table import LiveTable
+from .running import Interrupted, Observer, end_simulator, observing
+
+if TYPE_CHECKING:
+    from .demo import DemoSettings
+    from .load_verification import LoadVerification
+
+__all__ = ["Interrupted", "Measurement", "watch"]
+
+MAX_START_S = 20.0
+"""Time, in seconds, within which every cube must have a tensor after the start."""
+
+DISCOVERY_S = 3.5
+"""Time, in seconds, after which DDS has found all other skins in this domain.
+
+Fast DDS repeats its announcements every 3 s, and the first ones can be lost. A measurement begins
+after this time, because it must not count tensors of another skin.
+"""
+
+CHECK_PERIOD_S = 1.0
+"""Period, in seconds, at which a demo without measurement looks for another skin."""
+
+MAX_LATE_S = 2.0
+"""Time, in seconds, for which the last tensors of a measurement are waited for."""
+
+MEASURED_NODES = ("driver", "reconstruction")
+"""Processes whose processor time and memory are measured."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The result of a demo that measures.
+
+    Attributes:
+        figures: Content of the JSON file.
+        verification: The samples that arrived, from which the forces are computed.
+        load: What acted on the skin.
+    """
+
+    figures: dict[str, Any]
+    verification: LoadVerification
+    load: AnyLoad
+
+    def publish(self, settings: DemoSettings) -> None:
+        """Draw the forces if a picture is wanted, and print or write the figures."""
+        figures = self.figures
+        if settings.figure is not None:
+            figures = figures | self._draw(settings.figure)
+        if settings.json is None:
+            print(json.dumps(figures, indent=2))
+            return
+        write_json(settings.json, figures)
+        sent, lost = figures["samples_sent"], figures["lost"]
+        print(f"wrote {settings.json}: {sent} samples sent, {lost} lost")
+
+    def _draw(self, path: Path) -> dict[str, object]:
+        """Draw the forces on the whole skin; returns their figures."""
+        from ..views.figures.skin_force import draw_forces
+        from ..views.figures.style import save
+
+        forces = self.verification.forces()
+        picture = draw_forces(
+            seconds=forces.seconds,
+            force=forces.force,
+            measured_force=forces.measured_force,
+            centre=forces.centre,
+            measured_centre=forces.measured_centre,
+            cubes=self.load.poses.position,
+        )
+        save(picture, path)
+        return forces.figures()
+
+
+def watch(
+    settings: DemoSettings,
+    skin_file: Path,
+    rate: float,
+    children: Children,
+    interrupted: threading.Event,
+    log: Path,
+) -> Measurement:
+    """Show a running skin until Ctrl-C, or measure it for a time.
+
+    Args:
+        settings: The settings of the demo.
+        skin_file: The skin file that the processes were started with.
+        rate: Samples per second of each cube.
+        children: The processes.
+        interrupted: Set by Ctrl-C.
+        log: File into which the simulator writes its samples when it ends.
+
+    Raises:
+        Interrupted: Ctrl-C.
+        CubeError: A file cannot be used, tensors do not come, or another skin publishes here.
+    """
+    skin = read_skin(skin_file)
+    if settings.imperfections is not None:
+        # The simulator reads it, too, but its error would be buried in its log.
+        read_imperfections(settings.imperfections)
+    load = make_load(skin, settings)
+    verification = None
+    if settings.duration is not None:
+        from .load_verification import LoadVerification
+
+        verification = LoadVerification(skin, load)
+
+    with ExitStack() as stack:
+        table = stack.enter_context(LiveTable(skin, show=not settings.headless))
+        observer = stack.enter_context(
+            observing("demo", children, interrupted=interrupted, on_step=table.refresh)
+        )
+        watcher = SkinWatcher(skin, rate, children, table, observer, verification)
+        watcher.wait_for_tensors()
+        if settings.view:
+            watcher.note_address()
+        if settings.duration is None or verification is None:
+            watcher.run()
+        figures = watcher.measure(verification, settings.duration, log)
+    head = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": settings.duration}
+    return Measurement(head | figures, verification, load)
+
+
+def make_load(skin: Skin, settings: DemoSettings) -> AnyLoad:
+    """Return what acts on the skin, as the simulator computes it.
+
+    Raises:
+        ConfigError: The script or scene cannot be used with this skin.
+    """
+    if settings.mujoco is not None:
+        from ..simulation.mujoco.scene import MujocoLoad
+
+        return MujocoLoad(settings.mujoco, skin)
+    return Load(skin, default_script() if settings.load is None else read_script(settings.load))
+
+
+class SkinWatcher:
+    """Receives what the running skin publishes, for the table and for the verification."""
+
+    def __init__(
+        self,
+        skin: Skin,
+        rate: float,
+        children: Children,
+        table: LiveTable,
+        observer: Observer,
+        verification: LoadVerification | None,
+    ) -> None:
+        """verification: None where nothing is measured."""
+        self._n_cubes = len(skin.cubes)
+        self._children, self._table, self._observer = children, table, observer
+        self._verification = verification
+        self._sees_other_skin = False
+        self._made_s = time.monotonic()
+        self._crc_errors: dict[str, int] = {}
+        observer.listen(SkinStress, "stress", self._on_stress, queue(rate))
+        if verification is not None:
+            observer.listen(SkinFrequencies, "frequencies", self._on_frequencies, queue(rate))
+            observer.node.create_subscription(
+                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
+            )
+
+    def wait_for_tensors(self) -> None:
+        """Wait until every cube has a tensor, and every topic that is measured has arrived.
+
+        Raises:
+            CubeError: They did not come within `MAX_START_S`.
+        """
+        self._observer.spin(MAX_START_S, self._is_ready)
+        self._check_alone()
+        if not self._table.seen_all:
+            logs = "\n".join(self._children.log(name)[-1500:] for name in MEASURED_NODES)
+            raise CubeError(
+                f"after {MAX_START_S:g} s only {self._table.seen} of {self._n_cubes} cubes have "
+                f"a tensor.\n{logs}"
+            )
+
+    def _is_ready(self) -> bool:
+        if self._sees_other_skin:
+            return True
+        if self._verification is None:
+            return self._table.seen_all
+        # Discovery takes up to seconds and differs from topic to topic.
+        has_samples = self._table.seen_all and self._verification.sampled
+        return has_samples and bool(self._crc_errors)
+
+    def run(self) -> NoReturn:
+        """Show the skin until Ctrl-C, which raises Interrupted."""
+        while True:
+            self._observer.spin(CHECK_PERIOD_S)
+            self._check_alone()
+
+    def note_address(self) -> None:
+        """Write the address of the browser view above the table."""
+        self._observer.spin(MAX_START_S, lambda: "http://" in self._children.log("view"))
+        address = self._children.wait_for_line("view", "http://", 0.0).split()[0]
+        self._table.note = f"\n{address} shows it"
+
+    def measure(
+        self, verification: LoadVerification, duration: float, log: Path
+    ) -> dict[str, object]:
+        """Measure for `duration` seconds, and end the simulator.
+
+        Returns:
+            Counts, errors, latencies, and what the nodes use of the machine.
+        """
+        from .usage import Usage
+
+        spin = self._observer.spin
+        spin(self._made_s + DISCOVERY_S - time.monotonic())
+        start_ns, usage = time.time_ns(), Usage(self._children, MEASURED_NODES)
+        spin(duration)
+        self._check_alone()
+        cpu, memory = usage.cpu_percent(), usage.memory_mb()
+        end_ns = start_ns + round(duration * 1e9)
+
+        # On a busy machine the simulator takes its samples late; its log must cover the span.
+        spin(MAX_LATE_S, lambda: verification.is_beyond(end_ns))
+        verification.compare(end_simulator(self._children, log), start_ns, end_ns)
+        spin(MAX_LATE_S, verification.is_complete)
+        self._check_alone()
+        return {
+            **verification.result(),
+            "crc_errors": sum(self._crc_errors.values()),
+            **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
+            **{f"rss_{name}_mb": round(value, 1) for name, value in memory.items()},
+        }
+
+    def _check_alone(self) -> None:
+        """Raise CubeError if another skin publishes here: its tensors would be counted."""
+        if self._sees_other_skin or self._observer.node.count_publishers("stress") > 1:
+            raise CubeError(
+                f"another skin publishes stress in DDS domain {os.environ.get('ROS_DOMAIN_ID', 0)}:"
+                " end it, or set another ROS_DOMAIN_ID for this one"
+            )
+
+    def _on_stress(self, data: bytes) -> None:
+        received_ns = time.time_ns()
+        try:
+            rows = stress_codec.decode(data).rows
+        except MessageError as error:
+            self._observer.log_error(str(error))
+            return
+        if int(rows.cube.max(initial=0)) >= self._n_cubes:
+            self._sees_other_skin = True
+            return
+        if self._verification is not None:
+            self._verification.add_stress(rows, received_ns)
+        self._table.update(rows)
+
+    def _on_frequencies(self, data: bytes) -> None:
+        if self._verification is not None:
+            self._verification.add_frequencies(frequency_codec.decode(data).rows)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            for pair in status.values:
+                if pair.key == "crc":
+                    self._crc_errors[status.name] = int(pair.value)
