@@ -9,7 +9,7 @@ import errno
 from collections.abc import Callable, Sequence
 
 from ...core.errors import LinkError
-from ..wire.decoder import NativeDecoder, unpacked
+from ..wire.decoder import NativeDecoder, unpack_all
 from ..wire.native import wire
 from ..wire.protocol import Frame
 from .link import Link
@@ -34,7 +34,7 @@ def take_in(links: Sequence[Link], clock_ns: Callable[[], int]) -> tuple[int, li
     taken: list[Intake] = []
     for link, (count, raws) in zip(links, results, strict=True):
         if count > 0:
-            taken.append(unpacked(raws))
+            taken.append(unpack_all(raws))
         else:
             taken.append(None if count == -errno.EAGAIN else link.read_error(-count))
     return arrival_ns, taken

@@ -1,49 +1,51 @@
-"""Consistent overhead byte stuffing: bytes without zeros, so that a zero can end a frame.
+"""Consistent overhead byte stuffing (COBS): removes zero bytes, so that a zero can end a frame.
 
+Each zero of the data ends a block. A block is encoded as its length plus one, then its bytes
+without the zero. Blocks longer than 254 bytes are split, and the last block has no zero. Source:
 Cheshire, Baker, "Consistent overhead byte stuffing", IEEE/ACM Transactions on Networking 7 (1999).
-Each zero of the data ends a block. A block is coded as its length plus one and its bytes; its zero
-is left out. Blocks longer than 254 bytes are cut, and the last one has no zero.
 """
 
 from __future__ import annotations
 
 from .native import wire
 
-FULL = 254
-"""Bytes of the longest block. Its code, 255, says that no zero follows."""
+MAX_BLOCK = 254
+"""Length of the longest block, in bytes. Its code, 255, means that no zero follows."""
 
 
 def encode_in_python(data: bytes) -> bytes:
-    """The code of any bytes."""
+    """Return the COBS encoding of any bytes."""
     code = bytearray()
     block = b""
     for block in data.split(b"\0"):
-        while len(block) >= FULL:
-            code += b"\xff" + block[:FULL]
-            block = block[FULL:]
+        while len(block) >= MAX_BLOCK:
+            code += b"\xff" + block[:MAX_BLOCK]
+            block = block[MAX_BLOCK:]
         code.append(len(block) + 1)
         code += block
+
     if data and data[-1] and not block:
-        # The data end with a full block: it needs no empty one behind it.
+        # The data end with a full block, which needs no empty block after it.
         del code[-1]
     return bytes(code)
 
 
 def decode_in_python(code: bytes) -> bytes | None:
-    """The bytes of a code; None if it is none."""
+    """Return the bytes that a COBS encoding stands for; None if it is not valid."""
     if b"\0" in code:
         return None
     blocks: list[bytes] = []
-    at = 0
-    while at < len(code):
-        length = code[at]
-        end = at + length
+    start = 0
+    while start < len(code):
+        length = code[start]
+        end = start + length
         if end > len(code):
             return None
-        blocks.append(code[at + 1 : end])
-        if length <= FULL and end < len(code):
+        blocks.append(code[start + 1 : end])
+        # The zero that ends a block is implied, except after a full block and after the last one.
+        if length <= MAX_BLOCK and end < len(code):
             blocks.append(b"\0")
-        at = end
+        start = end
     return b"".join(blocks)
 
 

@@ -1,8 +1,9 @@
-"""From the bytes of a link to frames, whatever the bytes are.
+"""Decoding of the bytes of a link to frames, whatever the bytes are.
 
-`Decoder.feed` never raises. Each non-empty run of bytes that a zero closes becomes one frame, or is
-counted in exactly one counter of `Counters`. `PythonDecoder` is for reading and for where nothing
-was compiled; `Decoder` is the one in C where there is one. Both give the same.
+Each non-empty run of bytes between two zeros becomes one frame, or is counted in exactly one
+counter of `Counters`. `PythonDecoder` is the readable implementation and the fallback where no
+compiler was present; `Decoder` is the implementation in C where it was compiled. Both give the same
+result.
 """
 
 from __future__ import annotations
@@ -15,37 +16,49 @@ from .native import SLOWER, wire
 from .protocol import HEADER, MAX_FRAME, OVERHEAD, REQUEST, UNPACK, VERSION, Frame
 
 MAX_RUN = MAX_FRAME + (MAX_FRAME + 253) // 254
-"""Longest run of bytes between two zeros that can be a frame. COBS adds one byte to each 254."""
+"""Length of the longest run of bytes that can be a frame. COBS adds one byte to each 254."""
 MIN_RUN = OVERHEAD + REQUEST.size + 1
-"""Shortest run that can be a frame of any version."""
-# The CRC-32 of data followed by its own CRC is this constant, so the CRC need not be cut off.
+"""Length of the shortest run of bytes that can be a frame of any protocol version."""
 _CRC_RESIDUE = 0x2144DF1C
+"""CRC-32 of any data followed by its own CRC-32. So the CRC need not be cut off for the check."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """What became of the bytes fed to a `Decoder`: how many bytes, frames, and runs that are no
-    frame."""
+    """Numbers of bytes, frames and invalid runs that a decoder has received.
+
+    Attributes:
+        bytes: Bytes.
+        frames: Valid frames.
+        crc: Runs with a wrong checksum.
+        framing: Runs that are not COBS, or were cut off by the end of the stream.
+        length: Runs that are too short for a frame, or whose length does not fit their contents.
+        version: Runs of another protocol version with a right checksum.
+        unknown_type: Runs with a right checksum and a type that version 1 does not have.
+        overrun: Runs longer than any frame, which were discarded up to the next zero.
+    """
 
     bytes: int = 0
     frames: int = 0
-    crc: int = 0  # checksum wrong
-    framing: int = 0  # not COBS, or cut off by the end of the stream
-    length: int = 0  # too short for a frame, or the length does not fit the contents
-    version: int = 0  # checksum right, but another protocol version: see Decoder.other_version
-    unknown_type: int = 0  # checksum right, but a type that version 1 does not have
-    overrun: int = 0  # longer than any frame can be; thrown away up to the next zero
+    crc: int = 0
+    framing: int = 0
+    length: int = 0
+    version: int = 0
+    unknown_type: int = 0
+    overrun: int = 0
 
     def as_dict(self) -> dict[str, int]:
+        """Return the counters by name."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
 class PythonDecoder:
-    """Bytes in, frames out. Keeps at most MAX_RUN bytes between calls.
+    """Decodes the bytes of one link; keeps at most `MAX_RUN` bytes between two calls.
 
-    counters: `Counters` of all bytes since the decoder was made.
-    other_version: the last version other than ours in a frame with a right checksum; None if there
-    was none.
+    Attributes:
+        counters: Numbers of bytes, frames and invalid runs since the decoder was made.
+        other_version: Protocol version of the last frame that had a right checksum and another
+            version than ours; None if there was no such frame.
     """
 
     def __init__(self) -> None:
@@ -55,7 +68,7 @@ class PythonDecoder:
         self._discarding = False
 
     def feed(self, data: bytes | bytearray) -> list[Frame]:
-        """The frames that `data` completes, in order. Never raises, whatever the bytes are."""
+        """Return the frames that `data` completes, in order. Never raises, whatever the bytes."""
         self.counters.bytes += len(data)
         *runs, rest = bytes(data).split(b"\0")
         frames: list[Frame] = []
@@ -67,6 +80,7 @@ class PythonDecoder:
             frame = self._decode(run)
             if frame is not None:
                 frames.append(frame)
+
         if not self._discarding:
             self._tail += rest
             if len(self._tail) > MAX_RUN:
@@ -76,13 +90,13 @@ class PythonDecoder:
         return frames
 
     def reset(self) -> None:
-        """The stream ended: the bytes of an unfinished frame are thrown away, and count as
-        framing."""
+        """Discard an unfinished frame, because the stream ended; it counts as `framing`."""
         self.counters.framing += bool(self._tail)
         self._tail.clear()
         self._discarding = False
 
     def _decode(self, run: bytes) -> Frame | None:
+        """Return the frame of one run, or count it as invalid and return None."""
         counters = self.counters
         if len(run) < MIN_RUN:
             counters.length += len(run) > 0
@@ -115,34 +129,43 @@ class PythonDecoder:
 
 
 class NativeDecoder:
-    """The same in C, where it was compiled; see `PythonDecoder`."""
+    """Decodes the bytes of one link in C; see `PythonDecoder`.
+
+    Attributes:
+        wire: The decoder of the C module, for reading several links in one call.
+
+    Raises:
+        RuntimeError: The C module was not compiled.
+    """
 
     def __init__(self) -> None:
-        """RuntimeError: it was not compiled."""
         if wire is None:
             raise RuntimeError(SLOWER)
         self.wire = wire.Decoder()
 
     @property
     def counters(self) -> Counters:
+        """Numbers of bytes, frames and invalid runs since the decoder was made."""
         return Counters(*self.wire.counters())
 
     @property
     def other_version(self) -> int | None:
+        """Protocol version of the last valid frame of another version; None without one."""
         return self.wire.other_version()
 
     def feed(self, data: bytes | bytearray) -> list[Frame]:
-        return unpacked(self.wire.feed(data))
+        """Return the frames that `data` completes, in order."""
+        return unpack_all(self.wire.feed(data))
 
     def reset(self) -> None:
+        """Discard an unfinished frame, because the stream ended."""
         self.wire.reset()
 
 
-def unpacked(raws: list[bytes]) -> list[Frame]:
-    """The frames of what the decoder in C gives, which has looked at their lengths."""
-    return [
-        frame for raw in raws if (frame := UNPACK[raw[0]](raw, len(raw) - OVERHEAD)) is not None
-    ]
+def unpack_all(raws: list[bytes]) -> list[Frame]:
+    """Return the frames of the bytes that the decoder in C gives and has checked."""
+    unpacked = (UNPACK[raw[0]](raw, len(raw) - OVERHEAD) for raw in raws)
+    return [frame for frame in unpacked if frame is not None]
 
 
 Decoder = PythonDecoder if wire is None else NativeDecoder

@@ -1,4 +1,7 @@
-"""Whether the wire was compiled (native/). Without it everything works in Python, and slower."""
+"""The wire module in C (native/), if it was compiled.
+
+Without it everything works in Python, more slowly.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,10 @@ try:
 except ImportError:
     wire = None  # type: ignore[assignment]
 
+__all__ = ["SLOWER", "wire"]
+
 SLOWER = (
     "the wire is decoded in Python, which is slower, because no C compiler was there at the "
     "installation: install one (sudo apt install gcc python3-dev) and install again"
 )
+"""Warning to log when `wire` is None."""

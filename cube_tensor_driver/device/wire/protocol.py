@@ -1,13 +1,13 @@
-"""Wire protocol, version 1: the frames and their bytes, without any I/O.
+"""The frames of wire protocol version 1 and their bytes, without input or output.
 
-A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian. `length` is that of the
-payload, `crc` the CRC-32 of IEEE 802.3 of all bytes before it. On the wire a frame is COBS-encoded,
-between two zero bytes. docs/protocol.md has the fields and an annotated hex dump of each frame
+A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian, where `length` is that
+of the payload and `crc` is the IEEE 802.3 CRC-32 of all bytes before it. On the wire a frame is
+COBS-encoded between two zero bytes. docs/protocol.md has the fields and an annotated dump of each
 type. The driver and the simulated hubs share this file.
 
-`encode` makes bytes of a frame, or raises `ProtocolError`. Arrays must have the dtype that the
-frame's docstring names; nothing is converted. decoder.py makes frames of bytes. The arrays of
-decoded frames are read-only, and made when they are first asked for.
+`encode` turns a frame into bytes; `decoder.py` does the reverse. Arrays must have the dtype that
+the docstring of the frame names, because nothing is converted. The arrays of decoded frames are
+read-only and are made when they are first used.
 """
 
 from __future__ import annotations
@@ -27,54 +27,66 @@ from ...core.errors import ProtocolError
 from . import cobs
 
 VERSION = 1
+"""Protocol version of the frames that are sent and accepted."""
 MAX_PAYLOAD = 0xFFFF
+"""Largest payload of a frame, in bytes."""
 MAX_FRAME = 4 + MAX_PAYLOAD + 4
-
+"""Length of the longest frame, in bytes, with header and CRC and before COBS."""
 TEMPERATURE_UNKNOWN = -32768
+"""Value of `Sample.temperature` where the hub does not know the temperature."""
 NOT_MEASURED = 0
+"""Value of `Sample.frequency` where the hub did not measure a pad."""
 
 HEADER = struct.Struct("<BBH")
+"""Type, version and length of a frame."""
+REQUEST = struct.Struct("<BI")
+"""Payload of a REQUEST."""
+OVERHEAD = HEADER.size + 4
+"""Bytes of a frame beside its payload: header and CRC."""
 _HELLO = struct.Struct("<QIHBBI")
 _SAMPLE = struct.Struct("<IHHQB3x")
 _STATS = struct.Struct("<QIIH")
-REQUEST = struct.Struct("<BI")
 _ACK = struct.Struct("<BBI")
 _TIME = struct.Struct("<IQ")
-_U16, _U32, _U64, _I16 = (np.dtype(code) for code in ("<u2", "<u4", "<u8", "<i2"))
-_Arrays = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.int16]]
-OVERHEAD = HEADER.size + 4
 _FREQUENCY = HEADER.size + _SAMPLE.size
+"""Position of the frequencies in a decoded SAMPLE."""
+_U32 = np.dtype("<u4")
+_U64 = np.dtype("<u8")
+_I16 = np.dtype("<i2")
+_Arrays = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.int16]]
+"""Frequencies, pad faults and temperatures."""
 
 
 class Command(IntEnum):
-    """What a REQUEST asks for; the comment says what its argument is."""
+    """What a `Request` asks for; each comment says what its argument is."""
 
     HELLO = 1  # 0
     START = 2  # 0
     STOP = 3  # 0
     SET_PERIOD = 4  # sample period, µs
-    IDENTIFY = 5  # how long the hub shows itself, s
-    TIME = 6  # a number, which the answer repeats; the answer is a `Time`
+    IDENTIFY = 5  # duration for which the hub shows itself, s
+    TIME = 6  # any number, which the answer repeats; the answer is a `Time`
 
 
 class Result(IntEnum):
-    """What an ACK answers."""
+    """What an `Ack` answers."""
 
     DONE = 0
     UNKNOWN = 1  # the hub does not know the request
-    REFUSED = 2  # the hub cannot do it; the ACK's argument is the value in force
+    REFUSED = 2  # the hub cannot do it; the argument of the ACK is the value in force
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hello:
-    """Who the hub is. Sent at power-up, on request, and once a second.
+    """Identification of a hub, sent at power-up, on request, and once a second.
 
-    hub_uid: u64
-    firmware: u32
-    n_pads: per cube, u8
-    period_us: sample period in force, µs, u32
-    cube_uids: (n_cubes,) uint64
-    flags: u8, 0 in version 1
+    Attributes:
+        hub_uid: Unique number of the hub, u64.
+        firmware: Version of its firmware, u32.
+        n_pads: Number of pads of each cube, u8.
+        period_us: Sample period in force, in µs, u32.
+        cube_uids: Unique numbers of the cubes (n_cubes,) uint64.
+        flags: 0 in version 1, u8.
     """
 
     hub_uid: int
@@ -86,16 +98,13 @@ class Hello:
 
     @property
     def n_cubes(self) -> int:
+        """Number of cubes of the hub."""
         return len(self.cube_uids)
 
     def _pack(self) -> bytes:
-        uids = _array("cube_uids", self.cube_uids, _U64, (len(self.cube_uids),))
-        return (
-            _HELLO.pack(
-                self.hub_uid, self.firmware, len(uids), self.n_pads, self.flags, self.period_us
-            )
-            + uids.tobytes()
-        )
+        uids = _check_array("cube_uids", self.cube_uids, _U64, (len(self.cube_uids),))
+        numbers = self.n_pads, self.flags, self.period_us
+        return _HELLO.pack(self.hub_uid, self.firmware, len(uids), *numbers) + uids.tobytes()
 
     @classmethod
     def _unpack(cls, raw: bytes, size: int) -> Hello | None:
@@ -109,16 +118,15 @@ class Hello:
 
 
 class Sample:
-    """One reading of n_cubes cubes of a hub, first_cube and those after it, at the same instant.
+    """One measurement of all pads of successive cubes of a hub, at the same instant.
 
-    sequence: u32, wraps; given when the sample is taken, so one dropped in the hub leaves a gap
-    first_cube: index on the hub, u16
-    device_us: hub clock, µs, u64
-    shape: (n_cubes, n_pads)
-    frequency: (n_cubes, n_pads) uint32, mHz; 0 not measured
-    pad_fault: (n_cubes,) uint32; bit p: the hub reports that pad p is faulty
-    temperature: (n_cubes,) int16, 0.01 °C; -32768 unknown
-    raw: the decoded bytes, from type to CRC; empty if the sample was not decoded
+    Attributes:
+        sequence: Number of the sample, u32, which wraps. The hub counts when it samples, so a
+            sample that it drops leaves a gap.
+        first_cube: Index of the first cube on the hub, u16.
+        device_us: Device time of the measurement, in µs, u64.
+        shape: (n_cubes, n_pads).
+        raw: Decoded bytes from type to CRC; empty if the sample was not decoded.
     """
 
     __slots__ = ("_arrays", "device_us", "first_cube", "raw", "sequence", "shape")
@@ -133,7 +141,7 @@ class Sample:
         temperature: NDArray[np.int16],
     ) -> None:
         self.sequence, self.first_cube, self.device_us = sequence, first_cube, device_us
-        self.shape = frequency.shape
+        self.shape: tuple[int, int] = frequency.shape
         self._arrays: _Arrays | None = (frequency, pad_fault, temperature)
         self.raw = b""
 
@@ -143,31 +151,36 @@ class Sample:
 
     @property
     def n_cubes(self) -> int:
+        """Number of cubes in the sample."""
         return self.shape[0]
 
     @property
     def n_pads(self) -> int:
+        """Number of pads of each cube."""
         return self.shape[1]
 
     @property
     def frequency(self) -> NDArray[np.uint32]:
-        return self._made_arrays()[0]
+        """Frequencies (n_cubes, n_pads) in mHz; 0 where a pad was not measured."""
+        return self._make_arrays()[0]
 
     @property
     def pad_fault(self) -> NDArray[np.uint32]:
-        return self._made_arrays()[1]
+        """Pad faults (n_cubes,); bit p is set if the hub reports that pad p is faulty."""
+        return self._make_arrays()[1]
 
     @property
     def temperature(self) -> NDArray[np.int16]:
-        return self._made_arrays()[2]
+        """Temperatures (n_cubes,) in 0.01 °C; -32768 where unknown."""
+        return self._make_arrays()[2]
 
     @property
     def spare(self) -> bytes:
-        """The spare bytes as they came, which hubs send as 0."""
+        """The spare bytes as they were received, which hubs send as 0."""
         return self.raw[_FREQUENCY - 3 : _FREQUENCY] or bytes(3)
 
-    def _made_arrays(self) -> _Arrays:
-        # Made late, because `join` makes the arrays of several samples at once.
+    def _make_arrays(self) -> _Arrays:
+        # The arrays are made late, because `join` makes those of several samples at once.
         if self._arrays is None:
             self._arrays = join([self])
         return self._arrays
@@ -178,9 +191,9 @@ class Sample:
                 f"frequency has {len(self.shape)} dimensions, must have 2: (n_cubes, n_pads)"
             )
         n_cubes, n_pads = self.shape
-        frequency = _array("frequency", self.frequency, _U32, (n_cubes, n_pads))
-        pad_fault = _array("pad_fault", self.pad_fault, _U32, (n_cubes,))
-        temperature = _array("temperature", self.temperature, _I16, (n_cubes,))
+        frequency = _check_array("frequency", self.frequency, _U32, (n_cubes, n_pads))
+        pad_fault = _check_array("pad_fault", self.pad_fault, _U32, (n_cubes,))
+        temperature = _check_array("temperature", self.temperature, _I16, (n_cubes,))
         head = _SAMPLE.pack(self.sequence, self.first_cube, n_cubes, self.device_us, n_pads)
         return b"".join((head, frequency.tobytes(), pad_fault.tobytes(), temperature.tobytes()))
 
@@ -188,54 +201,56 @@ class Sample:
     def _unpack(cls, raw: bytes, size: int) -> Sample | None:
         if size < _SAMPLE.size:
             return None
-        sample = cls.__new__(cls)
-        sample.sequence, sample.first_cube, n_cubes, sample.device_us, n_pads = _SAMPLE.unpack_from(
-            raw, 4
-        )
+        sequence, first_cube, n_cubes, device_us, n_pads = _SAMPLE.unpack_from(raw, HEADER.size)
         if size != _SAMPLE.size + n_cubes * (4 * n_pads + 6):
             return None
+        sample = cls.__new__(cls)
+        sample.sequence, sample.first_cube, sample.device_us = sequence, first_cube, device_us
         sample.shape = n_cubes, n_pads
         sample.raw, sample._arrays = raw, None
         return sample
 
 
 @lru_cache(maxsize=64)
-def _fields(n_cubes: int, n_pads: int) -> struct.Struct:
-    """Splits a decoded SAMPLE into the bytes of its frequencies, faults and temperatures."""
-    return struct.Struct(f"{_FREQUENCY}x{4 * n_cubes * n_pads}s{4 * n_cubes}s{2 * n_cubes}s4x")
+def _split_fields(n_cubes: int, n_pads: int) -> struct.Struct:
+    """Return what splits a decoded SAMPLE into frequencies, faults and temperatures."""
+    sizes = 4 * n_cubes * n_pads, 4 * n_cubes, 2 * n_cubes
+    fields = "".join(f"{size}s" for size in sizes)
+    return struct.Struct(f"{_FREQUENCY}x{fields}4x")
 
 
 def join(samples: Sequence[Sample]) -> _Arrays:
-    """frequency (N, P), pad_fault (N,) and temperature (N,) of samples with P pads, one after the
-    other.
+    """Return the arrays of samples with the same number of pads, one after the other.
 
     The bytes of all decoded samples become arrays at once, which are read-only.
+
+    Returns:
+        Frequencies (N, n_pads), pad faults (N,) and temperatures (N,).
     """
-    width = samples[0].n_pads
+    if not all(sample.raw for sample in samples):
+        arrays = [sample._make_arrays() for sample in samples]
+        frequency, pad_fault, temperature = zip(*arrays, strict=True)
+        return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
+
     parts: list[bytes] = []
     for sample in samples:
-        if not sample.raw:
-            frequency, pad_fault, temperature = zip(
-                *(sample._made_arrays() for sample in samples), strict=True
-            )
-            return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
-        parts += _fields(*sample.shape).unpack(sample.raw)
-    return (
-        np.frombuffer(b"".join(parts[::3]), _U32).reshape(
-            sum(sample.n_cubes for sample in samples), width
-        ),
-        np.frombuffer(b"".join(parts[1::3]), _U32),
-        np.frombuffer(b"".join(parts[2::3]), _I16),
-    )
+        parts += _split_fields(*sample.shape).unpack(sample.raw)
+    n_rows = sum(sample.n_cubes for sample in samples)
+    values = np.frombuffer(b"".join(parts[::3]), _U32)
+    pad_faults = np.frombuffer(b"".join(parts[1::3]), _U32)
+    temperatures = np.frombuffer(b"".join(parts[2::3]), _I16)
+    return values.reshape(n_rows, samples[0].n_pads), pad_faults, temperatures
 
 
 @dataclass(frozen=True, slots=True)
 class Stats:
-    """What the hub has counted.
+    """Counters of a hub.
 
-    uptime_ms: since power-up, u64
-    taken, dropped: samples taken, and dropped in the hub, since power-up; u32, wrap
-    supply_mv: mV, u16; 0 unknown
+    Attributes:
+        uptime_ms: Time since power-up, in ms, u64.
+        taken: Samples taken since power-up, u32, which wraps.
+        dropped: Samples dropped in the hub since power-up, u32, which wraps.
+        supply_mv: Supply voltage, in mV, u16; 0 if unknown.
     """
 
     uptime_ms: int
@@ -253,10 +268,11 @@ class Stats:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """From host to hub.
+    """Request of the host to a hub.
 
-    request: a `Command`, u8; to other numbers the hub answers UNKNOWN
-    argument: u32
+    Attributes:
+        request: A `Command`, u8. To other numbers the hub answers UNKNOWN.
+        argument: Argument of the command, u32.
     """
 
     request: int
@@ -272,11 +288,12 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """From hub to host, one for each REQUEST but TIME.
+    """Answer of a hub to a request other than TIME.
 
-    request: the one answered, u8
-    result: a `Result`, u8
-    argument: the value now in force, u32
+    Attributes:
+        request: The `Command` that is answered, u8.
+        result: A `Result`, u8.
+        argument: The value that is now in force, u32.
     """
 
     request: int
@@ -293,10 +310,12 @@ class Ack:
 
 @dataclass(frozen=True, slots=True)
 class Time:
-    """From hub to host: the answer to request TIME, in place of an `Ack`.
+    """Answer of a hub to the request TIME, in place of an `Ack`.
 
-    number: the argument of the request, u32
-    device_us: hub clock between the end of the request and the beginning of the answer, µs, u64
+    Attributes:
+        number: The argument of the request, u32.
+        device_us: Device time between the end of the request and the beginning of the answer, in
+            µs, u64.
     """
 
     number: int
@@ -324,22 +343,29 @@ _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
 UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
     code: frame_type._unpack for code, frame_type in _TYPES.items()
 }
+"""For each type code the function that turns the bytes of a frame and the length of its payload
+into the frame, or into None if they do not fit."""
 
 
 def sample_bytes(n_cubes: int, n_pads: int) -> int:
-    """How many bytes one SAMPLE of all cubes of a hub takes on the wire, in one frame."""
+    """Return the length on the wire, in bytes, of one SAMPLE of all cubes of a hub in one frame."""
     frame = _FREQUENCY + n_cubes * (4 * n_pads + 4 + 2) + 4
     # COBS adds one byte in 254, and each frame lies between two zeros.
     return frame + 1 + frame // 254 + 2
 
 
 def encode(frame: Frame, version: int = VERSION) -> bytes:
-    """Bytes of one frame: a zero, the COBS code of header, payload and CRC-32, a zero.
+    """Return the bytes of one frame on the wire: a zero, the COBS-encoded frame, and a zero.
 
-    The leading zero ends any unfinished frame before it, which would otherwise swallow this one.
-    version: another one than ours, for tests of the other end.
-    ProtocolError: a field out of its range, an array of the wrong dtype or shape, a payload of over
-    65535 bytes.
+    The first zero ends an unfinished frame before it, which would otherwise absorb this one.
+
+    Args:
+        frame: The frame.
+        version: Protocol version; another than ours is for tests of the other end.
+
+    Raises:
+        ProtocolError: A field is out of its range, an array has the wrong dtype or shape, or the
+            payload is longer than 65535 bytes.
     """
     code = _CODES.get(type(frame))
     if code is None:
@@ -361,7 +387,10 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
     return b"\0" + code_words + b"\0"
 
 
-def _array(name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def _check_array(
+    name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> NDArray[Any]:
+    """Return a field that is an array of this dtype and shape; raise ProtocolError otherwise."""
     if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape:
         return value
     actual = type(value).__name__
