@@ -20,7 +20,7 @@ from ..core.status import STAMP
 from .clock.hub_clock import HubClock
 from .clock.steps import HostClockWatch
 from .links.link import Link, LinkConfig, LinkState
-from .links.link_log import LinkLog, Log
+from .links.link_log import LinkLogger, Log
 from .links.reader import LinkFrames, Reader
 from .scans.cube_table import CubeAddress
 from .scans.row_account import RowAccount, RowCounts
@@ -121,7 +121,7 @@ class LiveLinks:
         self._log: Log = log or logging.getLogger(__name__)
         if wire is None:
             self._log.warning(SLOWER)
-        self._link_logs = [LinkLog(config.name, self._log) for config in self._configs]
+        self._link_logs = [LinkLogger(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
         # Reports look at accounts and clocks while the reader's thread does not change them.
         self._taking = threading.Lock()
@@ -314,7 +314,7 @@ class LiveLinks:
         """Whether a simulator has yet to make the port of a link."""
         return self._configs[link].is_simulated and not self._records[link].was_open
 
-    def _report(self, link: Link, record: _LinkRecord, log: LinkLog) -> LinkReport:
+    def _report(self, link: Link, record: _LinkRecord, log: LinkLogger) -> LinkReport:
         notes = [*record.problems, *record.contradictions]
         if link.error is not None:
             notes.insert(0, str(link.error))
@@ -354,7 +354,7 @@ def _period_us(rate: float | None) -> int | None:
     return None if rate is None else round(1e6 / rate)
 
 
-def _values(link: Link, record: _LinkRecord, log: LinkLog) -> dict[str, object]:
+def _values(link: Link, record: _LinkRecord, log: LinkLogger) -> dict[str, object]:
     clock = record.clock
     bound_ns = clock.bound_ns
     values: dict[str, object] = {

@@ -19,7 +19,13 @@ import serial
 
 from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device.links import tcp
-from cube_tensor_driver.device.links.link import OUT_LIMIT, READ_CHUNK, Link, LinkConfig, open_error
+from cube_tensor_driver.device.links.link import (
+    MAX_UNSENT,
+    READ_CHUNK,
+    Link,
+    LinkConfig,
+    explain_open_error,
+)
 
 WAIT_S = 5.0
 
@@ -139,7 +145,7 @@ def test_read_takes_much_but_lets_others_in(server: socket.socket) -> None:
 def test_output_is_bounded(server: socket.socket) -> None:
     link = opened(Link(LinkConfig("a", url(server))))
     peer, _ = server.accept()  # and never read
-    with peer, pytest.raises(LinkError, match=rf"limit {OUT_LIMIT}") as full:
+    with peer, pytest.raises(LinkError, match=rf"limit {MAX_UNSENT}") as full:
         for _ in range(1_000_000):
             link.write(b"x" * 1000)
     assert full.value.kind == "overflow"
@@ -260,7 +266,7 @@ def test_no_permission(pty: tuple[int, str]) -> None:
     ],
 )
 def test_classified_by_errno(code: int, kind: str, words: str) -> None:
-    error = open_error("/dev/ttyX", serial.SerialException(code, "could not open port"))
+    error = explain_open_error("/dev/ttyX", serial.SerialException(code, "could not open port"))
     assert error.kind == kind
     assert words in str(error)
     assert "/dev/ttyX" in str(error)
@@ -274,7 +280,7 @@ def test_classified_through_termios() -> None:
         except termios.error as inner:
             raise serial.SerialException(f"Could not configure port: {inner}")  # noqa: B904  (as pyserial does)
     except serial.SerialException as error:
-        assert open_error("x", error).kind == "not_serial"
+        assert explain_open_error("x", error).kind == "not_serial"
 
 
 @pytest.mark.parametrize("function", ["tcsetattr", "tcflush"])
@@ -344,11 +350,11 @@ def test_tcp_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_pauses_double_up_to_the_limit() -> None:
     usb = Link(LinkConfig("a", "/dev/x"))
-    assert [usb.next_pause() for _ in range(7)] == [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0]
+    assert [usb.increase_pause() for _ in range(7)] == [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0]
     usb.reset_pause()
-    assert usb.next_pause() == 0.25
+    assert usb.increase_pause() == 0.25
     tcp_link = Link(LinkConfig("a", "socket://127.0.0.1:1"))
-    assert [tcp_link.next_pause() for _ in range(5)] == [0.25, 0.5, 1.0, 1.5, 1.5]
+    assert [tcp_link.increase_pause() for _ in range(5)] == [0.25, 0.5, 1.0, 1.5, 1.5]
 
 
 def test_pattern_tries_the_matches_in_turn(tmp_path: Path, pty: tuple[int, str]) -> None:
@@ -359,7 +365,7 @@ def test_pattern_tries_the_matches_in_turn(tmp_path: Path, pty: tuple[int, str])
     link.close()
     other_master, other_slave = os.openpty()
     (tmp_path / "hub2").symlink_to(os.ttyname(other_slave))
-    link.next_candidate()
+    link.skip_match()
     assert opened(link).path == str(tmp_path / "hub2")
     link.close()
     os.close(other_master)
@@ -369,14 +375,14 @@ def test_pattern_tries_the_matches_in_turn(tmp_path: Path, pty: tuple[int, str])
 def test_fingerprint_changes_with_the_port(tmp_path: Path, pty: tuple[int, str]) -> None:
     port = tmp_path / "hub"
     link = Link(LinkConfig("a", str(port)))
-    gone = link.fingerprint()
+    gone = link.identify_ports()
     port.symlink_to(pty[1])
-    there = link.fingerprint()
+    there = link.identify_ports()
     assert there != gone
     Path(pty[1]).chmod(Path(pty[1]).stat().st_mode ^ 0o004)
-    assert link.fingerprint() != there
+    assert link.identify_ports() != there
     port.unlink()
-    assert link.fingerprint() == gone
+    assert link.identify_ports() == gone
 
 
 def test_no_file_is_left_open(pty: tuple[int, str]) -> None:

@@ -244,7 +244,7 @@ def test_who_comes_first_waits_for_those_that_deliver(
 ) -> None:
     """At most for a part of the sample period: 0.2 ms of the short one, 0.2 s of the long
     one."""
-    monkeypatch.setattr(reader_module, "GATHER_S", 5.0)
+    monkeypatch.setattr(reader_module, "MAX_WAIT_S", 5.0)
     later = PtyHub()
     watch = start(LinkConfig("a", hub.port), LinkConfig("b", later.port))
     hub.greet(period_us=period_us)
@@ -340,7 +340,7 @@ def test_return_after_a_long_absence_resets_the_pause(
     start: Start, tmp_path: Path, monkeypatch
 ) -> None:
     """The pause has grown to its limit; the port's return ends it."""
-    monkeypatch.setattr("cube_tensor_driver.device.links.link.BACKOFF_S", (60.0, 60.0))
+    monkeypatch.setattr("cube_tensor_driver.device.links.link.MIN_PAUSE_S", 60.0)
     port = tmp_path / "hub"
     watch = start(LinkConfig("a", str(port)))
     watch.state(LinkState.WAITING, "no_port")
@@ -456,10 +456,10 @@ def test_answer_of_the_hub_resets_the_pause(start: Start, hub: PtyHub) -> None:
     watch = start(LinkConfig("a", hub.port))
     watch.state(LinkState.OPEN)
     for _ in range(5):
-        watch.reader.links[0].next_pause()
+        watch.reader.links[0].increase_pause()
     hub.greet()
     watch.frame(Hello)
-    assert watch.reader.links[0].next_pause() == 0.25
+    assert watch.reader.links[0].increase_pause() == 0.25
 
 
 def test_slow_samples_are_not_silence(start: Start, hub: PtyHub) -> None:
@@ -749,7 +749,7 @@ def test_a_thread_that_ends_unasked_says_why_and_lets_go_of_the_ports(
     def fail(*arguments: object) -> None:
         raise broken
 
-    monkeypatch.setattr(reader_module, "take_in", fail)
+    monkeypatch.setattr(reader_module, "read_links", fail)
     reader.start()
     hub.expect(Command.HELLO)
     assert reader.failure is None

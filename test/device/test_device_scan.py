@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.links.link import LinkConfig
-from cube_tensor_driver.device.links.link_log import LinkLog
+from cube_tensor_driver.device.links.link_log import LinkLogger
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
 from cube_tensor_driver.device.scans.row_account import RowCounts
@@ -338,7 +338,7 @@ def test_a_hub_that_is_ever_another_one_does_not_fill_the_log():
 def test_lines_that_were_left_out_are_counted_and_told():
     now = [0.0]
     log = LinesLog()
-    link_log = LinkLog("a", log, lambda: now[0])
+    link_log = LinkLogger("a", log, lambda: now[0])
     for number in range(50):
         link_log.error(str(number))
     assert len(log.lines) == 20 and link_log.left_out == 30

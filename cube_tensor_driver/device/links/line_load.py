@@ -1,4 +1,4 @@
-"""Whether the serial line of a link can carry what its cubes send."""
+"""Check whether the serial line of a link can carry what its cubes send."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from ...config.skin import Skin
 from ..wire.protocol import sample_bytes
 
 BITS_PER_BYTE = 10
-"""On the line: a start bit, eight data bits, a stop bit."""
-WITHOUT_BAUD = (TCP, "/dev/ttyACM")
-"""What ports begin with that have no baud rate: TCP, and USB devices that are no serial adapter."""
+"""Bits on the line for each byte: a start bit, eight data bits, a stop bit."""
+PORTS_WITHOUT_BAUD = (TCP, "/dev/ttyACM")
+"""First characters of ports that have no baud rate: TCP, and USB devices that are no adapters."""
 
 
 def line_doubts(skin: Skin) -> Iterator[str]:
-    """One line for each link whose cubes send more at the skin's rate than its baud rate allows.
+    """Yield one line for each link whose cubes send more than its baud rate allows.
 
-    Nothing is said of a skin that leaves the rate to the hubs.
+    A skin that leaves the rate to its hubs cannot be checked.
     """
     if skin.rate is None:
         return
     for link in skin.links:
         cubes = [cube for cube in skin.cubes if cube.link == link.name]
-        if not cubes or link.port.startswith(WITHOUT_BAUD):
+        if not cubes or link.port.startswith(PORTS_WITHOUT_BAUD):
             continue
         wanted = sample_bytes(len(cubes), cubes[0].calibration.layout.n_pads) * skin.rate
         carried = link.baud / BITS_PER_BYTE

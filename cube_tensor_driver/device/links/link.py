@@ -1,12 +1,12 @@
-"""One link: a byte stream from and to a hub over a serial port, a pseudo-terminal or TCP.
+"""One link: a byte stream to and from a hub over a serial port, a pseudo-terminal or TCP.
 
-Nothing here blocks, has a thread or knows a frame; `session.py` drives it. Serial ports are opened
-by pyserial, by their path only, and read with ``os.read``, which gives up to 4 kB per call. What
-goes wrong is a `LinkError`. Its `kind` is one word, its text names the fix:
+Nothing here blocks, starts a thread or knows frames; `session.py` controls a link. pyserial opens
+serial ports by their path, and ``os.read`` reads them, up to 4 kB per call. Every failure is a
+`LinkError`, whose `kind` is one word and whose text names the fix:
 
     no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
     refused  no_answer  unreachable  unresolved                       opening a TCP link
-    lost  overflow                                                    while open
+    lost  overflow                                                    while the link is open
     silent  wrong_hub                                                 found by the session
 """
 
@@ -30,42 +30,55 @@ from ...config.port import TCP, port_problem
 from ...core.errors import LinkError
 from ..wire.decoder import Decoder
 from ..wire.protocol import Hello
-from .tcp import Connecting
+from .tcp import TcpConnection
 
 READ_CHUNK = 1 << 16
-"""Bytes read from one link at a time, so that a link that floods does not hold up the others."""
-OUT_LIMIT = 4096
-"""Bytes that may wait to be sent."""
-BACKOFF_S = (0.25, 5.0)
-"""Shortest and longest pause between two attempts to open a link."""
-BACKOFF_TCP_S = 1.5
-"""Longest pause for TCP. Nothing announces that a TCP peer is back, and a link shall be back within
-2 s."""
-
+"""Largest number of bytes read from one link at a time, so that a link that sends without pause
+does not hold up the others."""
+MAX_UNSENT = 4096
+"""Largest number of bytes that may wait to be sent."""
+MIN_PAUSE_S = 0.25
+"""Pause after the first failed attempt to open a link. It doubles with each further attempt."""
+MAX_PAUSE_S = 5.0
+"""Longest pause between two attempts to open a serial port. Its device file announces a hub that is
+plugged in again, and then the pause is over at once."""
+MAX_TCP_PAUSE_S = 1.5
+"""Longest pause between two attempts to open a TCP link. Nothing announces that a TCP peer is back,
+and a link should be back within 2 s."""
 END_OF_STREAM = OSError(errno.EIO, "end of stream")
+"""Error of a read that returned no byte, although the port was ready."""
 
 _NO_PERMISSION = (
     "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
 )
+_NO_DEVICE = "nothing is behind this port: plug the hub in or correct the port"
+_IN_USE = "another program has it open: end that one (fuser -v shows which)"
+_NOT_SERIAL = "this is no serial port: correct the port"
 _OPEN_ERRORS = {
     errno.ENOENT: ("no_port", "plug the hub in or correct the port"),
-    errno.ENXIO: ("no_port", "nothing is behind this port: plug the hub in or correct the port"),
-    errno.ENODEV: ("no_port", "nothing is behind this port: plug the hub in or correct the port"),
-    errno.EIO: ("no_port", "nothing is behind this port: plug the hub in or correct the port"),
+    errno.ENXIO: ("no_port", _NO_DEVICE),
+    errno.ENODEV: ("no_port", _NO_DEVICE),
+    errno.EIO: ("no_port", _NO_DEVICE),
     errno.EACCES: ("no_permission", _NO_PERMISSION),
     errno.EPERM: ("no_permission", _NO_PERMISSION),
-    errno.EBUSY: ("busy", "another program has it open: end that one (fuser -v shows which)"),
-    errno.EAGAIN: ("busy", "another program has it open: end that one (fuser -v shows which)"),
-    errno.ENOTTY: ("not_serial", "this is no serial port: correct the port"),
-    errno.EINVAL: ("not_serial", "this is no serial port: correct the port"),
-    errno.EISDIR: ("not_serial", "this is no serial port: correct the port"),
-    errno.ENOTDIR: ("not_serial", "this is no serial port: correct the port"),
+    errno.EBUSY: ("busy", _IN_USE),
+    errno.EAGAIN: ("busy", _IN_USE),
+    errno.ENOTTY: ("not_serial", _NOT_SERIAL),
+    errno.EINVAL: ("not_serial", _NOT_SERIAL),
+    errno.EISDIR: ("not_serial", _NOT_SERIAL),
+    errno.ENOTDIR: ("not_serial", _NOT_SERIAL),
 }
+"""Kind and fix of the errors of opening a serial port."""
 
 
 class LinkState(str, Enum):
-    """closed: not in use. waiting: not open, tried again and again. open: the port is open.
-    silent: open, but no sample for max(3 sample periods, 0.2 s) although samples were asked for."""
+    """State of a link.
+
+    CLOSED: it is not in use. WAITING: it is not open, and the next attempt to open it follows.
+        OPEN:
+    the port is open. SILENT: the port is open, but there was no sample for max(3 sample periods,
+    0.2 s) although samples were requested.
+    """
 
     CLOSED = "closed"
     WAITING = "waiting"
@@ -75,15 +88,17 @@ class LinkState(str, Enum):
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """Where a hub is.
+    """Place and identity of a hub.
 
-    port: device path or ``socket://host:port``; other URLs are refused. A device path may be a
-    pattern such as ``/dev/ttyACM*``: its matches are tried one after the other, which finds a
-    hub that comes back under another name.
-    baud: ignored by USB and TCP.
-    hub_uid: the hub that must answer; None for any.
-    is_simulated: a simulator that may start later makes the port. It is no news that the port is
-        missing until then.
+    Attributes:
+        name: Name of the link in the skin file.
+        port: Device path or ``socket://host:port``; other URLs are refused. A device path may be a
+            pattern such as ``/dev/ttyACM*``: its matches are tried one after the other, which finds
+            a hub that comes back under another name.
+        baud: Baud rate of a serial adapter. USB and TCP ignore it.
+        hub_uid: Unique number of the hub that must answer; None for any.
+        is_simulated: Whether a simulator makes the port, perhaps later. Then a port that has never
+            existed is not logged as missing.
     """
 
     name: str
@@ -94,15 +109,25 @@ class LinkConfig:
 
 
 class Link:
-    """One link, opened and closed many times.
+    """One link, which can be opened and closed many times.
 
-    state, error: set by the session.
-    period_problem: set by the session: what the hub made of the sample period, if that is wrong.
-    decoder, hello, counters: kept over reconnects; hello is the hub's last, None before the first.
+    Args:
+        config: Place and identity of the hub.
+
+    Attributes:
+        state: State, which the session sets.
+        error: Reason of the state, which the session sets; None if there is none.
+        period_problem: What is wrong with the sample period of the hub, in words; set by the
+            session.
+        decoder: Decoder of the received bytes, kept when the link is reopened.
+        hello: Last HELLO of the hub, kept when the link is reopened; None before the first.
+        path: Path of the port that was opened last, one match if the port is a pattern.
+
+    Raises:
+        LinkError: `bad_port`: the port is neither a device path nor a TCP address.
     """
 
     def __init__(self, config: LinkConfig) -> None:
-        """LinkError `bad_port`: neither a device path nor a TCP address."""
         self.config = config
         self.state = LinkState.CLOSED
         self.error: LinkError | None = None
@@ -114,41 +139,47 @@ class Link:
         self.is_pattern = "://" not in config.port and glob.has_magic(config.port)
         self._tcp = config.port.startswith(TCP)
         self._stream: serial.Serial | socket.socket | None = None
-        self._connecting: Connecting | None = None
+        self._connecting: TcpConnection | None = None
         self._fd = -1
         self._out = bytearray()
-        self._backoff = BACKOFF_S[0]
-        self._first_candidate = 0  # which match of the pattern to try first
+        self._pause = MIN_PAUSE_S
+        self._first_match = 0  # index of the match of the pattern to try first
         problem = port_problem(config.port)
         if problem:
             raise LinkError(f"link {config.name!r}: port: {problem}", "bad_port")
 
     @property
     def counters(self) -> dict[str, int]:
-        """The decoder's counters, and how often the link was opened, lost and silent.
+        """Counters of the decoder and of the link by name.
 
-        before_hello: samples not delivered because the hub had not said yet who it is.
+        opened, lost, silences: number of times the link was opened, lost, and became silent.
+        before_hello: samples that were not delivered because the hub had not identified itself.
         """
         names = ("opened", "lost", "silences", "before_hello", "bytes_out")
         return {**self.decoder.counters.as_dict(), **{name: getattr(self, name) for name in names}}
 
     @property
     def is_open(self) -> bool:
+        """Whether the port is open."""
         return self._stream is not None
 
     @property
     def unsent(self) -> bool:
-        """Whether bytes wait in our buffer for room in the kernel's."""
+        """Whether bytes wait here because the kernel's buffer is full."""
         return bool(self._out)
 
     def fileno(self) -> int:
+        """Return the file descriptor of the open port; -1 if it is closed."""
         return self._fd
 
     def open(self) -> bool:
-        """Take one step towards an open link. True: it is open. False: a TCP connection is under
-        way; call again.
+        """Take one step towards an open link.
 
-        LinkError: this attempt failed.
+        Returns:
+            Whether the link is open; if not, a TCP connection is under way: call again.
+
+        Raises:
+            LinkError: This attempt failed.
         """
         if self._tcp:
             self._open_tcp()
@@ -161,11 +192,14 @@ class Link:
         return True
 
     def read(self) -> bytes:
-        """The bytes that one call gives, at most READ_CHUNK; b"" if there are none.
+        """Return the bytes that one system call gives, at most `READ_CHUNK`; empty if there are
+        none.
 
-        A tty gives 4 kB at a time. Asking again at once would mean waiting until the kernel has
-        fetched the next 4 kB; it does so while the other links are read.
-        LinkError `lost`: the other end is gone.
+        A serial port gives 4 kB at a time. A second call at once would wait until the kernel has
+        fetched the next 4 kB, which it does while the other links are read.
+
+        Raises:
+            LinkError: `lost`: the other end is gone.
         """
         try:
             data = os.read(self._fd, READ_CHUNK)
@@ -178,26 +212,31 @@ class Link:
         return data
 
     def read_error(self, number: int) -> LinkError:
-        """The LinkError for a read that failed with this error number; 0: the stream ended."""
+        """Return the LinkError for a read that failed with this errno; 0: the stream ended."""
         return self._lost(OSError(number, os.strerror(number)) if number else END_OF_STREAM)
 
     def write(self, data: bytes) -> None:
         """Send without blocking. Bytes that the kernel does not accept now wait for `flush`.
 
-        LinkError `overflow`: more than OUT_LIMIT bytes would wait, because the hub does not read.
-        LinkError `lost`: the other end is gone.
+        Raises:
+            LinkError: `overflow`: more than `MAX_UNSENT` bytes would wait, because the hub does not
+                read. `lost`: the other end is gone.
         """
-        if len(self._out) + len(data) > OUT_LIMIT:
+        if len(self._out) + len(data) > MAX_UNSENT:
             raise LinkError(
                 f"{self.path}: the hub has not read the last {len(self._out)} bytes "
-                f"(limit {OUT_LIMIT}): check flow control, or replug it",
+                f"(limit {MAX_UNSENT}): check flow control, or replug it",
                 "overflow",
             )
         self._out += data
         self.flush()
 
     def flush(self) -> None:
-        """Send bytes that wait, as many as the kernel accepts. LinkError `lost`."""
+        """Send the bytes that wait, as many as the kernel accepts.
+
+        Raises:
+            LinkError: `lost`: the other end is gone.
+        """
         try:
             while self._out:
                 sent = os.write(self._fd, self._out)
@@ -208,8 +247,8 @@ class Link:
         except OSError as error:
             raise self._lost(error) from error
 
-    def draining(self) -> bool:
-        """Whether bytes have not left this machine's serial port yet."""
+    def is_draining(self) -> bool:
+        """Return whether bytes have not yet left this machine's serial port."""
         if self._tcp or self._stream is None:
             return False
         try:
@@ -219,13 +258,15 @@ class Link:
         return bool(self._out) or waiting > 0
 
     def close(self) -> None:
-        """Close at once, in any state. Safe to call twice. An unfinished frame counts as
-        framing."""
+        """Close at once, in any state; a second call does nothing.
+
+        An unfinished frame counts as `framing`.
+        """
         if self._connecting is not None:
             self._connecting.close()
             self._connecting = None
         if self._stream is not None:
-            if self.draining():
+            if self.is_draining():
                 # Otherwise the kernel waits for up to 30 s for a hub that does not read.
                 with contextlib.suppress(termios.error):
                     termios.tcflush(self._fd, termios.TCOFLUSH)
@@ -236,51 +277,55 @@ class Link:
         self._fd = -1
         self._out.clear()
 
-    def next_pause(self) -> float:
-        """Seconds until the next attempt: 0.25, 0.5, 1 … 5 (TCP 1.5)."""
-        pause = self._backoff
-        self._backoff = min(2 * pause, BACKOFF_TCP_S if self._tcp else BACKOFF_S[1])
+    def increase_pause(self) -> float:
+        """Return the time until the next attempt, in s, and double it: 0.25, 0.5 … 5 (TCP: 1.5)."""
+        pause = self._pause
+        self._pause = min(2 * pause, MAX_TCP_PAUSE_S if self._tcp else MAX_PAUSE_S)
         return pause
 
     def reset_pause(self) -> None:
-        """The hub answered: after the next loss, begin with the shortest pause again."""
-        self._backoff = BACKOFF_S[0]
+        """Begin with the shortest pause after the next loss, because the hub answered."""
+        self._pause = MIN_PAUSE_S
 
-    def next_candidate(self) -> None:
-        """The port that was opened is not the right one: try the next match of the pattern
-        first."""
-        self._first_candidate += 1
+    def skip_match(self) -> None:
+        """Begin with the next match of the pattern, because the opened port is the wrong one."""
+        self._first_match += 1
 
-    def fingerprint(self) -> tuple[object, ...]:
-        """Which files the port's path leads to now. After a change, trying again at once is worth
-        it."""
+    def identify_ports(self) -> tuple[object, ...]:
+        """Return which files the path of the port leads to now.
+
+        After a change of them it is useful to try again at once.
+        """
         if self._tcp:
             return ()
-        return tuple(_identity(path) for path in self._candidates())
+        return tuple(_identify_file(path) for path in self._matches())
 
-    def _candidates(self) -> list[str]:
+    def _matches(self) -> list[str]:
+        """Return the paths that match the port."""
         if not self.is_pattern:
             return [self.config.port]
         return sorted(glob.glob(self.config.port))  # noqa: PTH207  (Path.glob takes no absolute pattern)
 
     def _open_serial(self) -> None:
-        paths = self._candidates()
+        """Open the first match that can be opened, beginning with `_first_match`."""
+        paths = self._matches()
         error = LinkError(
             f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port"
         )
         for i in range(len(paths)):
-            self.path = paths[(self._first_candidate + i) % len(paths)]
+            self.path = paths[(self._first_match + i) % len(paths)]
             try:
                 self._stream = _open_port(self.path, self.config.baud)
-                self._first_candidate += i
+                self._first_match += i
                 return
             except LinkError as failure:
                 error = failure
         raise error
 
     def _open_tcp(self) -> None:
+        """Begin or continue a TCP connection."""
         if self._connecting is None:
-            self._connecting = Connecting(self.config.port)
+            self._connecting = TcpConnection(self.config.port)
         try:
             self._stream = self._connecting.poll()
         except LinkError:
@@ -290,6 +335,7 @@ class Link:
             self._connecting = None
 
     def _lost(self, error: OSError) -> LinkError:
+        """Return the LinkError for a connection that broke."""
         reason = error.strerror or str(error)
         return LinkError(
             f"{self.path}: connection lost ({reason}): replug the hub, "
@@ -298,8 +344,8 @@ class Link:
         )
 
 
-def open_error(path: str, error: BaseException) -> LinkError:
-    """The LinkError for a failed attempt to open `path`."""
+def explain_open_error(path: str, error: BaseException) -> LinkError:
+    """Return the LinkError for a failed attempt to open `path`."""
     code = getattr(error, "errno", None)
     for source in (error, error.__context__):
         # pyserial passes on some errors of termios, and hides the number of others.
@@ -312,12 +358,13 @@ def open_error(path: str, error: BaseException) -> LinkError:
 
 
 def _open_port(path: str, baud: int) -> serial.Serial:
+    """Open and lock one serial port; raise LinkError if that fails."""
     try:
-        # inter_byte_timeout=0 sets VMIN to 1: then reading an empty port gives EAGAIN, and b""
-        # always means unplugged.
+        # inter_byte_timeout=0 sets VMIN to 1. Then reading an empty port fails with EAGAIN, and an
+        # empty result always means that the hub was unplugged.
         port = serial.Serial(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
     except (OSError, termios.error) as error:
-        raise open_error(path, error) from error
+        raise explain_open_error(path, error) from error
     except ValueError as error:
         kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"
         raise LinkError(
@@ -328,7 +375,8 @@ def _open_port(path: str, baud: int) -> serial.Serial:
     return port
 
 
-def _identity(path: str) -> tuple[object, ...] | None:
+def _identify_file(path: str) -> tuple[object, ...] | None:
+    """Return what identifies the file at a path; None if there is none."""
     try:
         status = Path(path).stat()
     except OSError:

@@ -1,4 +1,5 @@
-"""Log lines about one link, bounded: a hub can say something new a thousand times a second."""
+"""Log lines about one link, limited in rate, because a hub can cause a thousand of them per
+second."""
 
 from __future__ import annotations
 
@@ -6,14 +7,15 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-BURST = 20
-"""Lines that may come at once: those of a link that opens, or is lost, and what does not fit."""
-REFILL_S = 1.0
-"""After a burst, one line in this time."""
+MAX_BURST = 20
+"""Number of lines that may be logged at once. A link that opens, is lost, or does not fit the skin
+logs a few lines together."""
+LINE_PERIOD_S = 1.0
+"""Period of the lines after a burst, in s."""
 
 
 class Log(Protocol):
-    """What is needed of a logger, that of Python or of ROS."""
+    """The methods used of a logger, which may be that of Python or of ROS."""
 
     def info(self, message: str, /) -> object: ...
 
@@ -22,11 +24,18 @@ class Log(Protocol):
     def error(self, message: str, /) -> object: ...
 
 
-class LinkLog:
-    """A `Log` of lines about one link. Lines beyond the bound are left out and counted; the next
-    one says how many.
+class LinkLogger:
+    """Logs lines about one link at a limited rate.
 
-    left_out: lines so far.
+    Lines beyond the limit are left out and counted, and the next line states their number.
+
+    Args:
+        name: Name of the link.
+        log: Logger to write to.
+        clock: Monotonic clock, in s.
+
+    Attributes:
+        left_out: Number of lines left out so far.
     """
 
     def __init__(self, name: str, log: Log, clock: Callable[[], float] = time.monotonic) -> None:
@@ -34,28 +43,34 @@ class LinkLog:
         self._name = name
         self._log = log
         self._clock = clock
-        self._allowed = float(BURST)
-        self._at = clock()
-        self._told = 0
+        self._allowed = float(MAX_BURST)
+        self._updated_at = clock()
+        self._reported_left_out = 0
 
-    # Each severity has its own line here, because the loggers of ROS go by the place of the call.
+    # Each severity has its own call here, because a logger of ROS accepts only one severity for
+    # each place of the call.
 
     def info(self, message: str, /) -> None:
-        if self._may():
+        """Log news."""
+        if self._is_allowed():
             self._log.info(self._line(message))
 
     def warning(self, message: str, /) -> None:
-        if self._may():
+        """Log a problem that may pass by itself."""
+        if self._is_allowed():
             self._log.warning(self._line(message))
 
     def error(self, message: str, /) -> None:
-        if self._may():
+        """Log a problem that somebody must solve."""
+        if self._is_allowed():
             self._log.error(self._line(message))
 
-    def _may(self) -> bool:
+    def _is_allowed(self) -> bool:
+        """Return whether a line may be logged now, and count it."""
         now = self._clock()
-        self._allowed = min(BURST, self._allowed + (now - self._at) / REFILL_S)
-        self._at = now
+        earned = (now - self._updated_at) / LINE_PERIOD_S
+        self._allowed = min(MAX_BURST, self._allowed + earned)
+        self._updated_at = now
         if self._allowed < 1.0:
             self.left_out += 1
             return False
@@ -63,6 +78,8 @@ class LinkLog:
         return True
 
     def _line(self, message: str) -> str:
-        omitted, self._told = self.left_out - self._told, self.left_out
-        after = f" ({omitted} lines about this link were left out before)" if omitted else ""
-        return f"link {self._name}: {message}{after}"
+        """Return the line for a message."""
+        omitted = self.left_out - self._reported_left_out
+        self._reported_left_out = self.left_out
+        note = f" ({omitted} lines about this link were left out before)" if omitted else ""
+        return f"link {self._name}: {message}{note}"

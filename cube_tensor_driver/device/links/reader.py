@@ -1,9 +1,9 @@
-"""One thread that reads all links: it opens and reopens them, decodes, and calls back once per
-wake-up.
+"""The thread that reads all links of a skin.
 
-No link waits for another: ports are read and TCP connections are made without blocking, and bytes
-that a link does not take stay in a bounded buffer of its own. What is said on a link is in
-`session.py`.
+It opens and reopens the links, decodes their bytes, and calls back once per wake-up. No link waits
+for another: ports are read and TCP connections are made without blocking, and bytes that a link
+    does
+not accept wait in a bounded buffer of its own. `session.py` decides what is sent on a link.
 """
 
 from __future__ import annotations
@@ -21,27 +21,36 @@ from typing import NamedTuple
 
 from ...core.errors import LinkError
 from ..wire.protocol import Command, Frame, Request, encode
-from .intake import take_in
+from .intake import read_links
 from .link import Link, LinkConfig, LinkState
 from .session import TICK_S, Session
 
-GATHER_PERIODS = 0.2
-GATHER_S = 1e-3
-"""Hubs sample together, but their bytes come one after the other. The reader waits for the other
-hubs for this part of the sample period, and at most for this time. So all come in one callback."""
-GATHER_STEP_S = 2e-4
-"""While it waits it looks at this interval, instead of waking up for each hub. Arrival times may be
-later than true by that."""
-NO_WAIT_S = 5e-5
-"""If waiting for data took less than this, data was there already."""
+MAX_WAIT_PERIODS = 0.2
+"""Longest wait for the hubs that have not delivered yet, as a part of the sample period. Hubs
+sample together, but their bytes arrive one after the other; after a short wait all come in one
+callback."""
+MAX_WAIT_S = 1e-3
+"""Longest wait for the hubs that have not delivered yet, in s."""
+WAIT_STEP_S = 2e-4
+"""Period at which the reader checks for data while it waits, in s, instead of waking up for each
+hub. Arrivals may be later than true by this time."""
+MIN_SELECT_S = 5e-5
+"""Duration of a wait for data, in s, below which the data were already there. Then this thread is
+late and does not wait for more."""
 DRAIN_S = 0.05
-"""How long closing waits for the last requests to leave the serial ports."""
+"""Time for which closing waits until the last requests have left the serial ports, in s."""
 CLOSE_S = 1.5
-"""How long closing waits for the thread to end."""
+"""Time for which closing waits for the end of the thread, in s."""
 
 
 class LinkRead(NamedTuple):
-    """What one read of a link gave: index of the link, time of arrival in ns, frames or error."""
+    """Result of one read of a link.
+
+    Attributes:
+        link: Index of the link.
+        arrival_ns: Arrival of the bytes.
+        result: The decoded frames, or the error by which the link is lost.
+    """
 
     link: int
     arrival_ns: int
@@ -49,9 +58,13 @@ class LinkRead(NamedTuple):
 
 
 class LinkFrames(NamedTuple):
-    """Frames that one read of a link completed: index of the link, time of arrival in ns.
+    """Frames to deliver, which one read of a link completed.
 
-    asked_ns: when the question was sent that a TIME among the frames answers
+    Attributes:
+        link: Index of the link.
+        arrival_ns: Arrival of the bytes.
+        frames: The frames.
+        asked_ns: Time of the question that a TIME among the frames answers; 0 if there is none.
     """
 
     link: int
@@ -69,18 +82,27 @@ _log = logging.getLogger(__name__)
 class Reader:
     """Reads all links in one thread.
 
-    on_frames: called once per wake-up with a list of `LinkFrames`, in order of arrival per link.
-    on_state: called with (link index, LinkState, LinkError or None) when the state of a link, or
-    the reason why it waits, changes.
-    Both run in the reader's thread and must return soon. If they raise, the error is logged and the
-    reader goes on.
-    clock_ns: the clock of arrival times. It is read after the bytes, so that no arrival is earlier
-    than true.
-    period_us: sample period to set on every hub; None leaves the hub's own.
-    on_end: called last of all in the reader's thread, however it ends.
+    Both callbacks run in the reader's thread and must return soon. If one raises, the error is
+    logged and the reader goes on.
 
-    failure: the error that ended the thread; None while it runs and after `close`.
-    callback_errors: how often a callback raised.
+    Args:
+        links: Place and identity of the hub of each link.
+        on_frames: Called once per wake-up with a list of `LinkFrames`, in order of arrival per
+            link.
+        on_state: Called with the index of a link, its state and the error that is the reason, when
+            one of them changes.
+        clock_ns: The clock of arrivals. It is read after the bytes, so that no arrival is earlier
+            than true.
+        period_us: Sample period to set on every hub, in µs; None leaves the hub's own.
+        on_end: Called last of all in the reader's thread, however it ends.
+
+    Attributes:
+        links: The links.
+        failure: Error that ended the thread; None while it runs and after `close`.
+        callback_errors: Number of times a callback raised.
+
+    Raises:
+        LinkError: `bad_port`: a port can never be opened.
     """
 
     def __init__(
@@ -92,7 +114,6 @@ class Reader:
         period_us: int | None = None,
         on_end: Callable[[], None] = lambda: None,
     ) -> None:
-        """LinkError `bad_port`: a port that can never be opened."""
         self.links = [Link(config) for config in links]
         self.callback_errors = 0
         self.failure: Exception | None = None
@@ -111,7 +132,11 @@ class Reader:
         self._wake_write = -1
 
     def start(self) -> None:
-        """Begin. LinkError `closed`: it was started before; a reader runs once."""
+        """Start the thread.
+
+        Raises:
+            LinkError: `closed`: the reader was started before; it runs once.
+        """
         if self._thread is not None:
             raise LinkError("a reader starts once: make a new Reader", "closed")
         wake_read, self._wake_write = os.pipe()
@@ -123,10 +148,13 @@ class Reader:
         self._thread.start()
 
     def send(self, link: int, request: Request) -> None:
-        """Send a request, from any thread.
+        """Send a request; callable from any thread.
 
-        Start, stop and set period are remembered and sent again after each reopening, so they may
-        be given while the link is down. LinkError `closed`: any other request while it is down.
+        START, STOP and SET_PERIOD are remembered and sent again after each reopening, so they may
+        be given while the link is not open.
+
+        Raises:
+            LinkError: `closed`: another request was given while the link is not open.
         """
         target = self.links[link]
         remembered = request.request in (Command.START, Command.STOP, Command.SET_PERIOD)
@@ -139,12 +167,12 @@ class Reader:
         self._wake()
 
     def forget_questions(self) -> None:
-        """Deliver no answer to what was asked until now; to be called by `on_frames`."""
+        """Ignore the answers to all requests TIME sent until now; callable from `on_frames`."""
         for session in self._sessions:
             session.asked_ns = None
 
     def close(self) -> None:
-        """Stop the hubs, close all links and end the thread, within CLOSE_S. Safe to call twice."""
+        """Stop the hubs, close all links and end the thread within `CLOSE_S`; idempotent."""
         self._stopping = True
         self._wake()
         thread = self._thread
@@ -156,13 +184,15 @@ class Reader:
                 )
 
     def _wake(self) -> None:
-        # The lock keeps a late send from writing to a number that the closed pipe has given back.
+        """Wake up the reader's thread."""
+        # Without the lock, a late call could write to a file descriptor that was closed and reused.
         with self._wake_lock:
             if self._wake_write >= 0:
                 with contextlib.suppress(BlockingIOError):
                     os.write(self._wake_write, b"\0")
 
     def _run(self, wake_read: int) -> None:
+        """Run the thread until the end."""
         try:
             self._selector.register(wake_read, selectors.EVENT_READ, None)
             self._loop(wake_read)
@@ -176,21 +206,21 @@ class Reader:
                 self._on_end()
 
     def _loop(self, wake_read: int) -> None:
+        """Wait for data and handle them until `close` is called."""
         tick_at = 0.0
         while not self._stopping:
             now = time.monotonic()
             ready = self._selector.select(max(0.0, tick_at - now))
             awake_at = time.monotonic()
             reads = self._read_ready(ready, wake_read)
-            # If data was there already, this thread is late and does not wait for more.
-            if reads and awake_at - now > NO_WAIT_S:
-                while time.monotonic() - awake_at < self._gather_time(reads):
-                    time.sleep(GATHER_STEP_S)
+            if reads and awake_at - now > MIN_SELECT_S:
+                while time.monotonic() - awake_at < self._waiting_time(reads):
+                    time.sleep(WAIT_STEP_S)
                     reads += self._read_ready(self._selector.select(0), wake_read)
             received, failed = self._handle_reads(reads)
             if received:
                 self._call(self._on_frames, received)
-            # Only after its frames were delivered: they would make the link look alive again.
+            # A link is closed after its frames were delivered, because frames mark it as open.
             for i, error in failed.items():
                 self._drop(i, error)
             if self._requests:
@@ -199,12 +229,12 @@ class Reader:
             if now >= tick_at:
                 tick_at = now + TICK_S
                 for i in range(len(self.links)):
-                    self._tick(i, now)
+                    self._check_timers(i, now)
 
     def _read_ready(
         self, ready: list[tuple[selectors.SelectorKey, int]], wake_read: int
     ) -> list[LinkRead]:
-        """Read and decode all links that are ready, and send what waits to be sent."""
+        """Read and decode all links that are ready, and send the bytes that wait."""
         reads: list[LinkRead] = []
         readable: list[int] = []
         for key, events in ready:
@@ -222,17 +252,20 @@ class Reader:
                 readable.append(key.data)
         if readable:
             links = [self.links[i] for i in readable]
-            arrival_ns, results = take_in(links, self._clock_ns)
+            arrival_ns, results = read_links(links, self._clock_ns)
             for i, result in zip(readable, results, strict=True):
                 if result is not None:
                     reads.append(LinkRead(i, arrival_ns, result))
         return reads
 
     def _handle_reads(self, reads: list[LinkRead]) -> tuple[list[LinkFrames], dict[int, LinkError]]:
-        """The frames to deliver, and the links to close, each with the reason.
+        """Handle all reads of a wake-up.
 
-        All reads of a wake-up are handled in one go, because after each wait Python's code and data
-        have left the processor's caches.
+        They are handled together, because after each wait Python's code and data have left the
+        caches of the processor.
+
+        Returns:
+            The frames to deliver, and the reason to close a link by its index.
         """
         received: list[LinkFrames] = []
         failed: dict[int, LinkError] = {}
@@ -259,8 +292,8 @@ class Reader:
                 received.append(LinkFrames(i, arrival_ns, frames, asked_ns))
         return received, failed
 
-    def _gather_time(self, reads: list[LinkRead]) -> float:
-        """How long to wait for links that deliver but have not come yet, s."""
+    def _waiting_time(self, reads: list[LinkRead]) -> float:
+        """Return how long to wait, in s, for links that should deliver but have not yet."""
         came = {i for i, _, result in reads if isinstance(result, list) and result}
         if len(came) in (0, len(self.links)):
             return 0.0
@@ -271,9 +304,10 @@ class Reader:
         ]
         if not periods_us:
             return 0.0
-        return min(GATHER_PERIODS * 1e-6 * min(periods_us), GATHER_S)
+        return min(MAX_WAIT_PERIODS * 1e-6 * min(periods_us), MAX_WAIT_S)
 
     def _send_requests(self) -> None:
+        """Send the requests of other threads."""
         while self._requests:
             i, request = self._requests.popleft()
             try:
@@ -282,12 +316,12 @@ class Reader:
             except LinkError as error:
                 self._drop(i, error)
 
-    def _tick(self, i: int, now: float) -> None:
-        """Look at the timers of one link."""
+    def _check_timers(self, i: int, now: float) -> None:
+        """Check the timers of one link, and open it if it is time."""
         session = self._sessions[i]
         try:
             if session.link.is_open:
-                session.look(now)
+                session.check_timers(now)
             elif session.open(now):
                 self._selector.register(session.link, selectors.EVENT_READ, i)
                 session.begin()
@@ -296,7 +330,7 @@ class Reader:
             self._drop(i, error)
 
     def _drop(self, i: int, error: LinkError) -> None:
-        """Close a link that failed; it is tried again later."""
+        """Close one link because of an error; it is opened again later."""
         link = self.links[i]
         if link.is_open:
             link.lost += 1
@@ -304,7 +338,7 @@ class Reader:
         self._sessions[i].close(error)
 
     def _watch(self, i: int) -> None:
-        """Wake up for writing only while bytes wait to be sent."""
+        """Make the selector wake up for writing while bytes wait to be sent, and only then."""
         link = self.links[i]
         if not link.is_open:
             return
@@ -313,21 +347,23 @@ class Reader:
             self._selector.modify(link, events, i)
 
     def _call(self, callback: Callable[..., None], *arguments: object) -> None:
+        """Call back; log and count an error."""
         try:
             callback(*arguments)
         except Exception:  # noqa: BLE001  (whatever a callback raises, the links go on)
             self.callback_errors += 1
-            # Not all of them: at 1 kHz they would fill the log.
+            # Only a few are logged: at 1 kHz all of them would fill the log.
             if self.callback_errors in (1, 10, 100, 1000, 10_000):
                 _log.exception("callback failed (%d so far); reading goes on", self.callback_errors)
 
     def _close_all(self, wake_read: int) -> None:
+        """Stop all hubs, wait until the requests have left, and close all links."""
         for link in self.links:
             if link.is_open:
                 with contextlib.suppress(LinkError):
                     link.write(encode(Request(Command.STOP)))
         until = time.monotonic() + DRAIN_S
-        while any(link.draining() for link in self.links) and time.monotonic() < until:
+        while any(link.is_draining() for link in self.links) and time.monotonic() < until:
             time.sleep(0.002)
         for session in self._sessions:
             session.link.close()

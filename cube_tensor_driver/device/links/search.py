@@ -1,4 +1,4 @@
-"""Serial ports of this machine, and which of them answer as hubs."""
+"""Search for the serial ports of this machine and for the hubs behind them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,21 @@ from ..wire.protocol import Command, Hello, Request, encode
 from .link import Link, LinkConfig
 
 ANSWER_S = 1.0
-"""How long a hub may take to say who it is."""
+"""Time that a hub may take to identify itself, in s."""
 DEMO_PORTS = "cube_demo_*/ports/*"
-"""Pseudo-terminals of demos that run, below the folder for temporary files."""
+"""Pattern of the pseudo-terminals of running demos, in the folder for temporary files."""
 
 
 @dataclass
 class Port:
-    """hello: of the hub that answered; problem: why the port could not be asked."""
+    """A port of this machine.
+
+    Attributes:
+        path: Device path.
+        description: Description by the system; empty if there is none.
+        hello: Answer of the hub; None if there was none.
+        problem: Why the port could not be asked; empty if it could.
+    """
 
     path: str
     description: str = ""
@@ -31,7 +38,7 @@ class Port:
 
 
 def find_ports() -> list[Port]:
-    """Serial ports that there are, and those of a demo that runs; nothing is opened."""
+    """Return the serial ports of the machine and of running demos, without opening any."""
     ports = [
         Port(found.device, "" if found.description in (None, "n/a") else found.description)
         for found in list_ports.comports()
@@ -42,7 +49,11 @@ def find_ports() -> list[Port]:
 
 
 def ask_ports(ports: list[Port]) -> None:
-    """Ask all ports at once who is there, and wait for answers. Sends nothing but the question."""
+    """Send the request HELLO to all ports at once and wait for the answers.
+
+    Args:
+        ports: The ports, to which the answers and problems are added.
+    """
     links: dict[int, tuple[Link, Port]] = {}
     question = encode(Request(Command.HELLO))
     try:
@@ -61,7 +72,7 @@ def ask_ports(ports: list[Port]) -> None:
 
 
 def _listen(links: dict[int, tuple[Link, Port]]) -> None:
-    """Until every link has answered, or ANSWER_S are over."""
+    """Wait until every link has answered, for at most `ANSWER_S`."""
     until = time.monotonic() + ANSWER_S
     waiting = set(links)
     while waiting and (left := until - time.monotonic()) > 0:

@@ -1,11 +1,11 @@
-"""The conversation with one hub, over all openings of its port.
+"""The conversation with one hub, which continues when its port is reopened.
 
-After every opening the hub is asked for HELLO, and on HELLO it is told what it should do (period,
-start or stop). A hub that restarts behind an open port falls silent, and its next HELLO brings it
-up again. Once it delivers, it is asked for its time about once a second.
+After each opening, the hub is asked for HELLO; on HELLO it receives its settings (sample period,
+start or stop). A hub that restarts behind an open port becomes silent, and its next HELLO starts it
+again. A hub that delivers samples is asked for its time about once a second.
 
-Nothing here waits or has a thread: the reader says what came and what time it is. Times are
-time.monotonic() in s.
+Nothing here waits or starts a thread: the reader passes on the frames and the time. Times are those
+of time.monotonic() in s, unless they end in _ns.
 """
 
 from __future__ import annotations
@@ -18,70 +18,81 @@ from ..wire.protocol import Ack, Command, Frame, Hello, Request, Result, Sample,
 from .link import Link, LinkState
 
 SILENT_S = 0.2
-"""A link is silent after so long without a sample, or after three sample periods if they are
+"""Time without a sample, in s, after which a link is silent. Three sample periods count if they are
 longer."""
 TICK_S = 0.02
-"""Interval at which the reader looks at timers."""
+"""Period at which the reader checks the timers, in s."""
 HELLO_S = 1.0
-"""Interval at which a hub that does not answer is asked again."""
+"""Period at which a hub that does not answer is asked for HELLO again, in s."""
 ASK_TIME_S = 0.983
-"""Interval at which a hub is asked for its time. It is no whole number of usual sample periods, so
-that the questions come at all times between two samples."""
+"""Period at which a hub is asked for its time, in s. It is not a multiple of usual sample periods,
+so that the questions are spread over all times between two samples."""
 REOPEN_S = 5.0
-"""A link without a single byte for so long is opened again. Hubs say HELLO every second."""
-LOOK_S = 0.25
-"""Interval at which a waiting link is looked at: its port may have come back."""
-ROUNDING = 0.01
-"""A hub may round the sample period by so much of it without a note."""
+"""Time without a single byte, in s, after which a link is reopened. Hubs send HELLO every
+second."""
+CHECK_PORT_S = 0.25
+"""Period at which a waiting link checks, in s, whether its port has come back."""
+PERIOD_TOLERANCE = 0.01
+"""Relative deviation of the sample period that a hub may round to without a note."""
 
 OnState = Callable[[LinkState, LinkError | None], None]
 
 
 class Session:
-    """Brings up one link again and again, and keeps its state.
+    """Starts the hub of one link after each opening, and keeps the state of the link.
 
-    on_state: called when the state of the link, or the reason why it waits, changes
-    clock_ns: the clock of arrival times
+    Args:
+        link: The link.
+        period_us: Sample period to request, in µs; None leaves the hub's own.
+        clock_ns: The clock of arrivals.
+        on_state: Called when the state of the link, or its reason, changes.
 
-    link: the link
-    actual_us: sample period in force, as the hub says; 0: not known yet
-    last_byte: when something came last
-    asked_ns: when the hub was asked for its time, in clock_ns; None: no answer is awaited
+    Attributes:
+        link: The link.
+        actual_us: Sample period in force, in µs, as the hub reports it; 0 before that.
+        last_byte: Time of the last received byte.
+        asked_ns: Time of `clock_ns` at which the hub was asked for its time; None if no answer is
+            expected.
     """
 
     def __init__(
         self, link: Link, period_us: int | None, clock_ns: Callable[[], int], on_state: OnState
     ) -> None:
-        """period_us: to ask for; None leaves the hub's own."""
         self.link = link
         self.actual_us = period_us or 0
         self.last_byte = 0.0
         self.asked_ns: int | None = None
         self._clock_ns, self._on_state = clock_ns, on_state
         self._period_us = period_us
-        self._answered_us: int | None = None  # what the hub made of the period that was asked for
-        self._started = True  # samples are asked for
-        self._greeted = False  # HELLO has come since the port was opened
+        self._answered_us: int | None = None  # the hub's answer to the requested period
+        self._is_started = True  # samples are requested
+        self._has_hello = False  # HELLO has come since the port was opened
         self._opened_at = self._last_sample = 0.0
-        self._retry_at = self._look_at = self._hello_at = self._ask_time_at = 0.0
-        self._knows_time = True  # the hub has not refused to say its time
-        self._question = 0  # number of the last question for the time
-        self._fingerprint: tuple[object, ...] = ()
+        self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
+        self._knows_time = True  # the hub has not refused the request TIME
+        self._question = 0  # number of the last request TIME
+        self._ports: tuple[object, ...] = ()
 
     @property
     def is_delivering(self) -> bool:
-        """Whether samples are to be expected."""
-        return self.link.state is LinkState.OPEN and self._greeted and self._started
+        """Whether samples are expected."""
+        return self.link.state is LinkState.OPEN and self._has_hello and self._is_started
 
     def open(self, now: float) -> bool:
-        """Open the link if it is time to try, and it can be; whether it is open. LinkError: it
-        cannot be opened."""
+        """Open the link if it is time to try.
+
+        Returns:
+            Whether the link is open.
+
+        Raises:
+            LinkError: The link cannot be opened.
+        """
         link = self.link
-        if now >= self._look_at:
-            self._look_at = now + LOOK_S
-            fingerprint = link.fingerprint()
-            if fingerprint != self._fingerprint:
-                self._fingerprint = fingerprint
+        if now >= self._check_port_at:
+            self._check_port_at = now + CHECK_PORT_S
+            ports = link.identify_ports()
+            if ports != self._ports:
+                self._ports = ports
                 self._retry_at = now
                 link.reset_pause()
         if now < self._retry_at:
@@ -91,22 +102,26 @@ class Session:
         if not link.open():
             return False
         self._opened_at = self.last_byte = self._last_sample = time.monotonic()
-        self._greeted = False
+        self._has_hello = False
         self._answered_us = self.asked_ns = None
         link.period_problem = ""
         return True
 
     def begin(self) -> None:
-        """The link was opened: ask the hub who it is. LinkError: the link must be closed."""
+        """Ask the hub for HELLO, because the link was opened.
+
+        Raises:
+            LinkError: The link must be closed.
+        """
         self.set_state(LinkState.OPEN)
         self._ask_hello(time.monotonic())
 
     def close(self, error: LinkError) -> None:
-        """Close a link that failed, to try again later."""
+        """Close the link because of an error; it is opened again later."""
         link = self.link
         link.close()
-        self._fingerprint = link.fingerprint()
-        self._retry_at = time.monotonic() + link.next_pause()
+        self._ports = link.identify_ports()
+        self._retry_at = time.monotonic() + link.increase_pause()
         self.set_state(LinkState.WAITING, error)
 
     def send(self, request: Request) -> None:
@@ -117,26 +132,31 @@ class Session:
             self._answered_us = None
             self.actual_us = max(self.actual_us, request.argument)
         elif request.request in (Command.START, Command.STOP):
-            self._started = request.request == Command.START
+            self._is_started = request.request == Command.START
             self._last_sample = time.monotonic()
         if self.link.is_open:
             self.link.write(encode(request))
 
     def take(self, frame: Frame) -> bool:
-        """Act on what a frame says about the link itself. Whether to deliver the frame.
+        """Handle what a frame means for the link itself.
 
-        LinkError: the link must be closed.
+        Returns:
+            Whether to deliver the frame.
+
+        Raises:
+            LinkError: The link must be closed.
         """
         link = self.link
         if isinstance(frame, Sample):
             self._last_sample = self.last_byte
             if link.state is not LinkState.OPEN or link.error is not None:
                 self.set_state(LinkState.OPEN)
-            # After a replug it may be another hub, whose samples must not pass for the old one's.
-            link.before_hello += not self._greeted
-            return self._greeted
+            # After a replug the port may lead to another hub. Its samples must not be taken for
+            # those of the hub before.
+            link.before_hello += not self._has_hello
+            return self._has_hello
         if isinstance(frame, Hello):
-            self._take_hello(frame)
+            self._handle_hello(frame)
         elif isinstance(frame, Ack) and frame.request == Command.SET_PERIOD:
             self.actual_us = self._answered_us = frame.argument
             link.period_problem = _period_problem(self._period_us, frame)
@@ -149,24 +169,28 @@ class Session:
             return is_answer
         return True
 
-    def look(self, now: float) -> None:
-        """Look at the timers of the open link. LinkError: it must be closed."""
+    def check_timers(self, now: float) -> None:
+        """Check the timers of the open link.
+
+        Raises:
+            LinkError: The link must be closed.
+        """
         link = self.link
         self._check_silence(now)
         if now - self.last_byte > REOPEN_S:
-            link.next_candidate()
+            link.skip_match()
             raise LinkError(
                 f"{link.path}: not a byte for {REOPEN_S:g} s: opening it again; "
                 "check the hub's power",
                 "silent",
             )
-        if link.is_pattern and not self._greeted and now - self._opened_at > REOPEN_S:
-            link.next_candidate()
+        if link.is_pattern and not self._has_hello and now - self._opened_at > REOPEN_S:
+            link.skip_match()
             raise LinkError(
                 f"{link.path}: no hub answers here: trying the next match of {link.config.port}",
                 "wrong_hub",
             )
-        if link.state is LinkState.SILENT or not self._greeted:
+        if link.state is LinkState.SILENT or not self._has_hello:
             if now >= self._hello_at:
                 self._ask_hello(now)
         # Not before the first sample, with which the answer is compared.
@@ -174,18 +198,19 @@ class Session:
             self._ask_time(now)
 
     def set_state(self, state: LinkState, error: LinkError | None = None) -> None:
-        """Keep state and reason, and call back if they are others."""
+        """Set the state and its reason, and call back if they have changed."""
         link = self.link
         before = link.state, link.error and link.error.kind
         link.state, link.error = state, error
         if (state, error and error.kind) != before:
             self._on_state(state, error)
 
-    def _take_hello(self, frame: Hello) -> None:
+    def _handle_hello(self, frame: Hello) -> None:
+        """Check the identity and the period of the hub, and start it if necessary."""
         link = self.link
         wanted = link.config.hub_uid
         if wanted is not None and frame.hub_uid != wanted:
-            link.next_candidate()
+            link.skip_match()
             raise LinkError(
                 f"{link.path}: hub {frame.hub_uid:#018x} answers, link {link.config.name!r} "
                 f"wants {wanted:#018x}: swap the cables or correct the uid",
@@ -194,26 +219,28 @@ class Session:
         link.hello = frame
         link.reset_pause()
         self.actual_us = frame.period_us
-        # A hub may round the period, or refuse it. It has answered then: it is not asked again.
-        known = (self._period_us, self._answered_us)
-        other_period = self._period_us is not None and frame.period_us not in known
-        if not self._greeted or link.state is LinkState.SILENT or other_period:
-            self._greeted = True
+        # A hub may round the period or refuse it. Once it has answered, it is not asked again.
+        expected = (self._period_us, self._answered_us)
+        has_other_period = self._period_us is not None and frame.period_us not in expected
+        if not self._has_hello or link.state is LinkState.SILENT or has_other_period:
+            self._has_hello = True
             self._configure()
 
     def _configure(self) -> None:
+        """Send the hub its sample period and START or STOP."""
         self._knows_time = True
         if self._period_us is not None:
             self.link.write(encode(Request(Command.SET_PERIOD, self._period_us)))
-        self.link.write(encode(Request(Command.START if self._started else Command.STOP)))
-        if not self._started:
+        self.link.write(encode(Request(Command.START if self._is_started else Command.STOP)))
+        if not self._is_started:
             self.set_state(LinkState.OPEN)
 
     def _check_silence(self, now: float) -> None:
+        """Set the state SILENT if the last sample is too long ago."""
         link = self.link
         silence = now - self._last_sample
         limit = max(3e-6 * self.actual_us, SILENT_S) - TICK_S
-        if not self._started or link.state is not LinkState.OPEN or silence <= limit:
+        if not self._is_started or link.state is not LinkState.OPEN or silence <= limit:
             return
         link.silences += 1
         self._hello_at = now
@@ -228,19 +255,22 @@ class Session:
         self.set_state(LinkState.SILENT, error)
 
     def _ask_hello(self, now: float) -> None:
+        """Ask the hub for HELLO."""
         self._hello_at = now + HELLO_S
         self.link.write(encode(Request(Command.HELLO)))
 
     def _ask_time(self, now: float) -> None:
+        """Ask the hub for its time."""
         self._ask_time_at = now + ASK_TIME_S
         self._question = (self._question + 1) % (1 << 32)
         request = encode(Request(Command.TIME, self._question))
-        self.asked_ns = self._clock_ns()  # no later than true
+        self.asked_ns = self._clock_ns()  # before the write, so that it is not later than true
         self.link.write(request)
 
 
 def _period_problem(asked_us: int | None, answer: Ack) -> str:
-    """What is wrong with the hub's answer to request 4, with the fix; empty if nothing is."""
+    """Return what is wrong with the hub's answer to SET_PERIOD, and the fix; empty if it is
+    right."""
     if asked_us is None:
         return ""
     in_force = f"the hub samples every {answer.argument} µs, asked for were {asked_us} µs"
@@ -248,6 +278,6 @@ def _period_problem(asked_us: int | None, answer: Ack) -> str:
         return f"{in_force}, which it refused: set a rate that it can do"
     if answer.result != Result.DONE:
         return f"{in_force}, and it cannot change that: leave the rate to it"
-    if abs(answer.argument - asked_us) > ROUNDING * asked_us:
+    if abs(answer.argument - asked_us) > PERIOD_TOLERANCE * asked_us:
         return f"{in_force}: set a rate that it can do"
     return ""

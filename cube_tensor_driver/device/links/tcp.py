@@ -1,6 +1,6 @@
-"""Makes a TCP connection without ever blocking the caller.
+"""TCP connections that are made without blocking the caller.
 
-The ``socket://`` of pyserial blocks for up to 5 s while it looks up the name and connects. That
+The ``socket://`` of pyserial blocks for up to 5 s while it looks up the name and connects, which
 would hold up all other links of the reader's thread.
 """
 
@@ -18,22 +18,29 @@ from ...config.port import port_problem, tcp_address
 from ...core.errors import LinkError
 
 CONNECT_TIMEOUT_S = 2.0
-"""For each address of the host. A host that is switched off does not answer at all."""
+"""Time for each address of the host, in s. A host that is switched off does not answer at all."""
 
 
 def parse_url(url: str) -> tuple[str, int]:
-    """Host and port of ``socket://host:port``, IPv6 hosts in brackets. LinkError `bad_port`."""
+    """Return host and port of ``socket://host:port``; IPv6 hosts stand in brackets.
+
+    Raises:
+        LinkError: `bad_port`: the text is not such a URL.
+    """
     address = tcp_address(url)
     if address is None:
         raise LinkError(port_problem(url), "bad_port")
     return address
 
 
-class Connecting:
-    """One attempt to connect; call `poll` until it gives the socket.
+class TcpConnection:
+    """One attempt to connect. `poll` is called until it returns the socket.
 
-    A name is looked up in a thread of its own, because the system's resolver can block for half a
-    minute and cannot be cancelled. Numeric hosts need no thread.
+    A name is looked up in a thread of its own, because the resolver of the system can block for
+    half a minute and cannot be cancelled. Numeric hosts need no thread.
+
+    Args:
+        url: ``socket://host:port``.
     """
 
     def __init__(self, url: str) -> None:
@@ -51,9 +58,10 @@ class Connecting:
             ).start()
 
     def poll(self) -> socket.socket | None:
-        """The connected, non-blocking socket; None while the attempt is under way.
+        """Return the connected, non-blocking socket; None while the attempt is under way.
 
-        LinkError: no address answers.
+        Raises:
+            LinkError: No address of the host answers.
         """
         if self._addresses is None:
             if self._error:
@@ -70,7 +78,7 @@ class Connecting:
                 code = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
                 if code:
                     self._fail(code)
-                elif self._connected():
+                elif self._is_connected():
                     connected, self._socket = self._socket, None
                     connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                     return connected
@@ -80,17 +88,19 @@ class Connecting:
                     return None
 
     def close(self) -> None:
-        """Give up. Safe to call twice."""
+        """Give the attempt up; a second call does nothing."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def _look_up(self, flags: int) -> list[Any]:
+        """Return the addresses of the host."""
         return list(
             socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=flags)
         )
 
     def _resolve(self) -> None:
+        """Look up the name of the host, in a thread of its own."""
         try:
             self._addresses = self._look_up(0)
         except (OSError, UnicodeError) as error:
@@ -101,6 +111,7 @@ class Connecting:
             )
 
     def _start(self, address: Any) -> None:
+        """Begin to connect to one address."""
         family, kind, protocol, _, target = address
         try:
             self._socket = socket.socket(family, kind | socket.SOCK_NONBLOCK, protocol)
@@ -111,12 +122,14 @@ class Connecting:
         if code not in (0, errno.EINPROGRESS):
             self._fail(code)
 
-    def _connected(self) -> bool:
+    def _is_connected(self) -> bool:
+        """Return whether the socket has a peer."""
         with contextlib.suppress(OSError):
             return self._socket is not None and bool(self._socket.getpeername())
         return False
 
     def _fail(self, code: int) -> None:
+        """Give one address up, because of this errno; the next one is tried."""
         self.close()
         if code == errno.ECONNREFUSED:
             kind, fix = "refused", "start the bridge there or correct the port"
