@@ -175,7 +175,7 @@ class LoadVerification:
         )
 
     def _comparison(self, arrivals: Arrivals) -> Comparison:
-        return compare(self._log, arrivals, *self._span_ns)
+        return compare(self._log.table, arrivals, *self._span_ns)
 
     def _received(self, comparison: Comparison) -> tuple[Index, AnyArray, Index]:
         """Return cube (K,), components (K, 15) and time (K,) in ns of the rows that arrived."""
@@ -183,7 +183,7 @@ class LoadVerification:
         if not len(first):
             return np.empty(0, np.intp), np.empty((0, len(COMPONENTS))), np.empty(0, np.int64)
         cube = self._stress.columns()[0]
-        return cube[first], np.concatenate(self._components)[first], comparison.taken_ns[first]
+        return cube[first], np.concatenate(self._components)[first], comparison.taken_ns
 
     def _errors(self, comparison: Comparison) -> dict[str, object]:
         """Return rms and largest error relative to the range of each component in the script, and

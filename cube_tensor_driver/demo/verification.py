@@ -1,34 +1,23 @@
 """Comparison of what simulated hubs sent with what arrived.
 
 Demo and bench collect what arrives in `Arrivals`, and `compare` it with the sample log at the end.
-Counts are rows: one cube, one sample. Torture checks more, see `workshop/judge/`.
+Counts are rows: one cube, one sample. Torture checks more, see `workshop/checks/`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from ..config.skin import Skin
 from ..core.arrays import AnyArray, Array, Index, Mask
+from ..core.matching import NO_MATCH, SampleKeys
 from ..core.rows import FrequencyRows, StressRows
 from ..simulation.cubes import hub_cubes
-from ..simulation.sample_log import NEVER
+from ..simulation.sample_log import SampleTable
 
 NS_TO_MS = 1e-6
-
-
-class Taken(Protocol):
-    """Which samples hubs took and when: a `SampleLog`, or what other hubs wrote."""
-
-    @property
-    def start_time_ns(self) -> int: ...
-
-    def rows_taken(self, start_ns: int, end_ns: int) -> int: ...
-
-    def taken_ns(self, cube: AnyArray, sequence: AnyArray, stamp_ns: AnyArray) -> Index: ...
 
 
 class Arrivals:
@@ -94,16 +83,16 @@ class Comparison:
     Attributes:
         sent: Number of rows of the samples that the hubs took.
         received: Number of these rows that arrived; repeated ones count once.
-        taken_ns: (N,) time at which each row kept in `Arrivals` was taken, or `NEVER`.
-        first: (K,) indices into these N of the first arrival of each row of the span.
+        first: (K,) indices into the rows kept in `Arrivals` of the first arrival of each row.
+        taken_ns: (K,) wall clock at which these rows were taken, in ns.
         latency_ms: (K,) time from the sample to its arrival, in ms.
         stamp_error_ms: (K,) absolute difference between the sample's time and its stamp, in ms.
     """
 
     sent: int
     received: int
-    taken_ns: Index
     first: Index
+    taken_ns: Index
     latency_ms: Array
     stamp_error_ms: Array
 
@@ -113,22 +102,21 @@ class Comparison:
         return self.sent - self.received
 
 
-def compare(log: Taken, arrivals: Arrivals, start_ns: int, end_ns: int) -> Comparison:
+def compare(taken: SampleTable, arrivals: Arrivals, start_ns: int, end_ns: int) -> Comparison:
     """Compare what arrived with what was taken from `start_ns` to before `end_ns` (wall clock)."""
     cube, sequence, stamp_ns, received_ns = arrivals.columns()
-    taken_ns = log.taken_ns(cube, sequence, stamp_ns)
-    in_span = (taken_ns != NEVER) & (taken_ns >= start_ns) & (taken_ns < end_ns)
+    sample = taken.match(SampleKeys(cube, sequence, stamp_ns))
+    taken_ns = taken.time_ns[sample] if len(taken) else np.zeros(len(sample), np.int64)
+    in_span = (sample != NO_MATCH) & (taken_ns >= start_ns) & (taken_ns < end_ns)
     rows = np.flatnonzero(in_span)
 
-    # A row is identified by cube and time, because numbers are given again after a restart.
-    since_us = (taken_ns[rows] - log.start_time_ns) // 1000
-    key = since_us * len(arrivals.row_count) + cube[rows]
-    first = rows[np.sort(np.unique(key, return_index=True)[1])]
+    row_id = sample[rows] * len(arrivals.row_count) + cube[rows]
+    first = rows[np.sort(np.unique(row_id, return_index=True)[1])]
     return Comparison(
-        sent=log.rows_taken(start_ns, end_ns),
+        sent=taken.rows_taken(start_ns, end_ns),
         received=int(arrivals.row_count[cube[first]].sum()),
-        taken_ns=taken_ns,
         first=first,
+        taken_ns=taken_ns[first],
         latency_ms=NS_TO_MS * (received_ns[first] - taken_ns[first]),
         stamp_error_ms=NS_TO_MS * np.abs(stamp_ns[first] - taken_ns[first]),
     )

@@ -23,7 +23,7 @@ OPEN_FACTOR = 8
 """An open pad has only its parasitic capacitance: its frequency rises above all that the pad law
 with β = 0.3 can give."""
 MAX_MILLIHERTZ = 0xFFFFFFFF
-SPOILING = ("drop", "flip", "insert", "truncate")
+DAMAGING_FAULTS = ("drop", "flip", "insert", "truncate")
 """What happens to a frame that may not be read any more."""
 
 
@@ -31,17 +31,17 @@ SPOILING = ("drop", "flip", "insert", "truncate")
 class SimulatedLink:
     """A link: the simulated hub at its far end, and the line between.
 
-    spoiled: restarts of the hub before, and number, of each sample that was not sent as it was
+    damaged: restarts of the hub before, and number, of each sample that was not sent as it was
     """
 
     name: str
     hub: SimulatedHub
     line: Line
-    spoiled: list[tuple[int, int]] = field(default_factory=list, kw_only=True)
+    damaged: list[tuple[int, int]] = field(default_factory=list, kw_only=True)
 
-    def spoil(self) -> None:
-        """The sample that the hub took last is spoiled."""
-        self.spoiled.append((self.hub.boots, self.hub.sequence - 1))
+    def mark_damaged(self) -> None:
+        """Note that the sample that the hub took last is not sent as it was."""
+        self.damaged.append((self.hub.boots, self.hub.sequence - 1))
 
 
 @dataclass
@@ -150,8 +150,8 @@ class Injector:
         state, random = self._states[link.name], self._random
         kind = state.frames.pop(0) if state.frames else ""
         held_back, state.held_back = state.held_back, b""
-        if kind in SPOILING:
-            link.spoil()
+        if kind in DAMAGING_FAULTS:
+            link.mark_damaged()
         if kind == "drop":
             data = b""
         elif kind == "flip":

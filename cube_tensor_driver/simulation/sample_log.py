@@ -6,22 +6,25 @@ The simulator writes it when it ends. Checks of what arrived read it.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.output_files import atomic_write
+from ..core.arrays import Index, Times
 from ..core.errors import ConfigError
+from ..core.matching import SampleKeys, SampleRows, match_rows
 from .faults import Fault
 
 ABSENT = -1
 """Index in the skin of a cube that the hub has and the skin has not."""
-NEVER = -1
-"""Time of a sample that no hub took."""
+NO_LINK = -1
+"""Link of a cube that is on none."""
+CUBE_RANGE = 1 << 16
+"""Number of possible indices of a cube, which are 16 bits wide in messages."""
 SEQUENCE_RANGE = 1 << 32
 """Sequence numbers on the wire begin again at 0 here; those in the log do not."""
 
@@ -59,14 +62,14 @@ class LinkLog:
     cubes: index in the skin of each of the hub's cubes, ABSENT where the skin has none
     dropped: samples that the hub took and had no room to send, since its last restart
     runs: all samples that it took, in the order of time
-    spoiled: boot and number of each sample that was harmed, or found no room on the line
+    damaged: boot and number of each sample that was harmed, or found no room on the line
     """
 
     name: str
     cubes: tuple[int, ...]
     dropped: int
     runs: tuple[SampleRun, ...]
-    spoiled: tuple[tuple[int, int], ...] = ()
+    damaged: tuple[tuple[int, int], ...] = ()
 
     @property
     def members(self) -> list[int]:
@@ -121,7 +124,7 @@ class SampleLog:
                 cubes=tuple(link["cubes"]),
                 dropped=link["dropped"],
                 runs=tuple(SampleRun(**run) for run in link["runs"]),
-                spoiled=tuple((boot, number) for boot, number in link["spoiled"]),
+                damaged=tuple((boot, number) for boot, number in link["damaged"]),
             )
             for link in data["links"]
         )
@@ -136,43 +139,62 @@ class SampleLog:
         """Samples that the hubs took and had no room to send."""
         return sum(link.dropped for link in self.links)
 
-    def times_ns(self, run: SampleRun) -> NDArray[np.int64]:
-        """(samples,) wall clock when each sample of a run was taken."""
-        return self.start_time_ns + 1000 * (run.start_us + run.period_us * np.arange(len(run)))
+    @cached_property
+    def table(self) -> SampleTable:
+        """All samples of the log, link after link, in the order of time."""
+        runs = [(number, run) for number, link in enumerate(self.links) for run in link.runs]
+        lengths = np.array([len(run) for _, run in runs], int)
+        number = [np.arange(run.first, run.last + 1) for _, run in runs]
+        time_us = [run.start_us + run.period_us * np.arange(len(run)) for _, run in runs]
+        no_samples = np.empty(0, np.int64)
 
-    def samples(self) -> Iterator[tuple[LinkLog, SampleRun, NDArray[np.int64]]]:
-        """Each run of each link with the wall clock (samples,) of its samples."""
-        for link in self.links:
-            for run in link.runs:
-                yield link, run, self.times_ns(run)
+        link_of_cube = np.full(CUBE_RANGE, NO_LINK, np.int64)
+        for index, link in enumerate(self.links):
+            link_of_cube[link.members] = index
+        return SampleTable(
+            start_time_ns=self.start_time_ns,
+            link=np.repeat(np.array([link for link, _ in runs], int), lengths),
+            number=np.concatenate([no_samples, *number]),
+            time_ns=self.start_time_ns + 1000 * np.concatenate([no_samples, *time_us]),
+            rows_per_sample=np.array([len(link.members) for link in self.links], int),
+            link_of_cube=link_of_cube,
+        )
+
+
+@dataclass(frozen=True)
+class SampleTable:
+    """Columns of all samples (S,) that the hubs of a skin took.
+
+    Attributes:
+        start_time_ns: Wall clock at time 0 of the hubs, in ns.
+        link: Index of the link whose hub took the sample (S,).
+        number: Number of the sample (S,); it does not wrap around.
+        time_ns: Wall clock at which it was taken (S,), in ns.
+        rows_per_sample: Number of the skin's cubes on each link (links,).
+        link_of_cube: Link of each possible index of a cube (`CUBE_RANGE`,), or `NO_LINK`.
+    """
+
+    start_time_ns: int
+    link: Index
+    number: Times
+    time_ns: Times
+    rows_per_sample: Index
+    link_of_cube: Index
+
+    def __len__(self) -> int:
+        return len(self.link)
+
+    def match(self, rows: SampleRows) -> Index:
+        """Find the sample of each row (N,), or `NO_MATCH` for what no hub took.
+
+        A hub that restarts gives its numbers again. Among the samples with the number of the row,
+        the one whose time is nearest to the row's stamp is chosen.
+        """
+        known = SampleKeys(self.link, self.number % SEQUENCE_RANGE, self.time_ns)
+        link = self.link_of_cube[rows.cube]
+        return match_rows(known, SampleKeys(link, rows.sequence, rows.stamp_ns))
 
     def rows_taken(self, start_ns: int, end_ns: int) -> int:
-        """Rows (one cube, one sample) taken from start_ns to before end_ns of the wall clock."""
-        rows = 0
-        for link, _, times in self.samples():
-            rows += len(link.members) * int(
-                np.count_nonzero((times >= start_ns) & (times < end_ns))
-            )
-        return rows
-
-    def taken_ns(
-        self, cube: NDArray[Any], sequence: NDArray[Any], stamp_ns: NDArray[Any]
-    ) -> NDArray[np.int64]:
-        """When samples (N,) were taken, wall clock; NEVER for what no hub took.
-
-        cube: index in the skin; sequence: as on the wire. A number may have been given again after
-        a restart: then the sample is meant that was taken nearest to stamp_ns.
-        """
-        time_ns = np.full(len(cube), NEVER, np.int64)
-        for link in self.links:
-            rows = np.flatnonzero(np.isin(cube, link.members))
-            for run in link.runs:
-                ahead = (sequence[rows].astype(np.int64) - run.first) % SEQUENCE_RANGE
-                there = ahead < len(run)
-                taken = rows[there]
-                moment = self.start_time_ns + 1000 * (run.start_us + ahead[there] * run.period_us)
-                distance = np.abs(moment - stamp_ns[taken])
-                best = np.abs(time_ns[taken] - stamp_ns[taken])
-                nearer = (time_ns[taken] == NEVER) | (distance < best)
-                time_ns[taken[nearer]] = moment[nearer]
-        return time_ns
+        """Count the rows (one cube, one sample) taken from `start_ns` to before `end_ns`."""
+        is_within = (self.time_ns >= start_ns) & (self.time_ns < end_ns)
+        return int(self.rows_per_sample[self.link[is_within]].sum())

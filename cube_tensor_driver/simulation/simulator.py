@@ -158,7 +158,7 @@ class Simulator:
                 cubes=tuple(link.carried.members.tolist()),
                 dropped=link.hub.dropped,
                 runs=tuple(link.hub.runs),
-                spoiled=tuple(link.spoiled),
+                damaged=tuple(link.damaged),
             )
             for link in self._links
         )
@@ -214,7 +214,7 @@ class Simulator:
         frame = link.hub.sample(self._injector.measured(link, frequency, time_us))
         if not link.line.send(self._injector.transmitted(link, frame), now_us):
             link.hub.dropped += 1
-            link.spoil()
+            link.mark_damaged()
 
     def _watch(
         self, selector: selectors.BaseSelector, watched: dict[str, int], link: PlayedLink

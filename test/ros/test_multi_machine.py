@@ -173,10 +173,11 @@ def lost_on_the_way(path: Path) -> int:
 def sampled(log: SampleLog) -> dict[tuple[int, int], int]:
     """When each row was sampled, ns of the wall clock, by cube and sequence number."""
     return {
-        (cube, run.first + k): time_ns
-        for link, run, times_ns in log.samples()
-        for k, time_ns in enumerate(times_ns.tolist())
-        for cube in link.members
+        (cube, int(number)): int(time_ns)
+        for link, number, time_ns in zip(
+            log.table.link, log.table.number, log.table.time_ns, strict=True
+        )
+        for cube in log.links[link].members
     }
 
 

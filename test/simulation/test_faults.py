@@ -272,4 +272,4 @@ def test_a_hub_reports_pads_and_a_sample_that_was_harmed_is_noted():
     _, samples = link.play(30)
     reported = [sample.sequence for sample in samples if sample.pad_fault.tolist() == [0, 1 << 2]]
     assert reported == list(range(5, 10))
-    assert link.spoiled == [(0, 15), (0, 16)]
+    assert link.damaged == [(0, 15), (0, 16)]

@@ -9,12 +9,12 @@ from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.core.matching import NO_MATCH, SampleKeys
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.demo.verification import Arrivals, compare
 from cube_tensor_driver.simulation.faults import Fault
 from cube_tensor_driver.simulation.sample_log import (
     ABSENT,
-    NEVER,
     FaultRecord,
     LinkLog,
     SampleLog,
@@ -52,9 +52,9 @@ def rows_of(cubes, sequence, stamp_ns) -> FrequencyRows:
 
 def everything():
     """(rows, link name) of all samples of the log, in order of each link."""
-    for link, run, times_ns in LOG.samples():
-        for k, time_ns in enumerate(times_ns.tolist()):
-            yield rows_of(link.members, run.first + k, time_ns + 150_000)
+    table = LOG.table
+    for link, number, time_ns in zip(table.link, table.number, table.time_ns, strict=True):
+        yield rows_of(LOG.links[link].members, int(number), time_ns + 150_000)
 
 
 @pytest.fixture(scope="module")
@@ -84,14 +84,15 @@ def test_what_is_no_log_is_refused(tmp_path, text):
 def test_when_a_sample_was_taken_and_how_many_in_a_span():
     cube, sequence = np.array([1, 1, 1, 2, 3, 2]), np.array([3, 3, 15, 2**32 - 1, 4, 5])
     near = START_NS + 1000 * np.array([0, 120_000, 0, 0, 0, 0])
-    time_ns = LOG.taken_ns(cube, sequence, near)
+    sample = LOG.table.match(SampleKeys(cube, sequence, near))
+    time_ns = LOG.table.time_ns[sample]
     expected_us = [6000, 106_000, 130_000, 8000, 18_000]
     assert ((time_ns[:5] - START_NS) // 1000).tolist() == expected_us
-    assert time_ns[5] == NEVER
+    assert sample[5] == NO_MATCH
     # Two cubes on each hub; the hub of 10 samples and the wrapped one in the first 20 ms.
-    assert LOG.rows_taken(START_NS, START_NS + 20_000_000) == 2 * 10 + 2 * 10
-    assert LOG.rows_taken(START_NS, START_NS + 10_000_001) == 2 * 6 + 2 * 6
-    assert LOG.rows_taken(START_NS, END_NS) == 2 * 30 + 2 * 10
+    assert LOG.table.rows_taken(START_NS, START_NS + 20_000_000) == 2 * 10 + 2 * 10
+    assert LOG.table.rows_taken(START_NS, START_NS + 10_000_001) == 2 * 6 + 2 * 6
+    assert LOG.table.rows_taken(START_NS, END_NS) == 2 * 30 + 2 * 10
 
 
 @pytest.mark.parametrize("one_per_hub", [False, True])
@@ -104,15 +105,15 @@ def test_rows_that_came_twice_or_were_never_taken_do_not_make_up_for_lost_ones(s
     arrivals.add(samples[8])
     arrivals.add(rows_of([0, 1], 1000, START_NS))
     assert arrivals.rows == 2 * len(samples)
-    comparison = compare(LOG, arrivals, START_NS, END_NS)
+    comparison = compare(LOG.table, arrivals, START_NS, END_NS)
     assert (comparison.sent, comparison.received, comparison.missing) == (80, 76, 4)
     np.testing.assert_allclose(comparison.latency_ms, 1.0)
     np.testing.assert_allclose(comparison.stamp_error_ms, 0.15)
     # Of a span: the first 10 ms of both hubs.
-    span = compare(LOG, arrivals, START_NS, START_NS + 10_000_000)
+    span = compare(LOG.table, arrivals, START_NS, START_NS + 10_000_000)
     assert (span.sent, span.received) == (20, 18)
 
 
 def test_nothing_arrived(skin):
-    comparison = compare(LOG, Arrivals(skin), START_NS, END_NS)
+    comparison = compare(LOG.table, Arrivals(skin), START_NS, END_NS)
     assert (comparison.sent, comparison.received, comparison.missing) == (80, 0, 80)

@@ -27,17 +27,18 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.demo.running import end_simulator, observing, report
 from cube_tensor_driver.demo.usage import Usage
-from cube_tensor_driver.demo.verification import Arrivals, Taken, compare, percentile
+from cube_tensor_driver.demo.verification import Arrivals, compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.node import queue
+from cube_tensor_driver.simulation.sample_log import SampleTable
 from cube_tensor_driver.views.figures.style import save
 from cube_tensor_hub.firmware import FirmwareError
 
-from .hubs_in_c import HubLoad, TakenSamples
+from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
 
 LAYOUT, PITCH = "planar", 0.012
@@ -251,14 +252,16 @@ def _skin(
     }
 
 
-def _end_load(executable: str, children: Children, log: Path, load: HubLoad) -> tuple[Taken, int]:
+def _end_load(
+    executable: str, children: Children, log: Path, load: HubLoad
+) -> tuple[SampleTable, int]:
     """End what sends the samples. Returns what it took, and how many samples it had no room for."""
     if executable == "simulator":
         sample_log = end_simulator(children, log)
-        return sample_log, sample_log.dropped
+        return sample_log.table, sample_log.dropped
     children.end([executable])
     dropped = re.findall(r" taken, (\d+) dropped", children.log(executable))
-    return TakenSamples.read(log, load), sum(map(int, dropped))
+    return read_samples(log, load), sum(map(int, dropped))
 
 
 def _echo(cubes: int, rate: float, duration: float, progress: Progress) -> dict[str, float]:

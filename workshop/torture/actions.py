@@ -21,7 +21,7 @@ from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.srv import Tare
 
-from ..judge.record import Deed
+from ..checks.record import Deed
 from .message_log import Tape
 from .mix import CUBES_PER_HUB, HELD_HUB
 

@@ -22,7 +22,7 @@ from cube_tensor_driver.messages.codec import AnyRows, MessageCodec
 from cube_tensor_driver.msg import StressTensorStamped
 from cube_tensor_driver.ros.messages import to_ns
 
-from ..judge.record import CubeMessages, Received
+from ..checks.record import CubeMessages, Received
 
 TOGETHER = 500
 """Messages that are decoded at a time."""

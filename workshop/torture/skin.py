@@ -32,8 +32,8 @@ from cube_tensor_driver.simulation.inject import fault_line
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.simulator import FAULT_PIPE
 
-from ..judge.expected import load_tables
-from ..judge.record import Deed, Record
+from ..checks.expected import load_tables
+from ..checks.record import Deed, Record
 from .actions import START_S, Deeds
 from .memory import Memory
 from .message_log import CubeTape, Tape
@@ -281,7 +281,7 @@ def _recording(
             step()
 
     with observing("torture", children, interrupted=interrupted, on_step=on_step) as observer:
-        node = rclpy.create_node("judge")
+        node = rclpy.create_node("checker")
         try:
             recorder = _Recorder(observer, node, skin)
             steps.append(recorder.take)

@@ -17,7 +17,7 @@ from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.stop_signals import stop_event
 from cube_tensor_driver.views.terminal.output import progress_bar
 
-from ..judge.verdict import judge
+from ..checks.verdict import judge
 from .mutations import MUTATIONS
 from .skin import play
 

@@ -27,11 +27,11 @@ class Samples:
 
     link: (S,) index in the log; boot, number: (S,) as in the log
     time_us: (S,) simulated time; time_ns: (S,) wall clock; period_us: (S,)
-    spoiled: (S,) bool, harmed on purpose, or it found no room on the line
+    damaged: (S,) bool, harmed on purpose, or it found no room on the line
     """
 
     def __init__(self, log: SampleLog) -> None:
-        parts, spoiled = [], []
+        parts, damaged = [], []
         self._begin: list[int] = []
         count = 0
         for number, link in enumerate(log.links):
@@ -42,8 +42,8 @@ class Samples:
                 time_us = run.start_us + run.period_us * n
                 same = [np.full(len(run), value) for value in (number, run.boot, run.period_us)]
                 parts.append((*same, run.first + n, time_us))
-            harmed = set(link.spoiled)
-            spoiled += [
+            harmed = set(link.damaged)
+            damaged += [
                 (run.boot, sample) in harmed
                 for run in link.runs
                 for sample in range(run.first, run.last + 1)
@@ -53,7 +53,7 @@ class Samples:
             np.concatenate(column).astype(np.int64) for column in columns
         )
         self.time_ns = log.start_time_ns + 1000 * self.time_us
-        self.spoiled = np.array(spoiled, bool)
+        self.damaged = np.array(damaged, bool)
         self._log = log
 
     def __len__(self) -> int:

@@ -15,11 +15,11 @@ from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.simulation.faults import Fault
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
-from workshop.judge.expected import Expected, load_tables
-from workshop.judge.record import CubeMessages, Deed, Received, Record
-from workshop.judge.rest import MARGIN_NS
-from workshop.judge.samples import Samples
-from workshop.judge.verdict import judge
+from workshop.checks.expected import Expected, load_tables
+from workshop.checks.record import CubeMessages, Deed, Received, Record
+from workshop.checks.rest import MARGIN_NS
+from workshop.checks.samples import Samples
+from workshop.checks.verdict import judge
 
 INSTANTS, COUNT, PERIOD_US, EACH = 400, 2000, 2000, 2
 FAULTS = {
@@ -56,7 +56,7 @@ def played(tmp_path_factory):
     before = replace(run, last=half - 1)
     after = SampleRun(0, half - 1, PERIOD_US * (half + 1), PERIOD_US, boot=1)
     links = (
-        LinkLog("hub0", (0, 1), 0, (run,), spoiled=((0, 70),)),
+        LinkLog("hub0", (0, 1), 0, (run,), damaged=((0, 70),)),
         LinkLog("hub1", (2, 3), 0, (before, after)),
     )
     return recorded(skin, SampleLog(0, links, RECORDS))
@@ -70,7 +70,7 @@ def recorded(skin, log, deeds=(), rest_after=None):
     samples = Samples(log)
     expected = Expected(skin, log, samples, INSTANTS)
     order = np.argsort(samples.time_us, kind="stable")
-    order = order[~samples.spoiled[order]]
+    order = order[~samples.damaged[order]]
     cube = (EACH * samples.link[order, None] + np.arange(EACH)).ravel().astype(np.uint16)
     of = np.repeat(order, EACH)
     readings = expected.of(cube, of)

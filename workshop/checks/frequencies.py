@@ -118,8 +118,8 @@ def _count(
 def _explained(record: Record, log: SampleLog, samples: Samples) -> NDArray[np.bool_]:
     """(S,) whether rows of a sample may be missing: it was harmed, its link was cut, its hub was
     stopped, or its message did not come here."""
-    explained = samples.spoiled.copy()
-    explained[:-1] |= samples.spoiled[1:]  # a sample that is held back goes out with the next one
+    explained = samples.damaged.copy()
+    explained[:-1] |= samples.damaged[1:]  # a sample that is held back goes out with the next one
     seconds = 1e-6 * samples.time_us
     numbers = {link.name: number for number, link in enumerate(log.links)}
     for fault in log.faults:
