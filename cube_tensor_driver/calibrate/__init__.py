@@ -1,5 +1,5 @@
-"""Calibration of a cube from known loads, and the first tests of a new hub's pads.
+"""Calibration of a cube from known loads, and the first tests of the pads of a new hub.
 
-A fit of the response to a table or a recording of loads, and what bring-up computes: the order of
-the pads, their rest frequencies, and which cube is turned.
+The fit takes a table or a recording of loads. Bring-up measures the pads at rest, and finds their
+order and the rotation of each cube from presses.
 """

@@ -1,11 +1,17 @@
-"""Fit of a calibration from recorded loads: the symmetric coefficients and one gain per pad.
+"""Fit of a calibration to known loads: the symmetric coefficients, and one gain per pad.
 
     v_np = g_p sum_k c_k (B_k s_n)_p + noise
 
-s_n: known state of load n, v_np: stress that pad p showed, B_k: basis of the structure. The product
-of g and c is settled by gains that average 1 over each set of pads that the symmetry carries onto
-each other. Solved by Gauss-Newton steps on weighted residuals: Huber's weights first, then Tukey's,
-which forget outliers altogether.
+    s_n   known state of load n
+    v_np  stress that pad p measured under load n
+    B_k   basis matrices of the structure
+    c_k   coefficients
+    g_p   gains
+
+Only the product of g and c is determined by loads. So gains average 1 over each set of pads that
+the symmetry maps onto each other. The fit takes Gauss-Newton steps on weighted residuals: with
+equal weights, then with Huber's, and at last with Tukey's, which ignore outliers altogether.
+
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """
 
@@ -15,65 +21,75 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ..core.arrays import Array, Mask
 from ..core.calibration import Calibration
 from ..core.errors import FitError
 from ..core.modes import Modes
 from ..core.oscillator import pad_stress
 from ..core.symmetry import Structure
 from .robust import (
+    MAX_STEPS,
     STAGES,
-    STEPS,
+    compute_weights,
+    estimate_scatter,
+    find_undetermined,
     hidden_directions,
     least_squares,
     robust_covariance,
-    scatter,
-    touched,
-    weights_of,
 )
 
 FOLDS = 10
-"""Of the cross-validation."""
+"""Number of parts of the cross-validation; each part is left out once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What loads say about a structure.
+    """Result of a fit to N loads.
 
-    coefficients, deviations: {name: value} and standard deviations, Pa per Pa; NaN where the loads
-        do not determine them
-    covariance: (K, K) of the coefficients
-    gain, gain_deviation: (P,)
-    scale: scatter found, in units of the stated noise
-    chi2, dof: over the readings that are not outliers
-    held_out: rms error on loads left out of the fit over rms reading (cross-validation), without
-        outliers
-    fitted: (N, P) Pa
-    outliers: (N, P) bool, readings that had no weight
-    undetermined: names of coefficients that these loads leave open
-    advice: which loads to add, in words
+    Attributes:
+        structure: Structure of the response.
+        coefficients: Values by name, in Pa per Pa; NaN where the loads do not determine them.
+        deviations: Standard deviations by name, in Pa per Pa.
+        covariance: Covariance (K, K) of the coefficients.
+        gain, gain_deviation: Gains and their standard deviations (P,).
+        scale: Scatter of the residuals, in units of the stated noise.
+        chi2, dof: Chi-square and its degrees of freedom, of the readings that are no outliers.
+        held_out: Ratio of the rms error on loads that are left out of the fit (cross-validation) to
+            the rms reading, without outliers.
+        fitted: Fitted pad stresses (N, P), in Pa.
+        outliers: Which readings had no weight (N, P).
+        undetermined: Names of the coefficients that the loads do not determine.
+        advice: Sentences that tell which loads to add.
     """
 
     structure: Structure
     coefficients: dict[str, float]
     deviations: dict[str, float]
-    covariance: np.ndarray
-    gain: np.ndarray
-    gain_deviation: np.ndarray
+    covariance: Array
+    gain: Array
+    gain_deviation: Array
     scale: float
     chi2: float
     dof: int
     held_out: float
-    fitted: np.ndarray
-    outliers: np.ndarray
+    fitted: Array
+    outliers: Mask
     undetermined: tuple[str, ...]
     advice: tuple[str, ...]
 
     def calibration(self, base: Calibration, created: str = "", source: str = "") -> Calibration:
-        """base with what was fitted, and with its noise raised to the scatter found.
+        """Return a calibration with the fitted values.
 
-        FitError when coefficients are undetermined: add the loads of `advice`, or give them as
-        `fixed`.
+        Args:
+            base: Calibration with all other values. Its noise is raised to the scatter found.
+            created: Time of creation, ISO 8601.
+            source: Origin of the values.
+
+        Raises:
+            FitError: Coefficients are undetermined. Add the loads of `advice`, or give the
+                coefficients as `fixed`.
         """
         if self.undetermined:
             raise FitError(
@@ -94,10 +110,18 @@ class Fit:
 
 
 def measured_stress(
-    base: Calibration, frequency: np.ndarray, temperature: np.ndarray | None = None
-) -> np.ndarray:
-    """(N, P) Pa from frequencies (N, P) by a calibration's pad law; FitError names one out of
-    range."""
+    base: Calibration, frequency: ArrayLike, temperature: Array | None = None
+) -> Array:
+    """Compute pad stresses (N, P), in Pa, by the pad law of a calibration.
+
+    Args:
+        base: Calibration with the pad law and the rest frequencies.
+        frequency: Frequencies (N, P), in Hz.
+        temperature: Temperatures (N,), in °C, if they are known.
+
+    Raises:
+        FitError: The shape is wrong, or a frequency is outside the range of the pad law.
+    """
     f = np.asarray(frequency, dtype=float)
     if f.ndim != 2 or f.shape[1] != base.layout.n_pads:
         raise FitError(
@@ -108,21 +132,30 @@ def measured_stress(
     if base.temperature is not None and temperature is not None:
         rest = rest * base.temperature.factor(temperature)
     v = pad_stress(f, rest, base.beta, base.modulus)
-    if not np.all(np.isfinite(v)):
-        n, p = np.argwhere(~np.isfinite(v))[0]
+    for load, pad in np.argwhere(~np.isfinite(v)).tolist():
         raise FitError(
-            f"load {n + 1}, pad {base.layout.pads[p]}: {f[n, p]:g} Hz is outside the pad's range; "
-            "correct or remove this row"
+            f"load {load + 1}, pad {base.layout.pads[pad]}: {f[load, pad]:g} Hz is outside the "
+            "pad's range; correct or remove this row"
         )
     return v
 
 
-def traction_loads(modes: Modes, force: np.ndarray, area: float) -> np.ndarray:
-    """(N, M) states for forces (N, 3) in N of a reference sensor over an area in m^2 of the face
-    +z.
+def loads_from_forces(modes: Modes, force: ArrayLike, area: float) -> Array:
+    """Compute the states of forces that a reference sensor measured on the face +z.
 
-    Uniform zz, yz and zx; the stresses along the skin are taken as 0: nothing holds the layer
-    sideways.
+    The stress is uniform in zz, yz and zx. The stresses along the skin are taken as 0, because
+    nothing holds the layer sideways.
+
+    Args:
+        modes: The M modes.
+        force: Forces (N, 3), in N.
+        area: Area that the forces act on, in m².
+
+    Returns:
+        States (N, M), in Pa.
+
+    Raises:
+        FitError: The shape is wrong, or the area is not above 0.
     """
     f = np.asarray(force, dtype=float)
     if f.ndim != 2 or f.shape[1] != 3 or not area > 0:
@@ -131,130 +164,175 @@ def traction_loads(modes: Modes, force: np.ndarray, area: float) -> np.ndarray:
             "needed are (loads, 3) and above 0"
         )
     stress = np.zeros((len(f), 6))
-    stress[:, [4, 3, 2]] = f / area
+    zx_yz_zz = [4, 3, 2]
+    stress[:, zx_yz_zz] = f / area
     return modes.state(stress)
 
 
 def fit(
     structure: Structure,
-    loads: np.ndarray,
-    measured: np.ndarray,
-    noise: np.ndarray | float = 1.0,
+    loads: ArrayLike,
+    measured: ArrayLike,
+    noise: ArrayLike = 1.0,
     fixed: Mapping[str, float] | None = None,
     gains: bool = True,
 ) -> Fit:
-    """Coefficients and gains from loads (N, M) in Pa and measured pad stresses (N, P) in Pa.
+    """Fit coefficients and gains to loads.
 
-    noise: standard deviation of the readings in Pa, one or (P,)
-    fixed: coefficients known from elsewhere
-    gains: False takes every gain as 1, for loads that reach too few pads to separate gains from
-        coefficients
-    FitError: wrong shapes, NaN, loads of zero, or loads that determine no coefficient at all.
+    Args:
+        structure: Structure of the response.
+        loads: Known states (N, M), in Pa.
+        measured: Measured pad stresses (N, P), in Pa.
+        noise: Standard deviation of the readings, one number or (P,), in Pa.
+        fixed: Coefficients that are known from elsewhere, by name.
+        gains: Whether gains are fitted. False takes every gain as 1, for loads that reach too few
+            pads to separate gains from coefficients.
+
+    Raises:
+        FitError: Shapes or numbers are invalid, all loads are zero, or the loads determine no
+            coefficient at all.
     """
     fixed = dict(fixed or {})
-    x, y, sigma = _check(structure, loads, measured, noise, fixed)
+    x, y, sigma = _check_inputs(structure, loads, measured, noise, fixed)
     model = _Model(structure, sigma, fixed, gains)
     design = model.design(x)
     theta, weights, scale = model.solve(design, y)
+
     jacobian = model.jacobian(theta, design)
     hidden = hidden_directions(jacobian)
-    open_ = touched(hidden, len(model.free))
+    n_free = len(model.free)
+    is_open = find_undetermined(hidden, n_free)
     names = [structure.names[k] for k in model.free]
-    if len(names) and open_.all():
-        raise FitError(
-            "these loads determine no coefficient: "
-            + "; ".join(_advise(model, theta, x, hidden, open_))
-        )
-    covariance = robust_covariance(jacobian, model.residuals(theta, design, y) / scale, scale)
-    covariance[: len(names)][open_] = covariance[:, : len(names)][:, open_] = np.nan
-    k = np.full((structure.n_coefficients,) * 2, 0.0)
-    k[np.ix_(model.free, model.free)] = covariance[: len(names), : len(names)]
-    c, g = model.unpack(theta)
-    c[np.array(model.free, dtype=int)[open_]] = np.nan
-    spread = model.gains @ covariance[len(names) :, len(names) :] @ model.gains.T
+    advice = _advise(model, theta, x, hidden, is_open)
+    if names and is_open.all():
+        raise FitError(f"these loads determine no coefficient: {'; '.join(advice)}")
+
+    residuals = model.residuals(theta, design, y) / scale
+    covariance = robust_covariance(jacobian, residuals, scale)
+    covariance[:n_free][is_open] = np.nan
+    covariance[:, :n_free][:, is_open] = np.nan
+    of_coefficients = np.zeros((structure.n_coefficients, structure.n_coefficients))
+    of_coefficients[np.ix_(model.free, model.free)] = covariance[:n_free, :n_free]
+    of_gains = model.gains @ covariance[n_free:, n_free:] @ model.gains.T
+    coefficients, gain = model.unpack(theta)
+    coefficients[np.array(model.free, dtype=int)[is_open]] = np.nan
+    deviations = np.sqrt(np.diag(of_coefficients))
+
     fitted = model.predict(theta, design)
-    kept = weights > 0
+    is_used = weights > 0
+    whitened = (y - fitted) / sigma
+    n_determined = jacobian.shape[1] - hidden.shape[1]
     return Fit(
-        structure,
-        dict(zip(structure.names, c.tolist(), strict=True)),
-        dict(zip(structure.names, np.sqrt(np.diag(k)).tolist(), strict=True)),
-        k,
-        g,
-        np.sqrt(np.diag(spread).clip(0)),
-        float(scale),
-        float(np.sum(((y - fitted) / sigma)[kept] ** 2)),
-        int(kept.sum()) - (jacobian.shape[1] - hidden.shape[1]),
-        _held_out(model, design, y, kept),
-        fitted,
-        ~kept,
-        tuple(n for n, o in zip(names, open_, strict=True) if o),
-        tuple(_advise(model, theta, x, hidden, open_)),
+        structure=structure,
+        coefficients=dict(zip(structure.names, coefficients.tolist(), strict=True)),
+        deviations=dict(zip(structure.names, deviations.tolist(), strict=True)),
+        covariance=of_coefficients,
+        gain=gain,
+        gain_deviation=np.sqrt(np.diag(of_gains).clip(0)),
+        scale=float(scale),
+        chi2=float(np.sum(whitened[is_used] ** 2)),
+        dof=int(is_used.sum()) - n_determined,
+        held_out=_cross_validate(model, design, y, is_used),
+        fitted=fitted,
+        outliers=~is_used,
+        undetermined=tuple(np.array(names, dtype=object)[is_open]),
+        advice=tuple(advice),
     )
 
 
 class _Model:
-    """theta = free coefficients, then coordinates of the gains around 1."""
+    """The model whose parameters theta are the free coefficients, then coordinates of the gains.
+
+    Attributes:
+        free: Numbers of the coefficients that are not fixed.
+        gains: Changes of the gains (P, G) per coordinate. Each raises one pad and lowers the first
+            pad of its orbit, which keeps the average at 1.
+    """
 
     def __init__(
-        self, structure: Structure, noise: np.ndarray, fixed: Mapping[str, float], gains: bool
+        self, structure: Structure, noise: Array, fixed: Mapping[str, float], gains: bool
     ) -> None:
         self.structure, self.noise = structure, noise
         self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
-        self.start = np.array([fixed.get(name, 0.0) for name in structure.names], dtype=float)
+        self._fixed = np.array([fixed.get(name, 0.0) for name in structure.names], dtype=float)
+        n_pads = structure.layout.n_pads
         columns = []
         for first, *others in structure.pad_orbits if gains else ():
             for pad in others:
-                column = np.zeros(structure.layout.n_pads)
+                column = np.zeros(n_pads)
                 column[pad], column[first] = 1, -1
                 columns.append(column)
-        self.gains = np.array(columns).reshape(-1, structure.layout.n_pads).T
+        self.gains: Array = np.array(columns).reshape(-1, n_pads).T
 
-    def unpack(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        c = self.start.copy()
-        c[self.free] = theta[: len(self.free)]
-        return c, 1 + self.gains @ theta[len(self.free) :]
+    def unpack(self, theta: Array) -> tuple[Array, Array]:
+        """Return all coefficients (K,) and gains (P,)."""
+        coefficients = self._fixed.copy()
+        coefficients[self.free] = theta[: len(self.free)]
+        return coefficients, 1 + self.gains @ theta[len(self.free) :]
 
-    def design(self, x: np.ndarray) -> np.ndarray:
-        """(N, P, K): what each coefficient adds to each reading at gain 1, for loads (N, M)."""
-        return np.moveaxis(np.tensordot(x, self.structure.basis, axes=(1, 2)), 1, 2)
+    def design(self, x: Array) -> Array:
+        """Return what each coefficient adds to each reading (N, P, K) for loads (N, M), at gain
+        1."""
+        by_coefficient = np.tensordot(x, self.structure.basis, axes=(1, 2))
+        return np.moveaxis(by_coefficient, 1, 2)
 
-    def predict(self, theta: np.ndarray, design: np.ndarray) -> np.ndarray:
-        c, g = self.unpack(theta)
-        return g * (design @ c)
+    def predict(self, theta: Array, design: Array) -> Array:
+        """Return the readings (N, P), in Pa."""
+        coefficients, gain = self.unpack(theta)
+        readings: Array = gain * (design @ coefficients)
+        return readings
 
-    def residuals(self, theta: np.ndarray, design: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return ((y - self.predict(theta, design)) / self.noise).ravel()
+    def residuals(self, theta: Array, design: Array, y: Array) -> Array:
+        """Return the whitened residuals (N P,)."""
+        residuals: Array = (y - self.predict(theta, design)) / self.noise
+        return residuals.ravel()
 
-    def jacobian(self, theta: np.ndarray, design: np.ndarray) -> np.ndarray:
-        """(N P, parameters) derivatives of the whitened predictions."""
-        c, g = self.unpack(theta)
-        by_c = design[:, :, self.free] * g[:, None]
-        by_g = (design @ c)[:, :, None] * self.gains
-        return (np.concatenate([by_c, by_g], axis=2) / self.noise[:, None]).reshape(-1, theta.size)
+    def jacobian(self, theta: Array, design: Array) -> Array:
+        """Return the derivatives (N P, parameters) of the whitened predictions."""
+        coefficients, gain = self.unpack(theta)
+        by_coefficient = design[:, :, self.free] * gain[:, None]
+        by_gain = (design @ coefficients)[:, :, None] * self.gains
+        derivatives = np.concatenate([by_coefficient, by_gain], axis=2)
+        whitened: Array = derivatives / self.noise[:, None]
+        return whitened.reshape(-1, theta.size)
 
-    def solve(self, design: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """theta, the weights (N, P) of the readings, and the scatter in units of the noise."""
+    def solve(self, design: Array, y: Array) -> tuple[Array, Array, float]:
+        """Fit the parameters.
+
+        Returns:
+            Parameters, weights of the readings (N, P), and scatter in units of the noise.
+        """
         theta = np.zeros(len(self.free) + self.gains.shape[1])
-        weights, scale = np.ones(y.size), 1.0
-        for stage, small in STAGES.items():
-            for _ in range(STEPS):
+        weights = np.ones(y.size)
+        scale = 1.0
+        for stage, tolerance in STAGES.items():
+            for _ in range(MAX_STEPS):
                 r = self.residuals(theta, design, y)
-                if stage == "huber":  # the scale of the last stage stays, so that it settles
-                    scale = scatter(r)
+                if stage == "huber":
+                    # Tukey's stage keeps the last scale, without which it might not settle.
+                    scale = estimate_scatter(r)
                 if stage != "plain":
-                    weights = weights_of(stage, r / scale)
+                    weights = compute_weights(stage, r / scale)
                 root = np.sqrt(weights)
-                step = least_squares(root[:, None] * self.jacobian(theta, design), root * r)
+                weighted = root[:, None] * self.jacobian(theta, design)
+                step = least_squares(weighted, root * r)
                 theta = theta + step
-                if np.linalg.norm(step) <= small * (1 + np.linalg.norm(theta)):
+                if np.linalg.norm(step) <= tolerance * (1 + np.linalg.norm(theta)):
                     break
         return theta, weights.reshape(y.shape), scale
 
 
-def _check(structure, loads, measured, noise, fixed):
+def _check_inputs(
+    structure: Structure,
+    loads: ArrayLike,
+    measured: ArrayLike,
+    noise: ArrayLike,
+    fixed: Mapping[str, float],
+) -> tuple[Array, Array, Array]:
+    """Return loads (N, M), readings (N, P) and noise (P,). FitError: see `fit`."""
     n_pads, n_modes = structure.basis.shape[1:]
     try:
-        x, y, noise = (np.array(a, dtype=float) for a in (loads, measured, noise))
+        x, y, sigma = (np.array(values, dtype=float) for values in (loads, measured, noise))
     except (TypeError, ValueError):
         raise FitError("loads, measured stresses and noise must be numbers") from None
     if x.ndim != 2 or x.shape[1] != n_modes or y.shape != (len(x), n_pads) or not len(x):
@@ -262,18 +340,11 @@ def _check(structure, loads, measured, noise, fixed):
             f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} "
             f"needs (loads, {n_modes}) and (loads, {n_pads}) with at least one load"
         )
-    for what, array, columns in (
-        ("load", x, structure.modes.names),
-        ("reading", y, structure.layout.pads),
-    ):
-        if not np.all(np.isfinite(array)):
-            n, i = np.argwhere(~np.isfinite(array))[0]
-            raise FitError(
-                f"{what} {n + 1}, {columns[i]}: {array[n, i]}; correct or remove this row"
-            )
-    if noise.shape not in ((), (n_pads,)) or not np.all(noise > 0):
+    _refuse_unknown("load", x, structure.modes.names)
+    _refuse_unknown("reading", y, structure.layout.pads)
+    if sigma.shape not in ((), (n_pads,)) or not np.all(sigma > 0):
         raise FitError(
-            f"noise is {noise.tolist()}; it must be one number or {n_pads}, each above 0 Pa"
+            f"noise is {sigma.tolist()}; it must be one number or {n_pads}, each above 0 Pa"
         )
     if not np.any(x):
         raise FitError("all loads are zero; record loads that press, shear or bend the skin")
@@ -283,61 +354,83 @@ def _check(structure, loads, measured, noise, fixed):
             f"unknown fixed coefficients {sorted(unknown)}; "
             f"the coefficients are {', '.join(structure.names)}"
         )
-    return x, y, np.broadcast_to(noise, (n_pads,))
+    return x, y, np.broadcast_to(sigma, (n_pads,))
 
 
-def _held_out(model: _Model, design: np.ndarray, y: np.ndarray, kept: np.ndarray) -> float:
-    if len(y) < 2 or not np.any(y[kept]):
+def _refuse_unknown(kind: str, values: Array, columns: tuple[str, ...]) -> None:
+    """Raise FitError that names the first value that is not finite."""
+    for row, column in np.argwhere(~np.isfinite(values)).tolist():
+        raise FitError(
+            f"{kind} {row + 1}, {columns[column]}: {values[row, column]}; "
+            "correct or remove this row"
+        )
+
+
+def _cross_validate(model: _Model, design: Array, y: Array, is_used: Mask) -> float:
+    """Return the ratio of the rms error on loads that are left out to the rms reading."""
+    if len(y) < 2 or not np.any(y[is_used]):
         return float("nan")
     errors = np.empty_like(y)
+    # Loads are taken in turn, because tables often hold similar loads one after the other.
     fold = np.arange(len(y)) % min(FOLDS, len(y))
     for k in range(fold.max() + 1):
-        theta, _, _ = model.solve(design[fold != k], y[fold != k])
-        errors[fold == k] = y[fold == k] - model.predict(theta, design[fold == k])
-    return float(np.sqrt(np.mean(errors[kept] ** 2) / np.mean(y[kept] ** 2)))
+        is_out = fold == k
+        theta, _, _ = model.solve(design[~is_out], y[~is_out])
+        errors[is_out] = y[is_out] - model.predict(theta, design[is_out])
+    mean_square_error = np.mean(errors[is_used] ** 2)
+    return float(np.sqrt(mean_square_error / np.mean(y[is_used] ** 2)))
 
 
-def _advise(
-    model: _Model, theta: np.ndarray, x: np.ndarray, hidden: np.ndarray, open_: np.ndarray
-) -> list[str]:
-    """Sentences that name single-mode loads, found greedily, which would determine what is open."""
+def _advise(model: _Model, theta: Array, x: Array, hidden: Array, is_open: Mask) -> list[str]:
+    """Find single-mode loads that would determine what is open, one after the other.
+
+    Args:
+        model: The model.
+        theta: Fitted parameters.
+        x: Loads (N, M), in Pa.
+        hidden: Directions of the parameters that change no reading.
+        is_open: Which free coefficients the loads do not determine.
+
+    Returns:
+        One sentence for each load to add.
+    """
     advice = []
+    names = np.array(model.structure.names, dtype=object)[np.array(model.free, dtype=int)]
     theta = theta.copy()
-    # Any value: without one, the gains of the new load would seem undetermined.
-    theta[: len(open_)][open_] = 0.5
-    loads, size = x, np.sqrt(np.mean(x[x != 0] ** 2))
-    while open_.any():
-        trials = [np.vstack([loads, size * np.eye(x.shape[1])[m]]) for m in range(x.shape[1])]
-        hiddens = [
-            hidden_directions(model.jacobian(theta, model.design(trial))) for trial in trials
-        ]
-        counts = [(touched(h, len(open_)).sum(), h.shape[1]) for h in hiddens]
-        best = min(range(len(counts)), key=counts.__getitem__)
-        still = touched(hiddens[best], len(open_))
-        names = [model.structure.names[k] for k, o in zip(model.free, open_, strict=True) if o]
+    # At the value 0 of a coefficient, the gains of the new load would seem undetermined.
+    theta[: len(names)][is_open] = 0.5
+    size = np.sqrt(np.mean(x[x != 0] ** 2))
+    loads = x
+    while is_open.any():
+        candidates = [np.vstack([loads, load]) for load in size * np.eye(x.shape[1])]
+        jacobians = [model.jacobian(theta, model.design(candidate)) for candidate in candidates]
+        hiddens = [hidden_directions(jacobian) for jacobian in jacobians]
+        opens = [find_undetermined(each, len(names)) for each in hiddens]
+        # The best load determines most coefficients, then most directions of the parameters.
+        left = [(open_.sum(), each.shape[1]) for open_, each in zip(opens, hiddens, strict=True)]
+        best = min(range(len(left)), key=left.__getitem__)
         if hiddens[best].shape[1] >= hidden.shape[1]:
             advice.append(
-                f"no load determines {', '.join(names)}: "
+                f"no load determines {', '.join(names[is_open])}: "
                 "give them as fixed, or choose a larger symmetry"
             )
             break
-        settled = [
-            model.structure.names[k]
-            for k, now, then in zip(model.free, open_, still, strict=True)
-            if now and not then
-        ]
+        # A load may determine a gain first, and a coefficient only together with the next load.
+        settled = names[is_open & ~opens[best]]
+        subject = settled if len(settled) else names[is_open]
         mode = model.structure.modes.names[best]
         advice.append(
-            f"these loads do not determine {', '.join(settled or names)}: add a load of {mode} "
+            f"these loads do not determine {', '.join(subject)}: add a load of {mode} "
             f"alone, {describe_mode(mode)}, of about {size:.3g} Pa"
         )
-        loads, hidden, open_ = trials[best], hiddens[best], still
+        loads, hidden, is_open = candidates[best], hiddens[best], opens[best]
     return advice
 
 
 def describe_mode(name: str) -> str:
-    """A mode's name in words, such as "sigma_zz growing along x"."""
-    return " against ".join(
-        f"sigma_{part[:2]}" + (f" growing along {part[3]}" if "_" in part else ", uniform")
-        for part in name.split("-")
-    )
+    """Return a mode's name in words, such as "sigma_zz growing along x"."""
+    terms = []
+    for part in name.split("-"):
+        place = f" growing along {part[3]}" if "_" in part else ", uniform"
+        terms.append(f"sigma_{part[:2]}{place}")
+    return " against ".join(terms)

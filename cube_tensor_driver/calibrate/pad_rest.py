@@ -1,8 +1,7 @@
-"""How the pads of cubes behave while nothing touches them: frequency, noise, drift, and what is
-wrong.
+"""Behaviour of the pads while nothing touches them: frequency, noise, drift and faults.
 
-    noise    sqrt(mean(e²) / 6),   e[n] = f[n] - 2 f[n-1] + f[n-2]    (`core/health/statistics.py`)
-    drift    the slope of the straight line through all samples
+noise    sqrt(mean(e²) / 6),   e[n] = f[n] - 2 f[n-1] + f[n-2]    (`core/health/statistics.py`)
+drift    slope of the straight line through all samples
 """
 
 from __future__ import annotations
@@ -11,62 +10,82 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..core.arrays import Array, Mask
 from ..core.health.diagnosis import NOISY_ENTER
 
-SILENT = 0.5
-"""Share of samples without a frequency from which a pad is silent."""
-LEAST_SAMPLES = 3
-"""That second differences need."""
-MINUTE = 60.0
+MIN_MEASURED_SHARE = 0.5
+"""Share of samples with a frequency below which a pad is silent."""
+
+MIN_SAMPLES = 3
+"""Number of samples that one second difference needs."""
+
+MINUTE_S = 60.0
 
 
 class PadsAtRest(NamedTuple):
-    """frequency: (C, P) Hz, the mean. noise: (C, P) relative. drift: (C, P) relative, per minute.
-    silent, stuck, noisy: (C, P) bool."""
+    """Statistics of P pads of C cubes, all of shape (C, P).
 
-    frequency: np.ndarray
-    noise: np.ndarray
-    drift: np.ndarray
-    silent: np.ndarray
-    stuck: np.ndarray
-    noisy: np.ndarray
+    Attributes:
+        frequency: Mean frequency, in Hz; NaN for silent pads.
+        noise: Noise relative to the frequency.
+        drift: Drift relative to the frequency, per minute.
+        silent: Whether most samples have no frequency.
+        stuck: Whether the pad shows a single value while others of its cube do not.
+        noisy: Whether the noise is `NOISY_ENTER` times the median of the cube's pads.
+    """
+
+    frequency: Array
+    noise: Array
+    drift: Array
+    silent: Mask
+    stuck: Mask
+    noisy: Mask
 
     @property
-    def works(self) -> np.ndarray:
-        """(C, P) bool: pads that can be used."""
-        works: np.ndarray = ~(self.silent | self.stuck)
+    def works(self) -> Mask:
+        """Which pads are usable (C, P)."""
+        works: Mask = ~(self.silent | self.stuck)
         return works
 
 
-def pads_at_rest(frequency: np.ndarray, seconds: np.ndarray) -> PadsAtRest:
-    """Statistics of S samples: frequency (S, C, P) Hz, NaN where nothing was measured; when (S,) s.
+def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
+    """Compute the statistics of S samples.
 
-    A pad is stuck if it shows a single value while others of its cube do not, and noisy if its
-    noise is NOISY_ENTER times the median of its cube.
+    Args:
+        frequency: Frequencies (S, C, P), in Hz; NaN where nothing was measured.
+        seconds: Times of the samples (S,), in s.
     """
-    measured = np.isfinite(frequency)
-    counts = measured.sum(axis=0)
-    known = np.maximum(counts, 1)
-    mean = np.where(measured, frequency, 0).sum(axis=0) / known
-    above = np.where(measured, frequency - mean, 0)
+    is_measured = np.isfinite(frequency)
+    counts = is_measured.sum(axis=0)
+    # Pads without a sample divide by 1 and are marked as silent below.
+    mean = np.where(is_measured, frequency, 0).sum(axis=0) / np.maximum(counts, 1)
+    deviation = np.where(is_measured, frequency - mean, 0)
+
     second = np.diff(frequency, n=2, axis=0)
-    differences = np.maximum(np.isfinite(second).sum(axis=0), 1)
-    noise = np.sqrt(np.nansum(second**2, axis=0) / (6 * differences))
-    time = np.where(measured, (seconds - seconds.mean())[:, None, None], 0)
-    slope = (above * time).sum(axis=0) / np.maximum((time**2).sum(axis=0), 1e-12)
-    silent = counts < SILENT * len(frequency)
-    span = np.where(measured, above, -np.inf).max(axis=0) - np.where(measured, above, np.inf).min(
-        axis=0
-    )
-    moves = ~silent & (span > 0)
-    stuck = ~silent & (span == 0) & moves.any(axis=1, keepdims=True)
+    n_second = np.maximum(np.isfinite(second).sum(axis=0), 1)
+    noise = np.sqrt(np.nansum(second**2, axis=0) / (6 * n_second))
+    time = np.where(is_measured, (seconds - seconds.mean())[:, None, None], 0)
+    sum_time_squares = np.maximum((time**2).sum(axis=0), 1e-12)
+    slope = (deviation * time).sum(axis=0) / sum_time_squares
+
+    silent = counts < MIN_MEASURED_SHARE * len(frequency)
+    highest = np.where(is_measured, deviation, -np.inf).max(axis=0)
+    lowest = np.where(is_measured, deviation, np.inf).min(axis=0)
+    span = highest - lowest
+    varies = ~silent & (span > 0)
+    stuck = ~silent & (span == 0) & varies.any(axis=1, keepdims=True)
+
     scale = np.where(silent | (mean <= 0), np.nan, mean)
-    relative = noise / scale
-    usual = np.array(
-        [
-            np.median(of[use]) if use.any() else np.inf
-            for of, use in zip(relative, moves, strict=True)
-        ]
+    relative_noise = noise / scale
+    usual = np.full(len(relative_noise), np.inf)
+    for cube in np.flatnonzero(varies.any(axis=1)):
+        usual[cube] = np.median(relative_noise[cube][varies[cube]])
+    noisy = varies & (relative_noise > NOISY_ENTER * usual[:, None])
+    return PadsAtRest(
+        frequency=scale,
+        noise=relative_noise,
+        drift=MINUTE_S * slope / scale,
+        silent=silent,
+        stuck=stuck,
+        noisy=noisy,
     )
-    noisy = moves & (relative > NOISY_ENTER * usual[:, None])
-    return PadsAtRest(scale, relative, MINUTE * slope / scale, silent, stuck, noisy)

@@ -1,5 +1,5 @@
-"""Loads from a bag: a cube's frequencies and what a reference sensor measured at the same time, the
-input of a fit."""
+"""Recorded loads: the frequencies of a cube in a bag, and what a reference sensor measured at the
+same time. They are the input of a fit."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bags.read import Bag
-from ..bags.source import open_bag
+from ..bags.source import BagSource, open_bag
+from ..core.arrays import AnyArray, Array, Times
 from ..core.calibration import Calibration
 from ..core.errors import BagError
 from ..core.layout import Layout
@@ -19,127 +19,185 @@ from ..core.modes import COMPONENTS, STRESS
 from ..core.symmetry import default_modes
 from ..messages.codec import SECOND
 from ..messages.types import STRESS as BATCH_TYPE
-from .fit import traction_loads
+from .fit import loads_from_forces
 from .load_table import Loads
 
-WRENCH, TENSOR = "geometry_msgs/msg/WrenchStamped", "cube_tensor_driver/msg/StressTensorStamped"
-GAP = 5.0
-"""Times the reference's usual step: within longer ones nothing is interpolated."""
-MOST = 4000
-"""Loads that a fit is given; of more samples neighbours are averaged."""
+WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
+TENSOR_TYPE = "cube_tensor_driver/msg/StressTensorStamped"
+
+MAX_STEP_RATIO = 5.0
+"""Longest step between two messages of the reference, as a multiple of the median step.
+
+Nothing is interpolated over a longer one.
+"""
+
+MAX_LOADS = 4000
+"""Maximum number of loads that a fit is given. Neighbours of more samples are averaged."""
+
+MAX_LISTED_CUBES = 20
+"""Number of cubes that an error message lists."""
 
 
-def bag_loads(
+def read_recorded_loads(
     path: Path, name: str | None, reference: str, layout: Layout, area: float | None
 ) -> tuple[Loads, Calibration]:
-    """Loads of a cube (None: the only one), and its recorded calibration with the rest frequencies
-    in use.
+    """Read the loads of a cube from a bag.
 
-    reference: topic of a WrenchStamped on the face +z (then area in m² is needed), of a
-    StressTensorStamped, or of a SkinStress with a row for the cube; modes that it does not know are
-    taken as 0. Samples and reference meet by their stamps; between two of the reference it is
-    interpolated linearly.
-    BagError: no such cube or topic, another layout, no time in common.
+    Samples and reference are related by their time stamps. Between two messages of the reference,
+    its load is interpolated linearly. Modes that the reference does not measure are taken as 0.
+
+    Args:
+        path: The bag.
+        name: Name of the cube; None means the only one.
+        reference: Topic of a WrenchStamped on the face +z, of a StressTensorStamped, or of a
+            SkinStress with a row for the cube.
+        layout: Layout of the cube.
+        area: Area that a WrenchStamped acts on, in m².
+
+    Returns:
+        Loads, and the recorded calibration with the rest frequencies in use.
+
+    Raises:
+        BagError: There is no such cube or topic, the layout is another, or cube and reference have
+            no time in common.
     """
     with open_bag(path) as source:
-        bag = source.bag
+        number = _find_cube(source, path, name)
         settings = source.recording.settings[-1]
-        names = [cube.name for cube in source.skin.cubes]
-        if name is None and len(names) > 1:
-            raise BagError(
-                f"{path}: {len(names)} cubes; say which one with --cube: {', '.join(names[:20])}"
-            )
-        if name is not None and name not in names:
-            raise BagError(f"{path}: no cube {name!r}; there are {', '.join(names[:20])}")
-        number = 0 if name is None else names.index(name)
-        calibration, n_pads = settings.calibrations[number], layout.n_pads
+        calibration = settings.calibrations[number]
         calibration.check(layout)
-        rest = settings.rest_frequency[number, :n_pads]
-        parts = []
-        for rows in source:
-            rows = rows.select((rows.cube == number) & (rows.pad_fault == 0))
-            parts.append((rows.stamp_ns, rows.frequency[:, :n_pads], rows.temperature))
-        times, frequency, temperature = (
-            np.concatenate(column) for column in zip(*parts, strict=True)
+        rest = settings.rest_frequency[number, : layout.n_pads]
+        stamp_ns, frequency, temperature = _read_samples(source, number, layout.n_pads)
+        reference_ns, state = _read_reference(
+            source.bag, reference, number, layout, area, calibration.half_side
         )
-        at, state = _reference(bag, reference, number, layout, area, calibration.half_side)
-    here = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    near = at[here] - at[here - 1] <= GAP * np.median(np.diff(at))
-    used = (times >= at[0]) & (times <= at[-1]) & near & np.isfinite(frequency).all(axis=1)
+    following = np.clip(np.searchsorted(reference_ns, stamp_ns), 1, len(reference_ns) - 1)
+    steps = np.diff(reference_ns)
+    is_close = steps[following - 1] <= MAX_STEP_RATIO * np.median(steps)
+    is_within = (stamp_ns >= reference_ns[0]) & (stamp_ns <= reference_ns[-1])
+    used = is_within & is_close & np.isfinite(frequency).all(axis=1)
     if not used.any():
         raise BagError(
-            f"{path}: the frequencies of {names[number]} and {reference} have no time in common"
+            f"{path}: the frequencies of {source.skin.cubes[number].name} and {reference} have no "
+            "time in common"
         )
-    seconds, known = (times[used] - at[0]) / SECOND, (at - at[0]) / SECOND
+
+    # Seconds from the first message, because a float does not hold nanoseconds since 1970.
+    seconds = (stamp_ns[used] - reference_ns[0]) / SECOND
+    known = (reference_ns - reference_ns[0]) / SECOND
     states = np.stack([np.interp(seconds, known, column) for column in state.T], axis=1)
-    size = -(-len(seconds) // MOST)
-    mean = [
-        _means(values, size)
-        for values in (states, frequency[used].astype(float), temperature[used].astype(float))
-    ]
-    warm = mean[2] if np.isfinite(mean[2]).all() else None
-    return Loads(mean[0], mean[1], warm), replace(calibration, rest_frequency=rest)
+    size = -(-len(seconds) // MAX_LOADS)
+    mean_temperature = _average_neighbours(temperature[used].astype(float), size)
+    loads = Loads(
+        state=_average_neighbours(states, size),
+        frequency=_average_neighbours(frequency[used].astype(float), size),
+        temperature=mean_temperature if np.isfinite(mean_temperature).all() else None,
+    )
+    return loads, replace(calibration, rest_frequency=rest)
 
 
-def _reference(
+def _find_cube(source: BagSource, path: Path, name: str | None) -> int:
+    """Return the number of a cube. BagError: there is no such cube, or more than one."""
+    names = [cube.name for cube in source.skin.cubes]
+    listed = ", ".join(names[:MAX_LISTED_CUBES])
+    if name is None and len(names) > 1:
+        raise BagError(f"{path}: {len(names)} cubes; say which one with --cube: {listed}")
+    if name is not None and name not in names:
+        raise BagError(f"{path}: no cube {name!r}; there are {listed}")
+    return 0 if name is None else names.index(name)
+
+
+def _read_samples(source: BagSource, number: int, n_pads: int) -> tuple[Times, AnyArray, AnyArray]:
+    """Return time stamps (N,), frequencies (N, P) and temperatures (N,) of a cube.
+
+    Samples with a pad that the device reports as broken are left out.
+    """
+    parts = []
+    for rows in source:
+        chosen = rows.select((rows.cube == number) & (rows.pad_fault == 0))
+        parts.append((chosen.stamp_ns, chosen.frequency[:, :n_pads], chosen.temperature))
+    stamp_ns, frequency, temperature = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
+    return stamp_ns, frequency, temperature
+
+
+def _read_reference(
     bag: Bag, topic: str, number: int, layout: Layout, area: float | None, half_side: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Times (N,) ns, rising, and states (N, M) in Pa."""
+) -> tuple[Times, Array]:
+    """Return times (N,), rising, in ns, and states (N, M), in Pa. BagError: see the caller."""
     types = {one.msgtype for one in bag.connections if one.topic == topic}
     msgtype = types.pop() if types else None
     if msgtype == BATCH_TYPE:
-        parts = []
-        for messages, _ in bag.stress(topic):
-            rows = messages.rows.select(messages.rows.cube == number)
-            parts.append((rows.stamp_ns, np.hstack([rows.stress, rows.gradient]).astype(float)))
-        at, values = (np.concatenate(column) for column in zip(*parts, strict=True))
-    elif msgtype in (WRENCH, TENSOR):
-        measured = [bag.decode(entry) for entry in bag.entries({topic})]
-        stamps = [one.header.stamp for one in measured]
-        at = np.array([stamp.sec * SECOND + stamp.nanosec for stamp in stamps], np.int64)
-        values = np.array(
-            [_force(one) if msgtype == WRENCH else _components(one.tensor) for one in measured]
-        )
+        stamp_ns, values = _read_batches(bag, topic, number)
+    elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
+        messages = [bag.decode(entry) for entry in bag.entries({topic})]
+        stamps = [message.header.stamp for message in messages]
+        read = _read_force if msgtype == WRENCH_TYPE else _read_components
+        stamp_ns = np.array([stamp.sec * SECOND + stamp.nanosec for stamp in stamps], np.int64)
+        values = np.array([read(message) for message in messages])
     else:
-        there = ", ".join(sorted({one.topic for one in bag.connections}))
+        topics = ", ".join(sorted({one.topic for one in bag.connections}))
         raise BagError(
             f"{bag.path}: --reference {topic} is {msgtype or 'not there'}; needed is a "
-            f"WrenchStamped, a StressTensorStamped or a SkinStress. Topics: {there}"
+            f"WrenchStamped, a StressTensorStamped or a SkinStress. Topics: {topics}"
         )
-    at, first = np.unique(at, return_index=True)
-    if len(at) < 2:
+
+    # Several messages of one time have no order, so the first of them is taken.
+    stamp_ns, first = np.unique(stamp_ns, return_index=True)
+    if len(stamp_ns) < 2:
         raise BagError(
-            f"{bag.path}: {len(at)} messages on {topic}; needed are two or more, with times"
+            f"{bag.path}: {len(stamp_ns)} messages on {topic}; needed are two or more, with times"
         )
     values = values[first]
     modes = default_modes(layout)
-    if msgtype == WRENCH:
+    if msgtype == WRENCH_TYPE:
         if area is None:
             raise BagError(
                 f"{bag.path}: {topic} gives forces; give the area they act on in m² (--area)"
             )
-        return at, traction_loads(modes, values, area)
+        return stamp_ns, loads_from_forces(modes, values, area)
+
+    # Amplitudes of gradients are times the half side.
     values[:, len(STRESS) :] *= half_side
-    state = [
-        values[:, COMPONENTS.index(mode)] if mode in COMPONENTS else np.zeros(len(at))
-        for mode in modes.names
-    ]
-    return at, np.nan_to_num(np.stack(state, axis=1))
+    state = np.zeros((len(values), modes.n_modes))
+    for column, mode in zip(state.T, modes.names, strict=True):
+        if mode in COMPONENTS:
+            column[:] = values[:, COMPONENTS.index(mode)]
+    return stamp_ns, np.nan_to_num(state)
 
 
-def _force(message: Any) -> list[float]:
+def _read_batches(bag: Bag, topic: str, number: int) -> tuple[Times, Array]:
+    """Return times (N,), in ns, and components (N, 15) of a cube in SkinStress messages."""
+    parts = []
+    for messages, _ in bag.stress(topic):
+        rows = messages.rows.select(messages.rows.cube == number)
+        components = np.hstack([rows.stress, rows.gradient])
+        parts.append((rows.stamp_ns, components.astype(float)))
+    stamp_ns, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return stamp_ns, values
+
+
+def _read_force(message: Any) -> list[float]:
+    """Return the force of a WrenchStamped."""
     force = message.wrench.force
     return [force.x, force.y, force.z]
 
 
-def _components(tensor: Any) -> list[float]:
+def _read_components(message: Any) -> list[float]:
+    """Return the 15 components of a StressTensorStamped."""
+    tensor = message.tensor
     normal, shear = tensor.normal, tensor.shear
-    return [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z, *tensor.normal_gradient]
+    stress = [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z]
+    return [*stress, *tensor.normal_gradient]
 
 
-def _means(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Means of `size` neighbours each along the first axis; what does not fill the last is left
-    out."""
-    complete = values[: len(values) // size * size]
-    means: NDArray[np.float64] = complete.reshape(-1, size, *values.shape[1:]).mean(axis=1)
+def _average_neighbours(values: Array, size: int) -> Array:
+    """Return the means of `size` neighbours each along the first axis.
+
+    Values at the end that do not fill a group are left out.
+    """
+    n_groups = len(values) // size
+    groups = values[: n_groups * size].reshape(n_groups, size, *values.shape[1:])
+    means: Array = groups.mean(axis=1)
     return means

@@ -1,4 +1,4 @@
-"""Least squares that forget outliers and know what the data leave open: steps and weights of `fit`.
+"""Robust least squares: weights that suppress outliers, and the directions that data leave open.
 
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """
@@ -7,60 +7,112 @@ from __future__ import annotations
 
 import numpy as np
 
-HUBER, TUKEY = 1.345, 4.685
-"""95 % efficient on normal noise."""
-STEPS = 100
-"""Of one stage at most."""
+from ..core.arrays import Array, Mask
+
+HUBER_LIMIT = 1.345
+"""Residual, in units of the scatter, above which Huber's weight falls as 1 / |r|.
+
+The estimate is 95 % efficient for normal noise.
+"""
+
+TUKEY_LIMIT = 4.685
+"""Residual, in units of the scatter, from which on Tukey's weight is 0.
+
+The estimate is 95 % efficient for normal noise.
+"""
+
+MAX_STEPS = 100
+"""Maximum number of Gauss-Newton steps in one stage."""
+
 STAGES = {"plain": 1e-10, "huber": 1e-3, "tukey": 1e-9}
-"""In order: relative change that ends a stage; Huber's only leads on."""
+"""Stages of the fit in their order, each with the relative change of the parameters that ends it.
+
+Huber's stage only has to lead into the neighbourhood of the solution. It has one minimum, while
+Tukey's weights find the nearest of several.
+"""
+
 DIRECTION_TOLERANCE = 1e-6
-"""A direction of parameters below this part of the strongest is not determined."""
+"""Smallest singular value, relative to the largest, of a direction of the parameters that counts as
+determined."""
+
+NORMAL_MEDIAN_RATIO = 1.4826
+"""Ratio of the standard deviation to the median of |r| for normal noise."""
 
 
-def scatter(r: np.ndarray) -> float:
-    """Standard deviation by the median of |r|; never 0, so that perfect data have a scale too."""
-    return max(1.4826 * float(np.median(np.abs(r))), 1e-12)
+def estimate_scatter(r: Array) -> float:
+    """Estimate the standard deviation of residuals from the median of |r|.
+
+    The result is never 0, so that perfect data have a scale, too.
+    """
+    return max(NORMAL_MEDIAN_RATIO * float(np.median(np.abs(r))), 1e-12)
 
 
-def weights_of(stage: str, r: np.ndarray) -> np.ndarray:
-    """Weights of residuals in units of their scatter, by Huber or by Tukey; same shape."""
+def compute_weights(stage: str, r: Array) -> Array:
+    """Compute the weights, by Huber or by Tukey, of residuals in units of their scatter."""
+    size = np.abs(r)
     if stage == "huber":
-        return np.minimum(1, HUBER / np.maximum(np.abs(r), 1e-300))
-    return np.where(np.abs(r) < TUKEY, (1 - (r / TUKEY) ** 2) ** 2, 0)
+        weights: Array = np.minimum(1, HUBER_LIMIT / np.maximum(size, 1e-300))
+        return weights
+    return np.where(size < TUKEY_LIMIT, (1 - (r / TUKEY_LIMIT) ** 2) ** 2, 0)
 
 
-def least_squares(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """x of a x = b for a (R, C) and b (R,), the smallest; directions that a does not determine stay
-    put."""
-    size = np.linalg.norm(a, axis=0)
-    size[size == 0] = 1
-    return np.linalg.lstsq(a / size, b, rcond=DIRECTION_TOLERANCE)[0] / size
+def least_squares(a: Array, b: Array) -> Array:
+    """Solve a x = b for a (R, C) and b (R,) in the sense of least squares.
+
+    Directions that a does not determine are 0.
+    """
+    scaled, size = _scale_columns(a)
+    solution: Array = np.linalg.lstsq(scaled, b, rcond=DIRECTION_TOLERANCE)[0] / size
+    return solution
 
 
-def hidden_directions(jacobian: np.ndarray) -> np.ndarray:
-    """(parameters, H) directions that change no reading."""
-    size = np.linalg.norm(jacobian, axis=0)
-    size[size == 0] = 1
-    _, s, vt = np.linalg.svd(jacobian / size, full_matrices=True)
-    return vt[int(np.sum(s > DIRECTION_TOLERANCE * s[0])) :].T if s[0] > 0 else vt.T
+def hidden_directions(jacobian: Array) -> Array:
+    """Return the directions (parameters, H) of the scaled parameters that change no reading."""
+    scaled, _ = _scale_columns(jacobian)
+    _, s, vt = np.linalg.svd(scaled, full_matrices=True)
+    rank = int(np.sum(s > DIRECTION_TOLERANCE * s[0])) if s[0] > 0 else 0
+    directions: Array = vt[rank:].T
+    return directions
 
 
-def touched(hidden: np.ndarray, count: int) -> np.ndarray:
-    """(count,) bool: which of the first parameters a hidden direction moves."""
-    return np.linalg.norm(hidden[:count], axis=1) > DIRECTION_TOLERANCE
+def find_undetermined(hidden: Array, count: int) -> Mask:
+    """Return which of the first parameters (count,) a hidden direction changes."""
+    undetermined: Mask = np.linalg.norm(hidden[:count], axis=1) > DIRECTION_TOLERANCE
+    return undetermined
 
 
-def robust_covariance(jacobian: np.ndarray, r: np.ndarray, scale: float) -> np.ndarray:
-    """(C, C) by Huber: scale^2 <psi^2> / <psi'>^2 (J'J)^-1, with the loss of degrees of freedom."""
-    u = np.where(np.abs(r) < TUKEY, (r / TUKEY) ** 2, 1)
-    psi2, slope = np.mean((r * (1 - u) ** 2) ** 2), np.mean((1 - u) * (1 - 5 * u))
+def robust_covariance(jacobian: Array, r: Array, scale: float) -> Array:
+    """Compute Huber's covariance scale^2 <psi^2> / <psi'>^2 (J'J)^-1 of Tukey's estimate.
+
+    It is corrected for the number of parameters.
+
+    Args:
+        jacobian: Derivatives J (R, C) of the whitened predictions.
+        r: Residuals (R,) in units of the scatter.
+        scale: Scatter.
+
+    Returns:
+        Covariance (C, C).
+    """
+    u = np.where(np.abs(r) < TUKEY_LIMIT, (r / TUKEY_LIMIT) ** 2, 1)
+    psi_squared = np.mean((r * (1 - u) ** 2) ** 2)
+    psi_slope = np.mean((1 - u) * (1 - 5 * u))
     rank = jacobian.shape[1] - hidden_directions(jacobian).shape[1]
-    factor = psi2 / slope**2 * len(r) / max(len(r) - rank, 1)
-    size = np.linalg.norm(jacobian, axis=0)
+    dof = max(len(r) - rank, 1)
+    factor = psi_squared / psi_slope**2 * len(r) / dof
+
+    scaled, size = _scale_columns(jacobian)
+    # The tolerance holds for singular values of J, which are squared in J'J.
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=DIRECTION_TOLERANCE**2)
+    covariance: Array = scale**2 * factor * inverse / np.outer(size, size)
+    return covariance
+
+
+def _scale_columns(matrix: Array) -> tuple[Array, Array]:
+    """Return a matrix with columns of length 1, and their lengths before; zero columns stay.
+
+    Without it, the units of the parameters would decide which of them count as determined.
+    """
+    size = np.linalg.norm(matrix, axis=0)
     size[size == 0] = 1
-    return (
-        scale**2
-        * factor
-        * np.linalg.pinv((jacobian / size).T @ (jacobian / size), rcond=DIRECTION_TOLERANCE**2)
-        / np.outer(size, size)
-    )
+    return matrix / size, size

@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     import numpy as np
     from rich.table import Table
 
-    from ..calibrate.pad_order import Explanation
     from ..calibrate.pad_rest import PadsAtRest
-    from ..calibrate.press import Press
+    from ..calibrate.presses import Explanation, SteadyPress
     from ..config.skin import Skin
     from ..device.live import LinkSource
 
@@ -85,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
         explanations = press_cubes(source, rest)
 
     for cube, explanation in explanations.items():
-        data["cubes"][cube]["pose"]["rpy"] = rpy(explanation.turn)
+        data["cubes"][cube]["pose"]["rpy"] = rpy(explanation.rotation)
         show_explanation(names[cube], explanation, pads)
     if any(each.swapped or not each.is_clear for each in explanations.values()):
         say("no file written: swap the wires, or press again, and run this command again", "red")
@@ -159,7 +158,7 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
     """Measure the pads for `REST_S` while nothing touches them."""
     import numpy as np
 
-    from ..calibrate.pad_rest import LEAST_SAMPLES, pads_at_rest
+    from ..calibrate.pad_rest import MIN_SAMPLES, measure_pads_at_rest
     from ..device.scans.averages import scans
 
     parts: list[tuple[np.ndarray, np.ndarray]] = []
@@ -168,12 +167,12 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
         parts.append(scans(rows, len(source.skin.cubes)))
         now_s = float(parts[-1][1][-1] - parts[0][1][0])
         is_over = now_s >= REST_S
-        has_enough = sum(len(each) for each, _ in parts) >= LEAST_SAMPLES
+        has_enough = sum(len(each) for each, _ in parts) >= MIN_SAMPLES
         if not has_enough or not (is_over or now_s >= next_shown_s):
             continue
         next_shown_s = now_s + AVERAGE_S
         frequency, seconds = (np.concatenate(each) for each in zip(*parts, strict=True))
-        rest = pads_at_rest(frequency, seconds)
+        rest = measure_pads_at_rest(frequency, seconds)
         screen.show(rest)
         if is_over:
             break
@@ -185,29 +184,33 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     """Ask for presses beside each cube that has working pads, and explain them, by cube."""
     import numpy as np
 
-    from ..calibrate.pad_order import cube_turns, explain_presses
-    from ..calibrate.press import PressWatch
-    from ..calibrate.side_press import SIDES, side_presses
+    from ..calibrate.presses import (
+        SIDES,
+        PressDetector,
+        cube_rotations,
+        expected_presses,
+        explain_presses,
+    )
     from ..core.oscillator import pad_stress
     from ..device.scans.averages import averages
     from ..views.terminal.output import say
 
     cubes = source.skin.cubes
     calibration = cubes[0].calibration
-    watch = PressWatch(rest.frequency, rest.noise, rest.works)
+    detector = PressDetector(rest.frequency, rest.noise, rest.works)
     means = averages(source, len(cubes), AVERAGE_S)
     waiting = set(np.flatnonzero(rest.works.any(axis=1)).tolist())
-    expected = side_presses(calibration, cube_turns())
+    expected = expected_presses(calibration, cube_rotations())
     explanations: dict[int, Explanation] = {}
 
-    def wait_for_press(allowed: set[int], where: str) -> Press:
+    def wait_for_press(allowed: set[int], where: str) -> SteadyPress:
         """Ask for a press until one is beside an allowed cube."""
         while True:
             say(f"press the skin next to {where}, and hold")
-            press = next(each for each in map(watch.update, means) if each is not None)
+            press = next(each for each in map(detector.update, means) if each is not None)
             say(f"{cubes[press.cube].name} answers: let go")
-            while watch.is_held:
-                watch.update(next(means))
+            while detector.is_held:
+                detector.update(next(means))
             if press.cube in allowed:
                 return press
 
@@ -296,8 +299,8 @@ def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -
         say(f"{name}: the presses do not say how it sits ({why})", "red")
         return
     findings = []
-    if explanation.is_turned:
-        findings.append(f"turned, rpy {rotation_text(explanation.turn)}")
+    if explanation.is_rotated:
+        findings.append(f"turned, rpy {rotation_text(explanation.rotation)}")
     if explanation.swapped:
         pairs = [
             f"{pads[wire]} is {pads[explanation.places[wire]]}" for wire in explanation.swapped

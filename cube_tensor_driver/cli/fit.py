@@ -111,15 +111,15 @@ def read_inputs(
         CubeError: The table or bag cannot be used, or there is no base calibration.
     """
     from ..bags.read import is_bag
-    from ..calibrate.load_table import read_loads, unloaded
-    from ..calibrate.recorded_loads import bag_loads
+    from ..calibrate.load_table import read_loads
+    from ..calibrate.recorded_loads import read_recorded_loads
     from ..config.calibration import find_calibration, read_calibration, shipped_calibration
     from ..core.errors import ConfigError
 
     base = shipped_calibration(layout)
     rest: Array | None
     if options.reference is not None:
-        loads, base = bag_loads(
+        loads, base = read_recorded_loads(
             options.loads, options.cube, options.reference, layout, options.area
         )
         # A reference sensor never reads exactly 0, so that only the tare of the recorded skin
@@ -132,7 +132,7 @@ def read_inputs(
         )
     else:
         loads = read_loads(options.loads, layout, options.area)
-        rest, rest_source = unloaded(loads), "of the rows without load"
+        rest, rest_source = loads.unloaded_frequency(), "of the rows without load"
 
     if options.base is not None:
         base = read_calibration(find_calibration(options.base, Path()))

@@ -84,14 +84,14 @@ def traction(stress: Real, normal: ArrayLike) -> Array:
     return result
 
 
-def rotate_stress(stress: Real, rotation: Array) -> Array:
+def rotate_stress(stress: Real, rotation: ArrayLike) -> Array:
     """Compute the stress R s R' (..., 6) in a frame with the coordinates R x. NaN spreads."""
     r = np.asarray(rotation, dtype=float)
     rotated: Array = r @ to_matrix(stress) @ np.swapaxes(r, -1, -2)
     return to_voigt(rotated)
 
 
-def rotate_gradient(gradient: Array, rotation: Array) -> Array:
+def rotate_gradient(gradient: Array, rotation: ArrayLike) -> Array:
     """Compute the gradient R_ia R_jb R_kc G_abc (..., 3, 3, 3) in a frame with the coordinates R x.
 
     All 27 entries are needed, because the nine normal gradients in a rotated frame depend on

@@ -17,10 +17,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cube_tensor_driver.calibrate.pad_order import cube_turns, explain_presses
-from cube_tensor_driver.calibrate.pad_rest import pads_at_rest
-from cube_tensor_driver.calibrate.press import PressWatch
-from cube_tensor_driver.calibrate.side_press import SIDES, side_presses
+from cube_tensor_driver.calibrate.pad_rest import measure_pads_at_rest
+from cube_tensor_driver.calibrate.presses import (
+    SIDES,
+    PressDetector,
+    cube_rotations,
+    expected_presses,
+    explain_presses,
+)
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.calibration import named_layout, shipped_calibration
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
@@ -31,8 +35,8 @@ from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotat
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.simulation.simulator import FIRST_UID, Simulator
 
-TURNS = cube_turns()
-OTHER_DEPTH = {"depth": 3.5e-3, "away": [1.3]}
+TURNS = cube_rotations()
+OTHER_DEPTH = {"depth": 3.5e-3, "distances": [1.3]}
 """Presses that are not those that are expected: another depth, another distance."""
 
 
@@ -45,7 +49,7 @@ def test_statistics_at_rest_give_back_what_was_put_in():
     frequency[:, :, 1] *= 1 + 300e-6 / 60 * seconds[:, None]
     frequency[:, 0, 2] = 1.5e5
     frequency[:, 1, 3] = np.nan
-    found = pads_at_rest(frequency, seconds)
+    found = measure_pads_at_rest(frequency, seconds)
     # The standard error of a noise from 1000 second differences is 3 %.
     np.testing.assert_allclose(found.noise[0, [0, 1, 3]], noise[[0, 1, 3]], rtol=0.12)
     # That of a slope over 10 s is sqrt(12 / 1000) noise / 10 s, here 7 ppm a minute.
@@ -57,9 +61,11 @@ def test_statistics_at_rest_give_back_what_was_put_in():
 
 def test_a_press_is_read_once_and_only_when_it_is_steady():
     rest = np.array([[1e5, 2e5], [1e5, 2e5]])
-    watch = PressWatch(rest, np.full((2, 2), 5e-6), np.ones((2, 2), bool))
+    detector = PressDetector(rest, np.full((2, 2), 5e-6), np.ones((2, 2), bool))
     sizes = [0, 0, 0.4, 1, 1, 1, 0.5, 0, 1, 1]
-    read = [watch.update(rest * (1 - 1e-2 * size * np.array([[0, 0], [1, 0.5]]))) for size in sizes]
+    read = [
+        detector.update(rest * (1 - 1e-2 * size * np.array([[0, 0], [1, 0.5]]))) for size in sizes
+    ]
     assert [each is not None for each in read] == [False] * 4 + [True] + [False] * 4 + [True]
     assert read[4].cube == 1
     np.testing.assert_allclose(read[4].change, [-1e-2, -5e-3], rtol=1e-9)
@@ -70,8 +76,8 @@ def test_turned_cubes_and_swapped_pads_are_told_apart(name):
     """All 24 turns, with pads in their order and with two of them swapped, presses elsewhere than
     expected and gains that differ by 3 %."""
     calibration = shipped_calibration(named_layout(name))
-    expected = side_presses(calibration, TURNS)
-    given = side_presses(calibration, TURNS, **OTHER_DEPTH)[:, :, 0]
+    expected = expected_presses(calibration, TURNS)
+    given = expected_presses(calibration, TURNS, **OTHER_DEPTH)[:, :, 0]
     random = np.random.default_rng(0)
     right = 0
     for number, turn in enumerate(TURNS[:: 1 if name == "planar" else 6]):
@@ -85,19 +91,19 @@ def test_turned_cubes_and_swapped_pads_are_told_apart(name):
             found = explain_presses(
                 given[number][:, places] * [[1.0], [2.0], [0.7]] * gain, expected
             )
-            right += np.array_equal(found.turn, turn) and np.array_equal(found.places, places)
+            right += np.array_equal(found.rotation, turn) and np.array_equal(found.places, places)
             if not is_swapped:
-                assert np.array_equal(found.turn, turn) and not found.swapped and found.is_clear
+                assert np.array_equal(found.rotation, turn) and not found.swapped and found.is_clear
     # Two pads that hardly feel these presses may be swapped without a trace.
     assert right >= (46 if name == "planar" else 7)
 
 
 def test_a_broken_pad_is_left_out():
     calibration = shipped_calibration(named_layout("planar"))
-    measured = side_presses(calibration, TURNS, **OTHER_DEPTH)[3, :, 0]
+    measured = expected_presses(calibration, TURNS, **OTHER_DEPTH)[3, :, 0]
     measured[:, 2] = np.nan
-    found = explain_presses(measured, side_presses(calibration, TURNS))
-    assert np.array_equal(found.turn, TURNS[3]) and not found.swapped
+    found = explain_presses(measured, expected_presses(calibration, TURNS))
+    assert np.array_equal(found.rotation, TURNS[3]) and not found.swapped
 
 
 def with_swapped_pads(calibration: Calibration, one: int, other: int) -> Calibration:

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cube_tensor_driver.calibrate.fit import describe_mode, fit, measured_stress, traction_loads
+from cube_tensor_driver.calibrate.fit import describe_mode, fit, loads_from_forces, measured_stress
 from cube_tensor_driver.core.calibration import Calibration, illustrative
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.modes import SPACE
@@ -169,7 +169,7 @@ def test_readings_from_frequencies():
 
 
 def test_loads_from_a_reference_force_sensor():
-    states = traction_loads(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
+    states = loads_from_forces(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
     assert dict(zip(SPACE.names, states[0], strict=True)) | {
         "zz": -3e4,
         "zx": 1e4,
@@ -177,7 +177,7 @@ def test_loads_from_a_reference_force_sensor():
     } == dict(zip(SPACE.names, states[0], strict=True))
     assert np.count_nonzero(states) == 3
     with pytest.raises(FitError, match="area"):
-        traction_loads(SPACE, np.ones((1, 3)), 0)
+        loads_from_forces(SPACE, np.ones((1, 3)), 0)
 
 
 def test_without_gains_fewer_loads_are_enough():
@@ -217,7 +217,7 @@ def test_what_cannot_be_fitted_is_an_error_with_its_reason(change, words):
 
 def test_one_load_alone_settles_no_coefficient():
     c = illustrative("cube")
-    loads = traction_loads(c.modes, np.array([[0, 0, -1.0]]), 1e-4)
+    loads = loads_from_forces(c.modes, np.array([[0, 0, -1.0]]), 1e-4)
     with pytest.raises(FitError, match=r"determine no coefficient.*add a load of"):
         fit(c.structure, loads, loads @ c.response.T)
 
