@@ -24,7 +24,7 @@ from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO
 from cube_tensor_driver.mechanics.layer import Layer
-from cube_tensor_driver.touch.windows import MODEL_ERROR
+from cube_tensor_driver.touch.posterior import MODEL_ERROR
 
 from ..fem.body import Body
 from ..fem.fem import Progress, compute_response

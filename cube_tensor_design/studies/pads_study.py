@@ -17,7 +17,7 @@ from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.influence_file import read_influence
-from cube_tensor_driver.touch.tracker.touches import Touches
+from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 from ..fem.body import Body
 from ..fem.reciprocity import compute_influence
@@ -108,7 +108,7 @@ def layer_example(true: Influence) -> FieldExample:
         points = bench.inverse.points
         pressure["truth"] = -bench.truth(points[:, :2], 5e-3, load, centre)[:, 2]
         values = bench.values(5e-3, load, centre, np.random.default_rng(1))
-        touches = Touches(bench.inverse, CONTACT_PRESSURE)
-        touches.update(values)
-        pressure[form] = touches.field.below
+        tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
+        tracker.update(values)
+        pressure[form] = tracker.field.depth_pressure
     return FieldExample(points, pressure, bench.poses.position, centre)

@@ -29,10 +29,10 @@ from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.kernels import Kernels
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.inverse import SurfaceInverse
+from cube_tensor_driver.touch.pad_measurement import model_pads
 from cube_tensor_driver.touch.pad_noise import noise_of_all_pads
-from cube_tensor_driver.touch.pad_reading import read_pads
 from cube_tensor_driver.touch.surface import Surface
-from cube_tensor_driver.touch.tracker.touches import Touches
+from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 from .field_study import FORCE, FRICTION, WINDOW, FieldExample, flat_skin
 
@@ -114,8 +114,8 @@ class Bench:
         by_pad = noise_of_all_pads([self.calibration] * n)
         layer, reading = Layer(setting.known_thickness), None
         if influence is not None:
-            reading = read_pads(influence, [self.calibration] * n)
-        self.inverse = SurfaceInverse.of_cubes(
+            reading = model_pads(influence, [self.calibration] * n)
+        self.inverse = SurfaceInverse.from_poses(
             self.poses, by_pad, layer, setting.depth, side, reading
         )
         self.surface = Surface(self.poses, setting.depth, side)
@@ -211,22 +211,22 @@ class Bench:
             points = self.inverse.points[self.window, :2]
             true = -self.truth(points, width, load, centre)[:, 2]
             values = self.values(width, load, centre, random)
-            touches = Touches(self.inverse, CONTACT_PRESSURE)
+            tracker = ContactTracker(self.inverse, CONTACT_PRESSURE)
             found: list[Any] = [
                 self.surface.contacts(values, CONTACT_PRESSURE),
-                touches.update(values),
+                tracker.update(values),
             ]
             one += len(found[1]) == 1
             fields = [
                 self.surface.field(values).pressure,
-                self.inverse.field(values).below,
-                touches.field.below,
+                self.inverse.field(values).depth_pressure,
+                tracker.field.depth_pressure,
             ]
-            stated = touches.deviation(values)
+            stated = tracker.deviation(values)
             surface = self.surface_truth(width, load, centre)
             pressed = true > PRESSED * true.max(), surface > PRESSED * surface.max()
-            errors = fields[2][self.window] - true, touches.field.pressure - surface
-            over = errors[0] / stated.below[self.window], errors[1] / stated.pressure
+            errors = fields[2][self.window] - true, tracker.field.pressure - surface
+            over = errors[0] / stated.depth_pressure[self.window], errors[1] / stated.pressure
             seen_field.append([z[where] ** 2 for z, where in zip(over, pressed, strict=True)])
             for k, computed in enumerate(fields):
                 field[case, k] = ((computed[self.window] - true) ** 2).mean() / (true**2).mean()
@@ -282,14 +282,14 @@ def traction_example() -> FieldExample:
     load = FORCE * np.array([FRICTION, 0.0, -1.0])
     values = bench.values(width, load, centre, np.random.default_rng(1))
     points = bench.inverse.points
-    touches = Touches(bench.inverse, CONTACT_PRESSURE)
-    touches.update(values)
+    tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
+    tracker.update(values)
     pressure = {
         "truth": -bench.truth(points[:, :2], width, load, centre)[:, 2],
         METHODS[0]: bench.surface.field(values).pressure,
-        METHODS[1]: bench.inverse.field(values).below,
-        METHODS[2]: touches.field.below,
-        "standard deviation": touches.deviation(values).below,
+        METHODS[1]: bench.inverse.field(values).depth_pressure,
+        METHODS[2]: tracker.field.depth_pressure,
+        "standard deviation": tracker.deviation(values).depth_pressure,
     }
     return FieldExample(points, pressure, bench.poses.position, centre)
 

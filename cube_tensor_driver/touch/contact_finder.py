@@ -1,4 +1,4 @@
-"""Contacts of a skin by one of two methods, for those who do not care which one it is."""
+"""Contacts of a skin by one of two methods, behind one interface."""
 
 from __future__ import annotations
 
@@ -17,24 +17,28 @@ from ..core.poses import CubePoses
 from ..mechanics.influence_file import read_influence
 from ..mechanics.layer import Layer
 from .inverse import SurfaceInverse
+from .pad_measurement import model_pads
 from .pad_noise import noise_by_pad, noise_of_all_pads
-from .pad_reading import read_pads
 from .surface import Contact, Surface
-from .tracker.touches import Touches, TrackedContact
+from .tracker.contact_tracker import ContactTracker, TrackedContact
 
 INTERPOLATION, INVERSE = CONTACT_METHODS
 
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """How contacts are found.
+    """Settings of the search for contacts. The names are those of the node's parameters.
 
-    method: of CONTACT_METHODS; depth: from the cubes' centres to the surface, m; least: pressure
-    at the cubes that counts as contact, Pa
-    thickness: of the elastomer over rigid ground, m, 0: a half space; poisson: of the elastomer;
-    both for the method inverse
-    influence: for the method inverse, which influence functions the pads have (influence_file.py);
-    then depth, thickness and poisson are theirs. Empty: cubes count as points
+    Attributes:
+        method: One of `CONTACT_METHODS`.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        least: Pressure at the depth of the cubes, in Pa, from which on something is a contact.
+        thickness: Thickness of the elastomer on rigid ground, in m; 0 for a half space. Used by the
+            method inverse.
+        poisson: Poisson's ratio of the elastomer. Used by the method inverse.
+        influence: Name of the influence functions of the pads (influence_file.py), which then
+            determine depth, thickness and Poisson's ratio; empty: cubes are modelled as points.
+            Used by the method inverse.
     """
 
     method: str = INTERPOLATION
@@ -46,12 +50,20 @@ class ContactSettings:
 
     @property
     def layer(self) -> Layer:
-        """ElasticError: no layer is like that."""
+        """Layer of these settings.
+
+        Raises:
+            ElasticError: Thickness or Poisson's ratio is out of range.
+        """
         return Layer(self.thickness or np.inf, self.poisson)
 
     def check(self) -> None:
-        """ElasticError: there is no such layer, or it does not have this depth. ConfigError: there
-        are no such influence functions."""
+        """Check the settings.
+
+        Raises:
+            ElasticError: There is no such layer, or it does not contain the depth.
+            ConfigError: The influence functions do not exist.
+        """
         self.layer.check_depth(self.depth)
         if self.influence:
             find_influence(self.influence)
@@ -61,54 +73,89 @@ class ContactFinder(Protocol):
     """Finds the contacts of one skin."""
 
     def update(self, values: Array, left_out: PadMasks) -> list[Contact] | list[TrackedContact]:
-        """Contacts of the newest values (cubes, 15), NaN where unknown; strongest first. left_out:
-        (cubes,) bits of pads that the values are without."""
+        """Find the contacts in the newest values.
+
+        Args:
+            values: Components (cubes, 15), NaN where unknown.
+            left_out: Bits (cubes,) of the pads that were left out of the values.
+
+        Returns:
+            Contacts, strongest first.
+        """
 
     def cloud(self, values: Array) -> Array | None:
-        """(M, 6) the surface after `update` of these values: place in the skin's parent frame, m,
-        pressure, shear and the standard deviation of the pressure, Pa. None: not known."""
+        """Return the surface after `update` with these values.
+
+        Returns:
+            Position in the skin's parent frame in m, pressure, shear and standard deviation of the
+            pressure in Pa (M, 6); None if the method does not compute the surface.
+        """
 
 
 def contact_finder(
-    settings: ContactSettings, poses: CubePoses, calibrations: Sequence[Calibration]
+    settings: ContactSettings,
+    poses: CubePoses,
+    calibrations: Sequence[Calibration],
 ) -> ContactFinder:
-    """The finder of these settings for cubes with these poses and calibrations.
+    """Create the finder of these settings; the method inverse takes seconds.
 
-    ElasticError, ConfigError: nothing to compute with. The method inverse takes seconds to set up.
+    Args:
+        settings: Method and properties of the elastomer.
+        poses: Poses of the cubes.
+        calibrations: Calibration of each cube.
+
+    Raises:
+        ElasticError: The settings and the cubes do not fit together.
+        ConfigError: The influence functions cannot be read.
     """
     if settings.method == INTERPOLATION:
-        return _Interpolated(settings, poses)
-    return _Followed(settings, poses, calibrations)
+        return _InterpolationFinder(settings, poses)
+    return _InverseFinder(settings, poses, calibrations)
 
 
-class _Interpolated:
+class _InterpolationFinder:
+    """Contacts from the interpolated pressure."""
+
     def __init__(self, settings: ContactSettings, poses: CubePoses) -> None:
-        self._surface, self._least = Surface(poses, settings.depth), settings.least
+        self._surface = Surface(poses, settings.depth)
+        self._threshold = settings.least
 
     def update(self, values: Array, left_out: PadMasks) -> list[Contact]:
-        return self._surface.contacts(values, self._least)
+        return self._surface.contacts(values, self._threshold)
 
     def cloud(self, values: Array) -> None:
         return None
 
 
-class _Followed:
+class _InverseFinder:
+    """Contacts that are tracked by fits to the values of all cubes."""
+
     def __init__(
         self,
         settings: ContactSettings,
         poses: CubePoses,
         calibrations: Sequence[Calibration],
     ) -> None:
-        layer, depth, reading = settings.layer, settings.depth, None
+        layer = settings.layer
+        depth = settings.depth
+        model = None
         if settings.influence:
             influence = read_influence(find_influence(settings.influence))
-            layer, depth = influence.layer, influence.depth
-            reading = read_pads(influence, calibrations)
+            layer = influence.layer
+            depth = influence.depth
+            model = model_pads(influence, calibrations)
+
         by_pad = noise_of_all_pads(calibrations)
         self._pipeline = Pipeline(calibrations)
         self._left_out = np.zeros(len(calibrations), np.uint32)
-        self._inverse = SurfaceInverse.of_cubes(poses, by_pad, layer, depth, reading=reading)
-        self._touches = Touches(self._inverse, settings.least)
+        self._inverse = SurfaceInverse.from_poses(
+            poses,
+            by_pad,
+            layer,
+            depth,
+            model=model,
+        )
+        self._tracker = ContactTracker(self._inverse, settings.least)
 
     def update(self, values: Array, left_out: PadMasks) -> list[TrackedContact]:
         changed = np.flatnonzero(left_out != self._left_out)
@@ -116,10 +163,10 @@ class _Followed:
             by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
-        return self._touches.update(values)
+        return self._tracker.update(values)
 
     def cloud(self, values: Array) -> Array:
-        field = self._touches.field
+        field = self._tracker.field
         shear = np.hypot(field.traction[:, 0], field.traction[:, 1])
-        sigma = self._touches.deviation(values).pressure
-        return np.column_stack([self._inverse.points, field.pressure, shear, sigma])
+        deviation = self._tracker.deviation(values).pressure
+        return np.column_stack([self._inverse.points, field.pressure, shear, deviation])

@@ -1,156 +1,268 @@
-"""Hermite interpolation between cubes by radial functions.
+"""Hermite interpolation between cubes by radial basis functions.
 
-Every cube has a patch of points, which its nearest neighbours make. The interpolant meets the value
-of every cube and, along the cube's own x and y where it observes them, the derivatives
-(gradient-enhanced interpolation; in statistics, co-kriging with derivatives). With a length c and
-the quantity p at the places a and b::
+Every cube has a patch of points, whose values come from its nearest neighbours. The interpolant
+matches the value of every cube and, along the cube's own x and y where it observes them, the
+derivatives (gradient-enhanced interpolation; in statistics, co-kriging with derivatives). With a
+length c and the quantity p at the positions a and b::
 
     φ(r) = (1 + r²/c²)^(−5/2)
     cov(p(a), p(b)) = φ,   cov(p(a), ∂_v p(b)) = ∂φ/∂b·v,   cov(∂_u p(a), ∂_v p(b)) = u·∂²φ/∂a∂b·v
 
-The exponent is that of a point force's pressure at a depth (Boussinesq). Source: G. E. Fasshauer,
-Meshfree Approximation Methods with MATLAB (2007), ch. 36 (Hermite interpolation).
+The exponent is that of the pressure of a point force at a depth (Boussinesq). Source: G. E.
+Fasshauer, Meshfree Approximation Methods with MATLAB (2007), ch. 36 (Hermite interpolation).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..core.arrays import Array, Mask
+from ..core.arrays import Array, Index, Mask
 from ..core.poses import CubePoses
 
 NEIGHBOURS = 9
-"""Nearest cubes, the own one included, that make the points of a cube's patch."""
+"""Number of nearest cubes, including the own one, that determine the points of a patch."""
+
 RIDGE = 1e-6
-"""Added to φ(0) = 1. A thousandth of a value then counts as noise: close cubes stay solvable."""
+"""Variance that is added to φ(0) = 1, so that the equations of close cubes stay solvable. A
+thousandth of a value then counts as noise."""
 
 
 class Interpolation:
-    """From values of cubes to points: a patch of equally many points for each cube.
+    """Interpolates values of cubes to a patch of points around each cube."""
 
-    poses: of the cubes; patches: (cubes, points, 3) m; length: c of the radial function, m
-    """
+    def __init__(
+        self,
+        poses: CubePoses,
+        patches: Array,
+        length: float,
+    ) -> None:
+        """Find the neighbours of each cube.
 
-    def __init__(self, poses: CubePoses, patches: Array, length: float) -> None:
-        self._poses, self._patches, self._length = poses, patches, length
-        self._near = _nearest(poses)
+        Args:
+            poses: Poses of the cubes.
+            patches: Positions (cubes, points, 3) in m of the points, equally many for each cube.
+            length: Length c of the radial basis function, in m.
+        """
+        self._poses = poses
+        self._patches = patches
+        self._length = length
+        self._near = _nearest_cubes(poses)
         self._weights: dict[tuple[int, ...], _Weights] = {}
 
     def values(self, values: Array, columns: list[int]) -> Array:
-        """(M,) on all points; NaN on patches of which no neighbour has a value.
+        """Interpolate one quantity.
 
-        values: (cubes, C), NaN where unknown
-        columns: that of the quantity, then those of its derivatives along the cubes' x and y, if
-        any
+        Args:
+            values: Values (cubes, C), NaN where unknown.
+            columns: Column of the quantity, followed by those of its derivatives along the cubes' x
+                and y, if they are to be used.
+
+        Returns:
+            Values (M,) on all points; NaN on patches of which no neighbour has a value.
         """
+        n_cubes, n_points, _ = self._patches.shape
         known = np.isfinite(values)
-        n_points = self._patches.shape[0] * self._patches.shape[1]
         if not known[:, columns[0]].any():
-            return np.full(n_points, np.nan)
-        weights = self._solved(known, columns)
+            return np.full(n_cubes * n_points, np.nan)
+
+        weights = self._solve_weights(known, columns)
         scale = np.array([1.0, self._length, self._length])[: len(columns)]
         scaled = np.where(known, values, 0)[:, columns] * scale
         result: Array = weights.matrix @ scaled.ravel()
-        result[np.repeat(weights.empty, self._patches.shape[1])] = np.nan
+        result[np.repeat(weights.empty, n_points)] = np.nan
         return result
 
     def uncertainty(self, values: Array, columns: list[int]) -> Array:
-        """(M,) standard deviation on all points, as a part of the quantity's own size: 0 to 1."""
-        return self._solved(np.isfinite(values), columns).uncertainty.ravel()
+        """Compute the standard deviation (M,) relative to that of the quantity itself, 0 to 1."""
+        return self._solve_weights(np.isfinite(values), columns).uncertainty.ravel()
 
-    def _solved(self, known: Mask, columns: list[int]) -> _Weights:
-        """Weights of these columns.
+    def _solve_weights(self, known: Mask, columns: list[int]) -> _Weights:
+        """Return the weights for these columns.
 
-        They depend only on what is known: they are kept, and solved again where that has changed.
+        They depend only on which values are known; patches are solved again only where that
+        changed.
         """
         wanted = known[:, columns]
         key = tuple(columns)
         if key not in self._weights:
             n_points = self._patches.shape[1]
+            # `known` of new weights differs everywhere, so that all patches are solved below.
             self._weights[key] = _Weights(self._near, n_points, ~wanted)
+
         weights = self._weights[key]
         if not np.array_equal(wanted, weights.known):
-            changed = np.flatnonzero((wanted != weights.known)[self._near].any(axis=(1, 2)))
+            differs = (wanted != weights.known)[self._near].any(axis=(1, 2))
+            changed = np.flatnonzero(differs)
             weights.data[changed], weights.uncertainty[changed] = self._solve(changed, wanted)
             weights.known = wanted
             weights.empty = ~wanted[self._near, 0].any(axis=1)
         return weights
 
-    def _solve(self, chosen: NDArray[np.intp], known: Mask) -> tuple[Array, Array]:
-        """Weights and relative uncertainty of some patches.
+    def _solve(self, chosen: Index, known: Mask) -> tuple[Array, Array]:
+        """Solve some patches.
 
-        known: (cubes, width). Returns (patches, points, neighbours × width), (patches, points).
+        Args:
+            chosen: Indices (patches,) of the patches.
+            known: Which values and derivatives are known (cubes, width).
+
+        Returns:
+            Weights (patches, points, neighbours x width), relative uncertainty (patches, points).
         """
-        near, n, width = self._near[chosen], len(chosen), known.shape[1]
-        size = near.shape[1] * width
-        seen = known[near].reshape(n, size)
+        near = self._near[chosen]
+        n, n_near = near.shape
+        width = known.shape[1]
+        size = n_near * width
+        is_known = known[near].reshape(n, size)
+
         cubes = self._poses.position[near] / self._length
-        # (n, neighbours, 2 or 0, 3): the axes along which derivatives are known
-        axes = np.swapaxes(self._poses.rotation[:, :, : width - 1], 1, 2)[near]
         points = self._patches[chosen] / self._length
-        matrix = _covariance(cubes[:, :, None] - cubes[:, None], axes[:, :, None], axes[:, None])
-        matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
-        matrix *= seen[:, :, None] & seen[:, None]
-        matrix[:, np.arange(size), np.arange(size)] += np.where(seen, RIDGE, 1.0)
+        # Directions (n, neighbours, 2 or 0, 3) of the derivatives: the cubes' x and y axes.
+        axes = np.swapaxes(
+            self._poses.rotation[:, :, : width - 1],
+            1,
+            2,
+        )[near]
+
+        offset = cubes[:, :, np.newaxis] - cubes[:, np.newaxis]
+        matrix = _covariance(
+            offset,
+            axes[:, :, np.newaxis],
+            axes[:, np.newaxis],
+        )
+        matrix = np.moveaxis(
+            matrix,
+            3,
+            2,
+        ).reshape(
+            n,
+            size,
+            size,
+        )
+        # Unknown values become independent of all others and get the weight 0.
+        matrix *= is_known[:, :, np.newaxis] & is_known[:, np.newaxis]
+        matrix[:, np.arange(size), np.arange(size)] += np.where(
+            is_known,
+            RIDGE,
+            1.0,
+        )
+
+        offset = points[:, :, np.newaxis] - cubes[:, np.newaxis]
         no_axes = np.zeros((n, points.shape[1], 1, 0, 3))
-        to_points = _covariance(points[:, :, None] - cubes[:, None], no_axes, axes[:, None])
-        to_points = to_points.reshape(n, -1, size) * seen[:, None]
-        weights = np.swapaxes(np.linalg.solve(matrix, np.swapaxes(to_points, 1, 2)), 1, 2)
+        to_points = _covariance(offset, no_axes, axes[:, np.newaxis])
+        to_points = (
+            to_points.reshape(
+                n,
+                -1,
+                size,
+            )
+            * is_known[:, np.newaxis]
+        )
+
+        weights = np.swapaxes(
+            np.linalg.solve(
+                matrix,
+                np.swapaxes(
+                    to_points,
+                    1,
+                    2,
+                ),
+            ),
+            1,
+            2,
+        )
         explained = np.einsum("nqd,nqd->nq", weights, to_points)
-        return weights, np.sqrt(np.clip(1 - explained, 0, 1))
+        return weights, np.sqrt(
+            np.clip(
+                1 - explained,
+                0,
+                1,
+            )
+        )
 
 
 class _Weights:
-    """A sparse matrix from cubes to points, whose entries can be replaced patch by patch.
+    """Sparse matrix from cubes to points, whose entries can be replaced patch by patch.
 
-    matrix: (M, cubes × width); data: its entries (cubes, points, neighbours × width)
-    known: (cubes, width) what they were solved for; uncertainty: (cubes, points), relative
-    empty: (cubes,) none of the neighbours has a value
+    Attributes:
+        matrix: Matrix (M, cubes x width).
+        data: Its entries (cubes, points, neighbours x width), a view.
+        known: Which values and derivatives (cubes, width) it was solved for.
+        uncertainty: Relative uncertainty (cubes, points).
+        empty: Whether no neighbour of a cube (cubes,) has a value.
     """
 
-    def __init__(self, near: NDArray[np.intp], points: int, known: Mask) -> None:
-        """near (cubes, neighbours); points: of a patch."""
+    def __init__(
+        self,
+        near: Index,
+        points: int,
+        known: Mask,
+    ) -> None:
+        """Create a matrix of zeros for neighbours (cubes, neighbours) and `points` per patch."""
         n, width = known.shape
-        columns = (near[:, :, None] * width + np.arange(width)).reshape(n, -1)
+        columns = near[:, :, np.newaxis] * width + np.arange(width)
+        columns = columns.reshape(n, -1)
+        per_row = columns.shape[1]
         rows = n * points
-        self.known, self.empty = known, np.zeros(n, bool)
+
+        self.known = known
+        self.empty = np.zeros(n, bool)
         self.uncertainty = np.zeros((n, points))
-        self.data = np.zeros((n, points, columns.shape[1]))
+        self.data = np.zeros((n, points, per_row))
         indices = np.repeat(columns, points, axis=0).ravel()
-        starts = np.arange(rows + 1) * columns.shape[1]
+        starts = np.arange(rows + 1) * per_row
         self.matrix = csr_matrix(
             (self.data.ravel(), indices, starts), shape=(rows, n * width), copy=False
         )
 
 
-def _nearest(poses: CubePoses) -> NDArray[np.intp]:
-    """(cubes, neighbours) numbers of the nearest cubes; of cubes equally far, the first ones."""
+def _nearest_cubes(poses: CubePoses) -> Index:
+    """Return the nearest cubes (cubes, neighbours); of cubes at equal distances, the first ones."""
     n = len(poses.position)
     count = min(NEIGHBOURS, n)
-    distance, near = cKDTree(poses.position).query(poses.position, min(3 * count, n))
-    distance, near = distance.reshape(n, -1), near.reshape(n, -1)
-    # Rounding of the distances must not decide.
-    order = np.lexsort((near, (distance / poses.pitch).round(6)))[:, :count]
-    return np.take_along_axis(near, order, axis=1)
+    # More than wanted: the tree may drop any of several cubes at the same distance.
+    candidates = min(3 * count, n)
+    distance, near = cKDTree(poses.position).query(poses.position, candidates)
+    distance = distance.reshape(n, -1)
+    near = near.reshape(n, -1)
+
+    # Rounding errors of the distances must not decide the order.
+    rounded = (distance / poses.pitch).round(6)
+    order = np.lexsort((near, rounded))[:, :count]
+    return np.asarray(np.take_along_axis(near, order, axis=1))
 
 
-def _covariance(d: Array, u: Array, v: Array) -> Array:
-    """(..., 1 + A, 1 + B) covariances of value and derivatives at two places.
+def _covariance(
+    d: Array,
+    u: Array,
+    v: Array,
+) -> Array:
+    """Compute the covariances of value and derivatives at two positions.
 
-    d: (..., 3) the first place minus the second, over c
-    u: (..., A, 3), v: (..., B, 3) directions of the derivatives at the first and second place
+    Args:
+        d: First position minus the second (..., 3), divided by c.
+        u: Directions (..., A, 3) of the derivatives at the first position.
+        v: Directions (..., B, 3) of the derivatives at the second position.
+
+    Returns:
+        Covariances (..., 1 + A, 1 + B).
     """
+    # φ = b^(-5/2) and its first two derivatives by b
     b = 1 + np.einsum("...i,...i->...", d, d)
-    f, f1, f2 = b**-2.5, -2.5 * b**-3.5, 8.75 * b**-4.5
-    du, dv = (np.einsum("...i,...ai->...a", d, axes) for axes in (u, v))
-    result = np.empty((*b.shape, 1 + du.shape[-1], 1 + dv.shape[-1]))
-    result[..., 0, 0] = f
-    result[..., 0, 1:] = -2 * f1[..., None] * dv
-    result[..., 1:, 0] = 2 * f1[..., None] * du
-    straight = -2 * f1[..., None, None] * np.einsum("...ai,...bi->...ab", u, v)
-    curved = 4 * f2[..., None, None] * du[..., None] * dv[..., None, :]
-    result[..., 1:, 1:] = straight - curved
+    phi = b**-2.5
+    phi1 = -2.5 * b**-3.5
+    phi2 = 8.75 * b**-4.5
+    along_u = np.einsum("...i,...ai->...a", d, u)
+    along_v = np.einsum("...i,...ai->...a", d, v)
+
+    result = np.empty((*b.shape, 1 + u.shape[-2], 1 + v.shape[-2]))
+    result[..., 0, 0] = phi
+    result[..., 0, 1:] = -2 * phi1[..., np.newaxis] * along_v
+    result[..., 1:, 0] = 2 * phi1[..., np.newaxis] * along_u
+    u_dot_v = np.einsum("...ai,...bi->...ab", u, v)
+    product = along_u[..., np.newaxis] * along_v[..., np.newaxis, :]
+    first = -2 * phi1[..., np.newaxis, np.newaxis] * u_dot_v
+    second = -4 * phi2[..., np.newaxis, np.newaxis] * product
+    result[..., 1:, 1:] = first + second
     return result

@@ -1,7 +1,7 @@
-"""Traction on the whole surface of a skin from all of its cubes, and how sure it is.
+"""Inverse problem of a skin: the traction on its surface from the measured values of all cubes.
 
-What the cubes see of a traction t is linear (layer.py), y = H t + e. windows.py has its posterior,
-and missing.py what takes the place of values that are missing.
+The measured values depend linearly on the traction t (layer.py), y = H t + e. posterior.py computes
+the posterior of t, prediction.py replaces values that are missing.
 """
 
 from __future__ import annotations
@@ -19,48 +19,61 @@ from ..core.tensor import rotation_from_rpy
 from ..mechanics.influence import Influence
 from ..mechanics.kernels import Kernels, MeasurementModel
 from ..mechanics.layer import Layer
-from .flattened import flattened
-from .missing import Missing
+from .pad_measurement import model_pads
 from .pad_noise import GAIN_ERROR, noise_of_all_pads, pad_stresses
-from .pad_reading import read_pads
+from .posterior import ObservationModel, WindowPosteriors
+from .prediction import MissingValuePrediction
 from .surface import patches
-from .windows import Observed, Windows
+from .unrolled_skin import unroll
 
 
 class TractionField(NamedTuple):
-    """On the M points of the surface, in the frame of the point's cube.
+    """Traction on the M points of a surface.
 
-    traction: (M, 3) Pa on the skin along x, y, z; pressing is negative along z
-    below: (M,) Pa the pressure at the depth of the cubes
+    Attributes:
+        traction: Traction (M, 3) in Pa on the skin along x, y, z, in the frame of the cube on whose
+            patch the point lies. Pressing is negative along z.
+        depth_pressure: Pressure (M,) in Pa below each point, at the depth of the cubes.
     """
 
     traction: Array
-    below: Array
+    depth_pressure: Array
 
     @property
     def pressure(self) -> Array:
-        """(M,) Pa on the surface."""
+        """Pressure (M,) in Pa on the surface."""
         return -self.traction[:, 2]
 
 
 class FieldDeviation(NamedTuple):
-    """Standard deviations of a TractionField: pressure (M,) and below (M,), Pa."""
+    """Standard deviations of a `TractionField`.
+
+    Attributes:
+        pressure: Standard deviation (M,) of the pressure on the surface, in Pa.
+        depth_pressure: Standard deviation (M,) of the pressure at the depth of the cubes, in Pa.
+    """
 
     pressure: Array
-    below: Array
+    depth_pressure: Array
 
 
 class SurfaceInverse:
-    """Traction on the surface of a skin from its stress rows; set up once for a skin.
+    """Computes the traction on the surface of a skin from its stress rows.
 
-    points: (M, 3) m on the surface in the parent frame, `side` x `side` on the patch of each cube
-    cube: (M,) whose patch it is; poses: of the cubes; kernels: of the layer
-
-    Parameters: skin: as `read_skin` gives it. depth: from the cubes' centres to the surface, m.
-    thickness: of the elastomer over rigid ground, m; inf: a half space. poisson: of the elastomer.
-    side: points along a side of a patch. influence: of the pads; then depth, thickness and poisson
-    are theirs. None: cubes count as points. Raises ElasticError for what no layer is, where no cube
-    observes anything, and for influence functions of other cubes.
+    Attributes:
+        poses: Poses of the cubes.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        pitch: Typical distance of neighbouring cubes, in m.
+        points: Positions (M, 3) of the points on the surface in the parent frame, in m: `side` x
+            `side` on the patch of each cube.
+        cube: Index (M,) of the cube on whose patch a point lies.
+        spacing: Distance of neighbouring points, in m.
+        area: Area that a point stands for, in m^2.
+        kernels: Kernels of the layer.
+        columns: Indices (C,) in `COMPONENTS` of the components that some cube observes.
+        observed: Whether each cube observes them (cubes, C), with all of its pads.
+        by_pad: Noise matrices (cubes, C, P) with the pads in use, in Pa.
+        variant: Variant (cubes,) of each cube in the measurement model.
     """
 
     def __init__(
@@ -73,32 +86,57 @@ class SurfaceInverse:
         side: int = 2,
         influence: Influence | None = None,
     ) -> None:
+        """Set up the matrices, which takes a second the first time.
+
+        Args:
+            skin: Skin as from `read_skin`.
+            depth: Distance from the centres of the cubes to the surface, in m.
+            thickness: Thickness of the elastomer on rigid ground, in m; infinite for a half space.
+            poisson: Poisson's ratio of the elastomer.
+            side: Number of points along a side of the patch of a cube.
+            influence: Influence functions of the pads, which determine depth, thickness and
+                Poisson's ratio; None: cubes are modelled as points.
+
+        Raises:
+            ElasticError: There is no such layer, no cube observes anything, or the influence
+                functions belong to other cubes.
+        """
         poses = CubePoses(
             position=np.array([cube.xyz for cube in skin.cubes]),
             rotation=np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes]),
             half_side=np.array([calibration.half_side for calibration in skin.calibrations]),
         )
         by_pad = noise_of_all_pads(skin.calibrations)
-        layer, reading = Layer(thickness, poisson), None
+        layer = Layer(thickness, poisson)
+        model = None
         if influence is not None:
-            layer, depth = influence.layer, influence.depth
-            reading = read_pads(influence, skin.calibrations)
-        self._set_up(poses, by_pad, layer, depth, side, reading)
+            layer = influence.layer
+            depth = influence.depth
+            model = model_pads(influence, skin.calibrations)
+        self._set_up(poses, by_pad, layer, depth, side, model)
 
     @classmethod
-    def of_cubes(
+    def from_poses(
         cls,
         poses: CubePoses,
         by_pad: Array,
         layer: Layer,
         depth: float,
         side: int = 2,
-        reading: MeasurementModel | None = None,
+        model: MeasurementModel | None = None,
     ) -> SurfaceInverse:
-        """The same from poses and by_pad (cubes, 15, P), see `noise_of_all_pads`. reading: how the
-        cubes see; by default as points."""
+        """Create an inverse without a skin file.
+
+        Args:
+            poses: Poses of the cubes.
+            by_pad: Noise matrices (cubes, 15, P) as from `noise_of_all_pads`.
+            layer: Elastic layer that contains the cubes.
+            depth: Distance from the centres of the cubes to the surface, in m.
+            side: Number of points along a side of the patch of a cube.
+            model: Measurement model of the cubes; by default they are points.
+        """
         inverse = cls.__new__(cls)
-        inverse._set_up(poses, by_pad, layer, depth, side, reading)
+        inverse._set_up(poses, by_pad, layer, depth, side, model)
         return inverse
 
     def _set_up(
@@ -108,98 +146,167 @@ class SurfaceInverse:
         layer: Layer,
         depth: float,
         side: int,
-        reading: MeasurementModel | None,
+        model: MeasurementModel | None,
     ) -> None:
+        """Compute points and matrices; arguments as in `from_poses`."""
         if side < 1:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
-        self.poses, self.depth, self.pitch, self.side = poses, depth, poses.pitch, side
-        scale = float(np.median(poses.half_side))
-        self.kernels = Kernels(layer, depth, scale, reading)
         n = len(poses.position)
-        self.reading = np.zeros(n, np.intp) if reading is None else reading.variant.copy()
-        self.spacing = poses.pitch / side
+        self.poses = poses
+        self.depth = depth
+        self.pitch = poses.pitch
+        scale = float(np.median(poses.half_side))
+        self.kernels = Kernels(layer, depth, scale, model)
+
+        self.spacing = self.pitch / side
         self.area = self.spacing**2
-        flat = patches(poses, self.spacing, side)
-        self.points = (flat + depth * poses.rotation[:, None, :, 2]).reshape(-1, 3)
-        self.cube = np.repeat(np.arange(len(flat)), side**2)
+        above = depth * poses.rotation[:, np.newaxis, :, 2]
+        self.points = (
+            patches(
+                poses,
+                self.spacing,
+                side,
+            )
+            + above
+        ).reshape(-1, 3)
+        self.cube = np.repeat(np.arange(n), side**2)
+
         observed = np.isfinite(by_pad.sum(axis=2))
         self.columns = np.flatnonzero(observed.any(axis=0))
         if not len(self.columns):
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
-        self._units = np.where(self.columns < len(STRESS), 1.0, scale)
-        self.by_pad = by_pad[:, self.columns] * self._units[:, None]
-        self._all_pads = self.by_pad.copy()
-        self._of_pads = None if reading is None else reading.pads
-        self._kind = self.reading.copy()
-        self._differs = np.zeros(n, bool)
         self.observed = observed[:, self.columns]
-        seen = Observed(self.columns, self.observed, self._all_pads, self._kind)
-        self._windows = Windows(self.kernels, poses, seen, self.spacing, side)
+        self._unit_factors = np.where(
+            self.columns < len(STRESS),
+            1.0,
+            scale,
+        )
+        self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, np.newaxis]
+        self._all_pads = self.by_pad.copy()
+
+        # Variants change when pads are left out; these are the ones with all pads.
+        self._whole_variant = np.zeros(n, np.intp) if model is None else model.variant
+        self._variant_pads = None if model is None else model.pads
+        self.variant = self._whole_variant.copy()
+        self._has_other_pads = np.zeros(n, bool)
+
+        observation = ObservationModel(
+            self.columns, self.observed, self._all_pads, self._whole_variant
+        )
+        self._windows = WindowPosteriors(
+            self.kernels,
+            poses,
+            observation,
+            self.spacing,
+            side,
+        )
         self._known = self.observed
-        self._missing = Missing(self._windows, self.observed, self.observed)
+        self._prediction = MissingValuePrediction(self._windows, self.observed, self._known)
 
     def scaled(self, values: Array) -> Array:
-        """(cubes, C) in Pa of values (cubes, 15): only what some cube observes."""
-        return np.asarray(values)[:, self.columns] * self._units
+        """Convert values (cubes, 15) to the observed components (cubes, C), all in Pa."""
+        return np.asarray(values)[:, self.columns] * self._unit_factors
 
-    def flattened(self, middle: int, cubes: Index) -> tuple[Array, Array]:
-        """Places (n, 2) m of cubes laid flat about the middle one, in its frame, and the angle (n,)
-        rad by which each is turned."""
-        place, angle = flattened(self.poses, np.array([middle]), cubes[None])
+    def unroll(self, centre: int, cubes: Index) -> tuple[Array, Array]:
+        """Lay cubes flat around one cube.
+
+        Args:
+            centre: Index of the cube that stays in place.
+            cubes: Indices (n,) of the cubes.
+
+        Returns:
+            Positions (n, 2) in m and rotations (n,) in rad, in the frame of the centre cube.
+        """
+        place, angle = unroll(
+            self.poses,
+            np.array([centre]),
+            cubes[np.newaxis],
+        )
         return place[0], angle[0]
 
     def leave_out(self, cubes: Index, by_pad: Array) -> None:
-        """From now on these cubes (n,) have other pads, by_pad (n, 15, P) as from `noise_by_pad`.
+        """Change the pads that cubes use.
 
-        Contacts take what such a cube says as it is. The field takes it so where cubes count as
-        points: they say the same without some pads. Where their pads are known it does not, since
-        its matrices are those of all pads: there the cube counts as missing.
+        The contact tracker uses the components of such a cube as they are. The field does so only
+        if cubes are modelled as points, whose components do not depend on the pads. With influence
+        functions they do, and the matrices of the field are those of all pads; there, the values of
+        the cube count as missing.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
+            by_pad: Noise matrices (n, 15, P) as from `noise_by_pad`, with the pads in use.
         """
-        self.by_pad[cubes] = by_pad[:, self.columns] * self._units[:, None]
-        if self._of_pads is None:
+        self.by_pad[cubes] = by_pad[:, self.columns] * self._unit_factors[:, np.newaxis]
+        if self._variant_pads is None:
             return
-        for cube, own in zip(cubes.tolist(), by_pad, strict=True):
-            said = self._of_pads[self._kind[cube]] @ np.nan_to_num(own).T
-            self.reading[cube] = self.kernels.add_variant(said)
-            here, whole = self.by_pad[cube], self._all_pads[cube]
-            self._differs[cube] = not np.array_equal(here, whole, equal_nan=True)
+        for cube, own in zip(
+            cubes.tolist(),
+            by_pad,
+            strict=True,
+        ):
+            pads = self._variant_pads[self._whole_variant[cube]]
+            self.variant[cube] = self.kernels.add_variant(pads @ np.nan_to_num(own).T)
+            self._has_other_pads[cube] = not np.array_equal(
+                self.by_pad[cube], self._all_pads[cube], equal_nan=True
+            )
 
     def field(self, values: Array) -> TractionField:
-        """The traction that the values (cubes, 15) tell, NaN where a component is not known.
+        """Compute the traction that explains the values of all cubes.
 
-        Values as in `StressRows`: Pa and Pa/m. Where no cube of a window is known, the traction
-        is 0.
+        Args:
+            values: Components (cubes, 15) as in `StressRows`, in Pa and Pa/m, NaN where unknown.
+
+        Returns:
+            Traction on all points; 0 where no cube of a window has a value.
         """
-        return self.field_of(self.scaled(values))
+        return self.field_of_scaled(self.scaled(values))
 
-    def field_of(self, scaled: Array) -> TractionField:
-        """The same of `scaled` values."""
-        result = self._windows.product(self._filled(scaled))
-        rows: Array = result.reshape(len(self.points), -1).astype(np.float64)
+    def field_of_scaled(self, scaled: Array) -> TractionField:
+        """Compute the same from values (cubes, C) as from `scaled`."""
+        result = self._windows.product(self._fill(scaled))
+        rows = result.reshape(len(self.points), -1).astype(np.float64)
         return TractionField(rows[:, :3], rows[:, 3])
 
     def deviation(self, values: Array) -> FieldDeviation:
-        """How far the field of these values may be off. Takes several times as long as `field`."""
+        """Compute the standard deviations of `field`, which takes several times as long."""
         scaled = self.scaled(values)
-        return self.deviation_of(scaled, scaled)
+        return self.residual_deviation(scaled, scaled)
 
-    def deviation_of(self, left: Array, scaled: Array) -> FieldDeviation:
-        """How far the field of what is left of `scaled` values may be off; all of these are on the
-        pads whose gains are not quite known."""
-        windows, y = self._windows, self._filled(left)
+    def residual_deviation(self, residual: Array, scaled: Array) -> FieldDeviation:
+        """Compute the standard deviations of the field of a residual.
+
+        Args:
+            residual: Part (cubes, C) of the scaled values that the contacts do not explain.
+            scaled: All scaled values (cubes, C); errors of the gains are proportional to them.
+        """
+        y = self._fill(residual)
         stresses = pad_stresses(self.by_pad, self._known, scaled)
-        whole = np.where(self._known.any(axis=1)[:, None], (GAIN_ERROR * stresses) ** 2 + 1, 0)
-        of_pads = whole.astype(np.float32)
-        square = windows.size(y, of_pads, self._known)[:, None]
-        prior = windows.prior[windows.kind] + self._missing.variance
-        variance = square * prior + windows.noise(of_pads) + self._missing.noise(of_pads)
+        has_values = self._known.any(axis=1)[:, np.newaxis]
+        gain_variance = (GAIN_ERROR * stresses) ** 2
+        pad_variance = np.where(
+            has_values,
+            gain_variance + 1,
+            0,
+        ).astype(np.float32)
+
+        windows = self._windows
+        scale = windows.scale(
+            y,
+            pad_variance,
+            self._known,
+        )[:, np.newaxis]
+        prior = windows.prior[windows.kind] + self._prediction.variance
+        variance = scale * prior
+        variance += windows.noise(pad_variance)
+        variance += self._prediction.noise(pad_variance)
         return FieldDeviation(*np.sqrt(variance).reshape(-1, 2).T)
 
-    def _filled(self, scaled: Array) -> Single:
-        """Values (cubes, C); where they are unknown, what the others predict."""
-        known = np.isfinite(scaled) & self.observed & ~self._differs[:, None]
+    def _fill(self, scaled: Array) -> Single:
+        """Return values (cubes, C) in which predictions replace those that are missing."""
+        usable = ~self._has_other_pads[:, np.newaxis]
+        known = np.isfinite(scaled) & self.observed & usable
         if not np.array_equal(known, self._known):
             self._known = known
-            self._missing = Missing(self._windows, self.observed, known)
+            self._prediction = MissingValuePrediction(self._windows, self.observed, known)
         y = np.where(known, scaled, 0.0).astype(np.float32)
-        return self._missing.filled(y)
+        return self._prediction.fill(y)

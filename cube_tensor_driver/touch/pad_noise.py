@@ -1,11 +1,12 @@
-"""Noise of a cube's components from that of its pads and of their gains.
+"""Noise of the components of a cube, caused by the noise of its pads and errors of their gains.
 
-The noise of the components of a cube is that of its pads by B, in units of their deviations. An
-error of a gain counts in proportion to the stress u on its pad::
+B is the matrix from the noise of the pads, in units of its standard deviation, to the components.
+The error of a gain counts in proportion to the stress u on the pad, also in these units. The
+covariance of the components is then::
 
     N = B diag(1 + GAIN_ERROR^2 u^2) B',     u = B' (B B')^-1 y
 
-u are the least stresses of pads, over their noise, that make the values y.
+u are the smallest pad stresses that explain the components y.
 """
 
 from __future__ import annotations
@@ -20,33 +21,70 @@ from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 
 GAIN_ERROR = 0.01
-"""Standard deviation of a pad's gain against what its calibration says."""
+"""Relative standard deviation of the gain of a pad from its calibrated value."""
 
 
-def noise_by_pad(pipeline: Pipeline, cubes: Index, left_out: PadMasks) -> Array:
-    """B (n, 15, P) of some cubes: what the standard deviation of each pad's noise makes of each
-    component, Pa and Pa/m.
+def noise_by_pad(
+    pipeline: Pipeline,
+    cubes: Index,
+    left_out: PadMasks,
+) -> Array:
+    """Return the noise matrices B of n cubes.
 
-    left_out: (n,) bits of pads that are left out. NaN where a component is not observed; 0 for pads
-    that are left out or that a cube does not have.
+    Args:
+        pipeline: Pipeline that computes the components of all cubes of the skin.
+        cubes: Indices (n,) of the cubes.
+        left_out: Bits (n,) of the pads that are left out.
+
+    Returns:
+        Change (n, 15, P) of each component, in Pa or Pa/m, for one standard deviation of the noise
+        of each pad. It is NaN where a component is not observed, and 0 for a pad that is left out
+        or that the cube does not have.
     """
     by_pad = np.zeros((len(cubes), len(COMPONENTS), pipeline.n_pads))
-    for row, (cube, mask) in enumerate(zip(cubes.tolist(), left_out.tolist(), strict=True)):
+    for row, (cube, mask) in enumerate(
+        zip(
+            cubes.tolist(),
+            left_out.tolist(),
+            strict=True,
+        )
+    ):
         own = pipeline.matrix(cube, mask) * pipeline.calibrations[cube].noise
         by_pad[row, :, : own.shape[1]] = own
     return by_pad
 
 
 def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
-    """The same (cubes, 15, P) of cubes with these calibrations and with all of their pads."""
+    """Return the noise matrices B (cubes, 15, P) of cubes that use all of their pads."""
     n = len(calibrations)
-    return noise_by_pad(Pipeline(calibrations), np.arange(n), np.zeros(n, np.uint32))
+    no_pads = np.zeros(n, np.uint32)
+    return noise_by_pad(Pipeline(calibrations), np.arange(n), no_pads)
 
 
-def pad_stresses(by_pad: Array, known: Mask, values: Array) -> Array:
-    """u (n, P) from by_pad (n, C, P) and what is known of values (n, C), in the same units."""
-    by_pad = np.where(known[:, :, None], by_pad, 0.0)
-    of_pad = by_pad.swapaxes(1, 2)
-    whole = by_pad @ of_pad + np.eye(known.shape[1]) * ~known[:, None, :]
-    weights = np.linalg.solve(whole, np.where(known, values, 0.0)[..., None])
-    return np.asarray((of_pad @ weights)[..., 0])
+def pad_stresses(
+    by_pad: Array,
+    known: Mask,
+    values: Array,
+) -> Array:
+    """Estimate the stresses u of the pads from the components of n cubes.
+
+    Args:
+        by_pad: Noise matrices B (n, C, P).
+        known: Whether each component (n, C) is known.
+        values: Components (n, C), in the units of `by_pad`.
+
+    Returns:
+        Stresses u (n, P), in units of the noise of each pad.
+    """
+    by_pad = np.where(
+        known[:, :, np.newaxis],
+        by_pad,
+        0.0,
+    )
+    transposed = by_pad.swapaxes(1, 2)
+
+    # Unknown components get a 1 on the diagonal, so that B B' stays regular.
+    unknown = np.eye(known.shape[1]) * ~known[:, np.newaxis, :]
+    right = np.where(known, values, 0.0)[..., np.newaxis]
+    weights = np.linalg.solve(by_pad @ transposed + unknown, right)
+    return np.asarray((transposed @ weights)[..., 0])

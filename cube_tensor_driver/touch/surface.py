@@ -1,11 +1,11 @@
-"""Pressure and shear over a skin's surface from each cube's values and gradients; its contacts.
+"""Pressure and shear over a skin by interpolation between its cubes, and the contacts in it.
 
-Pressure is p = −σzz in the cubes' plane, `depth` below the surface. It is interpolated from the
-values and gradients of the cubes (interpolation.py), with the length c = 3 depth: the best of those
-tried for indenters of 2 to 20 mm at pitches of 6 to 24 mm (`./cube pictures` draws the errors).
-Shear (σzx, σyz) has no measured gradients; it is interpolated from values.
+The pressure p = −σzz in the plane of the cubes, `depth` below the surface, is interpolated from the
+values and gradients of the cubes (interpolation.py). The length c = 3 depth was the best of those
+tried for indenters of 2 to 20 mm at pitches of 6 to 24 mm (`./cube pictures` draws the errors). The
+shear (σzx, σyz) has no measured gradients and is interpolated from values.
 
-A contact's force and position follow from the equilibrium of the layer above the cubes.
+Force and position of a contact follow from the equilibrium of the layer above the cubes.
 """
 
 from __future__ import annotations
@@ -13,29 +13,35 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Index, Mask
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS
 from ..core.poses import CubePoses
 from .interpolation import Interpolation
 
 PRESSURE = [COMPONENTS.index(name) for name in ("zz", "zz_x", "zz_y")]
+"""Columns of σzz and of its derivatives along x and y in `COMPONENTS`."""
+
 SHEAR = [COMPONENTS.index(name) for name in ("zx", "yz")]
+"""Columns of σzx and σyz in `COMPONENTS`."""
+
 RELATIVE_THRESHOLD = 0.2
-"""A contact is where the pressure is above this part of the skin's greatest pressure."""
+"""Fraction of the largest pressure on the skin above which a point counts as in contact."""
+
 LENGTH_PER_DEPTH = 3.0
-"""Length of the radial function over the depth of the cubes."""
+"""Length c of the radial basis function divided by the depth of the cubes."""
 
 
 class Field(NamedTuple):
-    """On the M points of a surface.
+    """Pressure and shear on the M points of a surface.
 
-    pressure: (M,) Pa; shear: (M, 2) Pa, σzx and σyz in the frame of the point's cube
+    Attributes:
+        pressure: Pressure (M,) in Pa.
+        shear: σzx and σyz (M, 2) in Pa, in the frame of the cube on whose patch the point lies.
     """
 
     pressure: Array
@@ -43,7 +49,19 @@ class Field(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """One contact in the skin's parent frame; fields and units as in SkinContacts.msg."""
+    """One contact in the skin's parent frame.
+
+    Attributes:
+        position: Position (3,) on the surface, in m, where the line of action of the force meets
+            it.
+        normal: Unit normal (3,) out of the skin.
+        force: Force (3,) in N on the skin.
+        normal_force: Normal force in N; pressing is positive.
+        shear_force: Tangential force in N; NaN if no cube observes shear.
+        area: Area in m^2 on which the pressure exceeds half of its maximum.
+        position_uncertainty: Standard deviation of the position along each axis, in m.
+        force_uncertainty: Standard deviation of the normal force, in N.
+    """
 
     position: Array
     normal: Array
@@ -56,149 +74,189 @@ class Contact(NamedTuple):
 
 
 class Surface:
-    """Points of a skin's surface, `side` × `side` on the patch of each cube, and the field on them.
+    """Points of a skin in the plane of its cubes, and the field on them.
 
-    points: (M, 3) m in the parent frame, in the cubes' plane; cube: (M,) whose patch it is
-    middle: (cubes,) the point nearest to each cube
-    spacing: of the points, m; area: of a point, m²
-
-    Parameters: depth: from the cubes' centres to the surface, m. gradients: False ignores the
-    cubes' gradients, which shows what they gain. Raises ElasticError unless depth > 0 and
-    side >= 1.
+    Attributes:
+        poses: Poses of the cubes.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        pitch: Typical distance of neighbouring cubes, in m.
+        points: Positions (M, 3) in the parent frame, in m: `side` x `side` around each cube.
+        cube: Index (M,) of the cube on whose patch a point lies.
+        middle: Index (cubes,) of the point nearest to each cube.
+        spacing: Distance of neighbouring points, in m.
+        area: Area that a point stands for, in m^2.
     """
 
     def __init__(
-        self, poses: CubePoses, depth: float, side: int = 4, gradients: bool = True
+        self,
+        poses: CubePoses,
+        depth: float,
+        side: int = 4,
+        gradients: bool = True,
     ) -> None:
+        """Set up the points and the interpolation.
+
+        Args:
+            poses: Poses of the cubes.
+            depth: Distance from the centres of the cubes to the surface, in m.
+            side: Number of points along a side of the patch of a cube.
+            gradients: Whether the gradients that the cubes observe are used.
+
+        Raises:
+            ElasticError: `depth` is not positive, or `side` is below 1.
+        """
         if not depth > 0 or side < 1:
             raise ElasticError(
                 f"surface: depth {depth} m, {side} points a side; both must be greater than 0"
             )
-        self.poses, self.depth, self.pitch = poses, depth, poses.pitch
+        n = len(poses.position)
+        self.poses = poses
+        self.depth = depth
+        self.pitch = poses.pitch
         self.spacing = self.pitch / side
         self.area = self.spacing**2
         self._patches = patches(poses, self.spacing, side)
         self.points = self._patches.reshape(-1, 3)
-        self.cube = np.repeat(np.arange(len(poses.position)), side**2)
-        self.middle = np.arange(len(poses.position)) * side**2 + side // 2 * (side + 1)
+        self.cube = np.repeat(np.arange(n), side**2)
+        self.middle = np.arange(n) * side**2 + side // 2 * (side + 1)
+
         self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
         self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
-        # (pairs, 2) points next to each other
-        self._pairs = cKDTree(self.points).query_pairs(1.5 * self.spacing, output_type="ndarray")
+        # Pairs (pairs, 2) of neighbouring points, diagonal ones included.
+        tree = cKDTree(self.points)
+        self._pairs = tree.query_pairs(1.5 * self.spacing, output_type="ndarray")
 
     def field(self, values: Array) -> Field:
-        """The field of values (cubes, 15), NaN where not observed. Takes O(M) time.
+        """Interpolate pressure and shear, in O(M) time.
 
-        Where a cube has no value, its neighbours fill the gap.
+        Args:
+            values: Components (cubes, 15), NaN where unknown. Neighbours replace a missing cube.
         """
         return Field(self._pressure(values), self._shear(values))
 
     def uncertainty(self, values: Array) -> Array:
-        """(M,) standard deviation of the pressure between the cubes over its own size: 0 to 1."""
+        """Compute the standard deviation (M,) of the pressure relative to its own size, 0 to 1."""
         return self._interpolation.uncertainty(values, self._pressure_columns)
 
     def contacts(self, values: Array, threshold: float) -> list[Contact]:
-        """Where the pressure exceeds `threshold` Pa and a part of its greatest; strongest first.
-
-        values: (cubes, 15) as in `field`. Each patch counts for the contact nearest to it.
+        """Find contacts, where the pressure exceeds a threshold and a fraction of its maximum.
 
         The layer above the cubes is in equilibrium: the integral of the pressure is the force. The
         first moment of the pressure is that of the load plus depth × shear force, which is
-        subtracted again. For this moment pressure and shear are interpolated alike, from values:
-        below a point force (σzx, σyz, σzz) points away from it in an incompressible body, so each
-        cube by itself gives the position, and so do any common weights.
+        subtracted again. For this moment, pressure and shear are interpolated alike, from values:
+            below a point
+        force on an incompressible body, (σzx, σyz, σzz) points away from the force, so that each
+        cube by itself gives the position, and so does any weighted mean.
 
-        What spreads beyond the skin is lost: hardly any pressure, but of shear about 1.5 depth /
-        distance to the edge.
+        What spreads beyond the edge of the skin is lost: hardly any pressure, but a fraction of the
+        shear of about 1.5 depth / distance to the edge.
+
+        Args:
+            values: Components (cubes, 15) as in `field`.
+            threshold: Pressure in Pa at the depth of the cubes.
+
+        Returns:
+            Contacts, strongest first. Each patch counts for the contact nearest to it.
         """
-        # Around cubes without any value, no pressure is known: none is assumed.
+        # Around cubes without any value, the pressure is unknown and counts as zero.
         pressure = np.nan_to_num(self._pressure(values))
         inside = pressure > max(threshold, RELATIVE_THRESHOLD * float(pressure.max()))
         if not inside.any():
             return []
+
         shear = np.nan_to_num(self._shear(values))
+        value_pressure = -self._interpolation.values(values, PRESSURE[:1])
         loaded = _LoadedSurface(
             pressure=self._by_patch(pressure),
-            shear=np.stack([self._by_patch(one) for one in shear.T]),
-            moment_pressure=self._by_patch(-np.nan_to_num(self._from_values(values))),
+            shear=np.stack([self._by_patch(component) for component in shear.T]),
+            moment_pressure=self._by_patch(np.nan_to_num(value_pressure)),
             uncertainty=self._by_patch(self.uncertainty(values)),
             sees_shear=bool(np.isfinite(values[:, SHEAR]).any()),
         )
-        owner = self._owners(inside)
-        contacts = [self._contact(loaded, owner == k) for k in np.unique(owner)]
+        owner = self._assign_patches(inside)
+        contacts = [self._contact(loaded, owner == number) for number in np.unique(owner)]
         return sorted(contacts, key=lambda contact: -contact.normal_force)
 
     def _pressure(self, values: Array) -> Array:
         return -self._interpolation.values(values, self._pressure_columns)
-
-    def _from_values(self, values: Array) -> Array:
-        """σzz (M,) from values alone, as shear is interpolated."""
-        return self._interpolation.values(values, PRESSURE[:1])
 
     def _shear(self, values: Array) -> Array:
         columns = [self._interpolation.values(values, [column]) for column in SHEAR]
         return np.stack(columns, axis=1)
 
     def _by_patch(self, on_points: Array) -> Array:
-        """(M,) as (cubes, points of a patch)."""
+        """Arrange values (M,) as (cubes, points of a patch)."""
         return on_points.reshape(len(self._patches), -1)
 
-    def _owners(self, inside: NDArray[np.bool_]) -> NDArray[np.int32]:
-        """(cubes,) number of the contact that each patch counts for.
+    def _assign_patches(self, inside: Mask) -> Index:
+        """Return the number (cubes,) of the contact that each patch counts for.
 
-        Points in contact that are next to each other, or in one patch, belong to one contact.
+        Points in contact belong to one contact if they are neighbours or lie on one patch.
         """
         n = len(self._patches)
-        here, there = self._pairs.T
-        joined = inside[here] & inside[there]
-        ends = (self.cube[here[joined]], self.cube[there[joined]])
-        links = coo_matrix((joined[joined], ends), shape=(n, n))
-        part = connected_components(links, directed=False)[1]
-        touched = inside.reshape(n, -1).any(axis=1)
-        nearest = cKDTree(self.poses.position[touched]).query(self.poses.position)[1]
-        owners: NDArray[np.int32] = part[touched][nearest]
-        return owners
+        first, second = self._pairs.T
+        joined = inside[first] & inside[second]
+        patch_pairs = (self.cube[first[joined]], self.cube[second[joined]])
+        links = coo_matrix((joined[joined], patch_pairs), shape=(n, n))
+        component = connected_components(links, directed=False)[1]
 
-    def _contact(self, loaded: _LoadedSurface, mine: NDArray[np.bool_]) -> Contact:
-        """The contact of the patches `mine` (cubes,)."""
-        rotation, points = self.poses.rotation[mine], self._patches[mine]
-        pressure = loaded.pressure[mine]
-        weight = loaded.moment_pressure[mine] * self.area
+        is_touched = inside.reshape(n, -1).any(axis=1)
+        touched = cKDTree(self.poses.position[is_touched])
+        nearest = touched.query(self.poses.position)[1]
+        return np.asarray(component[is_touched][nearest], np.intp)
+
+    def _contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
+        """Compute the contact of the chosen patches (cubes,)."""
+        rotation = self.poses.rotation[chosen]
+        points = self._patches[chosen]
+        pressure = loaded.pressure[chosen]
+        weight = loaded.moment_pressure[chosen] * self.area
         normal_force = float(pressure.sum() * self.area)
         normal = _weighted_sum(pressure.sum(axis=1), rotation[:, :, 2])
         normal /= np.linalg.norm(normal)
-        shear = self._shear_force(loaded.shear[:, mine], rotation)
+
+        shear = self._shear_force(loaded.shear[:, chosen], rotation)
         shear -= normal * (shear @ normal)
         centre = _weighted_sum(weight, points) / weight.sum()
         position = centre + self.depth * (normal - shear / weight.sum())
-        # Errors between cubes are as wide as the pitch: so many points are wrong together.
-        deviation = loaded.uncertainty[mine] * pressure * self.pitch * self.spacing
+
+        # Interpolation errors are correlated over one pitch: so many points err together.
+        deviation = loaded.uncertainty[chosen] * pressure * self.pitch * self.spacing
         variance = deviation**2
         lever = ((points - centre) ** 2).sum(axis=2) / 2
-        pressed = np.count_nonzero(pressure > 0.5 * pressure.max())
+        n_pressed = np.count_nonzero(pressure > 0.5 * pressure.max())
         return Contact(
             position=position,
             normal=normal,
             force=shear - normal * normal_force,
             normal_force=normal_force,
             shear_force=float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan,
-            area=float(pressed * self.area),
+            area=float(n_pressed * self.area),
             position_uncertainty=float(np.sqrt((variance * lever).sum()) / normal_force),
             force_uncertainty=float(np.sqrt(variance.sum())),
         )
 
     def _shear_force(self, shear: Array, rotation: Array) -> Array:
-        """(3,) N from shear (2, patches, points) Pa in the frames rotation (patches, 3, 3)."""
-        along_x, along_y = (_weighted_sum(shear[k].sum(axis=1), rotation[:, :, k]) for k in (0, 1))
+        """Return the shear force (3,) in N.
+
+        Args:
+            shear: Shear (2, patches, points) in Pa, in the frames of the cubes.
+            rotation: Rotations (patches, 3, 3) of these frames.
+        """
+        along_x = _weighted_sum(shear[0].sum(axis=1), rotation[:, :, 0])
+        along_y = _weighted_sum(shear[1].sum(axis=1), rotation[:, :, 1])
         return (along_x + along_y) * self.area
 
 
 class _LoadedSurface(NamedTuple):
-    """What contacts are computed from, by patch: (cubes, points of a patch), in Pa.
+    """Quantities from which contacts are computed, (cubes, points of a patch), in Pa.
 
-    shear: (2, cubes, points) σzx and σyz
-    moment_pressure: interpolated from values alone, as shear is
-    uncertainty: relative; sees_shear: some cube observes shear
+    Attributes:
+        pressure: Pressure, interpolated from values and gradients.
+        shear: σzx and σyz (2, cubes, points).
+        moment_pressure: Pressure, interpolated from values alone, as the shear is.
+        uncertainty: Standard deviation of the pressure relative to its own size.
+        sees_shear: Whether some cube observes shear.
     """
 
     pressure: Array
@@ -208,25 +266,29 @@ class _LoadedSurface(NamedTuple):
     sees_shear: bool
 
 
-def patches(poses: CubePoses, spacing: float, side: int) -> Array:
-    """(cubes, side², 3) m: a square of points around each cube, in its x-y plane."""
-    line = (np.arange(side) - (side - 1) / 2) * spacing
-    x, y = np.meshgrid(line, line)
-    square = np.stack([x.ravel(), y.ravel(), np.zeros(side**2)], axis=1)
-    return poses.position[:, None] + np.einsum("nij,qj->nqi", poses.rotation, square)
-
-
-def square(spacing: float, side: int) -> Array:
-    """(side^2, 2) m: the points of a patch about its cube, in the order of `patches`."""
+def square_points(spacing: float, side: int) -> Array:
+    """Return the points (side^2, 2) of a square grid with this spacing around the origin, in m."""
     line = (np.arange(side) - (side - 1) / 2) * spacing
     x, y = np.meshgrid(line, line)
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def _weighted_sum(weights: Array, vectors: Array) -> Array:
-    """(3,) the sum of weights (...) times vectors (..., 3).
+def patches(
+    poses: CubePoses,
+    spacing: float,
+    side: int,
+) -> Array:
+    """Return a square grid of points (cubes, side^2, 3) around each cube, in its x-y plane, in
+    m."""
+    in_plane = poses.rotation[:, :, :2]
+    offset = np.einsum("nij,qj->nqi", in_plane, square_points(spacing, side))
+    return np.asarray(poses.position[:, np.newaxis] + offset)
 
-    Not by BLAS: its threads would burn a second core for this.
+
+def _weighted_sum(weights: Array, vectors: Array) -> Array:
+    """Return the sum (3,) of weights (...) times vectors (..., 3).
+
+    Einsum, because the threads of a BLAS product would occupy a second core.
     """
     result: Array = np.einsum("n,ni->i", weights.ravel(), vectors.reshape(-1, 3))
     return result

@@ -1,1 +1,1 @@
-"""Contacts followed from scan to scan, each a loaded disc fitted to the stress of the cubes."""
+"""Contact tracker: follows contacts from scan to scan as Hertz contacts fitted to all cubes."""

@@ -54,7 +54,7 @@ def rms(values: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def inverse():
-    return SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(), DEPTH, side=4)
+    return SurfaceInverse.from_poses(grid(), pads_noise(), Layer(), DEPTH, side=4)
 
 
 @pytest.mark.parametrize(("width", "limit"), [(5e-3, 0.06), (10e-3, 0.03)])
@@ -68,11 +68,12 @@ def test_the_field_at_the_cubes_depth_is_the_true_one(inverse, width, limit):
     interpolated = Surface(inverse.poses, DEPTH, 4).field(values).pressure[middle]
     size = np.sqrt((truth**2).mean())
     error, before = (
-        np.sqrt(((one - truth) ** 2).mean()) / size for one in (field.below[middle], interpolated)
+        np.sqrt(((one - truth) ** 2).mean()) / size
+        for one in (field.depth_pressure[middle], interpolated)
     )
     assert error < limit and error < before / 2
     # one contact is one draw: the stated deviation is right within a factor of two and a half
-    stated = np.sqrt((inverse.deviation(values).below[middle] ** 2).mean()) / size
+    stated = np.sqrt((inverse.deviation(values).depth_pressure[middle] ** 2).mean()) / size
     assert stated / 2.5 < error < 2.5 * stated
 
 
@@ -98,13 +99,15 @@ def test_values_that_are_missing_are_those_of_a_skin_without_them(inverse):
     noise = pads_noise()
     noise[[17, 24]] = np.nan
     noise[30, ACROSS] = np.nan
-    anew = SurfaceInverse.of_cubes(grid(), noise, Layer(), DEPTH, side=4)
+    anew = SurfaceInverse.from_poses(grid(), noise, Layer(), DEPTH, side=4)
     expected, stated = anew.field(lost), inverse.deviation(lost)
     truth = -ball(inverse.points, 10e-3, np.zeros(2))[:, 2]
-    assert rms(field.below - truth) < 1.2 * rms(expected.below - truth)
-    assert rms(stated.below) == pytest.approx(rms(anew.deviation(lost).below), rel=0.2)
+    assert rms(field.depth_pressure - truth) < 1.2 * rms(expected.depth_pressure - truth)
+    assert rms(stated.depth_pressure) == pytest.approx(
+        rms(anew.deviation(lost).depth_pressure), rel=0.2
+    )
     there = inverse.cube == 24
-    assert (stated.below[there] > before.below[there]).all()
+    assert (stated.depth_pressure[there] > before.depth_pressure[there]).all()
     again = inverse.field(values)
     np.testing.assert_array_equal(again.traction, whole.traction)
     unknown = np.full_like(values, np.nan)
@@ -140,21 +143,21 @@ def test_cubes_that_are_turned_see_the_same_traction(inverse):
     away = rotation_from_rpy(0.7, -1.1, 2.0)
     poses = CubePoses(grid().position @ away.T + [1, 2, 3], away @ turns, grid().half_side)
     straight = inverse.field(values)
-    field = SurfaceInverse.of_cubes(poses, pads_noise(), Layer(), DEPTH, side=1).field(turned)
-    one = SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(), DEPTH, side=1).field(values)
+    field = SurfaceInverse.from_poses(poses, pads_noise(), Layer(), DEPTH, side=1).field(turned)
+    one = SurfaceInverse.from_poses(grid(), pads_noise(), Layer(), DEPTH, side=1).field(values)
     peak = np.abs(straight.traction).max()
     in_parent = np.einsum("nij,nj->ni", turns, field.traction)
     np.testing.assert_allclose(in_parent, one.traction, atol=0.03 * peak)
-    np.testing.assert_allclose(field.below, one.below, atol=0.01 * peak)
+    np.testing.assert_allclose(field.depth_pressure, one.depth_pressure, atol=0.01 * peak)
 
 
 def test_a_skin_that_observes_nothing_and_a_patch_without_points():
     with pytest.raises(ElasticError, match="no cube"):
-        SurfaceInverse.of_cubes(grid(), pads_noise() * np.nan, Layer(), DEPTH)
+        SurfaceInverse.from_poses(grid(), pads_noise() * np.nan, Layer(), DEPTH)
     with pytest.raises(ElasticError, match="at least 1"):
-        SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(), DEPTH, side=0)
+        SurfaceInverse.from_poses(grid(), pads_noise(), Layer(), DEPTH, side=0)
     with pytest.raises(ElasticError, match="between 0 and"):
-        SurfaceInverse.of_cubes(grid(), pads_noise(), Layer(3e-3), DEPTH)
+        SurfaceInverse.from_poses(grid(), pads_noise(), Layer(3e-3), DEPTH)
 
 
 def test_a_curved_skin_laid_flat_is_off_by_half_its_depth_over_its_radius():

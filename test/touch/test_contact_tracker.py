@@ -16,9 +16,14 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.inverse import SurfaceInverse, TractionField
 from cube_tensor_driver.touch.prior import covariance_matrix
-from cube_tensor_driver.touch.tracker.disc import Disc, DiscModel
-from cube_tensor_driver.touch.tracker.disc_fit import COLD, Fitted, Scan, fit
-from cube_tensor_driver.touch.tracker.touches import Touches
+from cube_tensor_driver.touch.tracker.contact_fit import (
+    STEPS_NEW,
+    ContactFit,
+    Observations,
+    fit_contacts,
+)
+from cube_tensor_driver.touch.tracker.contact_model import ContactModel, HertzContact
+from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 DEPTH, PITCH, COUNT, LEAST = 4e-3, 12e-3, 7, 300.0
 PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
@@ -31,7 +36,7 @@ def inverse():
     position = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
     poses = CubePoses(position, np.tile(np.eye(3), (COUNT**2, 1, 1)), np.full(COUNT**2, 2e-3))
     by_pad = np.tile(np.diag(PADS_NOISE), (COUNT**2, 1, 1))  # one pad for each component
-    return SurfaceInverse.of_cubes(poses, by_pad, Layer(), DEPTH)
+    return SurfaceInverse.from_poses(poses, by_pad, Layer(), DEPTH)
 
 
 def seen(inverse, sources, forces) -> np.ndarray:
@@ -71,7 +76,7 @@ def test_a_contact_between_wide_pitches_has_its_force_and_place(
     random = np.random.default_rng(2)
     for centre in random.uniform(-PITCH / 2, PITCH / 2, (3, 2)):
         force = np.array([0.6, -0.3, -3.0])
-        (found,) = Touches(inverse, LEAST).update(
+        (found,) = ContactTracker(inverse, LEAST).update(
             noisy(load(inverse, width, centre, force), random)
         )
         assert np.linalg.norm(found.force - force) < force_limit * 3
@@ -106,8 +111,10 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
     drawn = [bench.inverse.scaled(bench.measured(pads, random)) for _ in range(12)]
     values = np.concatenate(drawn)
     cube, n = np.arange(1), values.shape[1]
-    scan = Scan(bench.inverse, values[:1], np.eye(n), cube, np.zeros((1, 2)), np.zeros(1))
-    root = np.linalg.inv(np.linalg.cholesky(scan.noise))
+    observations = Observations(
+        bench.inverse, values[:1], np.eye(n), cube, np.zeros((1, 2)), np.zeros(1)
+    )
+    root = np.linalg.inv(np.linalg.cholesky(observations.noise))
     found = np.linalg.eigvalsh(root @ np.cov(values.T) @ root.T)
     # Marchenko and Pastur: the least and greatest of a sample covariance that is right
     spread = np.sqrt(n / len(values))
@@ -125,8 +132,8 @@ def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it
     drawn = np.stack([inverse.scaled(bench.measured(pads, random)) for _ in range(100)])
     drawn[:, lost] = np.nan
     middle = drawn.mean(axis=0)
-    below = np.array([inverse.field_of(values - middle).below for values in drawn])
-    stated = inverse.deviation_of(0 * middle, middle).below
+    below = np.array([inverse.field_of_scaled(values - middle).depth_pressure for values in drawn])
+    stated = inverse.residual_deviation(0 * middle, middle).depth_pressure
     # 100 draws of pads leave 2 % open, summed over the points.
     near = inverse.cube == 40
     for points in (near, ~near):
@@ -134,24 +141,28 @@ def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it
         assert np.sqrt((stated[points] ** 2).mean()) == pytest.approx(seen, rel=limit)
 
 
-def fitted_scan(inverse, values) -> tuple[Scan, Fitted]:
+def fitted_scan(inverse, values) -> tuple[Observations, ContactFit]:
     """One contact and the cubes around the one in the middle."""
     x, y = inverse.poses.position[:, :2].T
     cubes = np.flatnonzero(np.maximum(abs(x), abs(y)) < 2.5 * PITCH)
-    place, angle = inverse.flattened(COUNT**2 // 2, cubes)
-    reading = inverse.reading[cubes]
-    prior = covariance_matrix(inverse.kernels, inverse.columns, place, angle, reading)
-    scan = Scan(inverse, inverse.scaled(values)[cubes], prior, cubes, place, angle)
-    return scan, fit(scan, np.array([[2e-3, 1e-3]]), np.array([4e-3]), 200.0, COLD)
+    place, angle = inverse.unroll(COUNT**2 // 2, cubes)
+    variant = inverse.variant[cubes]
+    prior = covariance_matrix(inverse.kernels, inverse.columns, place, angle, variant)
+    observations = Observations(inverse, inverse.scaled(values)[cubes], prior, cubes, place, angle)
+    return observations, fit_contacts(
+        observations, np.array([[2e-3, 1e-3]]), np.array([4e-3]), 200.0, STEPS_NEW
+    )
 
 
 def test_covariance_of_a_contact_is_that_of_all_its_unknowns_together(inverse):
     """Force, place, size and shapes solved for at once: the shapes are no noise then."""
     values = noisy(ball(inverse, 8e-3, (2e-3, 1e-3), (0.6, 0.3, -3.0)), np.random.default_rng(8))
-    scan, fitted = fitted_scan(inverse, values)
+    observations, fitted = fitted_scan(inverse, values)
     jacobian = np.concatenate([fitted.jacobian, fitted.shapes], axis=1)
-    rest = fitted.alpha**2 * scan.prior + scan.noise
-    prior = np.diag(fitted.normal - fitted.jacobian.T @ cho_solve(fitted.factor, fitted.jacobian))
+    rest = fitted.residual_scale**2 * observations.prior + observations.noise
+    prior = np.diag(
+        fitted.normal_matrix - fitted.jacobian.T @ cho_solve(fitted.factor, fitted.jacobian)
+    )
     every = np.diag([*prior, 1, 1, 1]) + jacobian.T @ np.linalg.solve(rest, jacobian)
     expected = np.linalg.inv(every)
     scale = np.sqrt(np.diag(expected))
@@ -164,13 +175,13 @@ def test_covariance_of_a_contact_is_that_of_all_its_unknowns_together(inverse):
 
 def test_what_is_unsure_of_a_contact_is_unsure_of_the_pressure(inverse):
     """Against contacts drawn from the covariance; the shapes have a test of their own."""
-    random, model = np.random.default_rng(6), DiscModel(inverse)
+    random, model = np.random.default_rng(6), ContactModel(inverse)
     place, force = np.array([1e-3, 2e-3]), np.array([0.6, 0.3, -3.0])
-    disc = Disc(0, COUNT**2 // 2, place, 6e-3, force, 1.0)
+    disc = HertzContact(0, COUNT**2 // 2, place, 6e-3, force, 1.0)
     root = np.zeros((9, 9))
     root[:6, :6] = random.standard_normal((6, 6)) * np.array([[0.02] * 3 + [5e-5] * 2 + [0.01]]).T
     disc.covariance = root @ root.T
-    stated = np.sqrt(model.variance([disc]))
+    stated = np.sqrt(model.pressure_variance([disc]))
     nothing = TractionField(np.zeros((len(inverse.points), 3)), np.zeros(len(inverse.points)))
     drawn = []
     for change in random.standard_normal((400, 9)) @ root.T:
@@ -180,8 +191,8 @@ def test_what_is_unsure_of_a_contact_is_unsure_of_the_pressure(inverse):
             place=place + change[3:5],
             size=6e-3 * np.exp(change[5]),
         )
-        field = model.with_discs(nothing, model.below([moved]), [moved])
-        drawn.append([field.pressure, field.below])
+        field = model.add_contacts(nothing, model.depth_pressure([moved]), [moved])
+        drawn.append([field.pressure, field.depth_pressure])
     seen = np.std(drawn, axis=0).T
     # 400 draws leave 4 % open; at the rim the pressure is no straight line of the radius.
     for part, limit in zip((0, 1), (0.15, 0.1), strict=True):
@@ -197,7 +208,7 @@ def test_a_contact_that_moves_on_to_a_turned_cube_is_as_unsure_as_one_that_begin
     turns = np.where(odd[:, None, None], rotation_from_rpy(0, 0, 0.6), np.eye(3))
     by_pad = np.tile(np.diag(PADS_NOISE), (COUNT**2, 1, 1))
     turned_poses = poses._replace(rotation=turns)
-    turned = SurfaceInverse.of_cubes(turned_poses, by_pad, Layer(), DEPTH, side=6)
+    turned = SurfaceInverse.from_poses(turned_poses, by_pad, Layer(), DEPTH, side=6)
 
     def values(place) -> np.ndarray:
         load = contact.hertz(3e-3, force, place, order=12)
@@ -207,7 +218,7 @@ def test_a_contact_that_moves_on_to_a_turned_cube_is_as_unsure_as_one_that_begin
         normal = np.einsum("niik->nik", rotate_gradient(slopes, into_cubes))
         return np.concatenate([rotate_stress(stress, into_cubes), normal.reshape(-1, 9)], axis=1)
 
-    moved, begun = Touches(turned, LEAST), Touches(turned, LEAST)
+    moved, begun = ContactTracker(turned, LEAST), ContactTracker(turned, LEAST)
     for x in (5.9e-3, 5.98e-3, 5.99e-3, 6.01e-3):
         there = values((x, 2e-3))
         moved.update(there)
@@ -223,7 +234,7 @@ def test_two_balls_that_touch_are_one_contact_with_the_force_and_place_of_both(i
     for centre in np.array([[5e-3, 4e-3], [-2e-3, 6e-3]]):
         apart = 1.25e-3 * np.array([0.6, 0.8])
         values = sum(ball(inverse, 2.5e-3, centre + sign * apart, force) for sign in (-1, 1))
-        (found,) = Touches(inverse, LEAST).update(noisy(values, random))
+        (found,) = ContactTracker(inverse, LEAST).update(noisy(values, random))
         assert found.normal_force == pytest.approx(3, rel=0.02)
         assert abs(found.normal_force - 3) < 4 * found.force_uncertainty
         assert np.linalg.norm(found.position[:2] - centre) < 0.1e-3
@@ -234,15 +245,15 @@ def test_two_balls_beside_each_other_without_a_valley_are_told_apart_by_likeliho
     """Below them the pressure has one peak. One contact in their place misses a third of the
     force; a flat punch just as wide stays one."""
     random, apart = np.random.default_rng(9), 5.5e-3 * np.array([0.8, 0.6])
-    touches = Touches(inverse, LEAST)
+    tracker = ContactTracker(inverse, LEAST)
     for _ in range(2):
         values = ball(inverse, 12e-3, centre + apart, (0, 0, -2.0))
         values += ball(inverse, 10e-3, centre - apart, (0, 0.3, -1.0))
-        strong, weak = touches.update(noisy(values, random))
+        strong, weak = tracker.update(noisy(values, random))
         for found, force, sign in ((strong, 2, 1), (weak, 1, -1)):
             assert found.normal_force == pytest.approx(force, rel=0.05)
             assert np.linalg.norm(found.position[:2] - centre - sign * apart) < 0.3e-3
-    (one,) = Touches(inverse, LEAST).update(flat_punch(inverse, 20e-3, centre, (0, 0, -3.0)))
+    (one,) = ContactTracker(inverse, LEAST).update(flat_punch(inverse, 20e-3, centre, (0, 0, -3.0)))
     assert one.normal_force == pytest.approx(3, rel=0.1)
 
 
@@ -254,7 +265,7 @@ def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact
     for centre, width in (((11.7, -4.4), 5e-3), ((6, 9), 5e-3), ((-0.5, 2.5), 2e-3)):
         centre = 1e-3 * np.array(centre)
         values = bench.values(width, force, centre, random)
-        (found,) = Touches(bench.inverse, LEAST).update(values)
+        (found,) = ContactTracker(bench.inverse, LEAST).update(values)
         assert np.linalg.norm(found.position[:2] - centre) < 0.3e-3
         assert found.position_uncertainty < 0.3e-3
 
@@ -268,7 +279,9 @@ def test_a_contact_midway_between_planar_cubes_is_not_looked_for_beside_another_
     )
     centre, angle = np.array([random.uniform(-4e-3, 4e-3), -11.7e-3]), random.uniform(0, 6.28)
     force = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), -3.0])
-    (found,) = Touches(bench.inverse, LEAST).update(bench.values(2e-3, force, centre, random))
+    (found,) = ContactTracker(bench.inverse, LEAST).update(
+        bench.values(2e-3, force, centre, random)
+    )
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
     assert np.linalg.norm(found.position[:2] - centre) < 0.2e-3
 
@@ -279,7 +292,9 @@ def test_the_size_of_a_flat_punch_settles():
     bench = Bench(Setting(pitch=24e-3, depth=4e-3, shape="flat punch"), side=2)
     random = np.random.default_rng(11)
     load, centre = bench.load(random)
-    (found,) = Touches(bench.inverse, LEAST).update(bench.values(10e-3, load, centre, random))
+    (found,) = ContactTracker(bench.inverse, LEAST).update(
+        bench.values(10e-3, load, centre, random)
+    )
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.05
 
 
@@ -292,7 +307,9 @@ def test_a_fit_from_the_wrong_side_of_a_cube_gets_to_a_contact_half_a_pitch_away
         side, y = random.choice([-1, 1]), random.uniform(-3e-3, 3e-3)
         centre, angle = np.array([4.02e-3 * side, y]), random.uniform(0, 6.28)
         force = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), -3.0])
-        (found,) = Touches(bench.inverse, LEAST).update(bench.values(5e-3, force, centre, random))
+        (found,) = ContactTracker(bench.inverse, LEAST).update(
+            bench.values(5e-3, force, centre, random)
+        )
         assert np.linalg.norm(found.position[:2] - centre) < 4 * found.position_uncertainty
 
 
@@ -303,7 +320,7 @@ def test_a_force_between_two_likely_ones_is_as_uncertain(seed):
     bench = Bench(Setting(cubes=CUBES[2]), side=1)
     force, centre = np.array([0.638, -0.635, -3.0]), np.array([3.8e-3, -0.6e-3])
     values = bench.values(10e-3, force, centre, np.random.default_rng(seed))
-    (found,) = Touches(bench.inverse, LEAST).update(values)
+    (found,) = ContactTracker(bench.inverse, LEAST).update(values)
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
     assert np.abs(found.position[:2] - centre).max() < 4 * found.position_uncertainty
 
@@ -317,10 +334,10 @@ def test_many_contacts_in_a_row(count):
     n, force, random = len(position), np.array([0.3, 0.0, -3.0]), np.random.default_rng(9)
     poses = CubePoses(position, np.tile(np.eye(3), (n, 1, 1)), np.full(n, 2e-3))
     by_pad = np.tile(np.diag(PADS_NOISE), (n, 1, 1))
-    long = SurfaceInverse.of_cubes(poses, by_pad, Layer(), DEPTH)
+    long = SurfaceInverse.from_poses(poses, by_pad, Layer(), DEPTH)
     places = [((k - (count - 1) / 2) * 40e-3 + 1e-3, 2e-3) for k in range(count)]
     values = noisy(sum(ball(long, 6e-3, place, force) for place in places), random)
-    found = sorted(Touches(long, LEAST).update(values), key=lambda one: one.position[0])
+    found = sorted(ContactTracker(long, LEAST).update(values), key=lambda one: one.position[0])
     assert len(found) == count
     for one, place in zip(found, places, strict=True):
         assert np.linalg.norm(one.force - force) < 0.02 * 3
@@ -328,42 +345,42 @@ def test_many_contacts_in_a_row(count):
 
 
 def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their_ids(inverse):
-    random, touches = np.random.default_rng(3), Touches(inverse, LEAST)
+    random, tracker = np.random.default_rng(3), ContactTracker(inverse, LEAST)
     first, second = np.array([-4e-3, 1e-3]), np.array([14e-3, 1e-3])
     ids = set()
     for step in range(4):
         moved = second + 1e-3 * step * np.array([0.0, 1.0])
         values = ball(inverse, 5e-3, first, (0, 0, -2.0))
         values += ball(inverse, 5e-3, moved, (0, 0.3, -3.0))
-        strong, weak = touches.update(noisy(values, random))
+        strong, weak = tracker.update(noisy(values, random))
         assert strong.normal_force == pytest.approx(3, rel=0.05)
         assert weak.normal_force == pytest.approx(2, rel=0.05)
         assert np.linalg.norm(strong.position[:2] - moved) < 0.3e-3
         assert np.linalg.norm(weak.position[:2] - first) < 0.3e-3
         ids.add((strong.id, weak.id))
     assert len(ids) == 1
-    assert touches.update(np.zeros_like(values)) == []
+    assert tracker.update(np.zeros_like(values)) == []
 
 
 def test_the_field_of_a_contact_is_its_pressure(inverse):
     centre = np.array([6e-3, 6e-3])  # in the middle between four cubes
-    touches = Touches(inverse, LEAST)
-    touches.update(ball(inverse, 8e-3, centre, (0, 0, -3.0)))
+    tracker = ContactTracker(inverse, LEAST)
+    tracker.update(ball(inverse, 8e-3, centre, (0, 0, -3.0)))
     fine = (np.arange(20) - 9.5) / 20 * inverse.spacing
     x, y = (inverse.points[:, k, None, None] - centre[k] for k in (0, 1))
     r = np.hypot(x + fine[:, None], y + fine)
     peak = 1.5 * 3 / (np.pi * 4e-3**2)
     pressure = peak * np.sqrt(np.clip(1 - (r / 4e-3) ** 2, 0, None))
     expected = pressure.mean(axis=(1, 2))  # over the square of each point
-    assert np.abs(touches.field.pressure - expected).max() < 0.03 * peak
-    assert touches.field.pressure.sum() * inverse.area == pytest.approx(3, rel=0.02)
+    assert np.abs(tracker.field.pressure - expected).max() < 0.03 * peak
+    assert tracker.field.pressure.sum() * inverse.area == pytest.approx(3, rel=0.02)
 
 
 def test_cubes_that_fail_beside_a_contact_and_a_skin_without_values(inverse):
-    touches = Touches(inverse, LEAST)
+    tracker = ContactTracker(inverse, LEAST)
     values = ball(inverse, 8e-3, np.array([2e-3, 1e-3]), (0, 0, -3.0))
     values[[COUNT**2 // 2, 3]] = np.nan
     values[COUNT**2 // 2 + 1, 6:] = np.nan
-    (found,) = touches.update(values)
+    (found,) = tracker.update(values)
     assert found.normal_force == pytest.approx(3, rel=0.05)
-    assert touches.update(np.full_like(values, np.nan)) == []
+    assert tracker.update(np.full_like(values, np.nan)) == []

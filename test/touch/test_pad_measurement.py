@@ -21,9 +21,9 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.influence_file import read_influence, write_influence
 from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO, Kernels
 from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
+from cube_tensor_driver.touch.pad_measurement import model_pads
 from cube_tensor_driver.touch.pad_noise import noise_by_pad
-from cube_tensor_driver.touch.pad_reading import read_pads
-from cube_tensor_driver.touch.tracker.touches import Touches
+from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 PLANAR, CUBE = (shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"))
 SCALE = 2e-3
@@ -41,7 +41,7 @@ def influence():
 @pytest.fixture(scope="module")
 def kernels(influence):
     """Of two cubes, the second one planar."""
-    reading = read_pads(influence, [CUBE, PLANAR])
+    reading = model_pads(influence, [CUBE, PLANAR])
     assert reading.variant.tolist() == [0, 1]
     return Kernels(influence.layer, influence.depth, SCALE, reading)
 
@@ -110,7 +110,7 @@ def test_a_contact_on_a_thin_layer(influence):
     for known in (None, influence):
         bench = LayerBench(setting, influence, known, side=2)
         values = bench.values(5e-3, load, centre, np.random.default_rng(1))
-        (touch,) = Touches(bench.inverse, 300.0).update(values)
+        (touch,) = ContactTracker(bench.inverse, 300.0).update(values)
         forces.append(touch.force)
     # 1 % of the gains is 0.1 to 0.3 % of the force (docs/contacts.md)
     assert np.linalg.norm(touch.position[:2] - centre) < 1e-4
@@ -159,10 +159,10 @@ def test_in_the_field_a_cube_without_a_pad_counts_as_missing(influence):
 
 def test_influence_functions_of_other_cubes_are_refused(influence):
     with pytest.raises(ElasticError, match=r"cube of 4 mm and calibration .* of 3 mm.*side: 0.003"):
-        read_pads(influence, [replace(CUBE, half_side=1.5e-3)])
+        model_pads(influence, [replace(CUBE, half_side=1.5e-3)])
     layout = replace(LAYOUTS["planar"], pad_size=0.3)
     with pytest.raises(ElasticError, match=r"no pad like .* of layout 'planar'"):
-        read_pads(influence, [replace(PLANAR, layout=layout)])
+        model_pads(influence, [replace(PLANAR, layout=layout)])
 
 
 def test_a_file_gives_back_what_is_written(influence, tmp_path):

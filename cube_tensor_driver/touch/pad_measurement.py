@@ -1,0 +1,209 @@
+"""Measurement model of cubes in a layer, from the influence functions of their pads.
+
+A cube is not rotationally symmetric, but the influence functions of its pads are sums of circular
+components (circular.py). With the direction phi from the force to the cube, each pad stress is::
+
+    v = sum_m Re(w c),   c = exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t)
+
+A Fourier series over phi gives the functions R, Z and T of every pad and order m. The functions of
+all pads are combinations of a few components of each order, found by singular value decomposition.
+The spectra of these components (spectra.py) are Hankel transforms::
+
+    P = 2 pi int (R + T) J_{m-1}(kr) r dr,   M = 2 pi int (R - T) J_{m+1}(kr) r dr,
+    N = 2 pi int Z J_m(kr) r dr
+
+In contrast to cubes that are modelled as points, no Taylor series of the stress is involved, and
+the pads respond to the stiffness of the cube, the surface and the ground. The components of a cube
+follow from its pads by its calibration (estimator.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..core.arrays import Array
+from ..core.calibration import Calibration
+from ..core.errors import ElasticError
+from ..core.pipeline import Pipeline
+from ..mechanics.influence import Influence
+from ..mechanics.kernels import MeasurementModel
+from ..mechanics.spectra import BesselTable, Spectra, tabulate_bessel, wavenumber_quadrature
+
+N_DIRECTIONS = 32
+"""Number of directions from force to cube, from which the Fourier series is computed."""
+
+N_ORDERS = 9
+"""Number of orders of the series, 0 to 8. The field of a point force has orders up to 4 at a point;
+the four-fold symmetry of a cube adds up to 4."""
+
+MIN_SINGULAR_VALUE = 1e-3
+"""Smallest singular value of a component that is kept, divided by the largest one."""
+
+_N_DISTANCES = 400
+"""Number of Gauss points in r. They resolve the oscillations of the Bessel functions over the half
+width of the body."""
+
+_LENGTH_TOLERANCE = 1e-6
+"""Relative difference below which lengths and pad positions count as equal."""
+
+
+def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> MeasurementModel:
+    """Build the measurement model of cubes with these calibrations.
+
+    Args:
+        influence: Influence functions of the pads of one cube in its layer.
+        calibrations: Calibration of each cube.
+
+    Raises:
+        ElasticError: The influence functions belong to a cube of another size, or lack a pad.
+    """
+    variants = list({id(one): one for one in calibrations}.values())
+    variant_numbers = {id(one): number for number, one in enumerate(variants)}
+    spectra, all_pads = _decompose(influence)
+
+    pipeline = Pipeline(variants)
+    components = []
+    pads = np.zeros((len(variants), len(all_pads), pipeline.n_pads))
+    for number, calibration in enumerate(variants):
+        own = all_pads[:, _match_pads(influence, calibration)]
+        matrix = np.nan_to_num(pipeline.matrix(number))
+        components.append(own @ matrix.T)
+        pads[number, :, : own.shape[1]] = own / calibration.noise
+
+    variant = np.array([variant_numbers[id(one)] for one in calibrations], np.intp)
+    return MeasurementModel(spectra, np.stack(components), variant, pads)
+
+
+def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
+    """Return the index of the influence function of each pad of a calibration."""
+    layout = calibration.layout
+    given = influence.layout
+    side = 2 * calibration.half_side
+    if abs(side / influence.side - 1) > _LENGTH_TOLERANCE:
+        raise ElasticError(
+            f"the influence functions are of a cube of {1e3 * influence.side:g} mm and calibration "
+            f"{calibration.id} of one of {1e3 * side:g} mm; make them again with "
+            f"./cube fem MODEL --surface, with side: {side:g} in the model"
+        )
+
+    same_size = abs(given.pad_size - layout.pad_size) <= _LENGTH_TOLERANCE
+    matches = []
+    for name, position, normal in zip(
+        layout.pads,
+        layout.positions,
+        layout.normals,
+        strict=True,
+    ):
+        difference = np.abs(given.positions - position).max(axis=1)
+        difference += np.abs(given.normals - normal).max(axis=1)
+        nearest = int(np.argmin(difference))
+        if difference[nearest] > _LENGTH_TOLERANCE or not same_size:
+            raise ElasticError(
+                f"the influence functions have no pad like {name} of layout {layout.name!r}; make "
+                "them again with ./cube fem MODEL --surface for this layout"
+            )
+        matches.append(nearest)
+    return matches
+
+
+def _decompose(influence: Influence) -> tuple[Spectra, Array]:
+    """Decompose the influence functions into n circular components.
+
+    Returns:
+        Spectra of the components, and the matrix (2 n, P) from their real and imaginary parts to
+        the pad stresses.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_N_DISTANCES)
+    half_reach = influence.reach / 2
+    r = (nodes + 1) * half_reach
+    weight = weights * half_reach
+
+    # With sqrt(r dr) as weight, the singular values measure the norm in the plane.
+    root = np.sqrt(r * weight)
+    decompositions = [
+        np.linalg.svd((series * root).reshape(len(series), -1), full_matrices=False)
+        for series in _fourier_series(influence, r)
+    ]
+    largest = max(values[0] for _, values, _ in decompositions)
+
+    k, wave_weight = wavenumber_quadrature(influence.depth)
+    bessel = tabulate_bessel(k, r)
+    orders: list[int] = []
+    spectra = []
+    pads = []
+    for order, (left, values, right) in enumerate(decompositions):
+        is_kept = values > MIN_SINGULAR_VALUE * largest
+        n_kept = int(is_kept.sum())
+        functions = right[is_kept].reshape(n_kept, 3, -1) / root
+        orders += [order] * n_kept
+        spectra.append(_hankel_transforms(functions, order, bessel, r * weight))
+        pads.append(
+            (left[:, is_kept] * values[is_kept]).reshape(
+                2,
+                -1,
+                n_kept,
+            )
+        )
+
+    plus, minus, normal = (np.concatenate(parts, axis=1) for parts in zip(*spectra, strict=True))
+    to_pads = np.concatenate(pads, axis=2).swapaxes(1, 2).reshape(2 * len(orders), -1)
+    return Spectra(
+        k,
+        wave_weight,
+        np.array(orders),
+        plus,
+        minus,
+        normal,
+    ), to_pads
+
+
+def _hankel_transforms(
+    functions: Array,
+    order: int,
+    bessel: BesselTable,
+    weight: Array,
+) -> tuple[Array, Array, Array]:
+    """Return the spectra P, M and N (waves, n) of functions R, Z and T (n, 3, distances)."""
+    along, normal, across = np.moveaxis(functions, 1, 0)
+
+    def transform(function: Array, shift: int) -> Array:
+        return np.asarray(2 * np.pi * bessel(order + shift).T @ (function * weight).T)
+
+    plus = transform(along + across, -1)
+    minus = transform(along - across, 1)
+    return plus, minus, transform(normal, 0)
+
+
+def _fourier_series(influence: Influence, r: Array) -> list[Array]:
+    """Return R, Z and T (2 P, 3, distances) of every pad for each order, real parts of w first."""
+    angle = 2 * np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    direction = np.stack([cosine, sine], axis=1)
+    # The direction runs from the force to the cube, so the force lies at minus r.
+    place = -(r[:, np.newaxis, np.newaxis] * direction).reshape(-1, 2)
+    responses = influence.at(place).reshape(
+        -1,
+        len(r),
+        N_DIRECTIONS,
+        3,
+    )
+
+    x, y, z = np.moveaxis(responses, -1, 0)
+    radial = cosine * x + sine * y
+    tangential = cosine * y - sine * x
+    polar = np.stack([radial, z, tangential], axis=1)
+    coefficients = np.fft.fft(polar, axis=-1) / N_DIRECTIONS
+
+    series = []
+    for order in range(N_ORDERS):
+        # exp(i m phi) and exp(-i m phi) both contribute, except at order 0.
+        factor = 1.0 if order == 0 else 2.0
+        even = factor * coefficients[..., order].real
+        odd = -factor * coefficients[..., order].imag
+        real = np.stack([even[:, 0], even[:, 1], -odd[:, 2]], axis=1)
+        imaginary = np.stack([odd[:, 0], odd[:, 1], even[:, 2]], axis=1)
+        series.append(np.concatenate([real, imaginary]))
+    return series

@@ -1,0 +1,401 @@
+"""Posterior of the traction on the surface, from windows of neighbouring cubes.
+
+With the Gaussian prior of prior.py and the noise covariance N, the measured values y give the
+posterior of the traction t::
+
+    t = G y,   G = K_ty P,   P = (K_yy + N)^-1,   covariance K_tt - G K_yt
+
+The patch of each cube takes its traction from the window of the nearest cubes. The matrices of a
+window are computed once, so that a scan costs one product. Windows of the same kind (same relative
+poses and noise) share their matrices.
+
+The amplitude of the prior adapts to the data. All prior variances are those of `AMPLITUDE` times a
+scale s^2. Noise and gain errors of the pads have the covariance M (pad_noise.py) and add diag(G M
+G')::
+
+    s^2 = (y' P y - tr P M) / n
+
+Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 2.2 and
+5.4.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial import cKDTree
+
+from ..core.arrays import AnyArray, Array, Index, Mask, Single
+from ..core.poses import CubePoses
+from ..mechanics.cache import Arrays, load_or_compute
+from ..mechanics.kernels import Kernels
+from .prior import AMPLITUDE, covariance_matrix
+from .surface import square_points
+from .unrolled_skin import unroll
+
+WINDOW_CUBES = 25
+"""Number of cubes of a window, 5 x 5 on a square grid."""
+
+INNER_CUBES = 13
+"""Number of cubes at the centre of a window that determine the scale of the prior and predict
+missing values of the centre. P of all 25 cubes would take most of the memory."""
+
+MODEL_ERROR = 0.01
+"""Standard deviation of a component divided by its prior standard deviation, for what response,
+depth and the noise of the load leave uncertain."""
+
+ROWS_PER_POINT = 4
+"""Number of results per point: the traction along x, y, z, and the pressure at the cubes' depth."""
+
+_POSE_TOLERANCE = 1e-5
+"""Difference of positions (m) and of sines and cosines below which windows are of the same kind."""
+
+
+class ObservationModel(NamedTuple):
+    """Which components n cubes observe, and how noisy.
+
+    Attributes:
+        columns: Indices (C,) in `COMPONENTS` of the components that some cube of the skin observes.
+        known: Whether each cube observes them (n, C).
+        by_pad: Noise matrices (n, C, P) as from `noise_by_pad`, all in Pa.
+        variant: Variants (n,) of the cubes in the measurement model.
+    """
+
+    columns: Index
+    known: Mask
+    by_pad: Array
+    variant: Index
+
+    def select(self, cubes: Index) -> ObservationModel:
+        """Return the model of some cubes; the shape of their indices becomes the leading axes."""
+        return ObservationModel(
+            self.columns, self.known[cubes], self.by_pad[cubes], self.variant[cubes]
+        )
+
+
+class WindowPosteriors:
+    """Matrices of the windows of all cubes; each kind of window is stored once.
+
+    Attributes:
+        near: Indices (cubes, W) of the cubes of each window, inner ones first, the own one first of
+            all.
+        inner: Number of inner cubes.
+        kind: Index (cubes,) of the matrices of each window.
+        gain: Matrix G (kinds, rows, W C), single precision.
+        precision: Matrix P (kinds, inner C, inner C) of the inner cubes.
+        prior: Posterior variance (kinds, points x 2) of the pressure on the surface and at the
+            cubes' depth, at the scale s = 1 and without pad noise.
+        by_pad: Change (kinds, points x 2, W P) of these variances by the noise variance of each
+            pad.
+        trace: Contribution (kinds, inner P) of the noise variance of each pad to tr P M.
+        pads: Noise matrices (cubes, C, P) of all cubes, 0 where nothing is observed.
+    """
+
+    def __init__(
+        self,
+        kernels: Kernels,
+        poses: CubePoses,
+        model: ObservationModel,
+        spacing: float,
+        side: int,
+    ) -> None:
+        """Compute the matrices or load them from the cache.
+
+        Args:
+            kernels: Kernels of the layer.
+            poses: Poses of the cubes.
+            model: What the cubes observe.
+            spacing: Distance of the points on the patch of a cube, in m.
+            side: Number of points along a side of the patch.
+        """
+        self.near = _nearest_cubes(poses)
+        self.inner = min(INNER_CUBES, self.near.shape[1])
+        self.pads = np.nan_to_num(model.by_pad)
+        n = len(self.near)
+        place, angle = unroll(poses, np.arange(n), self.near)
+        self.kind = self._find_kinds(model, place, angle)
+
+        # One window stands for all windows of its kind.
+        kinds, first = np.unique(self.kind, return_index=True)
+        example = model.select(self.near[first])
+        inputs: list[Any] = [*kernels.inputs, spacing, side, place[first], angle[first]]
+        inputs += [example.columns, example.by_pad, example.variant]
+        points = square_points(spacing, side)
+
+        def solve_kinds() -> Arrays:
+            """Solve all kinds, each into its place in the result: copies would double the
+            memory."""
+            solved: dict[str, AnyArray] = {}
+            for number, one in enumerate(first):
+                own = model.select(self.near[one])
+                window = _solve_window(
+                    kernels,
+                    own,
+                    place[one],
+                    angle[one],
+                    points,
+                )
+                for name, array in window._asdict().items():
+                    if name not in solved:
+                        solved[name] = np.empty((len(first), *array.shape), array.dtype)
+                    solved[name][number] = array
+            return solved
+
+        solved = load_or_compute("windows", inputs, solve_kinds)
+        self.gain = solved["gain"]
+        self.precision = solved["precision"]
+        self.prior = solved["variance"]
+        self.by_pad = solved["by_pad"]
+        self.trace = solved["trace"]
+
+        # Kinds with one window are multiplied together, the others one kind at a time.
+        self._rows = [(kind, np.flatnonzero(self.kind == kind)) for kind in kinds]
+        self._shared_kinds = [(kind, rows) for kind, rows in self._rows if len(rows) > 1]
+        counts = np.bincount(self.kind)
+        self._single = np.flatnonzero(counts[self.kind] == 1)
+        self._single_gain = self.gain[self.kind[self._single]]
+
+    def _find_kinds(
+        self,
+        model: ObservationModel,
+        place: Array,
+        angle: Array,
+    ) -> Index:
+        """Return the kind (cubes,) of each window from the relative poses and noise of its
+        cubes."""
+        n = len(place)
+        noise = np.nan_to_num(model.by_pad, nan=-1.0)
+        noise_kind = _number_distinct(noise.reshape(n, -1))
+        poses = np.concatenate([place.reshape(n, -1), np.cos(angle), np.sin(angle)], axis=1)
+        rounded = np.round(poses / _POSE_TOLERANCE)
+        features = [rounded, noise_kind[self.near], model.variant[self.near]]
+        return _number_distinct(np.concatenate(features, axis=1))
+
+    def product(self, y: Single) -> Single:
+        """Compute G y (cubes, rows) of values y (cubes, C), which are 0 where unknown."""
+        gathered = y[self.near].reshape(len(self.near), -1)
+        result = np.empty((len(self.near), self.gain.shape[1]), np.float32)
+        for kind, rows in self._shared_kinds:
+            result[rows] = gathered[rows] @ self.gain[kind].T
+        if len(self._single):
+            single = gathered[self._single][:, :, np.newaxis]
+            result[self._single] = (self._single_gain @ single)[:, :, 0]
+        return result
+
+    def scale(
+        self,
+        y: Single,
+        pad_variance: Single,
+        known: Mask,
+    ) -> Array:
+        """Compute the scale s^2 (cubes,) of the prior in each window; 1 where nothing is known.
+
+        Args:
+            y: Values (cubes, C).
+            pad_variance: Variance (cubes, P) of each pad divided by that of its noise.
+            known: Whether each value is known (cubes, C).
+        """
+        inner = self.near[:, : self.inner]
+        n = len(inner)
+        gathered = y[inner].reshape(n, -1)
+        pads = pad_variance[inner].reshape(n, -1)
+
+        excess = np.empty(n)  # y' P y - tr P M
+        for kind, rows in self._rows:
+            own = gathered[rows]
+            weighted = own @ self.precision[kind]
+            excess[rows] = (weighted * own).sum(axis=1)
+            excess[rows] -= pads[rows] @ self.trace[kind]
+        count = known.sum(axis=1)[inner].sum(axis=1)
+        return np.where(
+            count > 0,
+            np.maximum(excess, 0) / np.maximum(count, 1),
+            1.0,
+        )
+
+    def noise(self, pad_variance: Single) -> Array:
+        """Compute the variances (cubes, points x 2) that the noise of the pads causes.
+
+        Args:
+            pad_variance: Variance (cubes, P) of each pad divided by that of its noise.
+        """
+        gathered = pad_variance[self.near].reshape(len(self.near), -1)
+        noise = np.empty((len(gathered), self.by_pad.shape[1]))
+        for kind, rows in self._rows:
+            noise[rows] = gathered[rows] @ self.by_pad[kind].T
+        return noise
+
+
+class _Window(NamedTuple):
+    """Matrices of one kind of window; see the attributes of `WindowPosteriors`."""
+
+    gain: Single
+    precision: Single
+    variance: Array
+    by_pad: Single
+    trace: Single
+
+
+def _solve_window(
+    kernels: Kernels,
+    model: ObservationModel,
+    place: Array,
+    angle: Array,
+    points: Array,
+) -> _Window:
+    """Compute the matrices of one window.
+
+    Args:
+        kernels: Kernels of the layer.
+        model: What the W cubes of the window observe.
+        place: Positions (W, 2) of the cubes in m.
+        angle: Rotations (W,) of the cubes in rad.
+        points: Positions (points, 2) on the patch of the centre cube, in m.
+    """
+    columns = model.columns
+    n = len(place)
+    width = len(columns)
+    known = model.known.ravel()
+    pads = np.nan_to_num(model.by_pad)
+
+    prior = AMPLITUDE**2 * covariance_matrix(
+        kernels,
+        columns,
+        place,
+        angle,
+        model.variant,
+    )
+    total = prior.copy()  # K_yy + N
+    for cube, own in enumerate(pads):
+        part = slice(cube * width, (cube + 1) * width)
+        total[part, part] += own @ own.T
+    total[np.diag_indices(n * width)] += MODEL_ERROR**2 * np.diag(prior)
+
+    # G = K_ty (K_yy + N)^-1 and diag(K_tt - G K_yt)
+    cross = _cross_covariance(kernels, model, place, angle, points)[:, known]
+    # Cholesky takes a quarter of the time of numpy's general solver.
+    factor = cho_factor(total[np.ix_(known, known)])
+    known_gain = cho_solve(factor, cross.T).T
+    per_point = np.array([*kernels.variance, kernels.pressure_variance])
+    prior_variance = AMPLITUDE**2 * np.tile(per_point, len(points))
+    variance = prior_variance - (known_gain * cross).sum(axis=1)
+    gain = np.zeros((len(cross), n * width), np.float32)
+    gain[:, known] = known_gain
+
+    # diag(G M G') is a sum over the pads of (G B)^2.
+    rows = gain.reshape(
+        -1,
+        ROWS_PER_POINT,
+        n,
+        width,
+    )[:, 2:].reshape(
+        -1,
+        n,
+        width,
+    )
+    by_pad = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
+
+    inner = min(INNER_CUBES, n)
+    size = inner * width
+    precision = _invert_known(total[:size, :size], known[:size])
+    cubes = np.arange(inner)
+    diagonal = precision.reshape(
+        inner,
+        width,
+        inner,
+        width,
+    )[cubes, :, cubes]
+    inner_pads = pads[:inner]
+    trace = np.einsum("wcp,wcd,wdp->wp", inner_pads, diagonal, inner_pads, optimize=True)
+    return _Window(
+        gain=gain,
+        precision=precision.astype(np.float32),
+        variance=np.maximum(select_pressure(variance), 0),
+        by_pad=by_pad.reshape(len(rows), -1).astype(np.float32),
+        trace=trace.ravel().astype(np.float32),
+    )
+
+
+def _cross_covariance(
+    kernels: Kernels,
+    model: ObservationModel,
+    place: Array,
+    angle: Array,
+    points: Array,
+) -> Array:
+    """Return the prior covariance K_ty (points x ROWS_PER_POINT, W C), in Pa^2."""
+    columns = model.columns
+    n = len(place)
+    n_points = len(points)
+    offset = (place[:, np.newaxis] - points).reshape(-1, 2)
+    angles = np.repeat(angle, n_points)
+    variants = np.repeat(model.variant, n_points)
+
+    traction = kernels.cross(offset, angles, variants)[:, columns]
+    pressure = kernels.pressure(offset, angles, variants)[:, columns]
+    cross = np.empty((n_points, ROWS_PER_POINT, n, len(columns)))
+    cross[:, :3] = traction.reshape(
+        n,
+        n_points,
+        -1,
+        3,
+    ).transpose(
+        1,
+        3,
+        0,
+        2,
+    )
+    cross[:, 3] = pressure.reshape(
+        n,
+        n_points,
+        -1,
+    ).transpose(
+        1,
+        0,
+        2,
+    )
+    return AMPLITUDE**2 * cross.reshape(-1, n * len(columns))
+
+
+def _invert_known(matrix: Array, known: Mask) -> Array:
+    """Invert the known rows and columns of a covariance matrix; the others become 0."""
+    inverse = np.zeros_like(matrix)
+    block = np.ix_(known, known)
+    inverse[block] = cho_solve(cho_factor(matrix[block]), np.eye(known.sum()))
+    return inverse
+
+
+def select_pressure(rows: Array) -> Array:
+    """Select pressure on the surface and pressure at depth (..., points x 2) from all rows."""
+    leading = rows.shape[:-1]
+    chosen = rows.reshape(*leading, -1, ROWS_PER_POINT)[..., 2:]
+    return chosen.reshape(*leading, -1)
+
+
+def _nearest_cubes(poses: CubePoses) -> Index:
+    """Return the nearest cubes (cubes, W) of each cube, itself first.
+
+    Cubes at equal distances are sorted by their position in the frame of the cube, so that windows
+    that are alike have the same order.
+    """
+    n = len(poses.position)
+    count = min(WINDOW_CUBES, n)
+    # More than wanted: the tree may drop any of several cubes at the same distance.
+    candidates = min(3 * count, n)
+    near = cKDTree(poses.position).query(poses.position, candidates)[1].reshape(n, -1)
+
+    offset = poses.position[near] - poses.position[:, np.newaxis]
+    local = np.einsum("nji,nkj->nki", poses.rotation, offset)
+    # Rounding errors must not decide the order.
+    local = np.round(local / poses.pitch, 4)
+    distance = np.round(np.linalg.norm(local, axis=2), 4)
+    order = np.lexsort((local[..., 1], local[..., 0], distance))[:, :count]
+    return np.asarray(np.take_along_axis(near, order, axis=1))
+
+
+def _number_distinct(rows: Array) -> Index:
+    """Return, for each row (n, k), its number (n,) among the distinct rows."""
+    _, number = np.unique(rows, axis=0, return_inverse=True)
+    return np.asarray(number).reshape(-1)

@@ -1,0 +1,133 @@
+"""Prediction of missing values of a cube from its neighbours.
+
+Missing values D (R are the other values around their cube) do not change the matrices of a window.
+Predicting the missing values and then using all values gives the same estimate as leaving them
+out::
+
+    y_D = -P_DD^-1 P_DR y_R,      the covariance of the estimate grows by G_D P_DD^-1 G_D'
+
+Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 5.4.2
+(leave-one-out predictions).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.arrays import Array, Index, Mask, Single
+from .posterior import WindowPosteriors, select_pressure
+
+
+class _Prediction(NamedTuple):
+    """Prediction of the missing values of one cube.
+
+    Attributes:
+        cube: Index of the cube.
+        columns: Columns (D,) of its missing values.
+        near: Indices (inner,) of the cubes that predict them.
+        weights: Matrix (D, inner C) from the values of these cubes.
+        by_pad: Change (D, inner P) of the predictions by the noise of each pad.
+        rows: Windows (n,) that contain the cube.
+        gain: Gains (n, D, points x 2) of the missing values in these windows.
+    """
+
+    cube: int
+    columns: Index
+    near: Index
+    weights: Array
+    by_pad: Array
+    rows: Index
+    gain: Array
+
+
+class MissingValuePrediction:
+    """Predictions of all missing values of a skin, each from the inner cubes of its cube's window.
+
+    The errors of the predictions of different cubes count as independent.
+
+    Attributes:
+        variance: Increase (cubes, points x 2) of the posterior variances, at the prior scale 1.
+    """
+
+    def __init__(
+        self,
+        windows: WindowPosteriors,
+        observed: Mask,
+        known: Mask,
+    ) -> None:
+        """Prepare the predictions.
+
+        Args:
+            windows: Matrices of all windows.
+            observed: Components (cubes, C) that the cubes normally observe.
+            known: Components (cubes, C) that are known now.
+        """
+        missing = observed & ~known
+        self.variance = np.zeros((len(known), windows.prior.shape[1]))
+        self._predictions: list[_Prediction] = []
+        for cube in np.flatnonzero(missing.any(axis=1)).tolist():
+            self._add_cube(windows, missing, cube)
+
+    def _add_cube(
+        self,
+        windows: WindowPosteriors,
+        missing: Mask,
+        cube: int,
+    ) -> None:
+        """Prepare the prediction of the missing values of one cube."""
+        width = missing.shape[1]
+        near = windows.near[cube, : windows.inner]
+        precision = windows.precision[windows.kind[cube]].astype(float)
+        is_missing = missing[near].ravel()
+        own = np.flatnonzero(missing[cube])
+
+        # The cube is the first of its window: its values are the first of all missing ones.
+        missing_block = precision[np.ix_(is_missing, is_missing)]
+        selection = np.eye(is_missing.sum(), len(own))
+        covariance = np.linalg.solve(missing_block, selection)
+        weights = -covariance.T @ precision[is_missing]
+        weights[:, is_missing] = 0.0
+
+        rows, place = np.nonzero(windows.near == cube)
+        columns = place[:, np.newaxis] * width + own
+        kinds = windows.kind[rows][:, np.newaxis]
+        gain = select_pressure(windows.gain[kinds, :, columns].astype(float))
+        increase = np.einsum("ncr,cd,ndr->nr", gain, covariance[: len(own)], gain)
+        self.variance[rows] += np.maximum(increase, 0)
+
+        if is_missing.all():
+            return  # nothing is known nearby: the prediction is the mean of the prior, 0
+        by_cube = weights.reshape(len(own), len(near), -1)
+        by_pad = np.einsum("fwc,wcp->fwp", by_cube, windows.pads[near]).reshape(len(own), -1)
+        self._predictions.append(
+            _Prediction(
+                cube,
+                own,
+                near,
+                weights,
+                by_pad,
+                rows,
+                gain,
+            )
+        )
+
+    def fill(self, y: Single) -> Single:
+        """Return values (cubes, C) whose missing entries, 0 in `y`, are replaced by predictions."""
+        filled: Single = y.copy()
+        for one in self._predictions:
+            filled[one.cube, one.columns] = one.weights @ y[one.near].ravel()
+        return filled
+
+    def noise(self, pad_variance: Single) -> Array:
+        """Compute the variances (cubes, points x 2) that pad noise causes through the predictions.
+
+        Args:
+            pad_variance: Variance (cubes, P) of each pad divided by that of its noise.
+        """
+        total = np.zeros_like(self.variance)
+        for one in self._predictions:
+            covariance = (one.by_pad * pad_variance[one.near].ravel()) @ one.by_pad.T
+            total[one.rows] += np.einsum("ncr,cd,ndr->nr", one.gain, covariance, one.gain)
+        return total

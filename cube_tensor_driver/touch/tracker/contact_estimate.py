@@ -1,0 +1,148 @@
+"""Force, position and moment of a fitted contact, with standard deviations.
+
+They are linear functionals L of the whole traction within reach of the contact: of the Hertz
+contact and of the residual field alike. Their variance is that of universal kriging. With k the
+covariance of the functional of the residual with the values y, and J and b the derivatives of y and
+of the functional by the parameters (f, c, ln a)::
+
+    var = k_LL - k' W k + (b - J' W k)' (J' W J + prior)^-1 (b - J' W k)
+
+Source: N. A. C. Cressie, Statistics for Spatial Data (1993), 3.4 (universal kriging).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_solve
+
+from ...core.arrays import Array
+from ...mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO
+from ..prior import AMPLITUDE
+from .contact_fit import ContactFit, Observations
+
+NEGLIGIBLE_RESIDUAL = 2.5e-4
+"""Residual scale divided by `AMPLITUDE` below which the residual adds less than a hundredth to any
+variance. Its contribution is then left out, which saves half of the time."""
+
+_MIN_NORMAL_FORCE = 1e-12
+"""Smallest normal force in N that is divided by."""
+
+
+class ContactEstimate(NamedTuple):
+    """Estimate of one contact on the unrolled skin; units and meaning as in `TrackedContact`."""
+
+    force: Array
+    force_variance: Array
+    place: Array
+    place_variance: Array
+    moment: float
+    moment_variance: float
+    area: float
+    area_uncertainty: float
+
+
+def estimate_contact(
+    observations: Observations,
+    fit: ContactFit,
+    j: int,
+) -> ContactEstimate:
+    """Estimate contact j of a fit, together with the residual field around it."""
+    depth = observations.kernels.depth
+    centre = fit.centres[j]
+    size = float(fit.sizes[j])
+    contact_force = fit.forces[j]
+
+    # The region around the contact ends halfway to the nearest other one.
+    distances = np.linalg.norm(
+        np.delete(
+            fit.centres,
+            j,
+            axis=0,
+        )
+        - centre,
+        axis=1,
+    )
+    half_gap = float(distances.min(initial=np.inf)) / 2
+    radius = min(size + depth, half_gap)
+    offset, weight = _disc_quadrature(radius)
+    cross = np.zeros((len(offset), 3, observations.size))
+    if fit.residual_scale > NEGLIGIBLE_RESIDUAL * AMPLITUDE:
+        covariance = observations.cross(centre + offset)
+        cross = fit.residual_scale**2 * covariance * weight[:, np.newaxis, np.newaxis]
+
+    # Force and first moment; the position is where the moment of the pressure vanishes.
+    total = cross.sum(axis=0)  # (3, D)
+    force = contact_force + total @ fit.weighted_residual
+    normal_force = force[2] if abs(force[2]) > _MIN_NORMAL_FORCE else -_MIN_NORMAL_FORCE
+    first_moment = np.einsum("pa,pd->ad", offset, cross[:, 2])
+    shift = first_moment @ fit.weighted_residual / normal_force
+    lever = (first_moment - np.outer(shift, total[2])) / normal_force
+
+    # Moment about the normal through this position.
+    arm = offset - shift
+    twist = arm[:, 0] @ cross[:, 1] - arm[:, 1] @ cross[:, 0]
+    contact_moment = shift[1] * contact_force[0] - shift[0] * contact_force[1]
+    moment = contact_moment + twist @ fit.weighted_residual
+
+    # Derivatives b (6, parameters) of force, position and moment.
+    functionals = np.concatenate([total, lever, twist[np.newaxis]])  # (6, D)
+    first = 6 * j
+    slopes = np.zeros((6, fit.jacobian.shape[1]))
+    slopes[:3, first : first + 3] = np.eye(3)
+    slopes[3:5, first + 2] = -shift / normal_force
+    slopes[3:5, first + 3 : first + 5] = np.eye(2) * (contact_force[2] / normal_force)
+    slopes[5, first : first + 2] = shift[1], -shift[0]
+
+    inverse = np.linalg.inv(fit.normal_matrix)
+    weighted = cho_solve(fit.factor, functionals.T)
+    explained = np.einsum("fd,df->f", functionals, weighted)
+    prior = _functional_variance(fit.residual_scale, depth, radius, normal_force)
+    open_slopes = slopes - weighted.T @ fit.jacobian
+    variance = np.maximum(prior - explained, 0)
+    variance += np.einsum("fp,pq,fq->f", open_slopes, inverse, open_slopes)
+
+    area = np.pi * size**2
+    log_size_deviation = float(np.sqrt(inverse[first + 5, first + 5]))
+    return ContactEstimate(
+        force=force,
+        force_variance=variance[:3],
+        place=centre + shift,
+        place_variance=variance[3:5],
+        moment=float(moment),
+        moment_variance=float(variance[5]),
+        area=area,
+        area_uncertainty=2 * area * log_size_deviation,
+    )
+
+
+def _functional_variance(
+    residual_scale: float,
+    depth: float,
+    radius: float,
+    normal_force: float,
+) -> Array:
+    """Return the prior variances k_LL (6,) of force, position and moment of the residual field."""
+    # Variance per area of an integral of the pressure over an area wider than the prior's lengths.
+    lengths = np.array(PRIOR_LENGTHS) * depth
+    density = residual_scale**2 * np.mean(2 * np.pi * lengths**2)
+
+    shear = SHEAR_RATIO**2
+    mean_square_x = radius**2 / 4
+    lever = mean_square_x / normal_force**2
+    polar = radius**2 / 2
+    factors = np.array([shear, shear, 1.0, lever, lever, shear * polar])
+    return np.asarray(density * np.pi * radius**2 * factors)
+
+
+def _disc_quadrature(radius: float) -> tuple[Array, Array]:
+    """Return points (Q, 2) on a disc and their areas (Q,): Gauss points in r^2 times angles."""
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    r = radius * np.sqrt((nodes + 1) / 2)
+    n_angles = 10
+    angle = 2 * np.pi * (np.arange(n_angles) + 0.5) / n_angles
+    x = np.outer(r, np.cos(angle))
+    y = np.outer(r, np.sin(angle))
+    areas = np.repeat(weights / 2, n_angles) * np.pi * radius**2 / n_angles
+    return np.stack([x.ravel(), y.ravel()], axis=1), areas

@@ -1,0 +1,493 @@
+"""Contact tracker: contacts from the values of all cubes, followed from scan to scan.
+
+A contact is narrow, which a prior that is the same everywhere does not know. So the traction is the
+sum of Hertz contacts and of a Gaussian process for the residual. contact_model.py computes the
+effect of the contacts, contact_fit.py fits them, contact_estimate.py computes force and position
+with standard deviations, contact_selection.py decides how many contacts there are, and
+contact_split.py whether one of them is really two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from ...core.arrays import Array, Index
+from ..inverse import FieldDeviation, SurfaceInverse, TractionField
+from ..prior import AMPLITUDE, covariance_matrix, make_positive_definite
+from .contact_estimate import ContactEstimate, estimate_contact
+from .contact_fit import (
+    STEPS_NEW,
+    STEPS_TRACKED,
+    USUAL_SIZE,
+    ContactFit,
+    Observations,
+    fit_contacts,
+)
+from .contact_model import ContactModel, HertzContact
+from .contact_selection import detect_contact, find_pair_to_merge, prune_contacts
+from .contact_split import split_contact
+
+CUBES_PER_CONTACT = 16
+"""Number of cubes nearest to a contact from whose values it is computed."""
+
+MAX_CONTACTS = 10
+"""Largest number of contacts that are tracked at the same time."""
+
+MAX_CONTACTS_PER_FIT = 4
+"""Largest number of contacts in one fit, whose time grows with the cube of this number."""
+
+JOINT_FIT_PITCHES = 4.0
+"""Distance, in cube pitches, below which contacts share cubes and are fitted together."""
+
+LARGE_RESIDUAL = 0.02
+"""Residual scale divided by `AMPLITUDE` above which a fit is doubted and other starts are tried."""
+
+WIDE_SIZE = 2.5
+"""Radius divided by the depth of a wide contact, with which a doubted fit starts once more."""
+
+POSITION_TOLERANCE_PITCHES = 0.005
+"""Standard deviation of a position, in cube pitches, by which fits from different starts may differ
+without that other starts are tried again in the next scan."""
+
+RESTART_CUBES = 4
+"""Number of nearest cubes around which a new contact with a large residual is searched."""
+
+START_SCALE = 0.05 * AMPLITUDE
+"""Residual scale in Pa with which the fit of a new contact begins."""
+
+_MIN_VALUES_PER_CONTACT = 6
+"""Smallest number of known values per contact for a fit: a contact has six parameters."""
+
+_CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+
+
+class TrackedContact(NamedTuple):
+    """One contact in the skin's parent frame, with standard deviations.
+
+    Attributes:
+        id: Number that stays the same from the first touch to the last.
+        position: Position (3,) in m, where the line of action of the normal force meets the
+            surface.
+        normal: Unit normal (3,) out of the skin.
+        force: Force (3,) in N on the skin.
+        normal_force: Normal force in N; pressing is positive.
+        shear_force: Tangential force in N.
+        moment: Moment about the normal through the position, in N m.
+        area: Area of the Hertz contact that fits best, in m^2.
+        position_uncertainty: Standard deviation of the position along each axis, in m.
+        force_uncertainty: Standard deviation of the normal force, in N.
+        shear_uncertainty: Standard deviation of the tangential force, in N.
+        moment_uncertainty: Standard deviation of the moment, in N m.
+        area_uncertainty: Standard deviation of the area, in m^2.
+    """
+
+    id: int
+    position: Array
+    normal: Array
+    force: Array
+    normal_force: float
+    shear_force: float
+    moment: float
+    area: float
+    position_uncertainty: float
+    force_uncertainty: float
+    shear_uncertainty: float
+    moment_uncertainty: float
+    area_uncertainty: float
+
+
+class ContactTracker:
+    """Follows the contacts of a skin from scan to scan.
+
+    Attributes:
+        field: Traction on the surface in the newest scan, contacts included; 0 before the first.
+    """
+
+    def __init__(self, inverse: SurfaceInverse, min_pressure: float) -> None:
+        """Begin without contacts.
+
+        Args:
+            inverse: Inverse of the skin.
+            min_pressure: Pressure at the depth of the cubes from which on something is a contact,
+                in Pa.
+        """
+        self._inverse = inverse
+        self._min_pressure = min_pressure
+        self._model = ContactModel(inverse)
+        self._contacts: list[HertzContact] = []
+        self._results: dict[int, TrackedContact] = {}
+        self._next_id = 0
+        self._priors: dict[tuple[int, ...], Array] = {}
+        n_points = len(inverse.points)
+        self.field = TractionField(np.zeros((n_points, 3)), np.zeros(n_points))
+        self._residual = np.full((len(inverse.poses.position), len(inverse.columns)), np.nan)
+
+    def update(self, values: Array) -> list[TrackedContact]:
+        """Fit the contacts to the newest values.
+
+        The time is bounded by `MAX_CONTACTS` and by the number of steps of each fit.
+
+        Args:
+            values: Components (cubes, 15), NaN where unknown.
+
+        Returns:
+            Contacts, strongest first.
+        """
+        model = self._model
+        y = self._inverse.scaled(values)
+        self._results = {}
+        self._fit(y, self._contacts, STEPS_TRACKED)
+        self._contacts = prune_contacts(model, self._contacts, self._min_pressure)
+
+        # Merge or add one contact at a time until the residual shows no further one.
+        tried: list[Array] = []
+        for _ in range(MAX_CONTACTS + 1):
+            self._residual = y - model.response(self._contacts)
+            residual = self._inverse.field_of_scaled(self._residual)
+            pressure = residual.depth_pressure + model.depth_pressure(self._contacts)
+            self.field = model.add_contacts(residual, pressure, self._contacts)
+
+            pair = find_pair_to_merge(model, self._contacts, pressure)
+            if pair is not None:
+                older, younger = pair
+                self._contacts.remove(younger)
+                self._fit(y, [older], STEPS_NEW)
+                continue
+
+            point = detect_contact(
+                model,
+                self._contacts,
+                residual.depth_pressure,
+                pressure,
+                tried,
+                self._min_pressure,
+            )
+            if point is None or len(self._contacts) >= MAX_CONTACTS:
+                break
+            tried.append(self._inverse.points[point])
+            contact = self._start_contact(point)
+            neighbours = self._neighbours(contact, self._contacts)
+            self._contacts.append(contact)
+            self._fit(y, [contact, *neighbours], STEPS_NEW)
+            self._contacts = prune_contacts(model, self._contacts, self._min_pressure)
+
+        results = [self._results[one.id] for one in self._contacts if one.id in self._results]
+        return sorted(results, key=lambda contact: -contact.normal_force)
+
+    def deviation(self, values: Array) -> FieldDeviation:
+        """Compute the standard deviations of `field` by the residual and by the contacts.
+
+        Args:
+            values: The components (cubes, 15) of the last `update`.
+        """
+        scaled = self._inverse.scaled(values)
+        residual = self._inverse.residual_deviation(self._residual, scaled)
+        contact_variance = self._model.pressure_variance(self._contacts)
+        variance = np.stack(residual, axis=1) ** 2 + contact_variance
+        return FieldDeviation(*np.sqrt(variance).T)
+
+    def _start_contact(self, point: int) -> HertzContact:
+        """Create a contact without force at a point of the surface."""
+        inverse = self._inverse
+        home = int(inverse.cube[point])
+        offset = inverse.points[point] - inverse.poses.position[home]
+        local = inverse.poses.rotation[home].T @ offset
+        return HertzContact(
+            id=self._take_id(),
+            home=home,
+            place=local[:2],
+            size=USUAL_SIZE * inverse.depth,
+            force=np.zeros(3),
+            residual_scale=START_SCALE,
+        )
+
+    def _take_id(self) -> int:
+        """Return an id that no contact had before."""
+        self._next_id += 1
+        return self._next_id - 1
+
+    def _neighbours(self, contact: HertzContact, others: list[HertzContact]) -> list[HertzContact]:
+        """Return the other contacts that share cubes with this one, nearest first."""
+        centre = self._model.centre(contact)
+        distances = [float(np.linalg.norm(self._model.centre(one) - centre)) for one in others]
+        reach = JOINT_FIT_PITCHES * self._inverse.pitch
+        return [others[k] for k in np.argsort(distances) if distances[k] < reach]
+
+    def _fit(
+        self,
+        y: Array,
+        contacts: list[HertzContact],
+        steps: int,
+    ) -> None:
+        """Fit contacts, those that share cubes together; other contacts stay as they are.
+
+        Args:
+            y: Scaled values (cubes, C).
+            contacts: Contacts to fit.
+            steps: As in `fit_contacts`.
+        """
+        remaining = list(contacts)
+        while remaining:
+            first = remaining.pop(0)
+            group = [first, *self._neighbours(first, remaining)[: MAX_CONTACTS_PER_FIT - 1]]
+            # By identity: two contacts with equal values are still two.
+            members = {id(one) for one in group}
+            remaining = [one for one in remaining if id(one) not in members]
+            others = [one for one in self._contacts if id(one) not in members]
+            self._fit_group(y - self._model.response(others), group, steps)
+
+    def _fit_group(
+        self,
+        y: Array,
+        contacts: list[HertzContact],
+        steps: int,
+    ) -> None:
+        """Fit contacts together, to values (cubes, C) without the response to all others."""
+        inverse = self._inverse
+        home = contacts[0].home
+        near = [self._model.nearest_cubes(contact, CUBES_PER_CONTACT) for contact in contacts]
+        cubes = np.unique(np.concatenate(near))
+        place, angle = inverse.unroll(home, cubes)
+        prior = self._prior(cubes, place, angle)
+        observations = Observations(inverse, y[cubes], prior, cubes, place, angle)
+        if observations.size < _MIN_VALUES_PER_CONTACT * len(contacts):
+            for contact in contacts:
+                contact.force = np.zeros(3)  # nothing is known: `prune_contacts` removes it
+            return
+
+        # Centres on the skin unrolled around the home of the first contact.
+        homes = np.array([contact.home for contact in contacts])
+        origins, rotations = _home_frames(*inverse.unroll(home, homes))
+        places = np.array([contact.place for contact in contacts])
+        centres = origins + np.einsum("jab,jb->ja", rotations, places)
+        sizes = np.array([contact.size for contact in contacts])
+        scale = max(contact.residual_scale for contact in contacts)
+        fit = fit_contacts(observations, centres, sizes, scale, steps)
+        for j, contact in enumerate(contacts):
+            fit = self._refit_from_other_starts(
+                observations,
+                fit,
+                contact,
+                j,
+                origins[j],
+                rotations[j],
+            )
+        fit = self._split_contacts(observations, fit, contacts)
+
+        for j, contact in enumerate(contacts):
+            self._store_fit(contact, fit, j, cubes, place, angle)
+            estimate = estimate_contact(observations, fit, j)
+            estimate = estimate._replace(
+                place_variance=estimate.place_variance + contact.place_doubt / 2,
+                force_variance=estimate.force_variance + contact.force_doubt,
+            )
+            result = self._to_parent_frame(contact.id, estimate, cubes, place, angle)
+            self._results[contact.id] = result
+
+    def _refit_from_other_starts(
+        self,
+        observations: Observations,
+        fit: ContactFit,
+        contact: HertzContact,
+        j: int,
+        origin: Array,
+        rotation: Array,
+    ) -> ContactFit:
+        """Restart the fit of one contact from other places and sizes and keep the most likely
+        result.
+
+        Gauss-Newton can end in a local optimum. A wide contact looks like a narrow one with a large
+        residual. Beside a cube that does not observe all components, mirrored positions have almost
+        the same response. Both are tried for contacts that are new or were in doubt. If cubes are
+        far apart, the field may point at the wrong cube: a new contact with a large residual is
+            also
+        searched around other cubes.
+
+        Args:
+            observations: Values of the cubes.
+            fit: Fit from the usual start.
+            contact: Contact, whose doubts are updated.
+            j: Index of the contact in the fit.
+            origin: Position (2,) of the contact's home on the unrolled skin.
+            rotation: Rotation (2, 2) from the frame of the home to the unrolled skin.
+        """
+        fits = [fit]
+
+        def start_at(centre: Array, size: float) -> None:
+            centres = fit.centres.copy()
+            sizes = fit.sizes.copy()
+            centres[j] = centre
+            sizes[j] = size
+            fits.append(fit_contacts(observations, centres, sizes, START_SCALE, STEPS_NEW))
+
+        limit = LARGE_RESIDUAL * AMPLITUDE
+        depth = self._inverse.depth
+        was_in_doubt = contact.place_doubt > 0
+        if fit.residual_scale > limit and (was_in_doubt or contact.residual_scale <= limit):
+            start_at(fit.centres[j], WIDE_SIZE * depth)
+
+        if was_in_doubt and not observations.sees_all:
+            best = min(fits, key=lambda one: one.score)
+            offset = np.abs(rotation.T @ (best.centres[j] - origin))
+            offset = np.maximum(offset, self._inverse.pitch / 4)
+            homes = [origin]
+            if best.residual_scale > limit and np.isinf(contact.place_doubt):
+                distance = np.linalg.norm(observations.place - best.centres[j], axis=1)
+                homes = list(observations.place[np.argsort(distance)[:RESTART_CUBES]])
+            for home in homes:
+                for corner in _CORNERS:
+                    start_at(home + rotation @ (corner * offset), USUAL_SIZE * depth)
+
+        # Variance over all fits, weighted with their evidence.
+        best = min(fits, key=lambda one: one.score)
+        weight = np.exp([(best.score - one.score) / 2 for one in fits])
+        weight /= weight.sum()
+        place_squares = [((one.centres[j] - best.centres[j]) ** 2).sum() for one in fits]
+        force_squares = [(one.forces[j] - best.forces[j]) ** 2 for one in fits]
+        contact.force_doubt = weight @ force_squares
+        doubt = float(weight @ place_squares)
+        tolerance = POSITION_TOLERANCE_PITCHES * self._inverse.pitch
+        contact.place_doubt = doubt if doubt > tolerance**2 else 0.0
+        return best
+
+    def _split_contacts(
+        self,
+        observations: Observations,
+        fit: ContactFit,
+        contacts: list[HertzContact],
+    ) -> ContactFit:
+        """Split contacts that are two each, also in `contacts`.
+
+        A contact is tested again only after its residual has doubled, because a test takes long.
+        """
+        limit = LARGE_RESIDUAL * AMPLITUDE
+        for j, contact in enumerate(list(contacts)):
+            if fit.residual_scale <= limit:
+                contact.split_tested_at = 0.0
+                continue
+            has_doubled = fit.residual_scale > 2 * contact.split_tested_at
+            if not has_doubled or len(self._contacts) >= MAX_CONTACTS:
+                continue
+
+            contact.split_tested_at = fit.residual_scale
+            two = split_contact(observations, fit, j, START_SCALE, limit)
+            if two is not None:
+                fit = two
+                contact.was_split = True
+                twin = replace(contact, id=self._take_id())
+                contacts.append(twin)
+                self._contacts.append(twin)
+        return fit
+
+    def _store_fit(
+        self,
+        contact: HertzContact,
+        fit: ContactFit,
+        j: int,
+        cubes: Index,
+        place: Array,
+        angle: Array,
+    ) -> None:
+        """Write a fit into a contact, in the frame of the cube that is nearest now.
+
+        Args:
+            contact: Contact to change.
+            fit: Fit.
+            j: Index of the contact in the fit.
+            cubes: Indices (n,) of the cubes of the fit.
+            place: Positions (n, 2) of the cubes on the unrolled skin, in m.
+            angle: Rotations (n,) of the cubes, in rad.
+        """
+        nearest, to_home = _nearest_home(fit.centres[j], place, angle)
+        in_plane = to_home[:2, :2]
+        contact.home = int(cubes[nearest])
+        contact.place = in_plane @ (fit.centres[j] - place[nearest])
+        contact.size = float(fit.sizes[j])
+        contact.force = to_home @ fit.forces[j]
+        contact.residual_scale = fit.residual_scale
+
+        # The two length shapes rotate by twice the angle, as an ellipse looks the same after 180°.
+        double = (to_home @ to_home)[:2, :2]
+        rotation = block_diag(to_home, in_plane, 1.0, double, 1.0)
+        place_doubts = [contact.place_doubt / 2] * 2
+        doubts = np.diag([*contact.force_doubt, *place_doubts, *np.zeros(4)])
+        contact.covariance = rotation @ (fit.covariance(j) + doubts) @ rotation.T
+
+    def _to_parent_frame(
+        self,
+        number: int,
+        estimate: ContactEstimate,
+        cubes: Index,
+        place: Array,
+        angle: Array,
+    ) -> TrackedContact:
+        """Convert an estimate to the skin's parent frame; arguments as in `_store_fit`."""
+        inverse = self._inverse
+        nearest, to_home = _nearest_home(estimate.place, place, angle)
+        home = int(cubes[nearest])
+        rotation = inverse.poses.rotation[home]
+        local = to_home[:2, :2] @ (estimate.place - place[nearest])
+        position = inverse.poses.position[home] + rotation @ np.array([*local, inverse.depth])
+        force = to_home @ estimate.force
+        shear = float(np.hypot(force[0], force[1]))
+        direction = estimate.force[:2] / max(shear, 1e-300)
+        shear_variance = direction**2 @ estimate.force_variance[:2]
+        return TrackedContact(
+            id=number,
+            position=position,
+            normal=rotation[:, 2].copy(),
+            force=rotation @ force,
+            normal_force=float(-force[2]),
+            shear_force=shear,
+            moment=estimate.moment,
+            area=estimate.area,
+            position_uncertainty=float(np.sqrt(estimate.place_variance.mean())),
+            force_uncertainty=float(np.sqrt(estimate.force_variance[2])),
+            shear_uncertainty=float(np.sqrt(shear_variance)),
+            moment_uncertainty=float(np.sqrt(estimate.moment_variance)),
+            area_uncertainty=estimate.area_uncertainty,
+        )
+
+    def _prior(
+        self,
+        cubes: Index,
+        place: Array,
+        angle: Array,
+    ) -> Array:
+        """Return the prior covariance (n C, n C) of cubes; the most recent ones are kept."""
+        inverse = self._inverse
+        variant = inverse.variant[cubes]
+        key = (*cubes.tolist(), *variant.tolist())
+        if key not in self._priors:
+            if len(self._priors) >= 2 * MAX_CONTACTS:
+                oldest = next(iter(self._priors))
+                self._priors.pop(oldest)
+            covariance = covariance_matrix(inverse.kernels, inverse.columns, place, angle, variant)
+            self._priors[key] = make_positive_definite(covariance)
+        return self._priors[key]
+
+
+def _home_frames(place: Array, angle: Array) -> tuple[Array, Array]:
+    """Return origins (J, 2) of cubes and rotations (J, 2, 2) from their frames."""
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    first_row = np.stack([cosine, -sine], axis=-1)
+    second_row = np.stack([sine, cosine], axis=-1)
+    return place, np.stack([first_row, second_row], axis=-2)
+
+
+def _nearest_home(
+    centre: Array,
+    place: Array,
+    angle: Array,
+) -> tuple[int, Array]:
+    """Return the index of the cube nearest to a position, and the rotation (3, 3) into its
+    frame."""
+    nearest = int(np.argmin(np.linalg.norm(place - centre, axis=1)))
+    c = np.cos(angle[nearest])
+    s = np.sin(angle[nearest])
+    return nearest, np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
