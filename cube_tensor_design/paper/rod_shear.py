@@ -1,7 +1,7 @@
 """Shear that is recovered under the paper's rod, by eq. 4, a cube's tensor, points and pads.
 
 The rod presses on the linear bench with a bonded bottom. *Points* and *pads* take the traction t on
-the surface for a Gaussian process, as touch/windows.py does, along x alone. What the cube gives
+the surface for a Gaussian process, as touch/posterior.py does, along x alone. What the cube gives
 is y = int H(x) t(x) dx, and the shear at its place, in the body without it, s = int h(x) t(x) dx::
 
     s = h S H' (H S H' + N)^-1 y

@@ -112,11 +112,7 @@ def _store(path: Path, arrays: Arrays) -> None:
         return
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with NamedTemporaryFile(
-        dir=path.parent,
-        suffix=".part",
-        delete=False,
-    ) as file:
+    with NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
         try:
             np.savez(file, allow_pickle=False, **arrays)
             file.close()

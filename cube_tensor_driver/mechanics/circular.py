@@ -28,13 +28,7 @@ Orders = NDArray[np.int64]
 def _define_components() -> tuple[Complex, Orders]:
     """Return the circular components (14, 24) as combinations of `FIELD`, and their orders
     (14,)."""
-    unit = dict(
-        zip(
-            FIELD,
-            np.eye(len(FIELD)),
-            strict=True,
-        )
-    )
+    unit = dict(zip(FIELD, np.eye(len(FIELD)), strict=True))
 
     def combine_stresses(suffix: str) -> list[tuple[int, Complex]]:
         """Return order and component for the six stresses, or for their derivative by `suffix`."""
@@ -51,11 +45,7 @@ def _define_components() -> tuple[Complex, Orders]:
     # The derivative d/dx + i d/dy raises the order by one, d/dx - i d/dy lowers it by one.
     by_x = combine_stresses("_x")
     by_y = combine_stresses("_y")
-    for (order, along_x), (_, along_y) in zip(
-        by_x,
-        by_y,
-        strict=True,
-    ):
+    for (order, along_x), (_, along_y) in zip(by_x, by_y, strict=True):
         components.append((order + 1, along_x + 1j * along_y))
         if order > 0:  # at order 0 it would be the complex conjugate of the one above
             components.append((order - 1, along_x - 1j * along_y))
@@ -95,8 +85,4 @@ def sum_rotated(
 
     parts = np.concatenate([total.real, total.imag], axis=1).astype(float)
     field = parts @ FIELD_FROM_CIRCULAR
-    return field[:, :6], field[:, 6:].reshape(
-        -1,
-        6,
-        3,
-    )
+    return field[:, :6], field[:, 6:].reshape(-1, 6, 3)

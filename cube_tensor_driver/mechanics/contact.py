@@ -252,11 +252,7 @@ def _airy(
     chi_Z = ln(R + Z) (log1, log2, log3) and of chi_ZZ = 1/R (inv1, inv2).
     """
     x, y, z = np.moveaxis(d, -1, 0)
-    fx, fy, fz = np.moveaxis(
-        np.broadcast_to(forces, d.shape),
-        -1,
-        0,
-    )
+    fx, fy, fz = np.moveaxis(np.broadcast_to(forces, d.shape), -1, 0)
     position = (x, y)
     force = (fx, fy)
     f_dot_d = fx * x + fy * y
@@ -300,39 +296,18 @@ def _airy(
                 value = value + chi2 * force[a] + (f_dot_d * chi3 - fz * log2) * position[a]
         return np.asarray(value.sum(axis=-1))
 
-    third_derivatives = {
-        (i, j, k): third(
-            i,
-            j,
-            k,
-        )
-        for i, j, k in _THIRD_DERIVATIVES
-    }
+    third_derivatives = {(i, j, k): third(i, j, k) for i, j, k in _THIRD_DERIVATIVES}
 
     # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy; d/dz = -d/dZ
     n_components = len(_STRESS_AXES)
     stress = np.zeros((*distance.shape[:-1], n_components))
     gradient = np.zeros((*distance.shape[:-1], n_components, 3))
     for component, i, j, sign in ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0)):
-        stress[..., component] = sign * second(
-            i,
-            j,
-            chi2,
-            chi3,
-            log1,
-            log2,
-        )
+        stress[..., component] = sign * second(i, j, chi2, chi3, log1, log2)
         for axis in (0, 1):
             i1, i2, i3 = sorted((i, j, axis))
             gradient[..., component, axis] = sign * third_derivatives[i1, i2, i3]
-        gradient[..., component, 2] = -sign * second(
-            i,
-            j,
-            log2,
-            log3,
-            inv1,
-            inv2,
-        )
+        gradient[..., component, 2] = -sign * second(i, j, log2, log3, inv1, inv2)
     return stress, gradient
 
 

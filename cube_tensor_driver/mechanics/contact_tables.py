@@ -157,12 +157,7 @@ class DiscTables(_ContactTables):
         direction = np.where(
             is_centred,
             1.0,
-            offset
-            / np.where(
-                is_centred,
-                1.0,
-                distance,
-            ),
+            offset / np.where(is_centred, 1.0, distance),
         )
 
         polar_force = _to_complex(forces) * direction.conj()  # F_r + i F_t
@@ -215,11 +210,7 @@ class PolygonTables(_ContactTables):
         r = np.hypot(d, t)
         is_origin = r == 0
         r_safe = np.where(is_origin, 1.0, r)
-        direction = np.where(
-            is_origin,
-            1.0,
-            (d + 1j * t) / r_safe,
-        )  # exp(i alpha)
+        direction = np.where(is_origin, 1.0, (d + 1j * t) / r_safe)  # exp(i alpha)
 
         # The integral over alpha becomes one over eta: alpha = atan(t / d), t = t(eta).
         alpha_slope = d * np.hypot(1.0, d) * np.cosh(eta) / r_safe**2
@@ -323,11 +314,7 @@ def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
     right = column - left
     upper = [(1 - down) * (1 - right), (1 - down) * right]
     lower = [down * (1 - right), down * right]
-    weights = np.stack(
-        upper + lower,
-        axis=-1,
-        dtype=np.float32,
-    )
+    weights = np.stack(upper + lower, axis=-1, dtype=np.float32)
     weights[..., 0, :] *= -1
 
     corners = np.array([0, 1, _GRID_COLUMNS, _GRID_COLUMNS + 1])

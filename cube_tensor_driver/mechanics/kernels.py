@@ -245,12 +245,7 @@ class Kernels:
         """
         table = self._interpolate_size(self._response, size, place)
         return self._measure(
-            self._rotate_loads(
-                table,
-                place,
-                angle,
-                self._order,
-            ),
+            self._rotate_loads(table, place, angle, self._order),
             variant,
         )
 
@@ -265,12 +260,7 @@ class Kernels:
             `FIELD` (N, 24, 3) at the depth of the cubes, in Pa and Pa/m.
         """
         table = self._interpolate_size(self._field, size, place)
-        circular = self._rotate_loads(
-            table,
-            place,
-            np.zeros(len(place)),
-            ORDERS,
-        )
+        circular = self._rotate_loads(table, place, np.zeros(len(place)), ORDERS)
         return np.asarray((circular @ FIELD_FROM_CIRCULAR).swapaxes(1, 2))
 
     def disc_pressure(
@@ -418,13 +408,7 @@ class Kernels:
 
         log_step = np.log(DISC_SIZES[1] / DISC_SIZES[0])
         index = np.log(size / self.depth / DISC_SIZES[0]) / log_step
-        first, weights = _cubic_weights(
-            np.clip(
-                index,
-                1.0,
-                len(DISC_SIZES) - 2.001,
-            )
-        )
+        first, weights = _cubic_weights(np.clip(index, 1.0, len(DISC_SIZES) - 2.001))
         neighbours = discs[int(first) - 1 : int(first) + 3, :n_distances]
         return np.asarray(np.tensordot(weights, neighbours, axes=1))
 
@@ -447,11 +431,7 @@ def hertz_pressure(distance: Array, size: float) -> Array:
         distance: Distances from the centre in m.
         size: Radius of the contact in m.
     """
-    inside = np.clip(
-        1 - (distance / size) ** 2,
-        0,
-        None,
-    )
+    inside = np.clip(1 - (distance / size) ** 2, 0, None)
     peak = 3 / (2 * np.pi * size**2)
     return np.asarray(peak * np.sqrt(inside))
 

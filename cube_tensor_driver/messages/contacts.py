@@ -14,7 +14,7 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.errors import BagError
 from ..touch.surface import Contact
-from ..touch.tracker.touches import TrackedContact
+from ..touch.tracker.contact_tracker import TrackedContact
 from .codec import SECOND
 from .types import CONTACTS, TRACTION
 

@@ -148,13 +148,7 @@ class _InverseFinder:
         by_pad = noise_of_all_pads(calibrations)
         self._pipeline = Pipeline(calibrations)
         self._left_out = np.zeros(len(calibrations), np.uint32)
-        self._inverse = SurfaceInverse.from_poses(
-            poses,
-            by_pad,
-            layer,
-            depth,
-            model=model,
-        )
+        self._inverse = SurfaceInverse.from_poses(poses, by_pad, layer, depth, model=model)
         self._tracker = ContactTracker(self._inverse, settings.least)
 
     def update(self, values: Array, left_out: PadMasks) -> list[TrackedContact]:

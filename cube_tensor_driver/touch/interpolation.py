@@ -119,11 +119,7 @@ class Interpolation:
         cubes = self._poses.position[near] / self._length
         points = self._patches[chosen] / self._length
         # Directions (n, neighbours, 2 or 0, 3) of the derivatives: the cubes' x and y axes.
-        axes = np.swapaxes(
-            self._poses.rotation[:, :, : width - 1],
-            1,
-            2,
-        )[near]
+        axes = np.swapaxes(self._poses.rotation[:, :, : width - 1], 1, 2)[near]
 
         offset = cubes[:, :, np.newaxis] - cubes[:, np.newaxis]
         matrix = _covariance(
@@ -131,55 +127,23 @@ class Interpolation:
             axes[:, :, np.newaxis],
             axes[:, np.newaxis],
         )
-        matrix = np.moveaxis(
-            matrix,
-            3,
-            2,
-        ).reshape(
-            n,
-            size,
-            size,
-        )
+        matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
         # Unknown values become independent of all others and get the weight 0.
         matrix *= is_known[:, :, np.newaxis] & is_known[:, np.newaxis]
-        matrix[:, np.arange(size), np.arange(size)] += np.where(
-            is_known,
-            RIDGE,
-            1.0,
-        )
+        matrix[:, np.arange(size), np.arange(size)] += np.where(is_known, RIDGE, 1.0)
 
         offset = points[:, :, np.newaxis] - cubes[:, np.newaxis]
         no_axes = np.zeros((n, points.shape[1], 1, 0, 3))
         to_points = _covariance(offset, no_axes, axes[:, np.newaxis])
-        to_points = (
-            to_points.reshape(
-                n,
-                -1,
-                size,
-            )
-            * is_known[:, np.newaxis]
-        )
+        to_points = to_points.reshape(n, -1, size) * is_known[:, np.newaxis]
 
         weights = np.swapaxes(
-            np.linalg.solve(
-                matrix,
-                np.swapaxes(
-                    to_points,
-                    1,
-                    2,
-                ),
-            ),
+            np.linalg.solve(matrix, np.swapaxes(to_points, 1, 2)),
             1,
             2,
         )
         explained = np.einsum("nqd,nqd->nq", weights, to_points)
-        return weights, np.sqrt(
-            np.clip(
-                1 - explained,
-                0,
-                1,
-            )
-        )
+        return weights, np.sqrt(np.clip(1 - explained, 0, 1))
 
 
 class _Weights:

@@ -161,14 +161,7 @@ class SurfaceInverse:
         self.spacing = self.pitch / side
         self.area = self.spacing**2
         above = depth * poses.rotation[:, np.newaxis, :, 2]
-        self.points = (
-            patches(
-                poses,
-                self.spacing,
-                side,
-            )
-            + above
-        ).reshape(-1, 3)
+        self.points = (patches(poses, self.spacing, side) + above).reshape(-1, 3)
         self.cube = np.repeat(np.arange(n), side**2)
 
         observed = np.isfinite(by_pad.sum(axis=2))
@@ -176,11 +169,7 @@ class SurfaceInverse:
         if not len(self.columns):
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
         self.observed = observed[:, self.columns]
-        self._unit_factors = np.where(
-            self.columns < len(STRESS),
-            1.0,
-            scale,
-        )
+        self._unit_factors = np.where(self.columns < len(STRESS), 1.0, scale)
         self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, np.newaxis]
         self._all_pads = self.by_pad.copy()
 
@@ -239,11 +228,7 @@ class SurfaceInverse:
         self.by_pad[cubes] = by_pad[:, self.columns] * self._unit_factors[:, np.newaxis]
         if self._variant_pads is None:
             return
-        for cube, own in zip(
-            cubes.tolist(),
-            by_pad,
-            strict=True,
-        ):
+        for cube, own in zip(cubes.tolist(), by_pad, strict=True):
             pads = self._variant_pads[self._whole_variant[cube]]
             self.variant[cube] = self.kernels.add_variant(pads @ np.nan_to_num(own).T)
             self._has_other_pads[cube] = not np.array_equal(
@@ -283,18 +268,10 @@ class SurfaceInverse:
         stresses = pad_stresses(self.by_pad, self._known, scaled)
         has_values = self._known.any(axis=1)[:, np.newaxis]
         gain_variance = (GAIN_ERROR * stresses) ** 2
-        pad_variance = np.where(
-            has_values,
-            gain_variance + 1,
-            0,
-        ).astype(np.float32)
+        pad_variance = np.where(has_values, gain_variance + 1, 0).astype(np.float32)
 
         windows = self._windows
-        scale = windows.scale(
-            y,
-            pad_variance,
-            self._known,
-        )[:, np.newaxis]
+        scale = windows.scale(y, pad_variance, self._known)[:, np.newaxis]
         prior = windows.prior[windows.kind] + self._prediction.variance
         variance = scale * prior
         variance += windows.noise(pad_variance)

@@ -139,13 +139,7 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
         functions = right[is_kept].reshape(n_kept, 3, -1) / root
         orders += [order] * n_kept
         spectra.append(_hankel_transforms(functions, order, bessel, r * weight))
-        pads.append(
-            (left[:, is_kept] * values[is_kept]).reshape(
-                2,
-                -1,
-                n_kept,
-            )
-        )
+        pads.append((left[:, is_kept] * values[is_kept]).reshape(2, -1, n_kept))
 
     plus, minus, normal = (np.concatenate(parts, axis=1) for parts in zip(*spectra, strict=True))
     to_pads = np.concatenate(pads, axis=2).swapaxes(1, 2).reshape(2 * len(orders), -1)
@@ -184,12 +178,7 @@ def _fourier_series(influence: Influence, r: Array) -> list[Array]:
     direction = np.stack([cosine, sine], axis=1)
     # The direction runs from the force to the cube, so the force lies at minus r.
     place = -(r[:, np.newaxis, np.newaxis] * direction).reshape(-1, 2)
-    responses = influence.at(place).reshape(
-        -1,
-        len(r),
-        N_DIRECTIONS,
-        3,
-    )
+    responses = influence.at(place).reshape(-1, len(r), N_DIRECTIONS, 3)
 
     x, y, z = np.moveaxis(responses, -1, 0)
     radial = cosine * x + sine * y

@@ -42,13 +42,7 @@ def noise_by_pad(
         or that the cube does not have.
     """
     by_pad = np.zeros((len(cubes), len(COMPONENTS), pipeline.n_pads))
-    for row, (cube, mask) in enumerate(
-        zip(
-            cubes.tolist(),
-            left_out.tolist(),
-            strict=True,
-        )
-    ):
+    for row, (cube, mask) in enumerate(zip(cubes.tolist(), left_out.tolist(), strict=True)):
         own = pipeline.matrix(cube, mask) * pipeline.calibrations[cube].noise
         by_pad[row, :, : own.shape[1]] = own
     return by_pad
@@ -76,11 +70,7 @@ def pad_stresses(
     Returns:
         Stresses u (n, P), in units of the noise of each pad.
     """
-    by_pad = np.where(
-        known[:, :, np.newaxis],
-        by_pad,
-        0.0,
-    )
+    by_pad = np.where(known[:, :, np.newaxis], by_pad, 0.0)
     transposed = by_pad.swapaxes(1, 2)
 
     # Unknown components get a 1 on the diagonal, so that B B' stays regular.

@@ -130,13 +130,7 @@ class WindowPosteriors:
             solved: dict[str, AnyArray] = {}
             for number, one in enumerate(first):
                 own = model.select(self.near[one])
-                window = _solve_window(
-                    kernels,
-                    own,
-                    place[one],
-                    angle[one],
-                    points,
-                )
+                window = _solve_window(kernels, own, place[one], angle[one], points)
                 for name, array in window._asdict().items():
                     if name not in solved:
                         solved[name] = np.empty((len(first), *array.shape), array.dtype)
@@ -260,13 +254,7 @@ def _solve_window(
     known = model.known.ravel()
     pads = np.nan_to_num(model.by_pad)
 
-    prior = AMPLITUDE**2 * covariance_matrix(
-        kernels,
-        columns,
-        place,
-        angle,
-        model.variant,
-    )
+    prior = AMPLITUDE**2 * covariance_matrix(kernels, columns, place, angle, model.variant)
     total = prior.copy()  # K_yy + N
     for cube, own in enumerate(pads):
         part = slice(cube * width, (cube + 1) * width)
@@ -285,28 +273,14 @@ def _solve_window(
     gain[:, known] = known_gain
 
     # diag(G M G') is a sum over the pads of (G B)^2.
-    rows = gain.reshape(
-        -1,
-        ROWS_PER_POINT,
-        n,
-        width,
-    )[:, 2:].reshape(
-        -1,
-        n,
-        width,
-    )
+    rows = gain.reshape(-1, ROWS_PER_POINT, n, width)[:, 2:].reshape(-1, n, width)
     by_pad = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
 
     inner = min(INNER_CUBES, n)
     size = inner * width
     precision = _invert_known(total[:size, :size], known[:size])
     cubes = np.arange(inner)
-    diagonal = precision.reshape(
-        inner,
-        width,
-        inner,
-        width,
-    )[cubes, :, cubes]
+    diagonal = precision.reshape(inner, width, inner, width)[cubes, :, cubes]
     inner_pads = pads[:inner]
     trace = np.einsum("wcp,wcd,wdp->wp", inner_pads, diagonal, inner_pads, optimize=True)
     return _Window(
@@ -336,26 +310,8 @@ def _cross_covariance(
     traction = kernels.cross(offset, angles, variants)[:, columns]
     pressure = kernels.pressure(offset, angles, variants)[:, columns]
     cross = np.empty((n_points, ROWS_PER_POINT, n, len(columns)))
-    cross[:, :3] = traction.reshape(
-        n,
-        n_points,
-        -1,
-        3,
-    ).transpose(
-        1,
-        3,
-        0,
-        2,
-    )
-    cross[:, 3] = pressure.reshape(
-        n,
-        n_points,
-        -1,
-    ).transpose(
-        1,
-        0,
-        2,
-    )
+    cross[:, :3] = traction.reshape(n, n_points, -1, 3).transpose(1, 3, 0, 2)
+    cross[:, 3] = pressure.reshape(n, n_points, -1).transpose(1, 0, 2)
     return AMPLITUDE**2 * cross.reshape(-1, n * len(columns))
 
 

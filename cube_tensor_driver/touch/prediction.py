@@ -101,17 +101,7 @@ class MissingValuePrediction:
             return  # nothing is known nearby: the prediction is the mean of the prior, 0
         by_cube = weights.reshape(len(own), len(near), -1)
         by_pad = np.einsum("fwc,wcp->fwp", by_cube, windows.pads[near]).reshape(len(own), -1)
-        self._predictions.append(
-            _Prediction(
-                cube,
-                own,
-                near,
-                weights,
-                by_pad,
-                rows,
-                gain,
-            )
-        )
+        self._predictions.append(_Prediction(cube, own, near, weights, by_pad, rows, gain))
 
     def fill(self, y: Single) -> Single:
         """Return values (cubes, C) whose missing entries, 0 in `y`, are replaced by predictions."""

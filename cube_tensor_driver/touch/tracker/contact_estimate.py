@@ -56,12 +56,7 @@ def estimate_contact(
 
     # The region around the contact ends halfway to the nearest other one.
     distances = np.linalg.norm(
-        np.delete(
-            fit.centres,
-            j,
-            axis=0,
-        )
-        - centre,
+        np.delete(fit.centres, j, axis=0) - centre,
         axis=1,
     )
     half_gap = float(distances.min(initial=np.inf)) / 2

@@ -193,11 +193,7 @@ class Observations:
         angle = np.tile(self._angle, n)
         variant = np.tile(self._variant, n)
         responses = self.kernels.response(offset, angle, variant, size)
-        return responses[:, self._columns].reshape(
-            n,
-            -1,
-            3,
-        )[:, self._known]
+        return responses[:, self._columns].reshape(n, -1, 3)[:, self._known]
 
     def cross(self, points: Array) -> Array:
         """Compute the prior covariance (points, 3, D) of the traction at points with the values."""
@@ -205,16 +201,9 @@ class Observations:
         offset = (self.place - points[:, np.newaxis]).reshape(-1, 2)
         angle = np.tile(self._angle, n)
         variant = np.tile(self._variant, n)
-        cross = self.kernels.cross(
-            offset,
-            angle,
-            variant,
-        )[:, self._columns]
-        return cross.reshape(
-            n,
-            -1,
-            3,
-        )[:, self._known].swapaxes(1, 2)
+        cross = self.kernels.cross(offset, angle, variant)[:, self._columns]
+        known = cross.reshape(n, -1, 3)[:, self._known]
+        return np.asarray(known.swapaxes(1, 2))
 
 
 class ContactFit(NamedTuple):
@@ -315,14 +304,7 @@ def fit_contacts(
         ]
 
         # Covariance with the shapes of the previous forces, then the forces by linear regression.
-        shape_parts = [
-            one.shapes @ force
-            for one, force in zip(
-                responses,
-                forces,
-                strict=True,
-            )
-        ]
+        shape_parts = [one.shapes @ force for one, force in zip(responses, forces, strict=True)]
         shapes = np.concatenate(shape_parts).T  # (D, 3 contacts)
         noise = observations.rough_noise if is_rough else observations.noise
         noise = noise + shapes @ shapes.T
@@ -353,11 +335,7 @@ def fit_contacts(
         # Gauss-Newton step, with the prior of ln a
         right = weighted.T @ residual
         right[5::_N_PARAMETERS] -= (log_sizes - usual_log_size) * SIZE_DEVIATION**-2
-        change = np.linalg.lstsq(
-            normal_matrix,
-            right,
-            rcond=None,
-        )[0].reshape(count, _N_PARAMETERS)
+        change = np.linalg.lstsq(normal_matrix, right, rcond=None)[0].reshape(count, _N_PARAMETERS)
         shift = change[:, 3:5]
         growth = change[:, 5]
         largest = max(np.abs(shift).max() / depth, np.abs(growth).max())
@@ -531,13 +509,7 @@ def _best_scale(
     """
     columns = jacobian / np.sqrt(precision)
     best = (AMPLITUDE, np.inf, (np.empty((0, 0)), True))
-    for scale in np.unique(
-        np.clip(
-            candidates,
-            1e-4 * AMPLITUDE,
-            AMPLITUDE,
-        )
-    ).tolist():
+    for scale in np.unique(np.clip(candidates, 1e-4 * AMPLITUDE, AMPLITUDE)).tolist():
         factor = _factorise(observations, noise, scale)
         weighted = cho_solve(factor, np.column_stack([columns, residual]))
         weighted_residual = weighted[:, -1]

@@ -71,13 +71,7 @@ def detect_contact(
         distance = np.linalg.norm(points - centre, axis=1)
         is_candidate &= distance > MIN_DISTANCE_PITCHES * model.inverse.pitch
 
-    highest_first = np.argsort(
-        -np.where(
-            is_candidate,
-            residual,
-            -np.inf,
-        )
-    )
+    highest_first = np.argsort(-np.where(is_candidate, residual, -np.inf))
     for candidate in highest_first[: is_candidate.sum()].tolist():
         position = points[candidate]
         valleys = [valley_ratio(model, centre, position, pressure) for centre in centres]
@@ -123,13 +117,7 @@ def prune_contacts(
     origin = np.zeros((1, 2))
     kernels = model.inverse.kernels
     peaks = {
-        contact.id: float(
-            kernels.disc_pressure(
-                origin,
-                contact.size,
-                contact.force,
-            )[0]
-        )
+        contact.id: float(kernels.disc_pressure(origin, contact.size, contact.force)[0])
         for contact in contacts
     }
     strongest = max(peaks.values(), default=0.0)
@@ -154,11 +142,7 @@ def valley_ratio(
 ) -> float:
     """Return the lowest pressure between two positions (3,), divided by the lower one at the
     ends."""
-    path = first + np.linspace(
-        0,
-        1,
-        _VALLEY_SAMPLES,
-    )[:, np.newaxis] * (second - first)
+    path = first + np.linspace(0, 1, _VALLEY_SAMPLES)[:, np.newaxis] * (second - first)
     along = pressure[model.nearest_points(path)]
     ends = max(min(along[0], along[-1]), _MIN_PRESSURE)
     return float(along.min() / ends)
