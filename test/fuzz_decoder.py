@@ -15,7 +15,7 @@ import zlib
 import atheris
 
 with atheris.instrument_imports(include=["cube_tensor_driver.device"]):
-    from cube_tensor_driver.device.scans.sequence import Account
+    from cube_tensor_driver.device.scans.sequence import SampleAccount
     from cube_tensor_driver.device.wire import cobs
     from cube_tensor_driver.device.wire.decoder import Decoder
     from cube_tensor_driver.device.wire.protocol import Sample, Stats, encode
@@ -36,7 +36,7 @@ def sound(part: bytes, any_type: bool) -> bytes:
 def one(data: bytes) -> None:
     provider = atheris.FuzzedDataProvider(data)
     mode, body = provider.ConsumeIntInRange(0, 2), provider.ConsumeBytes(4096)
-    decoder, account = Decoder(), Account()
+    decoder, account = Decoder(), SampleAccount()
     parts = (
         [body, b"\0"] if mode == 0 else [sound(part, mode == 2) for part in body.split(b"\xff\xff")]
     )

@@ -159,12 +159,12 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
     import numpy as np
 
     from ..calibrate.pad_rest import MIN_SAMPLES, measure_pads_at_rest
-    from ..device.scans.averages import scans
+    from ..device.scans.averages import split_into_scans
 
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     next_shown_s = 0.0
     for rows in source:
-        parts.append(scans(rows, len(source.skin.cubes)))
+        parts.append(split_into_scans(rows, len(source.skin.cubes)))
         now_s = float(parts[-1][1][-1] - parts[0][1][0])
         is_over = now_s >= REST_S
         has_enough = sum(len(each) for each, _ in parts) >= MIN_SAMPLES
@@ -192,13 +192,13 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
         explain_presses,
     )
     from ..core.oscillator import pad_stress
-    from ..device.scans.averages import averages
+    from ..device.scans.averages import average_over_time
     from ..views.terminal.output import say
 
     cubes = source.skin.cubes
     calibration = cubes[0].calibration
     detector = PressDetector(rest.frequency, rest.noise, rest.works)
-    means = averages(source, len(cubes), AVERAGE_S)
+    means = average_over_time(source, len(cubes), AVERAGE_S)
     waiting = set(np.flatnonzero(rest.works.any(axis=1)).tolist())
     expected = expected_presses(calibration, cube_rotations())
     explanations: dict[int, Explanation] = {}

@@ -25,7 +25,7 @@ from .links.reader import LinkFrames, Reader
 from .scans.cube_table import CubeAddress
 from .scans.row_account import RowAccount, RowCounts
 from .scans.scan import MakeRows, ScanBuilder, empty_rows
-from .scans.sequence import Account, Arrival
+from .scans.sequence import Arrival, SampleAccount
 from .wire.native import SLOWER, wire
 from .wire.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
 
@@ -67,7 +67,7 @@ class _LinkRecord:
     was_open: the link has been open before
     """
 
-    account: Account = field(default_factory=Account)
+    account: SampleAccount = field(default_factory=SampleAccount)
     clock: HubClock = field(default_factory=HubClock)
     problems: list[str] = field(default_factory=list)
     contradictions: list[str] = field(default_factory=list)
@@ -272,7 +272,7 @@ class LiveLinks:
 
     def _lose(self, error: Exception) -> None:
         """An error has lost rows: they are counted with its reason."""
-        lost = self._rows.lose(error)
+        lost = self._rows.count_lost(error)
         self._errors += 1
         # Not all of them: at 1 kHz they would fill the log.
         if self._errors in (1, 10, 100, 1000, 10_000):

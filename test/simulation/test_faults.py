@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError
-from cube_tensor_driver.device.scans.sequence import Account, Arrival
+from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Hello, Sample, Stats
 from cube_tensor_driver.simulation.faults import FRAME_FAULTS, KINDS, Fault, parse_faults
@@ -75,7 +75,7 @@ class FaultyLink(SimulatedLink):
 def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
     link = FaultyLink({"kind": kind, "at": 0.01, "count": 20})
     decoder, samples = link.play(100)
-    account = Account()
+    account = SampleAccount()
     arrivals = [account.sample(sample) for sample in samples]
     account.stats(Stats(10_000, link.hub.sequence, 0))
     counters = account.counters()
@@ -99,7 +99,7 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
 
 
 def test_stats_complete_the_account_and_tell_drops_from_loss():
-    account = Account()
+    account = SampleAccount()
     link = FaultyLink()
     _, samples = link.play(10)
     for sample in samples[:6]:

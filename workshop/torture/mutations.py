@@ -24,7 +24,7 @@ from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import NOISY, OPEN, RESIDUAL, SHORT, STUCK
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.links import link
-from cube_tensor_driver.device.scans.sequence import Account, Arrival
+from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
 from cube_tensor_driver.device.wire import decoder
 from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.ros import node
@@ -200,7 +200,7 @@ def _take_as(found: Arrival, instead: Arrival) -> Patch:
         arrival: Arrival = original(account, frame)
         return instead if arrival is found else arrival
 
-    return _around(Account, "sample", sample)
+    return _around(SampleAccount, "sample", sample)
 
 
 def _no_losses(original: Any, account: Any) -> dict[str, int]:
@@ -338,7 +338,7 @@ DRIVER: dict[str, tuple[str, Patch]] = {
     ),
     "losses uncounted": (
         "samples lost on the way are not counted",
-        _around(Account, "counters", _no_losses),
+        _around(SampleAccount, "counters", _no_losses),
     ),
     "checksum": ("checksums are not looked at", _believe_checksums),
     "rate ignored": ("a new rate is not asked for", _around(LiveLinks, "set_rate", _nothing)),

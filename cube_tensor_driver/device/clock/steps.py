@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable
 
-from ..scans.sequence import MAX_GAP, MEMORY
+from ..scans.sequence import MAX_DISORDER, MAX_GAP
 
 MIN_STEP_US = 4000.0
 """Smallest deviation from the period, in µs, that counts as a step. Steps of 5 ms are found, with
@@ -120,7 +120,7 @@ class SampleTiming:
         if is_known and 0 < advance <= MAX_GAP:
             return True
         # The newest sample may have another frame.
-        is_late = is_known and -MEMORY <= advance <= 0
+        is_late = is_known and -MAX_DISORDER <= advance <= 0
         if not is_late:
             self.restart()
             self._number = self._reference = number

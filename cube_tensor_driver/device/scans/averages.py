@@ -1,4 +1,4 @@
-"""Rows of a live source as whole scans and as averages, for commands that watch pads."""
+"""Whole scans, and averages over time, of the rows of a live source."""
 
 from __future__ import annotations
 
@@ -10,27 +10,49 @@ from ...core.arrays import Array
 from ...core.rows import FrequencyRows
 
 
-def scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
-    """Frequency (S, n_cubes, P) Hz of the scans in rows, NaN where a cube has no row; when each
-    began (S,) s."""
-    begins = np.diff(rows.cube.astype(int), prepend=n_cubes) <= 0
-    number = np.cumsum(begins) - 1
-    frequency = np.full((int(begins.sum()), n_cubes, rows.frequency.shape[1]), np.nan)
-    frequency[number, rows.cube] = rows.frequency
-    return frequency, rows.stamp_ns[begins].astype(np.float64) * 1e-9
+def split_into_scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
+    """Arrange rows by scan and cube.
+
+    Args:
+        rows: Rows of a live source; those of one scan are in order of the cubes.
+        n_cubes: Number of cubes of the skin.
+
+    Returns:
+        Frequencies (S, n_cubes, P) in Hz of the S scans, NaN where a cube has no row, and the stamp
+        (S,) in s of the first row of each scan.
+    """
+    # A scan begins where the index of the cube does not increase.
+    is_first = np.diff(rows.cube.astype(int), prepend=n_cubes) <= 0
+    scan = np.cumsum(is_first) - 1
+    n_scans = int(is_first.sum())
+    n_pads = rows.frequency.shape[1]
+
+    frequency = np.full((n_scans, n_cubes, n_pads), np.nan)
+    frequency[scan, rows.cube] = rows.frequency
+    return frequency, rows.stamp_ns[is_first].astype(np.float64) * 1e-9
 
 
-def averages(source: Iterable[FrequencyRows], n_cubes: int, span_s: float) -> Iterator[Array]:
-    """(n_cubes, P) Hz, the mean of the rows of each span of time; NaN without a row."""
-    kept: list[Array] = []
-    begun = None
+def average_over_time(
+    source: Iterable[FrequencyRows], n_cubes: int, duration_s: float
+) -> Iterator[Array]:
+    """Yield the mean frequency of each pad over successive durations.
+
+    Yields:
+        Frequencies (n_cubes, P) in Hz; NaN for a pad without a measurement.
+    """
+    parts: list[Array] = []
+    begin_s: float | None = None
     for rows in source:
-        frequency, seconds = scans(rows, n_cubes)
-        kept.append(frequency)
-        begun = seconds[0] if begun is None else begun
-        if seconds[-1] - begun >= span_s:
-            together = np.concatenate(kept)
-            measured = np.isfinite(together)
-            count = np.where(measured.any(axis=0), measured.sum(axis=0), np.nan)
-            yield np.where(measured, together, 0).sum(axis=0) / count
-            kept, begun = [], None
+        frequency, seconds = split_into_scans(rows, n_cubes)
+        parts.append(frequency)
+        if begin_s is None:
+            begin_s = float(seconds[0])
+        if seconds[-1] - begin_s < duration_s:
+            continue
+
+        values = np.concatenate(parts)
+        is_measured = np.isfinite(values)
+        total = np.where(is_measured, values, 0).sum(axis=0)
+        count = is_measured.sum(axis=0)
+        yield np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+        parts, begin_s = [], None

@@ -1,4 +1,4 @@
-"""Which cube of the skin each cube of each hub is, from what the hubs say in HELLO.
+"""Table that finds the cubes of the skin in the samples of the hubs, from what HELLO reports.
 
 Rows of cubes that the skin does not have, or has with another number of pads, are left out and
 counted.
@@ -15,17 +15,22 @@ from numpy.typing import NDArray
 from ..wire.protocol import Hello, Sample
 
 MAX_NAMES = 8
-"""How many cubes a message names; of the others it gives the number."""
+"""Number of cubes that a message names; the number of the others follows."""
 ABSENT = -1
-_CLAIMED = "left out here: another link has a cube of the same uid"
+"""Index of a cube that the skin does not have."""
+_OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
 
 
 @dataclass(frozen=True)
 class CubeAddress:
-    """Where the skin says that a cube is: by uid (on `link`, or on any link if that is None), or by
-    link and index.
+    """Place of a cube, as the skin file gives it: by uid, or by link and index.
 
-    n_pads: of its layout.
+    Attributes:
+        name: Name of the cube.
+        link: Index of the link; None if the cube may be on any link.
+        index: Index of the cube on the hub; None if it is found by uid.
+        uid: Unique number of the cube; None if it is found by index.
+        n_pads: Number of pads of its layout.
     """
 
     name: str
@@ -40,14 +45,16 @@ class CubeAddress:
 
 
 @dataclass
-class _Hub:
-    """What is known of the hub of one link.
+class _HubCubes:
+    """The cubes of the hub of one link.
 
-    is_present: it has said HELLO since its link was last closed or silent.
-    waits_for_cube: another hub has a cube of the same uid, which this one takes over when that hub
-    is gone.
-    cubes: (n_cubes,) index in the skin, or ABSENT.
-    complete: the same and the shape of a sample, if every cube of the hub fits the skin.
+    Attributes:
+        hello: Last HELLO; None before the first.
+        is_present: Whether HELLO has come since the link was last closed or silent.
+        waits_for_cube: Whether another hub has a cube of the same uid, which this one takes over
+            when the other is gone.
+        cubes: Index in the skin (n_cubes,), or `ABSENT`.
+        complete: The same with the shape of a sample, if every cube of the hub is in the skin.
     """
 
     hello: Hello | None = None
@@ -60,10 +67,16 @@ class _Hub:
 class CubeTable:
     """Finds the cubes of a skin in the samples of its hubs.
 
-    n_pads: of the widest cube of the skin.
-    uids: of the skin's cubes by index, as the hubs say.
-    unknown_cube, wrong_pads: rows left out because the skin does not have the cube, or has it with
-    another number of pads.
+    Args:
+        n_links: Number of links.
+        addresses: Places of the cubes of the skin.
+
+    Attributes:
+        n_pads: Largest number of pads of a cube of the skin.
+        uids: Unique number of each cube by its index in the skin, as the hubs report it.
+        unknown_cube: Number of rows left out because the skin does not have the cube.
+        wrong_pads: Number of rows left out because the skin has the cube with another number of
+            pads.
     """
 
     def __init__(self, n_links: int, addresses: Sequence[CubeAddress]) -> None:
@@ -73,21 +86,22 @@ class CubeTable:
         self.wrong_pads = 0
         self._addresses = tuple(addresses)
         self._pads = np.array([address.n_pads for address in addresses])
-        self._hubs = [_Hub() for _ in range(n_links)]
+        self._hubs = [_HubCubes() for _ in range(n_links)]
 
     def learn(self, link: int, hello: Hello) -> list[str] | None:
-        """Learn which cubes a link carries.
+        """Learn the cubes of a link.
 
-        Returns what does not fit the skin, in words; None if nothing changed.
+        Returns:
+            What does not fit the skin, in words; None if nothing has changed.
         """
         hub = self._hubs[link]
-        same = hub.hello is not None and _same_cubes(hub.hello, hello)
-        if same and hub.is_present and not hub.waits_for_cube:
+        is_same = hub.hello is not None and _has_same_cubes(hub.hello, hello)
+        if is_same and hub.is_present and not hub.waits_for_cube:
             return None
         hub.hello = hello
         hub.is_present = True
         cubes, problems = self._match(link, hello)
-        if same and np.array_equal(cubes, hub.cubes):
+        if is_same and np.array_equal(cubes, hub.cubes):
             return None
         hub.cubes = cubes
         hub.complete = None
@@ -96,17 +110,21 @@ class CubeTable:
         uids = dict(self.uids)
         for index in np.flatnonzero(cubes != ABSENT).tolist():
             uids[int(cubes[index])] = int(hello.cube_uids[index])
-        # In one step, because other threads read it.
+        # The table is replaced in one step, because other threads read it.
         self.uids = uids
         return problems
 
     def forget(self, link: int) -> None:
-        """The link was closed or fell silent: another link may take over its cubes."""
+        """Let other links take over the cubes of a link, because it was closed or is silent."""
         self._hubs[link].is_present = False
 
     def find(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
-        """The skin's cubes in a sample, and the sample without all other rows; None if none is
-        left."""
+        """Find the cubes of the skin in a sample.
+
+        Returns:
+            Index in the skin of each cube, and the sample without all other rows; None if no row is
+            left.
+        """
         if not sample.n_cubes:
             return None
         hub = self._hubs[link]
@@ -116,8 +134,10 @@ class CubeTable:
                 return cubes, sample
         return self._select(hub, sample)
 
-    def _select(self, hub: _Hub, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
-        cubes = hub.cubes[sample.first_cube : sample.first_cube + sample.n_cubes]
+    def _select(self, hub: _HubCubes, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
+        """Find the cubes of the skin in a sample with other rows, and count these."""
+        end = sample.first_cube + sample.n_cubes
+        cubes = hub.cubes[sample.first_cube : end]
         known = cubes != ABSENT
         fits = known & (self._pads[cubes] == sample.n_pads)
         if len(cubes) == sample.n_cubes and fits.all():
@@ -139,38 +159,41 @@ class CubeTable:
         return cubes[rows].astype(np.uint16), kept
 
     def _match(self, link: int, hello: Hello) -> tuple[NDArray[np.int32], list[str]]:
-        """Index in the skin of each cube of a hub, and what does not fit."""
+        """Return the index in the skin of each cube of a hub, and what does not fit."""
         uids = hello.cube_uids.tolist()
         index_of_uid: dict[int, int] = {}
-        for at, uid in enumerate(uids):
-            index_of_uid.setdefault(uid, at)
+        for index, uid in enumerate(uids):
+            index_of_uid.setdefault(uid, index)
+
         claimed = self._claimed_by_others(link)
         cubes = np.full(hello.n_cubes, ABSENT, np.int32)
-        names: dict[str, list[str]] = {}  # of the cubes, by what is wrong with them
+        names: dict[str, list[str]] = {}  # of the cubes of the skin, by what is wrong with them
         for number, address in enumerate(self._addresses):
-            index, problem = _locate(address, link, hello, index_of_uid, number in claimed)
-            if index is not None:
-                cubes[index] = number
+            found, problem = _locate(address, link, hello, index_of_uid, number in claimed)
+            if found is not None:
+                cubes[found] = number
             if problem:
                 names.setdefault(problem, []).append(str(address))
-        self._hubs[link].waits_for_cube = _CLAIMED in names
-        problems = [_about("cube", cubes_named, text) for text, cubes_named in names.items()]
+        self._hubs[link].waits_for_cube = _OTHER_LINK_HAS_IT in names
+        problems = [_join_names("cube", group, text) for text, group in names.items()]
 
         repeated: list[str] = []
         unknown: list[str] = []
-        for at in np.flatnonzero(cubes == ABSENT).tolist():
-            is_first_of_its_uid = index_of_uid[uids[at]] == at
-            names_of = unknown if is_first_of_its_uid else repeated
-            names_of.append(f"{at} (uid {uids[at]:#x})")
+        for index in np.flatnonzero(cubes == ABSENT).tolist():
+            uid = uids[index]
+            is_first_of_uid = index_of_uid[uid] == index
+            group = unknown if is_first_of_uid else repeated
+            group.append(f"{index} (uid {uid:#x})")
         if repeated:
             text = "left out: an earlier one has the same uid"
-            problems.append(_about("the hub's cube", repeated, text))
+            problems.append(_join_names("the hub's cube", repeated, text))
         if unknown:
-            problems.append(_about("the hub's cube", unknown, "not in the skin file: add it there"))
+            text = "not in the skin file: add it there"
+            problems.append(_join_names("the hub's cube", unknown, text))
         return cubes, problems
 
     def _claimed_by_others(self, link: int) -> set[int]:
-        """Cubes of the skin that present hubs of other links carry."""
+        """Return the cubes of the skin that present hubs of other links have."""
         claimed: set[int] = set()
         for other, hub in enumerate(self._hubs):
             if other != link and hub.is_present:
@@ -178,7 +201,8 @@ class CubeTable:
         return claimed
 
 
-def _same_cubes(one: Hello, other: Hello) -> bool:
+def _has_same_cubes(one: Hello, other: Hello) -> bool:
+    """Return whether two HELLOs report the same cubes."""
     return one.n_pads == other.n_pads and np.array_equal(one.cube_uids, other.cube_uids)
 
 
@@ -189,8 +213,19 @@ def _locate(
     index_of_uid: dict[int, int],
     is_claimed: bool,
 ) -> tuple[int | None, str]:
-    """Index on the hub of one cube of the skin, None if it is not there or another hub has it; and
-    what is wrong, in words."""
+    """Find one cube of the skin on a hub.
+
+    Args:
+        address: Place of the cube, as the skin file gives it.
+        link: Index of the link.
+        hello: HELLO of the hub.
+        index_of_uid: Index on the hub of each uid.
+        is_claimed: Whether a hub of another link has the cube.
+
+    Returns:
+        Index on the hub, None if the cube is not there or another hub has it; and what is wrong, in
+        words.
+    """
     if address.uid is None:
         index = address.index if address.link == link else None
         if index is not None and index >= hello.n_cubes:
@@ -202,7 +237,7 @@ def _locate(
         if index is not None and address.link not in (None, link):
             return None, "left out: by uid on this link, by the skin file on another"
         if index is not None and is_claimed:
-            return None, _CLAIMED
+            return None, _OTHER_LINK_HAS_IT
     if index is not None and address.n_pads != hello.n_pads:
         return index, (
             f"left out: the hub reports {hello.n_pads} pads, its layout has {address.n_pads}; "
@@ -211,8 +246,9 @@ def _locate(
     return index, ""
 
 
-def _about(what: str, names: Sequence[str], text: str) -> str:
-    """One line about several, the first few by name."""
-    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+def _join_names(what: str, names: Sequence[str], text: str) -> str:
+    """Return one line about several cubes, of which the first few are named."""
     plural = "s" if len(names) > 1 else ""
-    return f"{what}{plural} {', '.join(names[:MAX_NAMES])}{more} {text}"
+    listed = ", ".join(names[:MAX_NAMES])
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    return f"{what}{plural} {listed}{more} {text}"

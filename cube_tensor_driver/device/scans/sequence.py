@@ -1,5 +1,5 @@
-"""Accounts of one link's samples: which are new, which came twice or late, how many are missing and
-where they were lost."""
+"""The account of one link's samples: which are new, late or duplicate, and where others were
+lost."""
 
 from __future__ import annotations
 
@@ -10,23 +10,26 @@ from enum import Enum
 
 from ..wire.protocol import Sample, Stats
 
-MEMORY = 64
-"""How many samples are remembered. A sample that comes later than so many others is taken for the
-first of a hub that restarted."""
+MAX_DISORDER = 64
+"""Number of samples that are remembered. A sample that comes later than this many others is taken
+for the first one of a hub that restarted."""
 MAX_GAP = 1 << 20
-"""A longer gap (17 minutes at 1 kHz) means that the hub restarted, not that samples were lost."""
+"""Longest gap in the numbers (17 minutes at 1 kHz) that counts as lost samples. A longer one means
+that the hub restarted."""
 RESTART_US = 1_000_000
-"""A sample with a number below the first one seen is late if its device time is at most so far
-away; otherwise it belongs to a new run of the hub."""
-_WRAP = 0x1_0000_0000
+"""Largest difference of device time, in µs, between the newest sample and a late one with a number
+below the first. If it is larger, the hub restarted."""
+_WRAP = 1 << 32
 
 
 class Arrival(str, Enum):
-    """What a sample is, by its number.
+    """Class of a sample by its number.
 
-    new: the next one, or the first after a gap. late: out of order, and counted as missing until
-    now. duplicate: it has come before; do not deliver it. reset: the hub restarted, and this is the
-    first sample of its new count. set_back: the next one, but its device time went back.
+    NEW: the next sample, or the first after a gap. LATE: a sample out of order, which was counted
+        as
+    missing until now. DUPLICATE: a sample that has come before and must not be delivered. RESET:
+    the first sample of a hub that restarted. SET_BACK: the next sample, but its device time went
+    back.
     """
 
     NEW = "new"
@@ -38,12 +41,18 @@ class Arrival(str, Enum):
 
 @dataclass(slots=True)
 class SequenceCounters:
-    """Numbers of samples.
+    """Numbers of samples of one hub.
 
-    Samples taken by the hub since the first one seen = delivered + missing.
-    Samples received = delivered + duplicate. Those out of order are among the delivered.
-    After a restart, the samples since power-up that did not come count as missing; the last samples
-    before the restart are unknown and not counted.
+    Samples taken since the first one seen = delivered + missing. Samples received = delivered +
+    duplicate. After a restart, the samples since power-up that did not come count as missing; the
+    last samples before the restart are unknown and not counted.
+
+    Attributes:
+        delivered: Samples to deliver, including those out of order.
+        missing: Samples that did not come.
+        duplicate: Samples that had come before.
+        out_of_order: Samples that came after a later one.
+        resets: Restarts of the hub, and steps back of its clock.
     """
 
     delivered: int = 0
@@ -53,27 +62,35 @@ class SequenceCounters:
     resets: int = 0
 
     def as_dict(self) -> dict[str, int]:
+        """Return the counters by name."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
 class SequenceTracker:
-    """Follows the 32-bit sequence numbers of one hub. counters: `SequenceCounters`."""
+    """Classifies and counts samples by their 32-bit numbers.
+
+    Attributes:
+        counters: Numbers of samples.
+    """
+
+    # Numbers are unwrapped here: they continue beyond 2**32.
 
     def __init__(self) -> None:
         self.counters = SequenceCounters()
-        # Numbers are unwrapped: they count on past 2**32.
-        self._seen: deque[tuple[int, int]] = deque(maxlen=MEMORY)  # number, device time
+        self._seen: deque[tuple[int, int]] = deque(maxlen=MAX_DISORDER)  # number, device time
         self._first = 0
         self._next = 0
         self._newest_us = 0
         self._set_back = 0  # number of the first sample after the clock was last set back
 
     def update(self, sequence: int, device_us: int) -> Arrival:
-        """Classify and count one sample by its sequence number (u32) and device time (µs).
+        """Classify and count one sample in constant time.
 
-        Constant time.
+        Args:
+            sequence: Number of the sample, u32.
+            device_us: Device time of the sample, in µs.
         """
-        # The next number is the common case, and it is quick.
+        # The next number is the usual case and is handled first, for speed.
         if sequence == self._next % _WRAP and device_us >= self._newest_us:
             self._seen.append((self._next, device_us))
             self._next += 1
@@ -82,6 +99,7 @@ class SequenceTracker:
             return Arrival.NEW
         if not self._seen:
             return self._begin(sequence, device_us, Arrival.NEW)
+
         ahead = self._ahead(sequence)
         number = self._next + ahead
         if 0 <= ahead <= MAX_GAP:
@@ -93,14 +111,17 @@ class SequenceTracker:
             self._next = number + 1
             self._newest_us = device_us
             return self._deliver(number, device_us, arrival)
-        if ahead < -MEMORY or ahead > MAX_GAP:
+
+        if ahead < -MAX_DISORDER or ahead > MAX_GAP:
             return self._restart(sequence, device_us)
         if (number, device_us) in self._seen:
             self.counters.duplicate += 1
             return Arrival.DUPLICATE
-        if not self._fits(number, device_us):
+        if not self._fits_run(number, device_us):
             return self._restart(sequence, device_us)
+
         if number < self._first:
+            # The account begins with an earlier sample than it did until now.
             self.counters.missing += self._first - number - 1
             self._first = number
         else:
@@ -109,7 +130,11 @@ class SequenceTracker:
         return self._deliver(number, device_us, Arrival.LATE)
 
     def count_missing(self, taken: int) -> None:
-        """The hub has taken so many samples (u32): those that have not come by now are missing."""
+        """Count the samples that have not come by now as missing.
+
+        Args:
+            taken: Number of samples that the hub has taken, u32.
+        """
         ahead = self._ahead(taken)
         if self._seen and 0 < ahead <= MAX_GAP:
             self.counters.missing += ahead
@@ -117,19 +142,19 @@ class SequenceTracker:
 
     @property
     def first(self) -> int:
-        """Number of the first sample of the present run that is counted, delivered or missing."""
+        """Number of the first sample since the restart that is counted."""
         return self._first
 
     def _ahead(self, sequence: int) -> int:
-        """How far a u32 lies ahead of the next number; negative: behind it."""
+        """Return the distance of a number (u32) from the next one; negative if it is behind."""
         half = _WRAP // 2
         return (sequence - self._next + half) % _WRAP - half
 
-    def _fits(self, number: int, device_us: int) -> bool:
-        """Whether a sample from before the newest belongs to the same run.
+    def _fits_run(self, number: int, device_us: int) -> bool:
+        """Return whether a late sample belongs to the current run of the hub.
 
-        It does if its device time lies between those of its neighbours; where the clock was set
-        back, between those before or between those after that.
+        It does if its device time lies between those of its neighbours. Where the clock was set
+        back, only the neighbours on the same side of the step count.
         """
         if any(other == number for other, _ in self._seen):
             return False
@@ -144,37 +169,48 @@ class SequenceTracker:
         return any(_is_in_order(number, device_us, entries) for entries in (before, after))
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
+        """Begin again with a sample of a hub that restarted."""
         self.counters.resets += 1
         self._seen.clear()
         arrival = self._begin(sequence, device_us, Arrival.RESET)
         if sequence <= MAX_GAP:
-            # Numbers begin at 0 with power-up, so all before this one are missing.
+            # Numbers begin at 0 with power-up, so all samples before this one are missing.
             self.counters.missing += sequence
             self._first = self._set_back = 0
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
+        """Begin to count with a sample."""
         self._first = self._set_back = sequence
         self._next = sequence + 1
         self._newest_us = device_us
         return self._deliver(sequence, device_us, arrival)
 
     def _deliver(self, number: int, device_us: int, arrival: Arrival) -> Arrival:
+        """Count and remember a sample that is to be delivered."""
         self.counters.delivered += 1
         self._seen.append((number, device_us))
         return arrival
 
 
 def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -> bool:
-    """Whether the device times grow with the numbers."""
-    return all((us <= device_us) if other < number else (us >= device_us) for other, us in seen)
+    """Return whether the device times grow with the numbers."""
+    for other, other_us in seen:
+        is_wrong = other_us > device_us if other < number else other_us < device_us
+        if is_wrong:
+            return False
+    return True
 
 
-class Account:
-    """The account of one link: each sample that the hub took was delivered, dropped in the hub, or
-    lost on the way.
+class SampleAccount:
+    """Account of the samples of one link.
 
-    A hub with many cubes spreads a sample over several frames. Each frame counts as one sample.
+    Each sample that the hub took was delivered, dropped in the hub, or lost on the way. A hub with
+    many cubes spreads a sample over several frames, and each frame counts as one sample.
+
+    Attributes:
+        received: Number of frames received.
+        stats_frame: Last STATS of the hub; None before the first.
     """
 
     def __init__(self) -> None:
@@ -185,7 +221,7 @@ class Account:
         self._dropped_before = 0
 
     def sample(self, frame: Sample) -> Arrival:
-        """Classify and count one frame."""
+        """Classify and count one SAMPLE."""
         tracker = self._trackers.get(frame.first_cube)
         if tracker is None:
             tracker = self._trackers[frame.first_cube] = SequenceTracker()
@@ -193,11 +229,12 @@ class Account:
         return tracker.update(frame.sequence, frame.device_us)
 
     def stats(self, frame: Stats) -> None:
-        """Compare with the hub's own count."""
+        """Compare the account with the counters of the hub."""
         last, self.stats_frame = self.stats_frame, frame
         joined_late = all(tracker.first for tracker in self._trackers.values())
         if last is None and joined_late:
-            # What the hub dropped before our first sample is not ours to count.
+            # Samples that the hub dropped before the first one received are not part of the
+            # account.
             self._dropped_before = frame.dropped
         elif last is not None and frame.uptime_ms < last.uptime_ms:
             # The hub restarted, perhaps before any sample of the new run came.
@@ -211,20 +248,21 @@ class Account:
 
     @property
     def resets(self) -> int:
+        """Number of restarts of the hub and steps back of its clock."""
         return sum(tracker.counters.resets for tracker in self._trackers.values())
 
     def counters(self) -> dict[str, int]:
-        """taken = delivered + dropped_in_hub + lost_on_the_way; received = delivered +
-        duplicate."""
-        # A copy, because another thread may add a tracker.
+        """Return the numbers of samples by name.
+
+        taken = delivered + dropped_in_hub + lost_on_the_way; received = delivered + duplicate.
+        """
+        # The copy is necessary because another thread may add a tracker.
         parts = [tracker.counters for tracker in list(self._trackers.values())]
-        total = {
-            name: sum(getattr(part, name) for part in parts)
-            for name in SequenceCounters().as_dict()
-        }
+        names = SequenceCounters().as_dict()
+        total = {name: sum(getattr(part, name) for part in parts) for name in names}
         missing = total.pop("missing")
-        # Until the next STATS, a sample dropped in the hub counts as lost on the way; never the
-        # other way round.
+        # A sample dropped in the hub counts as lost on the way until the next STATS, but no sample
+        # lost on the way ever counts as dropped.
         dropped = min(self._dropped, missing)
         return {
             "taken": total["delivered"] + missing,
@@ -234,7 +272,7 @@ class Account:
         }
 
     def contradictions(self) -> list[str]:
-        """What does not add up, in words. Empty unless this program lost count."""
+        """Return errors of the account in words; empty unless the driver lost count."""
         counters = self.counters()
         delivered, duplicate = counters["delivered"], counters["duplicate"]
         if self.received == delivered + duplicate:
