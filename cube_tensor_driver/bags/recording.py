@@ -1,5 +1,5 @@
-"""What a bag says beside its frequencies: which settings were in force when, and the verdicts about
-pads."""
+"""What a bag states beside its frequencies: the settings, each from its time on, and the health of
+the pads."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.skin import Skin, SkinCube, SkinLink
+from ..core.arrays import Array, pad_table
 from ..core.calibration import Calibration
 from ..core.errors import BagError, MessageError
 from ..core.reconstructor import RecordedHealth
@@ -18,30 +18,41 @@ from ..core.tensor import rpy_from_quaternion
 from ..messages.codec import SECOND
 from ..messages.skin_info import cube_calibrations
 from .read import Bag
-from .recorded_verdicts import VerdictReader
+from .recorded_health import RecordedHealthReader
 
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What stress was made with.
+    """What stress was reconstructed with.
 
-    calibrations: of the cubes in order
-    rest_frequency: (cubes, P) Hz as they were after tare; NaN where a cube has no such pad
+    Attributes:
+        calibrations: Calibration of each cube, in order.
+        rest_frequency: (cubes, P) frequencies without load after the last tare, in Hz; NaN where a
+            cube has no such pad.
     """
 
     calibrations: tuple[Calibration, ...]
-    rest_frequency: NDArray[np.float64]
+    rest_frequency: Array
 
 
 class Recording:
-    """The infos and verdicts that belong to the frequencies on `topic` of an open bag.
+    """The settings and the recorded health that belong to the frequencies on one topic.
 
-    infos: SkinInfo messages in the order of their stamps
-    settings: one for each info
-    BagError: there is no info, or it cannot be used.
+    Attributes:
+        infos: SkinInfo messages in the order of their stamps.
+        settings: Settings of each info.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
+        """Read the infos of an open bag.
+
+        Args:
+            bag: Open bag.
+            topic: Topic of the frequencies.
+
+        Raises:
+            BagError: There is no info, or it cannot be used.
+        """
         self._bag = bag
         self.infos = sorted(skin_infos(bag, topic), key=stamp_ns)
         try:
@@ -49,31 +60,44 @@ class Recording:
         except MessageError as error:
             raise BagError(f"{bag.path}: {error}") from None
         self._since_ns = np.array([stamp_ns(info) for info in self.infos])
-        self._verdicts = VerdictReader(bag, topic)
+        self._health = RecordedHealthReader(bag, topic)
+
+    def __repr__(self) -> str:
+        return f"Recording({self.infos[-1].name!r} of {self._bag.path}: {len(self.infos)} infos)"
 
     @property
     def skin(self) -> Skin:
-        """The skin as the last info has it."""
+        """The skin as the last info describes it."""
         return recorded_skin(self.infos[-1], self.settings[-1].calibrations)
 
     def number_at(self, newest_ns: Any) -> Any:
-        """Which info holds for a message whose newest row has this stamp; of an array (M,) too.
+        """Return which info holds for a message, by its place in `infos`.
 
         An info holds for what was sampled from its stamp on: the node stamps it just behind the
-        last row that was made without it.
+        last row that was reconstructed without it.
+
+        Args:
+            newest_ns: Stamp of the newest row of the message, in ns; or an array (M,) of stamps.
         """
         return np.maximum(np.searchsorted(self._since_ns, newest_ns, side="right") - 1, 0)
 
     def settings_at(self, rows: FrequencyRows) -> Settings:
-        """The settings under which the rows of one message were reconstructed."""
+        """Return the settings under which the rows of one message were reconstructed."""
         return self.settings[int(self.number_at(rows.stamp_ns.max(initial=0)))]
 
-    def verdicts(self, rows: FrequencyRows) -> RecordedHealth:
-        """What was found bad of rows when they were recorded. Fastest in the order of recording."""
-        return self._verdicts.of(rows)
+    def health_at(self, rows: FrequencyRows) -> RecordedHealth:
+        """Return the health of the pads that was found when rows were recorded.
+
+        It is fastest when rows are asked for in the order of recording.
+        """
+        return self._health.health_at(rows)
 
     def check_calibrations_stay(self) -> None:
-        """BagError: cubes change their calibration within the recording."""
+        """Check that no cube changes its calibration.
+
+        Raises:
+            BagError: One does.
+        """
         ids = [[one.id for one in settings.calibrations] for settings in self.settings]
         if any(other != ids[0] for other in ids):
             raise BagError(
@@ -83,10 +107,13 @@ class Recording:
 
 
 def skin_infos(bag: Bag, topic: str) -> list[Any]:
-    """The infos of the skin whose frequencies are on `topic`. BagError: there is none.
+    """Return the infos of the skin whose frequencies are on a topic.
 
-    They are the reconstruction's. The driver knows of no tare: what it says counts only where no
-    reconstruction ran. It says it on `driver/info`; bags of older versions have it on `info`, too.
+    They are the reconstruction's. The driver does not know of a tare: its info on `driver/info`
+    counts only where no reconstruction ran.
+
+    Raises:
+        BagError: There is none.
     """
     skin = topic.removesuffix("frequencies")
     own, of_driver = f"{skin}info", f"{skin}driver/info"
@@ -95,31 +122,36 @@ def skin_infos(bag: Bag, topic: str) -> list[Any]:
     return [info for info in infos if info.sender == "reconstruction"] or infos
 
 
-def stamp_ns(info: Any) -> int:
-    """When an info became true."""
-    return int(info.header.stamp.sec) * SECOND + int(info.header.stamp.nanosec)
+def stamp_ns(message: Any) -> int:
+    """Return the stamp of a message's header, in ns since the epoch."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
 def settings_of(info: Any) -> Settings:
-    """The settings that a SkinInfo describes. MessageError: they contradict each other."""
+    """Return the settings that a SkinInfo describes.
+
+    Raises:
+        MessageError: They contradict each other.
+    """
     calibrations = cube_calibrations(info)
     if not calibrations:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
-    widest = max(calibration.layout.n_pads for calibration in calibrations)
-    rest = np.full((len(calibrations), widest), np.nan)
-    for row, cube, calibration in zip(rest, info.cubes, calibrations, strict=True):
+    rest = []
+    for cube, calibration in zip(info.cubes, calibrations, strict=True):
         layout = calibration.layout
         if len(cube.rest_frequency) != layout.n_pads:
             raise MessageError(
                 f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} "
                 f"rest frequencies, its layout {layout.name} has {layout.n_pads} pads"
             )
-        row[: layout.n_pads] = cube.rest_frequency
-    return Settings(calibrations, rest)
+        rest.append(np.asarray(cube.rest_frequency, float))
+    widest = max(map(len, rest))
+    return Settings(calibrations, pad_table(rest, widest, np.nan))
 
 
 def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
-    """The skin of a SkinInfo. A bag does not say where the ports of its links were."""
+    """Return the skin of a SkinInfo; a bag does not state where the ports of its links were."""
     names = dict.fromkeys(cube.link for cube in info.cubes if cube.link)
     links = tuple(SkinLink(name, "recorded", 0, None) for name in names)
     cubes = []
@@ -128,13 +160,13 @@ def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
         roll, pitch, yaw = rpy_from_quaternion(np.array([q.x, q.y, q.z, q.w])).tolist()
         cubes.append(
             SkinCube(
-                cube.name,
-                cube.link or None,
-                int(cube.index),
-                int(cube.uid) or None,
-                (float(position.x), float(position.y), float(position.z)),
-                (roll, pitch, yaw),
-                calibration,
+                name=cube.name,
+                link=cube.link or None,
+                index=int(cube.index),
+                uid=int(cube.uid) or None,
+                xyz=(float(position.x), float(position.y), float(position.z)),
+                rpy=(roll, pitch, yaw),
+                calibration=calibration,
             )
         )
     return Skin(info.name, info.header.frame_id, None, links, tuple(cubes))

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.skin import Skin
+from ..core.arrays import Times
 from ..core.errors import BagError
 from ..core.pattern import count_repeats
 from ..core.rows import FrequencyRows
@@ -23,33 +23,46 @@ from .recording import Recording
 class Segment(NamedTuple):
     """Messages that follow each other, with the same cubes and under the same info.
 
-    recorded_ns: (M,) when each was recorded; number: of the info in `Recording.infos`
+    Attributes:
+        messages: M messages of frequencies.
+        recorded_ns: (M,) when each was recorded, in ns.
+        number: Place of the info in `Recording.infos`.
     """
 
     messages: Decoded[FrequencyRows]
-    recorded_ns: NDArray[np.int64]
+    recorded_ns: Times
     number: int
 
 
 class BagSource:
-    """The frequencies on one topic of a bag. A context manager, which closes the bag.
+    """The frequencies on one topic of a bag; a context manager that closes the bag.
 
-    bag: the bag, open
-    topic: of the frequencies
-    recording: settings and verdicts that belong to the rows
-    skin: as it was recorded
-    is_live: False
-    messages, rows: delivered so far
+    Attributes:
+        bag: The open bag.
+        topic: Topic of the frequencies.
+        recording: Settings and recorded health that belong to the rows.
+        skin: The skin as it was recorded.
+        is_live: Always false.
+        messages: Number of messages delivered so far.
+        rows: Number of rows delivered so far.
     """
 
     is_live = False
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """BagError: there is no info for the topic."""
+        """Prepare to read a topic.
+
+        Raises:
+            BagError: There is no info for the topic.
+        """
         self.bag, self.topic = bag, topic
         self.recording = Recording(bag, topic)
         self.skin: Skin = self.recording.skin
         self.messages = self.rows = 0
+
+    def __repr__(self) -> str:
+        seconds = (self.bag.end_ns - self.bag.start_ns) * 1e-9
+        return f"BagSource({str(self.bag.path)!r}, {self.topic}: {self.skin!r}, {seconds:.1f} s)"
 
     def __enter__(self) -> BagSource:
         return self
@@ -58,26 +71,37 @@ class BagSource:
         self.bag.close()
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        """All rows in the order of recording: of several messages at a time where that is the same
-        to those who process them. BagError: damaged."""
+        """Yield all rows in the order of recording.
+
+        Rows of several messages come at once where that gives the same results.
+
+        Raises:
+            BagError: The bag is damaged.
+        """
         for segment in self.segments():
             yield segment.messages.rows
 
     def statistics(self) -> dict[str, object]:
-        """Messages and rows that were delivered so far."""
+        """Return the numbers of messages and rows delivered so far."""
         return {"messages": self.messages, "rows": self.rows}
 
     def segments(self) -> Iterator[Segment]:
-        """The stream as messages, for those who need their stamps. BagError: damaged."""
+        """Yield the rows together with the messages that they came in.
+
+        Raises:
+            BagError: The bag is damaged.
+        """
         for messages, recorded_ns in self.bag.frequencies(self.topic):
             cube = messages.by_message(messages.rows.cube)
             times_ns = messages.by_message(messages.rows.stamp_ns)
             newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
             number = self.recording.number_at(newest_ns)
+
+            # A segment ends where the cubes change, or the info that holds.
             ends = (cube[1:] != cube[:-1]).any(axis=1) | (number[1:] != number[:-1])
             bounds = [0, *(np.flatnonzero(ends) + 1).tolist(), len(messages)]
             for begin, end in pairwise(bounds):
-                # Only repeats of one scan mean the same together as they do one by one.
+                # Only repeats of one scan give the same results together as one by one.
                 step = end - begin if count_repeats(cube[begin]) else 1
                 for first in range(begin, end, step):
                     chosen = slice(first, first + step)
@@ -88,9 +112,14 @@ class BagSource:
 
 
 def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
-    """The frequencies that a bag holds. topic: where it holds those of several skins.
+    """Open the frequencies of a bag.
 
-    BagError: no bag, no such topic, several skins, or no info for it.
+    Args:
+        path: Folder or file of the bag.
+        topic: Topic of the frequencies; needed where the bag has those of several skins.
+
+    Raises:
+        BagError: There is no bag, no such topic, no info for it, or several skins.
     """
     bag = Bag(Path(path))
     bag.open()

@@ -1,4 +1,4 @@
-"""What a bag says about its cubes: rates, losses, gaps, and the last diagnostics."""
+"""Summary of a bag for people: rates, losses and gaps of each cube, and the last diagnostics."""
 
 from __future__ import annotations
 
@@ -7,19 +7,32 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import AnyArray, Times
 from .read import Bag
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-GAP = 1.5
-"""A step between two samples of a cube that is so many times the usual one counts as a gap."""
+
+MIN_GAP_PERIODS = 1.5
+"""Time between two samples of a cube, in median periods, from which on it counts as a gap."""
+
+SEQUENCE_RANGE = 1 << 32
+"""Number of different sequence numbers; the next one after the last is 0."""
 
 
 @dataclass(frozen=True)
 class CubeSummary:
-    """lost: samples missing in the sequence. rate (Hz) and longest_gap (s) of the time between
-    samples; None with fewer than two samples."""
+    """How completely one cube was recorded.
+
+    Attributes:
+        name: Name of the cube.
+        uid: Number of its hub.
+        samples: Number of samples.
+        lost: Number of samples missing in the sequence.
+        gaps: Number of gaps in time.
+        rate: Samples per second, from the median period; None with fewer than two samples.
+        longest_gap: Longest time between two samples, in s; None with fewer than two samples.
+    """
 
     name: str
     uid: int
@@ -31,15 +44,15 @@ class CubeSummary:
 
 
 def cube_summaries(bag: Bag, topic: str, info: Any) -> Iterator[CubeSummary]:
-    """Of every cube of a SkinInfo, from the frequencies of `topic`."""
+    """Summarise every cube of a SkinInfo from the frequencies on a topic."""
     cube, sequence, stamp_ns = _columns(bag, topic)
     for number, one in enumerate(info.cubes):
         rows = cube == number
-        yield _summary(one.name, one.uid, sequence[rows], stamp_ns[rows])
+        yield _summarise(one.name, one.uid, sequence[rows], stamp_ns[rows])
 
 
 def last_diagnostics(bag: Bag) -> list[Any]:
-    """The last DiagnosticStatus of each name, by name."""
+    """Return the last DiagnosticStatus of each name, sorted by name."""
     last = {}
     topics = set(bag.topics(DIAGNOSTICS))
     for entry in bag.entries(topics) if topics else ():
@@ -48,31 +61,28 @@ def last_diagnostics(bag: Bag) -> list[Any]:
     return [last[name] for name in sorted(last)]
 
 
-def _summary(
-    name: str, uid: int, sequence: NDArray[np.uint32], stamp_ns: NDArray[np.int64]
-) -> CubeSummary:
+def _summarise(name: str, uid: int, sequence: AnyArray, stamp_ns: Times) -> CubeSummary:
+    """Summarise the samples of one cube."""
     if len(sequence) < 2:
         return CubeSummary(name, uid, len(sequence))
-    steps = np.diff(sequence).astype(np.uint32).astype(np.int64)
-    # A step of half the range is a hub that restarted, not loss.
-    lost = (steps[(steps > 0) & (steps < 1 << 31)] - 1).sum()
-    times_ns = np.diff(stamp_ns)
-    usual_ns = float(np.median(times_ns))
+    steps = np.mod(np.diff(sequence.astype(np.int64)), SEQUENCE_RANGE)
+    # A step of half the range or more is a hub that restarted, not loss.
+    lost = (steps[(steps > 0) & (steps < SEQUENCE_RANGE // 2)] - 1).sum()
+    periods_ns = np.diff(stamp_ns)
+    median_ns = float(np.median(periods_ns))
     return CubeSummary(
         name,
         uid,
-        len(sequence),
+        samples=len(sequence),
         lost=int(lost),
-        gaps=int(np.count_nonzero(times_ns > GAP * usual_ns)),
-        rate=1e9 / usual_ns if usual_ns > 0 else np.nan,
-        longest_gap=1e-9 * float(times_ns.max()),
+        gaps=int(np.count_nonzero(periods_ns > MIN_GAP_PERIODS * median_ns)),
+        rate=1e9 / median_ns if median_ns > 0 else np.nan,
+        longest_gap=1e-9 * float(periods_ns.max()),
     )
 
 
-def _columns(
-    bag: Bag, topic: str
-) -> tuple[NDArray[np.uint16], NDArray[np.uint32], NDArray[np.int64]]:
-    """cube, sequence and stamp_ns of all rows."""
+def _columns(bag: Bag, topic: str) -> tuple[AnyArray, AnyArray, Times]:
+    """Return cube, sequence number and stamp of all rows."""
     cube = [np.empty(0, np.uint16)]
     sequence = [np.empty(0, np.uint32)]
     stamp_ns = [np.empty(0, np.int64)]

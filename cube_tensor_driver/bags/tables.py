@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,9 @@ from ..core.errors import BagError
 from ..core.modes import COMPONENTS, STRESS
 from ..core.rows import StressRows
 
-GROUP = 1 << 16
-"""Rows at a time: one row group of a Parquet file."""
+ROWS_PER_GROUP = 1 << 16
+"""Number of rows written at a time: one row group of a Parquet file."""
+
 _SCHEMA = pyarrow.schema(
     [
         ("stamp_ns", pyarrow.int64()),
@@ -31,72 +34,75 @@ _SCHEMA = pyarrow.schema(
 )
 
 
+@contextmanager
+def report_write_errors(path: Path) -> Iterator[None]:
+    """Turn an error of the file system into a BagError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise BagError(
+            f"{path}: {error.strerror or error}; name a folder that can be written, on a disk "
+            "with room"
+        ) from None
+
+
 class TableWriter:
-    """A table of rows; a context that completes it. NaN: not observed. BagError: cannot be
-    written."""
+    """A new table of stress; a context manager that completes it. NaN stands for not observed."""
 
     def __init__(self, path: Path, cubes: list[str]) -> None:
+        """Create the file.
+
+        Args:
+            path: File; its suffix decides the format, ``.csv`` or else Parquet.
+            cubes: Names of the cubes. Rows of cubes that the skin does not have get the last one.
+
+        Raises:
+            BagError: The file cannot be written.
+        """
         self._path = path
         self._cubes = pyarrow.array(cubes)
         self._batches: list[Any] = []
-        self._rows = 0
-        self._csv = path.suffix == ".csv"
-        schema = _SCHEMA.set(1, pyarrow.field("cube", pyarrow.string())) if self._csv else _SCHEMA
-        self._schema = schema
-        make = pyarrow.csv.CSVWriter if self._csv else pyarrow.parquet.ParquetWriter
-        try:
-            self._writer = make(str(path), schema)
-        except OSError as error:
-            raise BagError(
-                f"{path}: {error.strerror or error}; name a folder that can be written"
-            ) from None
+        self._waiting_rows = 0
+        self._is_csv = path.suffix == ".csv"
+        self._schema = _SCHEMA
+        if self._is_csv:
+            self._schema = _SCHEMA.set(1, pyarrow.field("cube", pyarrow.string()))
+        make = pyarrow.csv.CSVWriter if self._is_csv else pyarrow.parquet.ParquetWriter
+        with report_write_errors(path):
+            self._writer = make(str(path), self._schema)
 
     def __enter__(self) -> TableWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        try:
+        with report_write_errors(self._path):
             self._flush()
             self._writer.close()
-        except OSError as error:
-            raise BagError(
-                f"{self._path}: {error.strerror or error}; name a disk with room"
-            ) from None
 
     def write(self, rows: StressRows) -> None:
-        """Add rows."""
-        # Rows of cubes that the skin does not have get the last name.
-        names = pyarrow.DictionaryArray.from_arrays(
-            np.minimum(rows.cube, len(self._cubes) - 1).astype(np.int32), self._cubes
-        )
+        """Add rows.
+
+        Raises:
+            BagError: The disk is full or gone.
+        """
+        numbers = np.minimum(rows.cube, len(self._cubes) - 1).astype(np.int32)
+        names = pyarrow.DictionaryArray.from_arrays(numbers, self._cubes)
         columns = [
-            rows.stamp_ns,
-            names,
-            rows.sequence,
-            *rows.stress.T,
-            *rows.gradient.T,
-            rows.residual,
-            rows.status,
-            rows.observed,
-            rows.left_out,
+            pyarrow.array(rows.stamp_ns),
+            names.dictionary_decode() if self._is_csv else names,
+            pyarrow.array(rows.sequence),
+            *map(pyarrow.array, rows.stress.T),
+            *map(pyarrow.array, rows.gradient.T),
+            *map(pyarrow.array, (rows.residual, rows.status, rows.observed, rows.left_out)),
         ]
-        arrays = [
-            pyarrow.array(column) if isinstance(column, np.ndarray) else column
-            for column in columns
-        ]
-        if self._csv:
-            arrays[1] = names.dictionary_decode()
-        self._batches.append(pyarrow.RecordBatch.from_arrays(arrays, schema=self._schema))
-        self._rows += len(rows)
-        if self._rows >= GROUP:
-            try:
+        self._batches.append(pyarrow.RecordBatch.from_arrays(columns, schema=self._schema))
+        self._waiting_rows += len(rows)
+        if self._waiting_rows >= ROWS_PER_GROUP:
+            with report_write_errors(self._path):
                 self._flush()
-            except OSError as error:
-                raise BagError(
-                    f"{self._path}: {error.strerror or error}; name a disk with room"
-                ) from None
 
     def _flush(self) -> None:
+        """Write the rows that wait."""
         if self._batches:
             self._writer.write_table(pyarrow.Table.from_batches(self._batches))
-        self._batches, self._rows = [], 0
+        self._batches, self._waiting_rows = [], 0

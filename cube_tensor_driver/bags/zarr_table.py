@@ -11,9 +11,11 @@ import zarr
 from ..core.errors import BagError
 from ..core.modes import COMPONENTS, STRESS
 from ..core.rows import StressRows, concatenate
+from .tables import report_write_errors
 
-CHUNK = 1 << 16
-"""Rows in a chunk."""
+ROWS_PER_CHUNK = 1 << 16
+"""Number of rows in one chunk of an array."""
+
 _UNITS = {"stamp_ns": "ns", "stress": "Pa", "gradient": "Pa/m"}
 _COMPONENTS = {"stress": COMPONENTS[: len(STRESS)], "gradient": COMPONENTS[len(STRESS) :]}
 _COLUMNS: dict[str, Any] = {
@@ -30,37 +32,30 @@ _COLUMNS: dict[str, Any] = {
 
 
 class ZarrWriter:
-    """A group of columns; a context that completes it. NaN: not observed. BagError: cannot be
-    written."""
+    """A new group of columns; a context manager that completes it. NaN stands for not observed."""
 
     def __init__(self, path: Path, cubes: list[str]) -> None:
-        """cubes: names, kept in the attributes of `cube`, which has their indices."""
+        """Create the group.
+
+        Args:
+            path: Folder of the group.
+            cubes: Names of the cubes, kept in the attributes of the column `cube`, which contains
+                their indices. Rows of cubes that the skin does not have get the last index.
+
+        Raises:
+            BagError: The library zarr is too old.
+        """
         if not hasattr(zarr.Group, "create_array"):
             raise BagError(
                 f"{path}: zarr {zarr.__version__} is too old, needed is 3: "
                 "pip install 'zarr>=3', with Python 3.11 or newer"
             )
-        self._path, self._last = path, len(cubes) - 1
+        self._path = path
+        self._last_cube = len(cubes) - 1
         self._waiting: list[StressRows] = []
-        self._rows = 0
+        self._waiting_rows = 0
         group = zarr.open_group(str(path), mode="w")
-        self._arrays: dict[str, Any] = {}
-        for name, kind in _COLUMNS.items():
-            components = _COMPONENTS.get(name, ())
-            width = (len(components),) if components else ()
-            attributes: dict[str, Any] = {"units": _UNITS[name]} if name in _UNITS else {}
-            if components:
-                attributes["components"] = list(components)
-            if name == "cube":
-                attributes["names"] = cubes
-            self._arrays[name] = group.create_array(
-                name,
-                shape=(0, *width),
-                chunks=(CHUNK, *width),
-                dtype=np.dtype(kind),
-                dimension_names=["row", f"{name}_component"] if components else ["row"],
-                attributes=attributes,
-            )
+        self._arrays = {name: _create_column(group, name, cubes) for name in _COLUMNS}
 
     def __enter__(self) -> ZarrWriter:
         return self
@@ -69,24 +64,43 @@ class ZarrWriter:
         self._flush()
 
     def write(self, rows: StressRows) -> None:
-        """Add rows."""
+        """Add rows.
+
+        Raises:
+            BagError: The disk is full or gone.
+        """
         self._waiting.append(rows)
-        self._rows += len(rows)
-        if self._rows >= CHUNK:
+        self._waiting_rows += len(rows)
+        if self._waiting_rows >= ROWS_PER_CHUNK:
             self._flush()
 
     def _flush(self) -> None:
+        """Write the rows that wait."""
         if not self._waiting:
             return
         rows = concatenate(self._waiting)
-        # Rows of cubes that the skin does not have get the last name.
         columns = {name: getattr(rows, name) for name in self._arrays}
-        columns["cube"] = np.minimum(rows.cube, self._last)
-        try:
+        columns["cube"] = np.minimum(rows.cube, self._last_cube)
+        with report_write_errors(self._path):
             for name, array in self._arrays.items():
                 array.append(columns[name])
-        except OSError as error:
-            raise BagError(
-                f"{self._path}: {error.strerror or error}; name a disk with room"
-            ) from None
-        self._waiting, self._rows = [], 0
+        self._waiting, self._waiting_rows = [], 0
+
+
+def _create_column(group: Any, name: str, cubes: list[str]) -> Any:
+    """Create the array of one column, with attributes that state what it means."""
+    components = _COMPONENTS.get(name, ())
+    width = (len(components),) if components else ()
+    attributes: dict[str, Any] = {"units": _UNITS[name]} if name in _UNITS else {}
+    if components:
+        attributes["components"] = list(components)
+    if name == "cube":
+        attributes["names"] = cubes
+    return group.create_array(
+        name,
+        shape=(0, *width),
+        chunks=(ROWS_PER_CHUNK, *width),
+        dtype=np.dtype(_COLUMNS[name]),
+        dimension_names=["row", f"{name}_component"] if components else ["row"],
+        attributes=attributes,
+    )

@@ -81,7 +81,7 @@ def loads_at(rest: np.ndarray, seconds: float) -> np.ndarray:
 
 def test_the_recorded_stress_comes_again_whoever_iterates(bag):
     """By `reconstruct`, and by a loop over rows that asks the recording for settings and
-    verdicts."""
+    health."""
     with open_bag(bag) as source:
         recorded = recorded_stress(source)
         assert_same([stress for _, stress in reconstruct(source)], recorded)
@@ -90,7 +90,7 @@ def test_the_recorded_stress_comes_again_whoever_iterates(bag):
         for rows in source:
             if settings is not (settings := source.recording.settings_at(rows)):
                 reconstructor.rest_frequency = settings.rest_frequency
-            made.append(reconstructor.process(rows, source.recording.verdicts(rows)))
+            made.append(reconstructor.process(rows, source.recording.health_at(rows)))
         assert_same(made, recorded)
     assert (np.concatenate([rows.status for rows in recorded]) & STUCK).any()
 
@@ -111,23 +111,23 @@ def test_message_by_message_too_and_again_after_a_jump_back(bag):
             for k in range(0, len(messages.rows), 16)
         ]
     for k in [*range(MESSAGES), *range(80, 120), *range(0, 10), 150, 3]:
-        stress = reconstructor.process(rows[k], recording.verdicts(rows[k], reconstructor))
+        stress = reconstructor.process(rows[k], recording.health_at(rows[k], reconstructor))
         assert_same([stress], [recorded[k]])
     recording.close()
 
 
-def test_verdicts_go_by_cube_and_stamp(bag):
+def test_health_goes_by_cube_and_stamp(bag):
     with open_bag(bag) as source:
         rows = next(iter(source))
         some = rows.select(np.random.default_rng(1).permutation(len(rows))[:300])
-        verdicts = source.recording.verdicts(some)
-        assert verdicts.known.all()
+        health = source.recording.health_at(some)
+        assert health.known.all()
         shifted = dataclasses.replace(some, stamp_ns=some.stamp_ns + 1)
-        assert not source.recording.verdicts(shifted).known.any()
+        assert not source.recording.health_at(shifted).known.any()
         later = next(rows for rows in source if rows.stamp_ns[0] > START_NS + 1_200_000_000)
-        verdicts = source.recording.verdicts(later)
-        assert (verdicts.left_out == np.where(later.cube == 3, 4, 0)).all()
-        assert ((verdicts.status & STUCK != 0) == (later.cube == 3)).all()
+        health = source.recording.health_at(later)
+        assert (health.left_out == np.where(later.cube == 3, 4, 0)).all()
+        assert ((health.status & STUCK != 0) == (later.cube == 3)).all()
 
 
 def test_cubes_that_are_no_repeated_pattern_come_message_by_message(tmp_path):

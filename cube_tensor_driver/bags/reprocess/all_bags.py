@@ -17,9 +17,11 @@ from ...core.errors import BagError, ConfigError, CubeError
 from .contacts import ContactsOverTime
 from .job import PARTIAL, Overrides, ReprocessJob, ReprocessResult, reprocess
 
-SUFFIX = {"bag": "", "parquet": ".parquet", "csv": ".csv", "zarr": ".zarr"}
+SUFFIXES = {"bag": "", "parquet": ".parquet", "csv": ".csv", "zarr": ".zarr"}
+"""Suffix of the output, by its format."""
+
 RECIPE = "reprocess.yaml"
-"""File in the folder of the results that says how they were made."""
+"""File in the folder of the results that states how they were made."""
 
 
 def make_jobs(
@@ -29,7 +31,18 @@ def make_jobs(
     overrides: Overrides,
     contacts: ContactsOverTime | None = None,
 ) -> list[ReprocessJob]:
-    """One job per bag, whose name its result has. BagError: two bags have one name."""
+    """Make one job per bag; its result has the name of the bag.
+
+    Args:
+        bags: The bags.
+        folder: Folder of the results.
+        form: Format of the results, a key of `SUFFIXES`.
+        overrides: What differs from the recordings.
+        contacts: How contacts are computed; None: not at all.
+
+    Raises:
+        BagError: Two bags have the same name.
+    """
     names: dict[str, Path] = {}
     for bag in bags:
         path = bag.resolve()
@@ -40,7 +53,7 @@ def make_jobs(
             )
         names[name] = bag
     return [
-        ReprocessJob(bag, folder / f"{name}{SUFFIX[form]}", form, overrides, contacts)
+        ReprocessJob(bag, folder / f"{name}{SUFFIXES[form]}", form, overrides, contacts)
         for name, bag in names.items()
     ]
 
@@ -48,9 +61,12 @@ def make_jobs(
 def write_recipe(
     folder: Path, form: str, overrides: Overrides, contacts: ContactsOverTime | None = None
 ) -> None:
-    """Make the folder and note how its results are made, so that a restart continues the same way.
+    """Create the folder and note how its results are made, so that a restart continues alike.
 
-    BagError: results in it were made another way, or it cannot be written.
+    Arguments are those of `make_jobs`.
+
+    Raises:
+        BagError: Results in the folder were made another way, or it cannot be written.
     """
     cubes = overrides.skin.cubes if overrides.skin else ()
     recipe: dict[str, Any] = {
@@ -76,12 +92,12 @@ def write_recipe(
 
 
 def has_results(folder: Path) -> bool:
-    """Whether a folder of results has any."""
+    """Return whether a folder of results has any."""
     return any(path.name not in (RECIPE, PARTIAL) for path in folder.iterdir())
 
 
 def remove_without_results(folder: Path) -> None:
-    """Remove a folder in which nothing was completed, with what was begun in it."""
+    """Remove a folder in which no result was completed, with what was begun in it."""
     if folder.is_dir() and not has_results(folder):
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -89,7 +105,7 @@ def remove_without_results(folder: Path) -> None:
 def reprocess_all(
     jobs: Sequence[ReprocessJob], executor: Executor
 ) -> Iterator[tuple[ReprocessJob, ReprocessResult | CubeError]]:
-    """Each job with what it did, or with the error that ended it, as they end."""
+    """Do jobs in parallel and yield each, as it ends, with its result or its error."""
     futures = {executor.submit(reprocess, job): job for job in jobs}
     for future in as_completed(futures):
         try:
@@ -100,9 +116,15 @@ def reprocess_all(
 
 @contextmanager
 def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
-    """`count` processes here, or the Dask cluster at the address `scheduler`.
+    """Provide worker processes.
 
-    ConfigError: no scheduler there. ModuleNotFoundError: `distributed` is not installed.
+    Args:
+        count: Number of processes on this machine.
+        scheduler: Address of a Dask cluster to use instead; None: this machine.
+
+    Raises:
+        ConfigError: There is no scheduler at the address.
+        ModuleNotFoundError: `distributed` is not installed.
     """
     if scheduler is None:
         # A process per core needs no threads beside it. The processes inherit it.
@@ -124,5 +146,5 @@ def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
 
 
 def useful_workers(wanted: int | None, jobs: int) -> int:
-    """At least one and no more than jobs; None: one per core."""
+    """Return the number of workers: as wanted (None: one per core), but at most one per job."""
     return max(1, min(wanted or os.cpu_count() or 1, jobs))

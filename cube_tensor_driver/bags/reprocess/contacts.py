@@ -1,13 +1,11 @@
-"""Contacts and the surface's traction out of the stress of a bag: a sink beside its writer."""
+"""Contacts and traction on the surface, computed from the stress of a bag and written with it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ...core.arrays import Times
 from ...core.errors import BagError
 from ...core.latest_stress import STALE_S, LatestStress
 from ...core.rows import StressRows
@@ -23,19 +21,28 @@ from ..write import BagWriter
 
 @dataclass(frozen=True)
 class ContactsOverTime:
-    """settings: how contacts are found; rate: messages per second at most."""
+    """How contacts of a bag are computed.
+
+    Attributes:
+        settings: Method and parameters.
+        rate: Largest number of messages per second.
+    """
 
     settings: ContactSettings
     rate: float
 
 
 class ContactWriter:
-    """Writes `contacts` and `traction` of one skin into a bag, as the node publishes them.
-
-    Parameters: topics: what the skin's topics begin with.
-    """
+    """Writes `contacts` and `traction` of one skin into a bag, as the node publishes them."""
 
     def __init__(self, writer: BagWriter, topics: str, wanted: ContactsOverTime) -> None:
+        """Add the topics to a bag.
+
+        Args:
+            writer: The bag.
+            topics: Prefix of the skin's topics.
+            wanted: How contacts are computed.
+        """
         self._writer, self._wanted = writer, wanted
         self._period_ns = 1e9 / wanted.rate
         self._contacts, self._traction = f"{topics}contacts", f"{topics}traction"
@@ -47,37 +54,44 @@ class ContactWriter:
         self._last_ns: int | None = None
 
     def set_up(self, info: Any) -> None:
-        """For the rows that follow. As in the node, contacts go on where cubes stay in place.
+        """Use a SkinInfo for the rows that follow.
 
-        CubeError: no contacts can be computed on such a skin.
+        As in the node, contacts continue where the cubes stay in place.
+
+        Raises:
+            CubeError: No contacts can be computed on such a skin.
         """
         if self._geometry == geometry(info):
             return
         self._finder = contact_finder(
             self._wanted.settings, cube_poses(info), cube_calibrations(info)
         )
-        self._newest = LatestStress(len(info.cubes))
+        self._latest = LatestStress(len(info.cubes))
         self._geometry, self._frame_id = geometry(info), info.header.frame_id
 
-    def write(
-        self, stress: StressRows, messages: Decoded[Any], recorded_ns: NDArray[np.int64]
-    ) -> None:
-        """What M messages of stress say, written when each of them was recorded."""
-        rows = len(stress) // len(messages)
+    def write(self, stress: StressRows, messages: Decoded[Any], recorded_ns: Times) -> None:
+        """Compute the contacts of M messages and write them when each message was recorded.
+
+        Args:
+            stress: Rows of all messages, message after message.
+            messages: The messages of frequencies.
+            recorded_ns: (M,) when each was recorded, in ns.
+        """
+        rows_per_message = len(stress) // len(messages)
         begin = 0
         for number, stamp_ns in enumerate(messages.stamp_ns.tolist()):
             if not self._is_due(stamp_ns):
                 continue
-            end = (number + 1) * rows
-            self._newest.update(stress.select(slice(begin, end)), stamp_ns * 1e-9)
+            end = (number + 1) * rows_per_message
+            self._latest.update(stress.select(slice(begin, end)), stamp_ns * 1e-9)
             begin = end
             self._write(stamp_ns, int(recorded_ns[number]))
         if begin < len(stress):
             last_ns = int(messages.stamp_ns[-1])
-            self._newest.update(stress.select(slice(begin, len(stress))), last_ns * 1e-9)
+            self._latest.update(stress.select(slice(begin, len(stress))), last_ns * 1e-9)
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Whether a period has passed, or time fell back."""
+        """Return whether a period has passed since the last message, or time jumped back."""
         last = self._last_ns
         if last is not None and 0 <= stamp_ns - last < self._period_ns:
             return False
@@ -85,10 +99,11 @@ class ContactWriter:
         return True
 
     def _write(self, stamp_ns: int, recorded_ns: int) -> None:
+        """Write the contacts of the newest stress."""
         if self._finder is None:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
-        values = self._newest.usable_values(self._newest.health(stamp_ns * 1e-9, STALE_S))
-        contacts = self._finder.update(values, self._newest.left_out)
+        values = self._latest.usable_values(self._latest.health(stamp_ns * 1e-9, STALE_S))
+        contacts = self._finder.update(values, self._latest.left_out)
         message = contacts_message(make_message, stamp_ns, self._frame_id, contacts)
         self._writer.write(self._contacts, recorded_ns, serialise(message))
         cloud = self._finder.cloud(values)

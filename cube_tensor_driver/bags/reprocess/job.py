@@ -1,4 +1,4 @@
-"""Recorded frequencies to stress again: a bag source, a Reconstructor, a writer.
+"""Stress computed again from recorded frequencies: a bag source, a Reconstructor, a writer.
 
 The result has the bits that the reconstruction node published, unless something is asked for that
 differs from the recording.
@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...config.calibration import calibration_text
 from ...config.skin import Skin
+from ...core.arrays import Array
 from ...core.calibration import Calibration
 from ...core.errors import BagError, CalibrationError, CubeError
 from ...core.pipeline import Pipeline
@@ -37,19 +37,23 @@ if TYPE_CHECKING:
     from ..zarr_table import ZarrWriter
 
 PARTIAL = ".partial"
-"""Folder beside the results for what is not complete; a restart begins those again."""
+"""Folder beside the results for results that are not complete. A restart begins those again."""
+
 WORKING_BYTES = 30 << 20
-NAMED = 5
-"""Cubes that a message names at most."""
+"""Size of the block that makes glibc's malloc keep the memory of a batch for the next one."""
+
+MAX_NAMED_CUBES = 5
+"""Largest number of cubes that a message names."""
 
 
 @dataclass(frozen=True)
 class Overrides:
-    """What differs from the recording. None: as it was recorded.
+    """What differs from the recording; None means as recorded.
 
-    calibration: for all cubes
-    skin: the calibrations of its cubes, by the cubes' names
-    tare: (begin, end) in s after the start of the bag, between which nothing touched the skin
+    Attributes:
+        calibration: Calibration of all cubes.
+        skin: Skin whose calibrations are used, by the names of the cubes.
+        tare: Begin and end of a time when nothing touched the skin, in s after the bag's start.
     """
 
     calibration: Calibration | None = None
@@ -58,17 +62,24 @@ class Overrides:
 
     @property
     def any(self) -> bool:
+        """Whether anything differs."""
         return any(value is not None for value in (self.calibration, self.skin, self.tare))
 
 
 AS_RECORDED = Overrides()
+"""Overrides of nothing."""
 
 
 @dataclass(frozen=True)
 class ReprocessJob:
     """One bag to reprocess.
 
-    form of the output: bag, parquet, csv or zarr; contacts: a bag has them, too
+    Attributes:
+        bag: Folder or file of the bag.
+        output: Folder or file to write.
+        form: Format of the output: bag, parquet, csv or zarr.
+        overrides: What differs from the recording.
+        contacts: How contacts are computed, which a bag then has, too; None: it has none.
     """
 
     bag: Path
@@ -79,7 +90,13 @@ class ReprocessJob:
 
 
 class ReprocessResult(NamedTuple):
-    """Messages and rows of stress that were made; how much time the bag covers, s."""
+    """What a job made.
+
+    Attributes:
+        messages: Number of messages of stress.
+        rows: Number of rows of stress.
+        seconds: Duration of the bag, in s.
+    """
 
     messages: int
     rows: int
@@ -89,10 +106,11 @@ class ReprocessResult(NamedTuple):
 def reprocess(job: ReprocessJob) -> ReprocessResult:
     """Do one job. The output appears when it is complete.
 
-    BagError: what is wrong with the bag, the overrides or the output.
+    Raises:
+        BagError: The bag is damaged, the overrides do not fit, or the output cannot be written.
     """
-    # glibc's malloc keeps freed memory up to twice the largest block that it has given back. This
-    # block makes it keep the arrays of the batches, which come again and again.
+    # glibc's malloc keeps freed memory up to twice the largest block that it has given back. After
+    # this block it keeps the arrays of the batches, which are requested again and again.
     np.empty(WORKING_BYTES, np.uint8)
     partial = job.output.parent / PARTIAL / job.output.name
     try:
@@ -104,7 +122,7 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
         with Bag(job.bag) as bag:
             result = _reprocess(bag, job, partial)
         partial.replace(job.output)
-        with suppress(OSError):  # other jobs are at work in there
+        with suppress(OSError):  # the folder is in use where other jobs are at work
             partial.parent.rmdir()
     except OSError as error:
         raise BagError(
@@ -113,64 +131,12 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
     return result
 
 
-def _reprocess(bag: Bag, job: ReprocessJob, output: Path) -> ReprocessResult:
-    topics = bag.topics(FREQUENCIES)
-    if not topics:
-        raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
-    if job.form != "bag" and len(topics) > 1:
-        raise BagError(
-            f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
-        )
-    sources = [BagSource(bag, topic) for topic in topics]
-    if job.form == "bag":
-        _write_bag(sources, job.overrides, job.contacts, output)
-    else:
-        _write_table(sources[0], job.overrides, output)
-    return ReprocessResult(
-        sum(source.messages for source in sources),
-        sum(source.rows for source in sources),
-        (bag.end_ns - bag.start_ns) * 1e-9,
-    )
-
-
-def _write_bag(
-    sources: list[BagSource],
-    overrides: Overrides,
-    contacts: ContactsOverTime | None,
-    output: Path,
-) -> None:
-    with BagWriter(output) as writer:
-        for source in sources:
-            bag, skin = source.bag, source.topic.removesuffix("frequencies")
-            settings = settings_with(source, overrides)
-            writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
-            writer.add_topic(f"{skin}stress", STRESS, [quality()])
-            infos = list(_infos(source.recording.infos, settings))
-            for info in infos:
-                inside_ns = max(bag.start_ns, min(bag.end_ns, stamp_ns(info)))
-                data = serialise(info)
-                writer.write(f"{skin}info", inside_ns, data)
-            touched = None if contacts is None else ContactWriter(writer, skin, contacts)
-            for segment, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):
-                messages = segment.messages
-                encoded = stress_codec.encode_many(stress, messages.stamp_ns, messages.frame_id)
-                for time_ns, data in zip(segment.recorded_ns.tolist(), encoded, strict=True):
-                    writer.write(f"{skin}stress", time_ns, data)
-                if touched is not None:
-                    touched.set_up(infos[segment.number])
-                    touched.write(stress, messages, segment.recorded_ns)
-
-
-def _write_table(source: BagSource, overrides: Overrides, output: Path) -> None:
-    settings = settings_with(source, overrides)
-    names = [cube.name for cube in source.skin.cubes]
-    with make_table(output, [*names, "unknown"]) as table:
-        for _, stress in _reconstruct(source, settings, with_verdicts=not overrides.any):
-            table.write(stress)
-
-
 def make_table(path: Path, cubes: list[str]) -> TableWriter | ZarrWriter:
-    """A table in the format that the suffix says. ModuleNotFoundError: its library is missing."""
+    """Create a table in the format that the suffix of a path states.
+
+    Raises:
+        ModuleNotFoundError: The library of the format is missing.
+    """
     if path.suffix == ".zarr":
         from ..zarr_table import ZarrWriter
 
@@ -181,56 +147,119 @@ def make_table(path: Path, cubes: list[str]) -> TableWriter | ZarrWriter:
 def reconstruct(
     source: BagSource, overrides: Overrides = AS_RECORDED
 ) -> Iterator[tuple[Segment, StressRows]]:
-    """The stress of each segment of a bag. BagError: damaged, or the overrides do not fit."""
-    return _reconstruct(source, settings_with(source, overrides), with_verdicts=not overrides.any)
+    """Yield each segment of a bag with its stress.
+
+    Raises:
+        BagError: The bag is damaged, or the overrides do not fit.
+    """
+    return _reconstruct(source, settings_with(source, overrides), use_health=not overrides.any)
+
+
+def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
+    """Return the settings of each info of a bag, with what differs.
+
+    Raises:
+        BagError: The overrides do not fit the bag.
+    """
+    recording = source.recording
+    settings = recording.settings
+    if overrides.skin is not None or overrides.calibration is not None:
+        settings = [
+            _recalibrate(source, info, recorded, overrides)
+            for info, recorded in zip(recording.infos, settings, strict=True)
+        ]
+    if overrides.tare is not None:
+        rest = _measure_rest(source, settings[-1], *overrides.tare)
+        settings = [replace(one, rest_frequency=rest) for one in settings]
+    return settings
+
+
+def _reprocess(bag: Bag, job: ReprocessJob, output: Path) -> ReprocessResult:
+    """Write the output of a job."""
+    topics = bag.topics(FREQUENCIES)
+    if not topics:
+        raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
+    if job.form != "bag" and len(topics) > 1:
+        raise BagError(
+            f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
+        )
+    sources = [BagSource(bag, topic) for topic in topics]
+    if job.form == "bag":
+        with BagWriter(output) as writer:
+            for source in sources:
+                _write_skin(source, job, writer)
+    else:
+        names = [cube.name for cube in sources[0].skin.cubes]
+        with make_table(output, [*names, "unknown"]) as table:
+            for _, stress in reconstruct(sources[0], job.overrides):
+                table.write(stress)
+    return ReprocessResult(
+        messages=sum(source.messages for source in sources),
+        rows=sum(source.rows for source in sources),
+        seconds=(bag.end_ns - bag.start_ns) * 1e-9,
+    )
+
+
+def _write_skin(source: BagSource, job: ReprocessJob, writer: BagWriter) -> None:
+    """Write info and stress of one skin into a bag, and its contacts if they are wanted."""
+    bag, skin = source.bag, source.topic.removesuffix("frequencies")
+    settings = settings_with(source, job.overrides)
+    writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
+    writer.add_topic(f"{skin}stress", STRESS, [quality()])
+    infos = list(_infos_with(source.recording.infos, settings))
+    for info in infos:
+        # An info may be stamped before the first message that was recorded.
+        inside_ns = max(bag.start_ns, min(bag.end_ns, stamp_ns(info)))
+        writer.write(f"{skin}info", inside_ns, serialise(info))
+
+    contacts = None if job.contacts is None else ContactWriter(writer, skin, job.contacts)
+    for segment, stress in _reconstruct(source, settings, use_health=not job.overrides.any):
+        messages = segment.messages
+        encoded = stress_codec.encode_many(stress, messages.stamp_ns, messages.frame_id)
+        for time_ns, data in zip(segment.recorded_ns.tolist(), encoded, strict=True):
+            writer.write(f"{skin}stress", time_ns, data)
+        if contacts is not None:
+            contacts.set_up(infos[segment.number])
+            contacts.write(stress, messages, segment.recorded_ns)
 
 
 def _reconstruct(
-    source: BagSource, settings: list[Settings], *, with_verdicts: bool
+    source: BagSource, settings: list[Settings], *, use_health: bool
 ) -> Iterator[tuple[Segment, StressRows]]:
-    """settings: for each info. with_verdicts: use those recorded; what was found bad under other
-    settings need not be so under these."""
+    """Reconstruct each segment of a bag.
+
+    Args:
+        source: The bag.
+        settings: Settings for each of its infos.
+        use_health: Whether the recorded health of the pads applies. Under other settings than the
+            recorded ones the same pads need not be faulty.
+    """
     number = -1
     ids: list[str] = []
     for segment in source.segments():
         rows = segment.messages.rows
-        verdicts = source.recording.verdicts(rows) if with_verdicts else None
+        health = source.recording.health_at(rows) if use_health else None
         try:
             if segment.number != number:
                 number = segment.number
-                now = settings[number]
+                current = settings[number]
                 # Health remembers across a tare, but not across other calibrations.
-                if ids != (ids := [one.id for one in now.calibrations]):
-                    reconstructor = Reconstructor(now.calibrations)
-                reconstructor.rest_frequency = now.rest_frequency
-            if verdicts is not None and verdicts.known.all():
-                stress = reconstructor.process_known(rows, verdicts)
+                if ids != (ids := [one.id for one in current.calibrations]):
+                    reconstructor = Reconstructor(current.calibrations)
+                reconstructor.rest_frequency = current.rest_frequency
+            if health is not None and health.known.all():
+                stress = reconstructor.process_known(rows, health)
             else:
-                stress = reconstructor.process(rows, verdicts)
+                stress = reconstructor.process(rows, health)
         except CubeError as error:
             raise BagError(f"{source.bag.path}: {source.topic}: {error}") from None
         yield segment, stress
 
 
-def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
-    """The settings of each info of a bag, with what differs. BagError: it does not fit the bag."""
-    recording = source.recording
-    settings = recording.settings
-    if overrides.skin is not None or overrides.calibration is not None:
-        settings = [
-            _recalibrated(source, info, recorded, overrides)
-            for info, recorded in zip(recording.infos, settings, strict=True)
-        ]
-    if overrides.tare is not None:
-        rest = _tared(source, settings[-1], *overrides.tare)
-        settings = [replace(one, rest_frequency=rest) for one in settings]
-    return settings
-
-
-def _recalibrated(
+def _recalibrate(
     source: BagSource, info: Any, recorded: Settings, overrides: Overrides
 ) -> Settings:
-    """Settings with the calibrations of the overrides."""
+    """Replace the calibrations of an info by those of the overrides."""
     path = source.bag.path
     if overrides.skin is not None:
         by_name = {cube.name: cube.calibration for cube in overrides.skin.cubes}
@@ -238,11 +267,12 @@ def _recalibrated(
         if missing:
             raise BagError(
                 f"{path}: the skin file {overrides.skin.name} has no cubes "
-                f"{', '.join(missing[:NAMED])}; the bag has"
+                f"{', '.join(missing[:MAX_NAMED_CUBES])}; the bag has"
             )
         calibrations = [by_name[cube.name] for cube in info.cubes]
     else:
         calibrations = [overrides.calibration] * len(info.cubes)  # type: ignore[list-item]
+
     rest_frequency = recorded.rest_frequency.copy()
     for cube, old, new, rest in zip(
         info.cubes, recorded.calibrations, calibrations, rest_frequency, strict=True
@@ -251,17 +281,28 @@ def _recalibrated(
             new.check(old.layout, cube.uid or None)
         except CalibrationError as error:
             raise BagError(f"{path}: cube {cube.name}: {error}") from None
-        # A tare is a measurement and stays; without one the calibration says what no load is.
+        # A tare is a measurement and stays. A pad that was never tared has the rest frequency of
+        # its calibration, so it gets that of the new one.
         pads = rest[: old.layout.n_pads]
         pads[:] = np.where(pads != old.rest_frequency, pads, new.rest_frequency)
     return Settings(tuple(calibrations), rest_frequency)
 
 
-def _tared(
-    source: BagSource, settings: Settings, begin_s: float, end_s: float
-) -> NDArray[np.float64]:
-    """(cubes, P) Hz: mean frequencies of all pads between two times, at the reference
-    temperature."""
+def _measure_rest(source: BagSource, settings: Settings, begin_s: float, end_s: float) -> Array:
+    """Measure the rest frequencies in a span of a bag in which nothing touched the skin.
+
+    Args:
+        source: The bag.
+        settings: Calibrations of the cubes.
+        begin_s: Begin of the span, in s after the start of the bag.
+        end_s: End of the span.
+
+    Returns:
+        (cubes, P) mean frequencies at the reference temperature, in Hz.
+
+    Raises:
+        BagError: A pad was not measured in that time.
+    """
     bag = source.bag
     pipeline = Pipeline(settings.calibrations)
     exists = np.isfinite(settings.rest_frequency)
@@ -273,14 +314,16 @@ def _tared(
         rows = rows.select(inside & (rows.cube < len(exists)))
         if not len(rows):
             continue
-        frequency = rows.frequency / pipeline.temperature_factor(rows.cube, rows.temperature)
-        bad = rows.pad_fault[:, None] >> np.arange(frequency.shape[1]) & 1 > 0
-        good = np.isfinite(frequency) & (frequency > 0) & ~bad
-        np.add.at(total, rows.cube, np.where(good, frequency, 0))
-        np.add.at(count, rows.cube, good)
-    without = np.flatnonzero((exists & (count == 0)).any(axis=1))
-    if len(without):
-        names = ", ".join(source.skin.cubes[cube].name for cube in without[:NAMED])
+        cube = rows.cube.astype(np.intp)
+        frequency = rows.frequency / pipeline.temperature_factor(cube, rows.temperature)
+        is_faulty = rows.pad_fault[:, None] >> np.arange(frequency.shape[1]) & 1 > 0
+        is_usable = np.isfinite(frequency) & (frequency > 0) & ~is_faulty
+        np.add.at(total, cube, np.where(is_usable, frequency, 0))
+        np.add.at(count, cube, is_usable)
+
+    unmeasured = np.flatnonzero((exists & (count == 0)).any(axis=1))
+    if len(unmeasured):
+        names = ", ".join(source.skin.cubes[cube].name for cube in unmeasured[:MAX_NAMED_CUBES])
         seconds = (bag.end_ns - bag.start_ns) * 1e-9
         raise BagError(
             f"{bag.path}: --tare-from {begin_s:g} {end_s:g}: not every pad of {names} was "
@@ -289,17 +332,18 @@ def _tared(
     return np.where(exists, total / np.maximum(count, 1), np.nan)
 
 
-def _infos(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
-    """The recorded infos with other settings."""
-    covariances: dict[str, NDArray[np.float64]] = {}
-    for info, one in zip(infos, settings, strict=True):
-        first = {
-            calibration.id: number
-            for number, calibration in reversed(list(enumerate(one.calibrations)))
-        }
-        if not first.keys() <= covariances.keys():
-            pipeline = Pipeline(one.calibrations)
-            covariances |= {key: pipeline.covariance(number) for key, number in first.items()}
+def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
+    """Yield the recorded infos with other settings in them."""
+    covariances: dict[str, Array] = {}
+    for info, current in zip(infos, settings, strict=True):
+        # Each calibration stands once in an info; the first cube that has it represents it.
+        numbered = reversed(list(enumerate(current.calibrations)))
+        first_cube = {calibration.id: number for number, calibration in numbered}
+        if not first_cube.keys() <= covariances.keys():
+            pipeline = Pipeline(current.calibrations)
+            covariances |= {
+                name: pipeline.covariance(number) for name, number in first_cube.items()
+            }
         cubes = [
             replace(
                 cube,
@@ -308,14 +352,14 @@ def _infos(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
                 rest_frequency=rest[: calibration.layout.n_pads],
             )
             for cube, calibration, rest in zip(
-                info.cubes, one.calibrations, one.rest_frequency, strict=True
+                info.cubes, current.calibrations, current.rest_frequency, strict=True
             )
         ]
         yield replace(
             info,
             sender="reconstruction",
             cubes=cubes,
-            calibration_ids=list(first),
-            calibrations=[calibration_text(one.calibrations[n]) for n in first.values()],
-            covariance=np.array([covariances[key] for key in first]).ravel(),
+            calibration_ids=list(first_cube),
+            calibrations=[calibration_text(current.calibrations[n]) for n in first_cube.values()],
+            covariance=np.array([covariances[name] for name in first_cube]).ravel(),
         )

@@ -1,4 +1,4 @@
-"""A bag as what a reconstruction goes by, so that replayed frequencies give the recorded stress."""
+"""A bag that determines a reconstruction, so that replayed frequencies give the recorded stress."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ from ..source import open_bag
 
 
 class RecordedReconstruction:
-    """The rest frequencies and verdicts of a recording, each at its time. skin: as recorded.
+    """The rest frequencies and the health of a recording, each at its time.
 
-    What the recording does not say is decided when the rows come.
+    Attributes:
+        skin: The skin as it was recorded.
     """
 
     def __init__(self, path: Path) -> None:
-        """BagError: no bag, or one of several skins or calibrations."""
+        """Open a bag.
+
+        Raises:
+            BagError: There is no bag, or it has several skins or changes its calibrations.
+        """
         self._source = open_bag(path)
         try:
             self._source.recording.check_calibrations_stay()
@@ -31,11 +36,14 @@ class RecordedReconstruction:
         """Close the bag."""
         self._source.bag.close()
 
-    def verdicts(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
-        """The verdicts about the rows of one message. Sets the reconstructor's rest frequencies to
-        those of their time."""
+    def health_at(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
+        """Return the recorded health for the rows of one message.
+
+        It also sets the rest frequencies of the reconstructor to those of the rows' time. What the
+        recording does not state is decided when the rows come.
+        """
         settings = self._source.recording.settings_at(rows)
         if settings is not self._settings:
             self._settings = settings
             reconstructor.rest_frequency = settings.rest_frequency
-        return self._source.recording.verdicts(rows)
+        return self._source.recording.health_at(rows)

@@ -108,8 +108,8 @@ class Reconstruction(CubeNode):
             check_scans(rows, self._scan_limit)
             with self._lock:
                 recorded = self._recorded
-                verdicts = recorded.verdicts(rows, self._reconstructor) if recorded else None
-                stress = self._reconstructor.process(rows, verdicts)
+                health = recorded.health_at(rows, self._reconstructor) if recorded else None
+                stress = self._reconstructor.process(rows, health)
                 if self._reconstructor.rest_changes != self._rest_published:
                     self._publish_info()
         except CubeError as error:
