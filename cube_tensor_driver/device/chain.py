@@ -1,6 +1,6 @@
 """The chain from bytes to rows: reader, accounts, clocks and scans of all links of a skin.
 
-It calls back in the reader's thread: the driver node publishes from there, and `live.py` puts a
+It calls back in the reader's thread. The driver node publishes from there, and `live.py` puts a
 queue behind it.
 """
 
@@ -30,21 +30,25 @@ from .wire.native import SLOWER, wire
 from .wire.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
 
 MAX_SCANS = 4
-"""Scans in one callback at most, or one more than were asked for. Many scans wait after a pause;
-memory that is kept for rows need not hold them all."""
-EVENTS_KEPT = 100
-"""Of each link, until the next report."""
+"""Largest number of scans in one callback, unless the caller gathers more. Many scans wait after a
+pause, and the memory that is kept for rows need not hold all of them."""
+MAX_EVENTS = 100
+"""Number of changes of state of one link that are kept until the next report."""
+LOGGED_ERRORS = (1, 10, 100, 1000, 10_000)
+"""Numbers of errors at which an error is logged. At 1 kHz all of them would fill the log."""
 
 
 @dataclass(frozen=True)
 class LinkReport:
-    """How one link is doing.
+    """State of one link.
 
-    hub_uid: None before the hub has said it
-    state: the present one
-    past_states: states other than open since the last report
-    notes: what is wrong, or was wrong since the last report, with the fix
-    values: counters and clock, by name
+    Attributes:
+        name: Name of the link.
+        hub_uid: Unique number of the hub; None before its first HELLO.
+        state: State now.
+        past_states: States other than open since the last report.
+        notes: What is wrong now, or was wrong since the last report, with the fix.
+        values: Counters and clock values by name.
     """
 
     name: str
@@ -57,21 +61,24 @@ class LinkReport:
 
 @dataclass
 class _LinkRecord:
-    """What `LiveLinks` keeps of one link.
+    """What `LiveLinks` knows of one link.
 
-    problems: cubes that do not fit the skin
-    contradictions: of the account
-    events: states other than open since the last report, and the reason of each
-    logged_version: the last other protocol version that was logged
-    hub_changes: how often a hub said that it has other cubes than before, the first time included
-    was_open: the link has been open before
+    Attributes:
+        account: Account of its samples.
+        clock: Clock of its hub.
+        problems: Cubes that do not fit the skin, in words.
+        account_errors: Errors of the account, in words.
+        events: States other than open since the last report, and the reason of each.
+        logged_version: Last other protocol version that was logged.
+        hub_changes: Number of times the hub reported other cubes than before, including the first.
+        was_open: Whether the link has ever been open.
     """
 
     account: SampleAccount = field(default_factory=SampleAccount)
     clock: HubClock = field(default_factory=HubClock)
     problems: list[str] = field(default_factory=list)
-    contradictions: list[str] = field(default_factory=list)
-    events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
+    account_errors: list[str] = field(default_factory=list)
+    events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     logged_version: int | None = None
     hub_changes: int = 0
     was_open: bool = False
@@ -80,15 +87,18 @@ class _LinkRecord:
 class LiveLinks:
     """Reads the links of a skin and calls back with rows of frequencies.
 
-    on_rows: called in the reader's thread with the rows of each complete scan. If make_rows gives
-        the same memory again, they are valid only until the call returns
-    rate: samples per second to ask of the hubs; None leaves it to them
-    scans_per_call: how many scans are gathered for one call
-    make_rows: makes the arrays that rows are written into
-    clock_ns: the clock of `stamp_ns`
-    is_host_clock: whether that is the host's now, and not a simulated time
-    log: for what happens to the links; None: Python's logging
-    on_end: called in the reader's thread when it ends, after `close` or by an error
+    Args:
+        links: Place and identity of the hub of each link.
+        cubes: Place of each cube of the skin.
+        on_rows: Called in the reader's thread with the rows of complete scans. If `make_rows`
+            returns the same memory again, they are valid only until the call returns.
+        rate: Sample rate to request of the hubs, in Hz; None leaves it to them.
+        scans_per_call: Number of scans that are gathered for one call.
+        make_rows: Makes the arrays that rows are written into.
+        clock_ns: Clock of the stamps.
+        is_host_clock: Returns whether `clock_ns` is now the host's clock, not a simulated time.
+        log: Logger for events of the links; None for Python's logging.
+        on_end: Called in the reader's thread when it ends, after `close` or because of an error.
     """
 
     def __init__(
@@ -117,21 +127,21 @@ class LiveLinks:
         self._clock_ns = clock_ns
         self._is_host_clock = is_host_clock
         self._clock_watch = HostClockWatch(clock_ns)
-        self._clock_steps: deque[int] = deque(maxlen=EVENTS_KEPT)
         self._log: Log = log or logging.getLogger(__name__)
         if wire is None:
             self._log.warning(SLOWER)
-        self._link_logs = [LinkLogger(config.name, self._log) for config in self._configs]
+        self._loggers = [LinkLogger(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
-        # Reports look at accounts and clocks while the reader's thread does not change them.
-        self._taking = threading.Lock()
+        # Reports read accounts and clocks only while the reader's thread does not change them.
+        self._lock = threading.Lock()
         self._errors = 0
         self._reader: Reader | None = None
 
     def start(self) -> None:
-        """Open the links and start the hubs; again after `close` if need be.
+        """Open the links and start the hubs; also again after `close`.
 
-        LinkError `bad_port`: a port that can never be opened.
+        Raises:
+            LinkError: `bad_port`: a port can never be opened.
         """
         self._reader = Reader(
             self._configs,
@@ -144,12 +154,12 @@ class LiveLinks:
         self._reader.start()
 
     def close(self) -> None:
-        """Stop the hubs and close the links. Safe to call twice."""
+        """Stop the hubs and close the links; a second call does nothing."""
         if self._reader is not None:
             self._reader.close()
 
     def set_rate(self, rate: float | None) -> None:
-        """Ask the hubs for another rate, samples per second; None: leave it as it is."""
+        """Request another sample rate of the hubs, in Hz; None leaves it as it is."""
         self._rate = rate
         period_us = _period_us(rate)
         if self._reader is not None and period_us is not None:
@@ -158,60 +168,61 @@ class LiveLinks:
 
     @property
     def failure(self) -> Exception | None:
-        """The error that ended the reader's thread; None while all is well."""
+        """Error that ended the reader's thread; None if there was none."""
         return None if self._reader is None else self._reader.failure
 
     @property
     def callback_errors(self) -> int:
-        """How often a callback in the reader's thread has failed."""
+        """Number of times a callback in the reader's thread has failed."""
         in_reader = 0 if self._reader is None else self._reader.callback_errors
         return self._errors + in_reader
 
     @property
     def cube_uids(self) -> dict[int, int]:
-        """uids of the skin's cubes by index, as the hubs say."""
+        """Unique number of each cube by its index in the skin, as the hubs report it."""
         return self._scans.cubes.uids
 
     def row_counts(self) -> RowCounts:
-        """What became of all rows until now."""
+        """Return the numbers of rows until now, by what happened to them."""
         return self._rows.counts
 
     def report(self) -> list[LinkReport]:
-        """How each link is doing, and what happened since the last report; empty before `start`."""
+        """Return the state of each link, and what happened since the last report.
+
+        Before `start` it is empty.
+        """
         if self._reader is None:
             return []
-        with self._taking:
-            return [
-                self._report(link, record, log)
-                for link, record, log in zip(
-                    self._reader.links, self._records, self._link_logs, strict=True
-                )
-            ]
+        links = zip(self._reader.links, self._records, self._loggers, strict=True)
+        with self._lock:
+            return [self._report(link, record, logger) for link, record, logger in links]
 
     def receive(self, received: Sequence[LinkFrames]) -> None:
-        """Take in frames of the links, and call back with what they complete.
+        """Handle frames of the links, and call back with the rows that they complete.
 
         The reader's thread calls this once per wake-up.
         """
-        with self._taking:
-            now_ns, step_ns = self._see_clock()
+        with self._lock:
+            now_ns, step_ns = self._check_host_clock()
             for link, arrival_ns, frames, asked_ns in received:
-                # Bytes that were read just before the clock was set have the old time.
+                # Bytes that were read just before the clock was set have an arrival in its old
+                # time.
                 if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
                     arrival_ns += step_ns
+                # All rows are counted first, so that an error in one frame hides no other.
                 for frame in frames:
                     if isinstance(frame, Sample):
                         self._rows.received += frame.n_cubes
                 try:
-                    # A round trip during which the clock was set says nothing.
-                    self._take(link, arrival_ns, frames, 0 if step_ns else asked_ns)
+                    # A round trip during which the clock was set gives no bound.
+                    self._handle_frames(link, arrival_ns, frames, 0 if step_ns else asked_ns)
                 except Exception as error:  # noqa: BLE001  (the rows of other links go on)
-                    self._lose(error)
+                    self._count_error(error)
         self._deliver()
         self._rows.check()
 
-    def _see_clock(self) -> tuple[int, int]:
-        """The time, and by how much the host's clock was set since the last call, ns."""
+    def _check_host_clock(self) -> tuple[int, int]:
+        """Return the time and the step of the host's clock since the last call, both in ns."""
         now_ns, step_ns = self._clock_watch.look()
         if not step_ns or not self._is_host_clock():
             return now_ns, 0
@@ -224,15 +235,17 @@ class LiveLinks:
             self._reader.forget_questions()
         return now_ns, step_ns
 
-    def _take(self, link: int, arrival_ns: int, frames: Sequence[Frame], asked_ns: int) -> None:
-        """Count the frames of a link and give their samples to the scans."""
+    def _handle_frames(
+        self, link: int, arrival_ns: int, frames: Sequence[Frame], asked_ns: int
+    ) -> None:
+        """Count the frames of a link and add their samples to the scans."""
         record = self._records[link]
         samples: list[Sample] = []
         for frame in frames:
             if isinstance(frame, Sample):
                 arrival = record.account.sample(frame)
                 if arrival is Arrival.RESET:
-                    self._give(link, arrival_ns, samples)
+                    self._add_samples(link, arrival_ns, samples)
                     samples = []
                     record.clock.reset()
                 if arrival is Arrival.DUPLICATE:
@@ -246,11 +259,11 @@ class LiveLinks:
                     record.clock.add_answer(asked_ns, frame.device_us, arrival_ns)
             elif isinstance(frame, Stats):
                 record.account.stats(frame)
-                record.contradictions = record.account.contradictions()
-        self._give(link, arrival_ns, samples)
+                record.account_errors = record.account.contradictions()
+        self._add_samples(link, arrival_ns, samples)
 
-    def _give(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
-        """Samples of one run of a hub, which arrived together, to the scans."""
+    def _add_samples(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
+        """Stamp samples that arrived together, and add them to the scans."""
         if not samples:
             return
         clock = self._records[link].clock
@@ -260,7 +273,7 @@ class LiveLinks:
         self._scans.add(link, samples, stamps_ns, STAMP if clock.in_doubt else 0)
 
     def _deliver(self) -> None:
-        """Call back with all scans that are complete. Scans without a row of the skin end here."""
+        """Call back with the rows of all complete scans; a scan without rows is discarded."""
         while self._scans.is_complete(self._scans_per_call):
             try:
                 rows = self._scans.build(self._make_rows, self._max_scans)
@@ -268,58 +281,59 @@ class LiveLinks:
                     self._on_rows(rows)
                     self._rows.delivered += len(rows)
             except Exception as error:  # noqa: BLE001  (the next rows go on)
-                self._lose(error)
+                self._count_error(error)
 
-    def _lose(self, error: Exception) -> None:
-        """An error has lost rows: they are counted with its reason."""
+    def _count_error(self, error: Exception) -> None:
+        """Count and log an error, and count the rows that it has lost."""
         lost = self._rows.count_lost(error)
         self._errors += 1
-        # Not all of them: at 1 kHz they would fill the log.
-        if self._errors in (1, 10, 100, 1000, 10_000):
+        if self._errors in LOGGED_ERRORS:
             self._log.error(
                 f"{lost} rows lost by an error ({self._errors} errors so far); reading goes on\n"
                 f"{traceback.format_exc()}"
             )
 
     def _learn_cubes(self, link: int, hello: Hello) -> None:
+        """Learn the cubes of a hub, and log them if they are other than before."""
         problems = self._scans.cubes.learn(link, hello)
         if problems is None:
             return
-        record, log = self._records[link], self._link_logs[link]
+        record, logger = self._records[link], self._loggers[link]
         record.problems = problems
         record.hub_changes += 1
-        log.info(f"hub {hello.hub_uid:#x} with {hello.n_cubes} cubes of {hello.n_pads} pads")
+        logger.info(f"hub {hello.hub_uid:#x} with {hello.n_cubes} cubes of {hello.n_pads} pads")
         for problem in problems:
-            log.error(problem)
+            logger.error(problem)
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
-        """The state of a link, or why it waits, has changed."""
+        """Handle a change of the state of a link, or of its reason."""
         record = self._records[link]
         record.was_open |= state is LinkState.OPEN
         if state is not LinkState.OPEN:
-            # Without an error a link waits because it is about to be opened for the first time.
+            # Without an error, a waiting link is about to be opened for the first time.
             if error is not None or state is LinkState.CLOSED:
                 record.events.append((state, str(error or state.value)))
             self._scans.set_live(link, False)
             self._deliver()
-        log = self._link_logs[link]
-        if error is not None and error.kind == "no_port" and self._is_expected(link):
-            return
-        if error is not None:
-            log.warning(f"{state.value}: {error}")
-        else:
-            log.info(state.value)
 
-    def _is_expected(self, link: int) -> bool:
-        """Whether a simulator has yet to make the port of a link."""
+        logger = self._loggers[link]
+        if error is None:
+            logger.info(state.value)
+        elif error.kind != "no_port" or not self._is_port_expected(link):
+            logger.warning(f"{state.value}: {error}")
+
+    def _is_port_expected(self, link: int) -> bool:
+        """Return whether a simulator has yet to make the port of a link."""
         return self._configs[link].is_simulated and not self._records[link].was_open
 
-    def _report(self, link: Link, record: _LinkRecord, log: LinkLogger) -> LinkReport:
-        notes = [*record.problems, *record.contradictions]
+    def _report(self, link: Link, record: _LinkRecord, logger: LinkLogger) -> LinkReport:
+        """Return the report of one link, and forget what happened since the last one."""
+        notes = [*record.problems, *record.account_errors]
         if link.error is not None:
             notes.insert(0, str(link.error))
         if link.period_problem:
             notes.append(link.period_problem)
+
         other = link.decoder.other_version
         if other is not None:
             notes.append(
@@ -328,13 +342,14 @@ class LiveLinks:
             )
             if other != record.logged_version:
                 record.logged_version = other
-                # Once a report at most, so it needs no other bound.
+                # It is logged once per report at most, so the rate needs no other limit.
                 self._log.error(f"link {link.config.name}: {notes[-1]}")
-        # In one step, because the reader's thread adds to them.
+
+        # The set is replaced and the events are removed one by one, because the reader's thread may
+        # add to both.
         problems, record.clock.problems = record.clock.problems, set()
         notes += sorted(problems)
         past_states = []
-        # Taken out one by one, because the reader's thread may add to them.
         while record.events:
             state, text = record.events.popleft()
             past_states.append(state)
@@ -346,28 +361,35 @@ class LiveLinks:
             state=link.state,
             past_states=tuple(past_states),
             notes=tuple(notes),
-            values=_values(link, record, log),
+            values=_report_values(link, record, logger),
         )
 
 
 def _period_us(rate: float | None) -> int | None:
+    """Return the sample period of a rate in Hz, in µs."""
     return None if rate is None else round(1e6 / rate)
 
 
-def _values(link: Link, record: _LinkRecord, log: LinkLogger) -> dict[str, object]:
+def _report_values(link: Link, record: _LinkRecord, logger: LinkLogger) -> dict[str, object]:
+    """Return the counters and clock values of one link by name."""
     clock = record.clock
     bound_ns = clock.bound_ns
+    delay_us: object = "unknown"
+    error_us: object = "unknown"
+    if bound_ns is not None:
+        delay_us = round(1e-3 * clock.delay_ns, 1)
+        error_us = round(1e-3 * bound_ns, 1)
     values: dict[str, object] = {
         **link.counters,
         **record.account.counters(),
         "clock offset s": round(1e-9 * clock.offset_ns, 6),
         "clock drift ppm": round(clock.drift_ppm, 2),
         "clock jitter us": round(1e-3 * clock.jitter_ns, 1),
-        "clock delay us": "unknown" if bound_ns is None else round(1e-3 * clock.delay_ns, 1),
-        "clock error at most us": "unknown" if bound_ns is None else round(1e-3 * bound_ns, 1),
+        "clock delay us": delay_us,
+        "clock error at most us": error_us,
         "clock resets": clock.resets,
         "hub changes": record.hub_changes,
-        "log lines left out": log.left_out,
+        "log lines left out": logger.left_out,
     }
     stats = record.account.stats_frame
     if stats is not None:

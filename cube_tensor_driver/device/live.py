@@ -1,4 +1,4 @@
-"""Live frequencies without ROS: the links of a skin as a source to iterate over."""
+"""The live source: the links of a skin as an iterable of rows, without ROS."""
 
 from __future__ import annotations
 
@@ -17,8 +17,11 @@ from .links.link import LinkConfig
 from .scans.cube_table import CubeAddress
 
 QUEUE_S = 2.0
-"""A consumer that is further behind loses the oldest rows."""
-RATE_LIMITS = 0.1, 10_000.0
+"""Time, in s, by which a consumer may be late. One that is further behind loses the oldest rows."""
+MIN_RATE = 0.1
+"""Lowest sample rate that can be requested, in Hz."""
+MAX_RATE = 10_000.0
+"""Highest sample rate that can be requested, in Hz."""
 
 
 def open_links(
@@ -34,23 +37,36 @@ def open_links(
             for rows in source:
                 ...
 
-    rate: samples per second to ask of the hubs, 0.1 to 10000; None: as the skin file says.
-    port: instead of the one in the skin file, for a skin with one link.
-    port_directory: folder with the links' ports under the links' names, as of simulated hubs.
-    A port that is not there yet is waited for. ConfigError: an argument that cannot be used, or a
-    port that can never be opened.
+    The source waits for a port that is not there yet.
+
+    Args:
+        skin: The skin.
+        rate: Sample rate to request of the hubs, 0.1 to 10000 Hz; None takes that of the skin file.
+        port: Port to use instead of the one in the skin file, for a skin with one link.
+        port_directory: Folder that holds the ports under the names of the links, as those of
+            simulated hubs.
+
+    Raises:
+        ConfigError: An argument cannot be used, or a port can never be opened.
     """
-    low, high = RATE_LIMITS
-    if rate is not None and not low <= rate <= high:
-        raise ConfigError(f"rate is {rate}, allowed: {low:g} to {high:g} samples per second")
+    if rate is not None and not MIN_RATE <= rate <= MAX_RATE:
+        raise ConfigError(
+            f"rate is {rate}, allowed: {MIN_RATE:g} to {MAX_RATE:g} samples per second"
+        )
     links = link_configs(skin, port, port_directory)
     return LinkSource(skin, links, skin.rate if rate is None else rate)
 
 
 def link_configs(skin: Skin, port: str = "", port_directory: str | Path = "") -> list[LinkConfig]:
-    """The links of a skin, with other ports if they are given; see `open_links`.
+    """Return the place of each link of a skin.
 
-    ConfigError: one port for a skin with several links, or a port that can never be opened.
+    Args:
+        skin: The skin.
+        port: Port to use instead of the one in the skin file.
+        port_directory: Folder that holds the ports under the names of the links.
+
+    Raises:
+        ConfigError: One port was given for several links, or a port can never be opened.
     """
     if port and len(skin.links) > 1:
         raise ConfigError(
@@ -59,18 +75,18 @@ def link_configs(skin: Skin, port: str = "", port_directory: str | Path = "") ->
         )
     configs = []
     for link in skin.links:
-        path = str(Path(port_directory) / link.name) if port_directory else link.port
-        chosen = port or path
-        problem = port_problem(chosen)
+        in_directory = str(Path(port_directory) / link.name) if port_directory else ""
+        path = port or in_directory or link.port
+        problem = port_problem(path)
         if problem:
             raise ConfigError(f"link {link.name}: port: {problem}")
-        simulated = bool(port_directory) and not port
-        configs.append(LinkConfig(link.name, chosen, link.baud, link.hub_uid, simulated))
+        is_simulated = bool(port_directory) and not port
+        configs.append(LinkConfig(link.name, path, link.baud, link.hub_uid, is_simulated))
     return configs
 
 
 def cube_addresses(skin: Skin) -> list[CubeAddress]:
-    """Where the cubes of a skin are, in its order."""
+    """Return the place of each cube of a skin, in its order."""
     number_of = {link.name: number for number, link in enumerate(skin.links)}
     return [
         CubeAddress(
@@ -85,16 +101,23 @@ def cube_addresses(skin: Skin) -> list[CubeAddress]:
 
 
 class LinkSource:
-    """A `Source` of what the links of a skin deliver, from now on until it is closed.
+    """Source of the rows that the links of a skin deliver, from now on until it is closed.
 
-    Iterating gives the rows of one scan after the other, and waits for the next. A consumer that is
-    more than QUEUE_S behind loses the oldest rows; `statistics` counts them.
+    Each iteration gives the rows of complete scans, or waits for them. A consumer that is more than
+    `QUEUE_S` late loses the oldest rows; `statistics` counts them.
+
+    Args:
+        skin: The skin.
+        links: Place of each link.
+        rate: Sample rate to request of the hubs, in Hz; None leaves it to them.
+
+    Raises:
+        LinkError: `bad_port`: a port can never be opened.
     """
 
     def __init__(self, skin: Skin, links: Sequence[LinkConfig], rate: float | None) -> None:
-        """LinkError `bad_port`: a port that can never be opened."""
         self._skin = skin
-        self._queue: deque[tuple[float, FrequencyRows]] = deque()  # with their time of arrival
+        self._queue: deque[tuple[float, FrequencyRows]] = deque()  # with their arrival
         self._changed = threading.Condition()
         self._closed = False
         self._ended = False
@@ -107,19 +130,21 @@ class LinkSource:
 
     @property
     def skin(self) -> Skin:
+        """The skin."""
         return self._skin
 
     @property
     def is_live(self) -> bool:
+        """True: rows come as they are measured."""
         return True
 
     def statistics(self) -> dict[str, object]:
-        """Rows by what became of them, and of each link its state, notes and counters.
+        """Return the numbers of rows, and the state, notes and counters of each link.
 
-        Rows that came in were given to the consumer, wait for it, were dropped because it was too
-        slow, came twice, were lost by an error of the driver, or were left out: of unknown cubes,
-        or with another number of pads. Notes of a link
-        include what happened since the last call.
+        Received rows were given to the consumer, wait for it, were dropped because it was too slow,
+        came twice, were lost by an error of the driver, or were left out because the skin does not
+        have their cube or has it with another number of pads. The notes of a link include what
+        happened since the last call.
         """
         counts = self._links.row_counts()
         links = {
@@ -145,14 +170,14 @@ class LinkSource:
             }
 
     def close(self) -> None:
-        """Stop the hubs, close the links and end every iteration. Safe to call twice."""
+        """Stop the hubs, close the links and end every iteration; a second call does nothing."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
         self._links.close()
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        """If an error ends the reader's thread, it is raised after the rows that came before."""
+        """Yield rows. An error that ends the reader's thread is raised after the rows before it."""
         while True:
             rows = self._get()
             if rows is None:
@@ -166,7 +191,7 @@ class LinkSource:
         self.close()
 
     def _put(self, rows: FrequencyRows) -> None:
-        """Reader's thread: rows have come."""
+        """Queue rows, in the reader's thread."""
         now = time.monotonic()
         with self._changed:
             self._queue.append((now, rows))
@@ -176,13 +201,13 @@ class LinkSource:
             self._changed.notify()
 
     def _on_end(self) -> None:
-        """Reader's thread: no rows will come any more."""
+        """Wake up the consumer, because the reader's thread ends."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
     def _get(self) -> FrequencyRows | None:
-        """The next rows; None when closed."""
+        """Return the next rows; None if the source is closed."""
         with self._changed:
             while not self._closed:
                 if self._queue:
