@@ -1,4 +1,4 @@
 """Messages as plain data: the codec of the batch messages, the description of a skin, contacts.
 
-Nodes and bags share it, so it imports neither ROS nor a library for bags.
+Nodes and bags share this folder, so it imports neither ROS nor a library for bags.
 """

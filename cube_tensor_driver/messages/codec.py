@@ -1,8 +1,9 @@
 """The codec of the batch messages: serialised bytes to rows, and rows to serialised bytes.
 
-A message of a given number of rows, pads and letters in its frame id always has the same fields at
-the same bytes (CDR, little-endian, OMG DDS-XTypes 7.4.1). So a numpy record type describes it, and
-nothing here loops over rows. ROS is not imported: nodes and bags share this codec.
+Two messages with the same number of rows and pads, and frame ids of the same length, have their
+fields at the same bytes. So a record type of numpy describes all of them, and nothing here loops
+over rows. The bytes are little-endian CDR (OMG DDS-XTypes 7.4.1): a sequence begins with its number
+of values as 4 bytes, at a multiple of 4.
 """
 
 from __future__ import annotations
@@ -16,29 +17,45 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import AnyArray, Index, Times
 from ..core.errors import MessageError
-from ..core.modes import COMPONENTS, STRESS
+from ..core.modes import GRADIENT, STRESS
 from ..core.rows import FrequencyRows, StressRows
 
 SECOND = 1_000_000_000
-LAYOUTS_KEPT = 32
-"""Layouts of messages that a codec remembers."""
+"""One second, in ns."""
+
+MAX_CACHED_LAYOUTS = 32
+"""Number of layouts of messages that a codec keeps in memory."""
+
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-PADS = -1
+"""First bytes of a message in little-endian CDR."""
+
+PER_PAD = -1
 """Width of a field that has one value per pad in each row."""
-ONCE = 0
+
+PER_MESSAGE = 0
 """Width of a field that has one value per message."""
+
 _SECONDS_AT = len(LITTLE_ENDIAN)
-_FRAME_LENGTH_AT = _SECONDS_AT + 8
-SHAPE_AT = _FRAME_LENGTH_AT
-"""Where in a message `shape_bytes` are."""
+_NANOSECONDS_AT = _SECONDS_AT + 4
+_FRAME_LENGTH_AT = _NANOSECONDS_AT + 4
 _FRAME_AT = _FRAME_LENGTH_AT + 4
+
+SHAPE_AT = _FRAME_LENGTH_AT
+"""Place in a message of the bytes that `MessageCodec.shape_bytes` returns."""
 
 AnyRows = TypeVar("AnyRows", FrequencyRows, StressRows)
 
 
 class _Field(NamedTuple):
-    """A field behind the header. type: numpy's; width: values per row, or PADS, or ONCE."""
+    """A field behind the header.
+
+    Attributes:
+        name: Name in the message definition.
+        type: numpy's name of the type of a value, whose last character is its size in bytes.
+        width: Number of values per row, or PER_PAD, or PER_MESSAGE.
+    """
 
     name: str
     type: str
@@ -49,8 +66,8 @@ _FREQUENCIES = (
     _Field("cube", "<u2", 1),
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
-    _Field("n_pads", "<u1", ONCE),
-    _Field("frequency", "<f4", PADS),
+    _Field("n_pads", "<u1", PER_MESSAGE),
+    _Field("frequency", "<f4", PER_PAD),
     _Field("temperature", "<f4", 1),
     _Field("pad_fault", "<u4", 1),
     _Field("status", "<u2", 1),
@@ -60,7 +77,7 @@ _STRESS = (
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
     _Field("stress", "<f4", len(STRESS)),
-    _Field("gradient", "<f4", len(COMPONENTS) - len(STRESS)),
+    _Field("gradient", "<f4", len(GRADIENT)),
     _Field("residual", "<f4", 1),
     _Field("status", "<u2", 1),
     _Field("observed", "<u2", 1),
@@ -69,16 +86,28 @@ _STRESS = (
 
 
 class _Shape(NamedTuple):
-    """What decides where the fields of a message are. frame: length of the frame id with its
-    closing zero; pads: of a row, 0 in messages without pads."""
+    """What determines the places of the fields of a message.
+
+    Attributes:
+        frame: Length of the frame id including its closing zero.
+        rows: Number of rows.
+        pads: Number of pads of a row; 0 in messages without pads.
+    """
 
     frame: int
     rows: int
     pads: int
 
 
-class _Item(NamedTuple):
-    """Where a field is. count_at: where its number of values is, None if it has none."""
+class _Place(NamedTuple):
+    """The place of a field in a message.
+
+    Attributes:
+        field: The field.
+        count_at: Place of its number of values; None if it is no sequence.
+        at: Place of its values.
+        values: Number of values.
+    """
 
     field: _Field
     count_at: int | None
@@ -87,49 +116,58 @@ class _Item(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Messages of one shape. count_words: which 4-byte words hold the lengths of its sequences;
-    counts: what they must be; names: of these sequences."""
+    """The layout of all messages of one shape.
+
+    Attributes:
+        shape: The shape.
+        record: Record type of a message.
+        sequences: Names of the sequences, `frame_id` first.
+        counts: Numbers of values that these sequences must have.
+        count_words: Places of these numbers, in units of 4 bytes.
+    """
 
     shape: _Shape
     record: np.dtype[Any]
-    count_words: NDArray[np.intp]
+    sequences: list[str]
     counts: NDArray[np.uint32]
-    names: list[str]
+    count_words: Index
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded(Generic[AnyRows]):
     """M messages of one shape.
 
-    rows: of all of them, message after message; views on the bytes of a single message
-    stamp_ns: (M,) of their headers
-    frame_id: of their headers, with its closing zero
+    Attributes:
+        rows: Rows of all messages, message after message. Those of a single message are views of
+            its bytes.
+        stamp_ns: Time stamps of the headers (M,), in ns.
+        frame_id: Frame id of the headers, with its closing zero.
     """
 
     rows: AnyRows
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Times
     frame_id: bytes
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
     def select(self, chosen: slice) -> Decoded[AnyRows]:
-        """Some of the messages, neighbours."""
-        rows = len(self.rows) // len(self.stamp_ns)
+        """Return some neighbouring messages."""
+        n_rows = len(self.rows) // len(self)
         begin, end, _ = chosen.indices(len(self))
-        part = self.rows.select(slice(begin * rows, end * rows))
-        return Decoded(part, self.stamp_ns[chosen], self.frame_id)
+        rows = self.rows.select(slice(begin * n_rows, end * n_rows))
+        return Decoded(rows, self.stamp_ns[chosen], self.frame_id)
 
-    def by_message(self, column: NDArray[Any]) -> NDArray[Any]:
-        """(M, rows, ...) a column of `rows`, message by message."""
-        rows = len(self.rows) // len(self.stamp_ns)
-        return column.reshape(len(self.stamp_ns), rows, *column.shape[1:])
+    def by_message(self, column: AnyArray) -> AnyArray:
+        """Return a column of `rows` as (M, rows, ...), message by message."""
+        return column.reshape(len(self), -1, *column.shape[1:])
 
 
 class MessageBuffer(Generic[AnyRows]):
-    """A serialised message of fixed shape, to be filled in place again and again.
+    """A serialised message of fixed shape that is filled in place again and again.
 
-    rows: write into its arrays. All but `stamp_ns` are views on the message's bytes.
+    Attributes:
+        rows: Rows to write into. All columns but `stamp_ns` are views of the bytes of the message.
     """
 
     def __init__(self, codec: MessageCodec[AnyRows], layout: _Layout, frame_id: bytes) -> None:
@@ -138,16 +176,21 @@ class MessageBuffer(Generic[AnyRows]):
         stamp_ns = np.zeros(layout.shape.rows, np.int64)
         self.rows: AnyRows = codec.make_rows(self._record, stamp_ns)
         self._time_offset = self._record["time_offset"][0]
-        self._columns = [getattr(self.rows, field.name) for field in fields(self.rows)]
+        # Looked up here once, because this takes as long as copying the rows of a small skin.
         self._names = [field.name for field in fields(self.rows)]
+        self._columns = [getattr(self.rows, name) for name in self._names]
 
     def fill(self, rows: AnyRows) -> None:
-        """Copy rows into it, as many as it was made for."""
+        """Copy as many rows as the buffer was made for."""
         for name, column in zip(self._names, self._columns, strict=True):
             column[:] = getattr(rows, name)
 
     def data(self, stamp_ns: int | None = None) -> bytes:
-        """The message as it is now. stamp_ns: of its header; None: that of the earliest row."""
+        """Return the message as it is now.
+
+        Args:
+            stamp_ns: Time stamp of the header, in ns. None stands for that of the earliest row.
+        """
         times_ns = self.rows.stamp_ns
         if stamp_ns is None:
             stamp_ns = int(times_ns.min())
@@ -160,129 +203,162 @@ class MessageCodec(Generic[AnyRows]):
     """Decodes and encodes one type of message."""
 
     def __init__(self, name: str, rows: type[AnyRows], message_fields: tuple[_Field, ...]) -> None:
+        """Describe a type of message.
+
+        Args:
+            name: Name for error messages.
+            rows: Type of the rows.
+            message_fields: Fields behind the header, in order.
+        """
         self._name = name
         self._rows: type[AnyRows] = rows
+        self._columns = [field.name for field in fields(rows)]
         self._fields = message_fields
-        names = [field.name for field in fields(rows)]
-        self._values = [
-            field.name for field in message_fields if field.name in names[names.index("stamp_ns") :]
-        ]
-        field_names = [field.name for field in message_fields]
-        self._has_pads = "n_pads" in field_names
-        self._before_pads = field_names.index("n_pads") if self._has_pads else 0
-        self._end = lru_cache(LAYOUTS_KEPT)(self._find_end)
-        self._layout = lru_cache(LAYOUTS_KEPT)(self._make_layout)
+        names = [field.name for field in message_fields]
+        self._n_fields_before_pads = names.index("n_pads") if "n_pads" in names else None
+        self._find_end = lru_cache(MAX_CACHED_LAYOUTS)(self._compute_end)
+        self._find_layout = lru_cache(MAX_CACHED_LAYOUTS)(self._make_layout)
 
     def decode(self, *messages: bytes) -> Decoded[AnyRows]:
-        """The rows of serialised messages, one or several of the same shape (`shape_bytes`).
+        """Decode one or several serialised messages of the same shape (`shape_bytes`).
 
-        MessageError: too short, fields that contradict each other, or shapes that differ.
+        Raises:
+            MessageError: A message is too short, its fields contradict each other, or the shapes
+                differ.
         """
-        layout, record = self._records(messages)
-        stamp_ns, times_ns = _stamps(record)
+        layout, record = self._read_records(messages)
+        stamp_ns, times_ns = _read_stamps(record)
         rows: AnyRows = self.make_rows(record, times_ns)
         frame_id = messages[0][_FRAME_AT : _FRAME_AT + layout.shape.frame]
         return Decoded(rows, stamp_ns, frame_id)
 
-    def decode_columns(self, names: Sequence[str], *messages: bytes) -> list[NDArray[Any]]:
-        """`stamp_ns` and the named columns of what `decode` gives: it does not copy the others."""
-        record: NDArray[Any] = self._records(messages)[1]
-        return [_stamps(record)[1], *(_flat(record, name) for name in names)]
+    def decode_columns(self, names: Sequence[str], *messages: bytes) -> list[AnyArray]:
+        """Decode only `stamp_ns` and the named columns of the rows, without copying the others."""
+        record: AnyArray = self._read_records(messages)[1]
+        _, times_ns = _read_stamps(record)
+        return [times_ns, *(_read_column(record, name) for name in names)]
 
     def shape_bytes(self, data: bytes) -> bytes:
-        """Frame id and number of rows. Messages of one length that have the same bytes at SHAPE_AT
-        can be decoded together."""
+        """Return the bytes at `SHAPE_AT` that hold frame id and number of rows.
+
+        Messages of one length that agree in these bytes can be decoded together.
+        """
         frame = int.from_bytes(data[_FRAME_LENGTH_AT:_FRAME_AT], "little")
-        return data[SHAPE_AT : _aligned(_FRAME_AT + frame) + 4]
+        end = _align(_FRAME_AT + frame) + 4
+        return data[SHAPE_AT:end]
 
     def buffer(self, frame_id: bytes, rows: int, pads: int = 0) -> MessageBuffer[AnyRows]:
-        """A message to fill. frame_id: with its closing zero; pads: of a row of frequencies."""
-        return MessageBuffer(self, self._layout(_Shape(len(frame_id), rows, pads)), frame_id)
+        """Return a message to fill.
+
+        Args:
+            frame_id: Frame id with its closing zero.
+            rows: Number of rows.
+            pads: Number of pads of a row of frequencies; 0 for rows of stress.
+        """
+        layout = self._find_layout(_Shape(len(frame_id), rows, pads))
+        return MessageBuffer(self, layout, frame_id)
 
     def encode(self, rows: AnyRows, frame_id: bytes, stamp_ns: int | None = None) -> bytes:
-        """One message of rows; arguments as in `MessageBuffer`."""
-        pads = rows.frequency.shape[1] if isinstance(rows, FrequencyRows) else 0
-        buffer = self.buffer(frame_id, len(rows), pads)
-        buffer.fill(rows)
-        return buffer.data(stamp_ns)
+        """Encode rows as one message.
 
-    def encode_many(
-        self, rows: AnyRows, stamp_ns: NDArray[np.int64], frame_id: bytes
-    ) -> list[bytes]:
-        """M messages of one shape.
+        Args:
+            rows: The rows.
+            frame_id: Frame id with its closing zero.
+            stamp_ns: Time stamp of the header, in ns. None stands for that of the earliest row.
+        """
+        if stamp_ns is None:
+            stamp_ns = int(rows.stamp_ns.min())
+        return self.encode_many(rows, np.array([stamp_ns]), frame_id)[0]
 
-        rows: of all of them, message after message; stamp_ns: (M,) of their headers.
+    def encode_many(self, rows: AnyRows, stamp_ns: Times, frame_id: bytes) -> list[bytes]:
+        """Encode rows as M messages of one shape.
+
+        Args:
+            rows: Rows of all messages, message after message.
+            stamp_ns: Time stamps of the headers (M,), in ns.
+            frame_id: Frame id with its closing zero.
         """
         count = len(stamp_ns)
         pads = rows.frequency.shape[1] if isinstance(rows, FrequencyRows) else 0
-        layout = self._layout(_Shape(len(frame_id), len(rows) // count, pads))
+        layout = self._find_layout(_Shape(len(frame_id), len(rows) // count, pads))
         record = np.zeros(count, layout.record)
         self.write_constants(record, layout, frame_id)
         record["sec"], record["nanosec"] = np.divmod(stamp_ns, SECOND)
         record["time_offset"] = rows.stamp_ns.reshape(count, -1) - stamp_ns[:, None]
-        for name in ("cube", "sequence", *self._values):
-            record[name] = getattr(rows, name).reshape(record[name].shape)
-        return [one.tobytes() for one in record]
+        for name in self._columns:
+            if name != "stamp_ns":
+                record[name] = getattr(rows, name).reshape(record[name].shape)
+        return [message.tobytes() for message in record]
 
-    def make_rows(self, record: NDArray[Any], stamp_ns: NDArray[np.int64]) -> AnyRows:
-        """The rows of records (M,): views of a single one, copies of several."""
-        columns: list[NDArray[Any]] = [_flat(record, "cube"), _flat(record, "sequence"), stamp_ns]
-        columns += [_flat(record, name) for name in self._values]
-        return self._rows(*columns)
+    def make_rows(self, record: AnyArray, stamp_ns: Times) -> AnyRows:
+        """Return the rows of records (M,): views of a single one, copies of several."""
+        columns: dict[str, AnyArray] = {
+            name: stamp_ns if name == "stamp_ns" else _read_column(record, name)
+            for name in self._columns
+        }
+        return self._rows(**columns)
 
-    def write_constants(self, record: NDArray[Any], layout: _Layout, frame_id: bytes) -> None:
-        """Write into records (M,) what all messages of a layout have in common."""
+    def write_constants(self, record: AnyArray, layout: _Layout, frame_id: bytes) -> None:
+        """Write what all messages of a layout have in common into records (M,)."""
         record["encapsulation"] = LITTLE_ENDIAN
         record["frame_id"] = np.void(frame_id)
-        for name, values in zip(layout.names, layout.counts.tolist(), strict=True):
-            record[f"length of {name}"] = values
-        if self._has_pads:
+        for name, count in zip(layout.sequences, layout.counts.tolist(), strict=True):
+            record[f"length of {name}"] = count
+        if self._n_fields_before_pads is not None:
             record["n_pads"] = layout.shape.pads
 
-    def _records(self, messages: Sequence[bytes]) -> tuple[_Layout, NDArray[Any]]:
-        """Messages of one shape as records (M,). MessageError: as `decode`."""
-        layout = self._layout(self._shape(messages[0]))
+    def _read_records(self, messages: Sequence[bytes]) -> tuple[_Layout, AnyArray]:
+        """Return messages of one shape as records (M,). MessageError: see `decode`."""
+        layout = self._find_layout(self._read_shape(messages[0]))
         size, count = layout.record.itemsize, len(messages)
         data = messages[0]
         if count > 1:
             data = b"".join(message[:size] for message in messages)
             if len(data) != count * size:
-                raise MessageError(f"{self._name}: {count} messages of different lengths")
-        self._check(layout, data, count)
-        record: NDArray[Any] = np.frombuffer(data, layout.record, count)
+                raise MessageError(
+                    f"{self._name}: {count} messages of different lengths; decode them one by one"
+                )
+        self._check_counts(layout, data, count)
+        record: AnyArray = np.frombuffer(data, layout.record, count)
         return layout, record
 
-    def _shape(self, data: bytes) -> _Shape:
-        """MessageError: too short, or its length is not that of so many rows."""
+    def _read_shape(self, data: bytes) -> _Shape:
+        """Return the shape that a message states.
+
+        Raises:
+            MessageError: It is too short, or its length does not belong to this shape.
+        """
         if len(data) < _FRAME_AT + 4 or data[:2] != LITTLE_ENDIAN[:2]:
             raise MessageError(
                 f"{self._name} of {len(data)} bytes that begin with {data[:4].hex()}: "
                 "not little-endian CDR"
             )
         (frame,) = struct.unpack_from("<I", data, _FRAME_LENGTH_AT)
-        rows_at = _aligned(_FRAME_AT + frame)
+        rows_at = _align(_FRAME_AT + frame)
         if rows_at + 4 > len(data):
             raise MessageError(
                 f"{self._name} of {len(data)} bytes says its frame id has {frame}: damaged"
             )
         (rows,) = struct.unpack_from("<I", data, rows_at)
         pads = 0
-        if self._has_pads:
-            pads_at = self._end(_Shape(frame, rows, 0), self._before_pads)
+        if self._n_fields_before_pads is not None:
+            pads_at = self._find_end(_Shape(frame, rows, 0), self._n_fields_before_pads)
             pads = data[pads_at] if pads_at < len(data) else 0
         shape = _Shape(frame, rows, pads)
-        # Middleware may add up to three bytes at the end. Nothing of a size that the message only
-        # claims is made before this.
-        if not 0 <= len(data) - self._end(shape, len(self._fields)) < 4:
+        # Middleware may add up to three bytes at the end. Before this check nothing is allocated,
+        # because a damaged message may state any number of rows.
+        n_extra = len(data) - self._find_end(shape, len(self._fields))
+        if not 0 <= n_extra < 4:
             raise MessageError(
                 f"{self._name} of {len(data)} bytes says it has {rows} rows of {pads} pads: "
                 "damaged, or of another version of the messages"
             )
         return shape
 
-    def _check(self, layout: _Layout, data: bytes, count: int) -> None:
-        """MessageError: a sequence does not have as many values as the rows need."""
+    def _check_counts(self, layout: _Layout, data: bytes, count: int) -> None:
+        """Raise MessageError if a sequence does not have as many values as the rows need."""
         size, expected = layout.record.itemsize, layout.counts
+        # A message may end between two words, so each row of the view has its own length.
         words = np.ndarray((count, size // 4), "<u4", data, 0, (size, 4))
         counts = words.take(layout.count_words, axis=1)
         # Comparing bytes takes a third of the time that comparing arrays takes.
@@ -291,77 +367,95 @@ class MessageCodec(Generic[AnyRows]):
         message, which = np.argwhere(counts != expected)[0].tolist()
         raise MessageError(
             f"{self._name} of {layout.shape.rows} rows has {counts[message, which]} values of "
-            f"{layout.names[which]}, they need {expected[which]}"
+            f"{layout.sequences[which]}, they need {expected[which]}"
         )
 
-    def _find_end(self, shape: _Shape, count: int) -> int:
-        """Where the first fields of a message end."""
-        return self._items(shape, count)[1]
+    def _compute_end(self, shape: _Shape, n_fields: int) -> int:
+        """Return the place where the first fields of a message end."""
+        _, end = self._place_fields(shape, n_fields)
+        return end
 
-    def _items(self, shape: _Shape, count: int) -> tuple[list[_Item], int]:
-        """Where the first fields of a message are, and where they end. Only integers of Python are
-        made: the shape may be a wrong claim."""
-        items = []
+    def _place_fields(self, shape: _Shape, n_fields: int) -> tuple[list[_Place], int]:
+        """Return the places of the first fields of a message, and where they end.
+
+        Only integers are computed, because a damaged message may state any shape.
+        """
+        places = []
         end = _FRAME_AT + shape.frame
-        for field in self._fields[:count]:
+        for field in self._fields[:n_fields]:
             count_at, values = None, 1
-            if field.width != ONCE:
-                count_at, end = _aligned(end), _aligned(end) + 4
-                values = shape.rows * (shape.pads if field.width == PADS else field.width)
-            items.append(_Item(field, count_at, end, values))
+            if field.width != PER_MESSAGE:
+                count_at = _align(end)
+                end = count_at + 4
+                width = shape.pads if field.width == PER_PAD else field.width
+                values = shape.rows * width
+            places.append(_Place(field, count_at, end, values))
             end += values * int(field.type[-1])
-        return items, end
+        return places, end
 
     def _make_layout(self, shape: _Shape) -> _Layout:
-        items, size = self._items(shape, len(self._fields))
-        names = ["encapsulation", "sec", "nanosec", "length of frame_id", "frame_id"]
-        formats: list[Any] = ["S4", "<i4", "<u4", "<u4", f"V{shape.frame}"]
-        offsets = [0, _SECONDS_AT, _SECONDS_AT + 4, _FRAME_LENGTH_AT, _FRAME_AT]
-        for field, count_at, at, _ in items:
+        places, size = self._place_fields(shape, len(self._fields))
+        # Name, type and place of each entry of the record.
+        entries: list[tuple[str, Any, int]] = [
+            ("encapsulation", "S4", 0),
+            ("sec", "<i4", _SECONDS_AT),
+            ("nanosec", "<u4", _NANOSECONDS_AT),
+            ("length of frame_id", "<u4", _FRAME_LENGTH_AT),
+            ("frame_id", f"V{shape.frame}", _FRAME_AT),
+        ]
+        sequences, counts, counts_at = ["frame_id"], [shape.frame], [_FRAME_LENGTH_AT]
+        for field, count_at, at, values in places:
             if count_at is not None:
-                names.append(f"length of {field.name}")
-                formats.append("<u4")
-                offsets.append(count_at)
-            names.append(field.name)
-            formats.append((field.type, _dimensions(field.width, shape)))
-            offsets.append(at)
+                entries.append((f"length of {field.name}", "<u4", count_at))
+                sequences.append(field.name)
+                counts.append(values)
+                counts_at.append(count_at)
+            entries.append((field.name, (field.type, _dimensions(field.width, shape)), at))
+        names, formats, offsets = zip(*entries, strict=True)
         record = np.dtype(
-            {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
+            {
+                "names": names,
+                "formats": formats,
+                "offsets": offsets,
+                "itemsize": size,
+            }
         )
-        counted: list[_Item] = [item for item in items if item.count_at is not None]
-        counts_at = [_FRAME_LENGTH_AT, *(item.count_at or 0 for item in counted)]
         return _Layout(
-            shape,
-            record,
-            np.array(counts_at) // 4,
-            np.array([shape.frame, *(item.values for item in counted)], "<u4"),
-            ["frame_id", *(item.field.name for item in counted)],
+            shape=shape,
+            record=record,
+            sequences=sequences,
+            counts=np.array(counts, "<u4"),
+            count_words=np.array(counts_at) // 4,
         )
 
 
 def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
-    if width == ONCE:
+    """Return the shape of a field's values in one message."""
+    if width == PER_MESSAGE:
         return ()
     if width == 1:
         return (shape.rows,)
-    return (shape.rows, shape.pads if width == PADS else width)
+    return (shape.rows, shape.pads if width == PER_PAD else width)
 
 
-def _stamps(record: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Of records (M,): their stamps, and those of all their rows one after the other."""
-    stamp_ns = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
-    return stamp_ns, (stamp_ns[:, None] + record["time_offset"]).reshape(-1)
+def _read_stamps(record: AnyArray) -> tuple[Times, Times]:
+    """Return the time stamps of records (M,), and those of all their rows one after the other."""
+    stamp_ns: Times = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
+    times_ns: Times = stamp_ns[:, None] + record["time_offset"]
+    return stamp_ns, times_ns.reshape(-1)
 
 
-def _flat(record: NDArray[Any], name: str) -> NDArray[Any]:
-    """A field of records (M,), the rows of all of them one after the other."""
-    values = record[name]
+def _read_column(record: AnyArray, name: str) -> AnyArray:
+    """Return a field of records (M,), with the rows of all of them one after the other."""
+    values: AnyArray = record[name]
     if len(record) == 1:
-        return values[0]  # type: ignore[no-any-return]
+        view: AnyArray = values[0]
+        return view
     return values.reshape(-1, *values.shape[2:])
 
 
-def _aligned(place: int) -> int:
+def _align(place: int) -> int:
+    """Return the next multiple of 4."""
     return -(-place // 4) * 4
 
 

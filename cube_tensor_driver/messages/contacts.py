@@ -1,7 +1,7 @@
-"""Messages of contacts, made alike by the node `contacts` and by reprocessing.
+"""Messages of contacts, which the node `contacts` and reprocessing make in the same way.
 
-The caller passes the function that makes a message: of rclpy's classes in a node, of the bag
-library's in reprocessing. So a robot needs no bag library for its contacts.
+The caller passes the function that makes a message: of the classes of rclpy in a node, of those of
+the bag library in reprocessing. So a robot needs no bag library for its contacts.
 """
 
 from __future__ import annotations
@@ -19,16 +19,30 @@ from .codec import SECOND
 from .types import CONTACTS, TRACTION
 
 MakeMessage = Callable[..., Any]
-"""Makes a message from its type, such as geometry_msgs/msg/Point, and its fields by name. Fields
-with numbers are numpy arrays."""
+"""Function that makes a message from its type, such as geometry_msgs/msg/Point, and its fields by
+name. Fields with numbers are numpy arrays."""
 
 CLOUD = ("x", "y", "z", "pressure", "shear", "sigma")
-"""Of the points of `traction`, each a float32: m in the skin's parent frame, Pa on the surface, and
-the standard deviation of the pressure, Pa."""
-_NUMBERS = ("normal_force", "shear_force", "area", "position_uncertainty", "force_uncertainty")
-_TRACKED = ("moment", "shear_uncertainty", "area_uncertainty", "moment_uncertainty")
-_FLOAT32 = 7
-"""`FLOAT32` of PointField."""
+"""Fields of a point of the topic `traction`, each a float32: position in the parent frame of the
+skin in m, pressure and shear on the surface in Pa, standard deviation of the pressure in Pa."""
+
+POINT_SIZE = 4 * len(CLOUD)
+"""Size of a point, in bytes."""
+
+_NUMBERS = (
+    "normal_force",
+    "shear_force",
+    "area",
+    "position_uncertainty",
+    "force_uncertainty",
+)
+_TRACKED_NUMBERS = (
+    "moment",
+    "shear_uncertainty",
+    "area_uncertainty",
+    "moment_uncertainty",
+)
+_FLOAT32 = 7  # sensor_msgs/msg/PointField.FLOAT32
 
 
 def contacts_message(
@@ -37,57 +51,78 @@ def contacts_message(
     frame_id: str,
     contacts: Sequence[Contact] | Sequence[TrackedContact],
 ) -> Any:
-    """A SkinContacts."""
-    tracked = [one for one in contacts if isinstance(one, TrackedContact)]
-    fields: dict[str, Any] = {name: _column(contacts, name) for name in _NUMBERS}
-    fields |= {name: _column(tracked, name) for name in _TRACKED}
-    fields["id"] = np.array([one.id for one in tracked], np.uint32)
-    fields["position"] = [_xyz(make, "Point", one.position) for one in contacts]
-    fields["normal"] = [_xyz(make, "Vector3", one.normal) for one in contacts]
-    fields["force"] = [_xyz(make, "Vector3", one.force) for one in contacts]
-    return make(CONTACTS, header=_header(make, stamp_ns, frame_id), **fields)
+    """Make a SkinContacts.
+
+    Args:
+        make: Function that makes messages.
+        stamp_ns: Time stamp, in ns.
+        frame_id: Frame of the contacts.
+        contacts: The contacts. Only tracked ones have an id, a moment and its uncertainties.
+    """
+    tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
+    fields: dict[str, Any] = {name: _collect(contacts, name) for name in _NUMBERS}
+    fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
+    fields["id"] = np.array([contact.id for contact in tracked], np.uint32)
+    for name, kind in (("position", "Point"), ("normal", "Vector3"), ("force", "Vector3")):
+        fields[name] = [_make_xyz(make, kind, getattr(contact, name)) for contact in contacts]
+    return make(CONTACTS, header=_make_header(make, stamp_ns, frame_id), **fields)
 
 
 def traction_message(make: MakeMessage, stamp_ns: int, frame_id: str, cloud: Array) -> Any:
-    """A PointCloud2 of a `ContactFinder.cloud` (M, 6)."""
+    """Make a PointCloud2.
+
+    Args:
+        make: Function that makes messages.
+        stamp_ns: Time stamp, in ns.
+        frame_id: Frame of the points.
+        cloud: Points (M, 6) of `ContactFinder.cloud`.
+    """
     data = cloud.astype("<f4")
-    step = data.itemsize * len(CLOUD)
     fields = [
-        make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=_FLOAT32, count=1)
-        for k, name in enumerate(CLOUD)
+        make(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=4 * number,
+            datatype=_FLOAT32,
+            count=1,
+        )
+        for number, name in enumerate(CLOUD)
     ]
     return make(
         TRACTION,
-        header=_header(make, stamp_ns, frame_id),
+        header=_make_header(make, stamp_ns, frame_id),
         height=1,
         width=len(data),
         fields=fields,
         is_bigendian=False,
-        point_step=step,
-        row_step=step * len(data),
+        point_step=POINT_SIZE,
+        row_step=POINT_SIZE * len(data),
         data=data.reshape(-1).view(np.uint8),
         is_dense=True,
     )
 
 
 def decode_contacts(message: Any) -> list[Contact]:
-    """The contacts of a SkinContacts. ValueError: its arrays differ in length."""
+    """Return the contacts of a SkinContacts. ValueError: its arrays differ in length."""
 
-    def xyz(one: Any) -> Array:
-        return np.array([one.x, one.y, one.z])
+    def read_xyz(vector: Any) -> Array:
+        return np.array([vector.x, vector.y, vector.z])
 
-    vectors = message.position, message.normal, message.force
-    numbers = (getattr(message, name) for name in _NUMBERS)
+    columns = [getattr(message, name) for name in ("position", "normal", "force", *_NUMBERS)]
     return [
-        Contact(xyz(position), xyz(normal), xyz(force), *rest)
-        for position, normal, force, *rest in zip(*vectors, *numbers, strict=True)
+        Contact(read_xyz(position), read_xyz(normal), read_xyz(force), *numbers)
+        for position, normal, force, *numbers in zip(*columns, strict=True)
     ]
 
 
 def decode_traction(message: Any) -> Array:
-    """(M, 6) the cloud of a PointCloud2 from `traction`. BagError: it has other fields."""
+    """Return the points (M, 6) of a PointCloud2 from the topic `traction`.
+
+    Raises:
+        BagError: The points have other fields.
+    """
     names = tuple(field.name for field in message.fields)
-    if names != CLOUD or message.point_step != 4 * len(CLOUD):
+    if names != CLOUD or message.point_step != POINT_SIZE:
         raise BagError(
             f"a point cloud has the fields {', '.join(names)}; those of the topic traction are "
             f"{', '.join(CLOUD)}: listen to the topic of the node contacts"
@@ -96,16 +131,17 @@ def decode_traction(message: Any) -> Array:
     return points.reshape(-1, len(CLOUD)).astype(float)
 
 
-def _column(contacts: Sequence[Any], name: str) -> Array:
-    return np.array([getattr(one, name) for one in contacts], float)
+def _collect(contacts: Sequence[Any], name: str) -> Array:
+    """Return an attribute of all contacts (contacts,)."""
+    return np.array([getattr(contact, name) for contact in contacts], float)
 
 
-def _header(make: MakeMessage, stamp_ns: int, frame_id: str) -> Any:
-    seconds, rest = divmod(stamp_ns, SECOND)
-    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+def _make_header(make: MakeMessage, stamp_ns: int, frame_id: str) -> Any:
+    seconds, nanoseconds = divmod(stamp_ns, SECOND)
+    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
-def _xyz(make: MakeMessage, kind: str, vector: Array) -> Any:
+def _make_xyz(make: MakeMessage, kind: str, vector: Array) -> Any:
     x, y, z = vector.tolist()
     return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)

@@ -1,4 +1,7 @@
-"""What an `info` says about a skin's cubes; of rclpy's message or of a bag's."""
+"""Reading of a SkinInfo: poses and calibrations of the cubes of a skin.
+
+The message may be one of rclpy or one of a bag.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +17,23 @@ from ..core.tensor import rotation_from_quaternion
 
 
 def cube_poses(info: Any) -> CubePoses:
-    """Where the cubes of an `info` are, in m.
+    """Return the poses of the cubes.
 
-    MessageError: no cubes, or a pose or size that no cube can have.
+    Raises:
+        MessageError: There are no cubes, or a pose or size is impossible.
     """
     if not info.cubes:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
     positions = [cube.pose.position for cube in info.cubes]
     orientations = [cube.pose.orientation for cube in info.cubes]
-    rotations = [rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w])) for q in orientations]
     poses = CubePoses(
         position=np.array([(p.x, p.y, p.z) for p in positions]),
-        rotation=np.array(rotations),
+        rotation=np.array([rotation_from_quaternion([q.x, q.y, q.z, q.w]) for q in orientations]),
         half_side=np.array([cube.half_side for cube in info.cubes]),
     )
-    possible = np.isfinite(poses.position).all(axis=1) & (poses.half_side > 0)
-    possible &= np.isfinite(poses.half_side)
-    for number in np.flatnonzero(~possible).tolist():
+    is_possible = np.isfinite(poses.position).all(axis=1)
+    is_possible &= np.isfinite(poses.half_side) & (poses.half_side > 0)
+    for number in np.flatnonzero(~is_possible).tolist():
         raise MessageError(
             f"info of the skin {info.name}: cube {info.cubes[number].name} is at "
             f"{poses.position[number].tolist()} m with a half side of {poses.half_side[number]} m; "
@@ -40,24 +43,28 @@ def cube_poses(info: Any) -> CubePoses:
 
 
 def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
-    """The calibration of each cube of an `info`; cubes with the same one share one object.
+    """Return the calibration of each cube; cubes with the same one share an object.
 
-    MessageError: a cube's calibration is missing, or none.
+    Raises:
+        MessageError: The calibration of a cube is missing or invalid.
     """
     texts = dict(zip(info.calibration_ids, info.calibrations, strict=False))
-    known: dict[str, Calibration] = {}
+    used_ids = [cube.calibration_id for cube in info.cubes]
+    calibrations: dict[str, Calibration] = {}
     try:
-        for name in {cube.calibration_id for cube in info.cubes}:
-            known[name] = Calibration.from_dict(parse_yaml(texts[name], f"calibration {name}"))
+        for used_id in set(used_ids):
+            data = parse_yaml(texts[used_id], f"calibration {used_id}")
+            calibrations[used_id] = Calibration.from_dict(data)
     except (CalibrationError, ConfigError) as error:
         raise MessageError(f"info of the skin {info.name}: {error}") from None
     except KeyError as error:
         raise MessageError(
             f"info of the skin {info.name}: no calibration {error}, which a cube uses"
         ) from None
-    return tuple(known[cube.calibration_id] for cube in info.cubes)
+    return tuple(calibrations[used_id] for used_id in used_ids)
 
 
 def geometry(info: Any) -> list[object]:
-    """What of an `info` makes it another skin if it changes."""
-    return [info.header.frame_id, *((cube.name, cube.pose, cube.half_side) for cube in info.cubes)]
+    """Return the parts of the message whose change means that the skin has become another one."""
+    cubes = [(cube.name, cube.pose, cube.half_side) for cube in info.cubes]
+    return [info.header.frame_id, *cubes]

@@ -1,4 +1,4 @@
-"""Names of the message types of the package."""
+"""Names of the message types that the package uses."""
 
 from __future__ import annotations
 
