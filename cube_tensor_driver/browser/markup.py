@@ -8,9 +8,8 @@ from html import escape
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.arrays import Array
+from ..core.arrays import AnyArray, Array
 from ..core.latest_stress import FAULTY, HEALTH_WORDS
 from ..core.modes import COMPONENTS
 from ..core.status import STATUS
@@ -18,30 +17,45 @@ from ..touch.surface import Contact
 from ..views import scene
 from .moment import Moment
 
-GREEN, AMBER, RED, BLUE = "#2b8a3e", "#e67700", "#c92a2a", "#1864ab"
+GREEN = "#2b8a3e"
+AMBER = "#e67700"
+RED = "#c92a2a"
+BLUE = "#1864ab"
+
 NoteColour = Literal["blue", "green", "red"]
-MOST_ROWS = 20
-"""Of cubes that are not fine; beside them the page tells how many there are."""
+"""Colours of notes, by the names that viser gives them."""
+
+MAX_LISTED_CUBES = 20
+"""Number of cubes with a fault that are listed; the page tells how many there are in all."""
+
 LEGEND_STEPS = 9
+"""Number of colours between which the bar of the legend changes gradually; an odd number, so that
+one of them is the middle."""
 
 BOX_STYLE = "padding:0 0.8em 0.4em;font-size:0.85em"
 BAR_STYLE = "height:0.9em;border-radius:3px;background:linear-gradient(to right,{})"
 TICKS_STYLE = "display:flex;justify-content:space-between"
 VALUE_STYLE = "text-align:right;font-family:monospace"
+
 PHONE_STYLE = (
     "<style>@media (max-width: 36em) {"
     "[style*='width: 20em'] {width: 100vw !important}"
     "[style*='max-height: 60%'] {max-height: 45% !important}}</style>"
 )
-"""viser's sheet for narrow screens is 20em wide and covers the skin: all of the width, but low."""
+"""A style for narrow screens. viser's panel there is 20em wide and covers the skin; this makes it
+as wide as the screen, and lower."""
 
 
 @dataclass
 class PageStatus:
     """What the page says about other things than the rows.
 
-    links: a line for each link. action: what became of the last thing that was asked for, with a
-    title and colour for a note. recording: whether a bag is being written.
+    Attributes:
+        links: A line for each link.
+        action: What became of the last action of the user.
+        title: Title of the note about it.
+        colour: Colour of that note.
+        recording: Whether a bag is being recorded.
     """
 
     links: list[str] = field(default_factory=list)
@@ -51,11 +65,12 @@ class PageStatus:
     recording: bool = False
 
     def say(self, title: str, action: str, colour: NoteColour = "blue") -> None:
+        """Show what became of an action, as a line and as a note."""
         self.title, self.action, self.colour = title, action, colour
 
 
 def waiting(domain: str) -> str:
-    """What page and terminal say while nothing publishes a skin. domain: of DDS."""
+    """Return what page and terminal say while no skin is published in a DDS domain."""
     return (
         f"Waiting for a skin: none is published in DDS domain {domain}. "
         "Start one, for example with ./cube demo; it appears here."
@@ -63,33 +78,33 @@ def waiting(domain: str) -> str:
 
 
 def box(content: str) -> str:
-    """Content with the margins that all texts of the page have."""
+    """Return content with the margins that all texts of the page have."""
     return _div(BOX_STYLE, content)
 
 
 def label(name: str) -> str:
-    """A component as people write it: ∂σzz/∂x for zz_x."""
+    """Return a component as people write it: ∂σzz/∂x for zz_x."""
     if name == "residual":
         return name
     return f"∂σ{name[:2]}/∂{name[3]}" if "_" in name else f"σ{name}"
 
 
 def unit(name: str) -> tuple[float, str]:
-    """Size in SI, and name, of the unit in which a component or the residual is shown."""
+    """Return size in SI units and name of the unit in which a component is shown."""
     if name == "residual":
         return 1.0, "× noise"
     return (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
 
 
-def value(quantity: scene.Quantity, shown: float) -> str:
-    """A quantity of one cube, SI, with its unit."""
-    if np.isnan(shown):
+def value(quantity: scene.Quantity, si_value: float) -> str:
+    """Return a value of a quantity, in SI units, as text with its unit."""
+    if np.isnan(si_value):
         return "unknown"
-    return f"{quantity.label} {_hundredths(shown / quantity.size)} {quantity.unit}"
+    return f"{quantity.label} {_hundredths(si_value / quantity.size)} {quantity.unit}"
 
 
 def surface_pressure(pressure: float, sigma: float) -> str:
-    """The pressure on the surface, Pa, with its standard deviation; NaN: unknown."""
+    """Return the pressure on the surface and its standard deviation, in Pa, as text."""
     if np.isnan(pressure):
         return "on the surface unknown"
     deviation = "unknown" if np.isnan(sigma) else f"{sigma / 1e3:.2f}"
@@ -97,36 +112,44 @@ def surface_pressure(pressure: float, sigma: float) -> str:
 
 
 def clock(seconds: float) -> str:
-    """12.3 s; or 3 min 12.3 s."""
+    """Return a duration as "12.3 s" or "3 min 12.3 s"."""
     minutes, rest = divmod(round(seconds, 1), 60)
     return f"{minutes:.0f} min {rest:.1f} s" if minutes else f"{rest:.1f} s"
 
 
 def newtons(contact: Contact) -> str:
-    """The forces of a contact; without shear if the cubes observe none."""
+    """Return the forces of a contact as text; without shear if no cube observes it."""
     shear = "" if np.isnan(contact.shear_force) else f", shear {contact.shear_force:.2f} N"
     return f"{contact.normal_force:.2f} N{shear}"
 
 
 def headline(
-    health: NDArray[np.integer],
+    health: AnyArray,
     hertz: float,
     contact: Contact | None,
     paused: bool,
     recording: bool,
 ) -> str:
-    """The first line: does it run, how many cubes, how fast, how hard it is pressed."""
+    """Return the first line of the page.
+
+    Args:
+        health: (N,) health of the cubes.
+        hertz: Rows per second.
+        contact: The strongest contact.
+        paused: Whether page or replay are stopped.
+        recording: Whether a bag is being recorded.
+    """
     live = int(np.count_nonzero(health < FAULTY))
     if paused:
-        dot, word = BLUE, "paused"
+        colour, word = BLUE, "paused"
     elif live == len(health):
-        dot, word = GREEN, "live"
+        colour, word = GREEN, "live"
     elif live:
-        dot, word = AMBER, "not all cubes"
+        colour, word = AMBER, "not all cubes"
     else:
-        dot, word = RED, "no data"
+        colour, word = RED, "no data"
     parts = [
-        f"<span style='color:{dot}'>⬤</span> <b>{word}</b>",
+        f"<span style='color:{colour}'>⬤</span> <b>{word}</b>",
         f"{live} of {len(health)} cubes",
         f"{hertz:.0f} Hz",
         "no load" if contact is None else newtons(contact).replace(" ", "&nbsp;"),
@@ -137,12 +160,12 @@ def headline(
 
 
 def action_line(action: str) -> str:
-    """What became of the last thing that was asked for; empty if nothing was."""
+    """Return the line about the last action of the user, empty if there was none."""
     return box(escape(action)) if action else ""
 
 
 def no_deviation() -> str:
-    """Instead of the legend of the standard deviation, where there is none."""
+    """Return what stands in place of the legend where the standard deviation is unknown."""
     return box(
         "Everything is grey: the standard deviation is known only while the node <i>contacts</i> "
         "runs with <i>method:=inverse</i>."
@@ -150,7 +173,7 @@ def no_deviation() -> str:
 
 
 def legend(quantity: scene.Quantity, top: float) -> str:
-    """The bar of colours with its range; top: SI."""
+    """Return the bar of colours with its range; top: upper end, in SI units."""
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
     colours = (255 * scene.colours(quantity, values, top)).astype(int).tolist()
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
@@ -162,23 +185,31 @@ def legend(quantity: scene.Quantity, top: float) -> str:
 
 
 def explanation(bar: float, stress: float, gradient: float, sigma: Array | None) -> str:
-    """What is drawn, and how long arrows are. bar: length of the scale bar, m. stress, Pa, and
-    gradient, Pa/m: of arrows as long as the bar. sigma: of the field, as in SurfaceField."""
+    """Return what is drawn, and what the lengths of arrows mean.
+
+    Args:
+        bar: Length of the scale bar, in metres.
+        stress: Traction, in Pa, whose arrow is as long as the bar.
+        gradient: Gradient, in Pa/m, whose arrow is as long as the bar.
+        sigma: Standard deviation of the field, as in `SurfaceField`.
+    """
     long = f"as long as the bar ({1e3 * bar:g} mm):"
-    lines = [
+    arrows = [
         ("#282c34", f"traction on the upper face, {long} <b>{stress / 1e3:.3g} kPa</b>"),
         ("#1969d2", f"pressure grows this way, {long} <b>{gradient / 1e6:.3g} kPa/mm</b>"),
     ]
-    rows = "".join(f"<div><b style='color:{colour}'>➜</b> {text}</div>" for colour, text in lines)
-    rows += f"<div><b>▦</b> {_field(sigma)}</div>"
-    rows += "<div><b>◯</b> the chosen cube; click another one to choose it</div>"
-    rows += "<div>principal stresses: <b style='color:#d22828'>red</b> pulls, "
-    rows += "<b style='color:#2850dc'>blue</b> pushes</div>"
-    rows += "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>"
-    return box(rows)
+    lines = [f"<div><b style='color:{colour}'>➜</b> {text}</div>" for colour, text in arrows]
+    lines += [
+        f"<div><b>▦</b> {_field_source(sigma)}</div>",
+        "<div><b>◯</b> the chosen cube; click another one to choose it</div>",
+        "<div>principal stresses: <b style='color:#d22828'>red</b> pulls, "
+        "<b style='color:#2850dc'>blue</b> pushes</div>",
+        "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>",
+    ]
+    return box("".join(lines))
 
 
-def _field(sigma: Array | None) -> str:
+def _field_source(sigma: Array | None) -> str:
     if sigma is None:
         return "field: interpolated between the cubes, at their depth"
     known = sigma[np.isfinite(sigma)]
@@ -187,12 +218,12 @@ def _field(sigma: Array | None) -> str:
 
 
 def numbers(moment: Moment, cube: int, hertz: float) -> str:
-    """The observed components of a cube, its residual, rate and state."""
+    """Return a table of the observed components of a cube, its residual, rate and state."""
     rows = []
-    for name, shown in zip(COMPONENTS, moment.values[cube], strict=True):
+    for name, si_value in zip(COMPONENTS, moment.values[cube], strict=True):
         size, unit_name = unit(name)
-        if np.isfinite(shown):
-            rows.append((label(name), f"{shown / size:+.3f}", unit_name))
+        if np.isfinite(si_value):
+            rows.append((label(name), f"{si_value / size:+.3f}", unit_name))
     rows.append(("residual", f"{moment.residual[cube]:.2f}", "× noise"))
     rows.append(("rate", f"{hertz:.0f}", "Hz"))
     rows.append(("state", _state(moment.status[cube], moment.health[cube]), ""))
@@ -200,7 +231,7 @@ def numbers(moment: Moment, cube: int, hertz: float) -> str:
 
 
 def _hundredths(number: float) -> str:
-    """0.00 for -0.001, too."""
+    # Adding 0.0 turns -0.0 into 0.0.
     return f"{round(number, 2) + 0.0:.2f}"
 
 
@@ -209,13 +240,13 @@ def _state(status: int, health: int) -> str:
     return ", ".join(words) or HEALTH_WORDS[health]
 
 
-def conditions(names: list[str], health: NDArray[np.integer], links: list[str]) -> str:
-    """The state of the links, how many cubes are in which state, and which are not fine."""
+def conditions(names: list[str], health: AnyArray, links: list[str]) -> str:
+    """Return the state of the links, the number of cubes in each state, and a list of faults."""
     counts = ", ".join(
         f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(HEALTH_WORDS)
     )
-    not_fine = np.flatnonzero(health)[:MOST_ROWS].tolist()
-    rows = [(names[cube], HEALTH_WORDS[health[cube]], "") for cube in not_fine]
+    with_fault = np.flatnonzero(health)[:MAX_LISTED_CUBES].tolist()
+    rows = [(names[cube], HEALTH_WORDS[health[cube]], "") for cube in with_fault]
     lines = "".join(f"<div>{escape(line)}</div>" for line in [*links, counts])
     return box(lines + _table(rows))
 
@@ -225,7 +256,7 @@ def _div(style: str, content: str) -> str:
 
 
 def _table(rows: Iterable[tuple[str, str, str]]) -> str:
-    """Rows of name, value and unit."""
+    """Return a table with the columns name, value and unit."""
     cells = "".join(
         f"<tr><td>{name}</td><td style='{VALUE_STYLE}'>{value}</td><td>&nbsp;{unit}</td></tr>"
         for name, value, unit in rows

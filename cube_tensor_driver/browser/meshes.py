@@ -1,21 +1,26 @@
-"""Triangle meshes of the 3-D view as plain arrays, and which cube a ray meets."""
+"""Triangle meshes of the 3-D view: prisms, arrows and rings as arrays, and squares in colours."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import viser
 from numpy.typing import NDArray
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Index
+from ..views import scene
+from ..views.scene import Quantity
 
 Mesh = tuple[NDArray[Any], NDArray[Any]]
 """Vertices (V, 3) and faces (F, 3), each three indices of vertices."""
 
-NOTHING: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))
-"""A mesh that is not seen; viser refuses one without faces."""
-SIDES = 6
-"""Of the prisms that arrows, crosses and rings are made of."""
+NO_MESH: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))
+"""A mesh without area, which is not seen. viser refuses one without faces."""
+
+PRISM_SIDES = 6
+"""Number of sides of the prisms that arrows, crosses and rings consist of."""
+
 CUBE: Mesh = (
     np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float),
     np.array(
@@ -29,7 +34,8 @@ CUBE: Mesh = (
         ]
     ),
 )
-"""A cube of half side 1 about the origin."""
+"""A cube with a half side of 1 about the origin."""
+
 CUBE_EDGES = np.array(
     [
         [one, other]
@@ -38,77 +44,102 @@ CUBE_EDGES = np.array(
         if np.count_nonzero(one != other) == 1
     ]
 )
-"""(12, 2, 3) its edges."""
+"""(12, 2, 3) edges of `CUBE`, each from corner to corner."""
 
-LEAST_ARROW, NECK = 0.15, 0.2
-"""Parts of an arrow's unit length: arrows below the first are left out, heads are the second."""
-SHAFT_RADIUS, HEAD_RADIUS = 0.025, 0.075
+MIN_ARROW = 0.15
+"""Length, in units of the arrow's unit length, below which an arrow is left out."""
+
+HEAD_LENGTH = 0.2
+"""Length of the head of an arrow, in units of its unit length."""
+
+SHAFT_RADIUS = 0.025
+"""Radius of the shaft of an arrow, in units of its unit length."""
+
+HEAD_RADIUS = 0.075
+"""Radius of the head of an arrow at its base, in units of its unit length."""
+
 RING_POINTS = 49
+"""Number of points of a ring; the last one is the first one again."""
+
+COLOUR_STEPS = 32
+"""Number of colours of a `SquareLayer`. Each is a mesh of its own, so that more cost more time."""
+
+_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+_SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
 
-def rods(lines: Array, start: float, end: float | None = None) -> Mesh:
-    """Open prisms along lines (N, 2, 3), with a radius that goes from `start` to `end`.
+def rods(lines: Array, start_radius: float, end_radius: float | None = None) -> Mesh:
+    """Make open prisms along lines.
 
-    end: None: as `start`; 0 makes pyramids.
+    Args:
+        lines: (N, 2, 3) start and end of each line.
+        start_radius: Radius at the start.
+        end_radius: Radius at the end, 0 for pyramids; None: as at the start.
     """
     if not len(lines):
-        return NOTHING
+        return NO_MESH
     along = lines[:, 1] - lines[:, 0]
-    # Perpendicular to the line and to the axis that the line is least parallel to.
-    first = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=1)])
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
-    second = np.cross(along, first)
-    second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-12)
+    # The axis that is least parallel to the line gives a stable perpendicular direction.
+    axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+    first = _normalised(np.cross(along, axis))
+    second = _normalised(np.cross(along, first))
 
-    angle = 2 * np.pi * np.arange(SIDES)[:, None, None] / SIDES
+    angle = 2 * np.pi * np.arange(PRISM_SIDES)[:, None, None] / PRISM_SIDES
     circle = (np.cos(angle) * first + np.sin(angle) * second).swapaxes(0, 1)
-    radii = np.array([start, start if end is None else end])
+    radii = np.array([start_radius, start_radius if end_radius is None else end_radius])
     vertices = lines[:, :, None] + circle[:, None] * radii[:, None, None]
 
-    corner = np.arange(SIDES)
-    following = (corner + 1) % SIDES
+    # Each side is two triangles between its two corners at the start and at the end.
+    corner = np.arange(PRISM_SIDES)
+    following = (corner + 1) % PRISM_SIDES
     triangles = [
-        [corner, following, following + SIDES],
-        [corner, following + SIDES, corner + SIDES],
+        [corner, following, following + PRISM_SIDES],
+        [corner, following + PRISM_SIDES, corner + PRISM_SIDES],
     ]
-    faces_of_one = np.array(triangles).transpose(0, 2, 1).reshape(-1, 3)
-    faces = faces_of_one + 2 * SIDES * np.arange(len(lines))[:, None, None]
+    prism = np.array(triangles).transpose(0, 2, 1).reshape(-1, 3)
+    faces = prism + 2 * PRISM_SIDES * np.arange(len(lines))[:, None, None]
     return vertices.reshape(-1, 3), faces.reshape(-1, 3)
 
 
+def _normalised(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-12))
+
+
 def arrows(lines: Array, unit: float) -> Mesh:
-    """Arrows from lines[:, 0] to lines[:, 1] with heads in proportion to `unit`.
+    """Make arrows along lines (N, 2, 3) whose heads are in proportion to the unit length.
 
     Arrows that would be hardly more than a head are left out.
     """
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1, keepdims=True)
-    long_enough = length[:, 0] > LEAST_ARROW * unit
-    lines, length = lines[long_enough], length[long_enough]
+    is_drawn = length[:, 0] > MIN_ARROW * unit
+    lines, length = lines[is_drawn], length[is_drawn]
     tail, tip = lines[:, 0], lines[:, 1]
-    neck = tip - (tip - tail) * np.minimum(NECK * unit / length, 1)
+    neck = tip - (tip - tail) * np.minimum(HEAD_LENGTH * unit / length, 1)
     shafts = rods(np.stack([tail, neck], axis=1), SHAFT_RADIUS * unit)
     heads = rods(np.stack([neck, tip], axis=1), HEAD_RADIUS * unit, 0.0)
-    return joined(shafts, heads)
+    vertices = np.concatenate([shafts[0], heads[0]])
+    faces = np.concatenate([shafts[1], heads[1] + len(shafts[0])])
+    return vertices, faces
 
 
 def ring(radius: float, thickness: float) -> Mesh:
-    """A ring about the origin in the x-y plane; thickness: the radius of its prisms."""
+    """Make a ring about the origin in the x-y plane from prisms with the radius `thickness`."""
     angle = np.linspace(0, 2 * np.pi, RING_POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * radius
     return rods(np.stack([circle[:-1], circle[1:]], axis=1), thickness)
 
 
-def joined(one: Mesh, other: Mesh) -> Mesh:
-    """Two meshes as one."""
-    vertices = np.concatenate([one[0], other[0]])
-    faces = np.concatenate([one[1], other[1] + len(one[0])])
-    return vertices, faces
-
-
 def hit(position: Array, pitch: float, start: Array, direction: Array) -> int | None:
-    """Which of the cubes at `position` (N, 3), `pitch` apart, a ray meets; None if it meets none.
+    """Return which cube a ray meets, None if it meets none.
 
-    Cubes on the far side of a skin, behind another one, do not count.
+    Cubes on the far side of a curved skin, behind another cube, do not count.
+
+    Args:
+        position: (N, 3) centres of the cubes.
+        pitch: Their distance from each other.
+        start: (3,) origin of the ray.
+        direction: (3,) its direction, of any length.
     """
     direction = direction / np.linalg.norm(direction)
     depth = (position - start) @ direction
@@ -118,3 +149,82 @@ def hit(position: Array, pitch: float, start: Array, direction: Array) -> int | 
         return None
     in_front = near & (depth < depth[near].min() + 2 * pitch)
     return int(np.where(in_front, distance, np.inf).argmin())
+
+
+class SquareLayer:
+    """Squares whose colours change: the field of a skin, or the cubes of a large skin.
+
+    The squares of one colour are one mesh, so that a skin is a few objects, which a computer
+    without a graphics card can draw often. An image would be less to send, but browsers decode
+    images apart from everything else, and a slow one would show the field of another instant than
+    the cubes.
+    """
+
+    def __init__(
+        self, api: viser.SceneApi, name: str, points: Array, rotation: Array, side: float
+    ) -> None:
+        """Make the layer, without colours.
+
+        Args:
+            api: The scene.
+            name: Name of the layer in the scene.
+            points: (M, 3) centres of the squares.
+            rotation: (M, 3, 3) frames of the squares, which lie in x and y.
+            side: Length of their sides.
+        """
+        corners = np.einsum("mij,qj->mqi", rotation[:, :, :2], side * _SQUARE)
+        self._corners = (points[:, None] + corners).astype(np.float32)
+        self._frame = api.add_frame(f"/{name}", show_axes=False)
+        self._meshes = [
+            api.add_mesh_simple(
+                f"/{name}/{step}",
+                *NO_MESH,
+                flat_shading=True,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            for step in range(COLOUR_STEPS + 1)
+        ]
+        self._is_drawn = np.zeros(COLOUR_STEPS + 1, bool)
+        self._quantity: Quantity | None = None
+
+    def hide(self) -> None:
+        self._frame.visible = False
+
+    def paint(self, quantity: Quantity, values: Array, top: float) -> None:
+        """Colour the squares by values (M,) of a quantity, on a range up to `top`, in SI units."""
+        if quantity is not self._quantity:
+            self._quantity = quantity
+            for mesh, colour in zip(self._meshes, step_colours(quantity).tolist(), strict=True):
+                mesh.color = tuple(colour)
+        self._frame.visible = True
+        steps = colour_steps(quantity, values, top)
+        for step, mesh in enumerate(self._meshes):
+            chosen = np.flatnonzero(steps == step)
+            # A mesh that was empty and stays empty is not sent again.
+            if len(chosen) or self._is_drawn[step]:
+                mesh.vertices, mesh.faces = self._squares(chosen)
+                self._is_drawn[step] = bool(len(chosen))
+
+    def _squares(self, chosen: Index) -> Mesh:
+        if not len(chosen):
+            return NO_MESH
+        first_vertex = 4 * np.arange(len(chosen), dtype=np.uint32)
+        faces = first_vertex[:, None, None] + _SQUARE_FACES
+        return self._corners[chosen].reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def colour_steps(quantity: Quantity, values: Array, top: float) -> Index:
+    """Return the step of the colour scale (M,) of each value; `COLOUR_STEPS` where it is NaN."""
+    bottom = -top if quantity.signed else 0.0
+    share = (np.nan_to_num(values) - bottom) / (top - bottom)
+    step = np.clip(share * COLOUR_STEPS, 0, COLOUR_STEPS - 1).astype(int)
+    return np.where(np.isfinite(values), step, COLOUR_STEPS)
+
+
+def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
+    """Return the sRGB colours (COLOUR_STEPS + 1, 3) of the steps; the last one is for NaN."""
+    middle = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
+    values = np.append(2 * middle - 1 if quantity.signed else middle, np.nan)
+    return np.round(255 * scene.colours(quantity, values, 1.0)).astype(np.uint8)

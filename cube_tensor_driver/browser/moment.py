@@ -5,30 +5,33 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.arrays import Array
+from ..core.arrays import AnyArray, Array
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.latest_stress import LatestStress
 from ..touch.surface import Contact, Surface
 from ..views.scene import QUANTITIES, Quantity
 
 DEVIATION = Quantity(
-    "standard deviation of pressure",
-    "kPa",
-    1e3,
-    QUANTITIES["pressure"].least,
-    False,
-    lambda values, residual: np.full(len(values), np.nan),
+    label="standard deviation of pressure",
+    unit="kPa",
+    size=1e3,
+    min_top=QUANTITIES["pressure"].min_top,
+    signed=False,
+    of=lambda values, residual: np.full(len(values), np.nan),
 )
-"""Of the field on the surface; a cube has none of its own."""
+"""The standard deviation of the pressure on the surface. Cubes alone have none, so that it is NaN
+unless the node `contacts` gives a field."""
 
 
 class SurfaceField(NamedTuple):
-    """On the M points of a surface.
+    """Values on the M points of a surface.
 
-    pressure, shear: (M,) Pa, NaN where unknown. sigma: (M,) standard deviation of the pressure, Pa;
-    None: interpolated between the cubes, at their depth.
+    Attributes:
+        pressure: (M,) Pa; NaN where it is unknown.
+        shear: (M,) Pa; NaN where it is unknown.
+        sigma: (M,) standard deviation of the pressure, in Pa; None: the values are interpolated
+            between the cubes, at their depth.
     """
 
     pressure: Array
@@ -37,32 +40,40 @@ class SurfaceField(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What the node `contacts` found; None: it does not run, or not with the method inverse."""
+    """What the node `contacts` found.
+
+    Attributes:
+        contacts: The contacts; None: the node does not run.
+        field: Pressure and shear on the surface; None: the node does not run with the method
+            `inverse`.
+    """
 
     contacts: list[Contact] | None = None
     field: SurfaceField | None = None
 
 
 class Moment(NamedTuple):
-    """The rows of N cubes at one instant, and what follows from them.
+    """The newest rows of the N cubes at one instant, and what follows from them.
 
-    values: (N, 15) as in views/scene.py, NaN where a cube has no tensor. residual: (N,). health:
-    (N,) as in views/scene.py. status: (N,) bits. field: on the points of the surface. contacts:
-    strongest first.
+    Attributes:
+        values: (N, 15) as in views/scene.py; NaN where a cube has no tensor.
+        residual: (N,) residual relative to the expected noise.
+        health: (N,) as in core/latest_stress.py.
+        status: (N,) status bits.
+        field: On the points of the surface.
+        contacts: Strongest first.
     """
 
     values: Array
     residual: Array
-    health: NDArray[np.integer]
-    status: NDArray[np.integer]
+    health: AnyArray
+    status: AnyArray
     field: SurfaceField
     contacts: list[Contact]
 
     @classmethod
-    def of(
-        cls, newest: LatestStress, health: NDArray[np.integer], surface: Surface, found: Found
-    ) -> Moment:
-        """A copy: rows that come later do not change it. What was not found is interpolated."""
+    def of(cls, newest: LatestStress, health: AnyArray, surface: Surface, found: Found) -> Moment:
+        """Copy the newest rows, and compute what the node `contacts` did not give."""
         values = newest.usable_values(health)
         field, contacts = found.field, found.contacts
         if field is None:
@@ -81,6 +92,6 @@ class Moment(NamedTuple):
         )
 
     @property
-    def contact(self) -> Contact | None:
-        """The strongest one; None without a load."""
+    def strongest_contact(self) -> Contact | None:
+        """The contact with the largest force; None without a load."""
         return self.contacts[0] if self.contacts else None

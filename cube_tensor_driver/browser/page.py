@@ -1,53 +1,83 @@
 """The page of the browser view: the skin in 3-D, controls, plots, and the skin from above.
 
-It knows viser but not ROS. Each browser has a page of its own, with its own settings.
+It uses viser but not ROS. Each browser has a page of its own, with its own settings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from ..core.arrays import Array
 from ..core.poses import CubePoses
 from ..touch.surface import Surface
 from . import markup
 from .charts import Charts
-from .controls import ColourControls, ReplayControls, ReplayState, ShownControls
+from .colouring import Colouring
+from .controls import ColourControls, ReplayControls, ReplayPosition, add_part_controls
 from .history import History
 from .markup import PageStatus
 from .moment import Moment
-from .scene_3d import SPAN, Colouring, Scene3D
+from .scene_3d import SPAN, Scene3D
 from .top_view import TopView
 
-MOST_POINTS = 5000
-"""On the surface."""
-MOST_POINTS_PER_SIDE = 12
-"""Of one cube's patch of it."""
+MAX_SURFACE_POINTS = 5000
+"""Approximate number of points of the surface at which the field is drawn."""
+
+MAX_POINTS_PER_SIDE = 12
+"""Number of points of the surface along one side of a cube's part of it."""
+
 BRAND_COLOUR = (24, 100, 171)
 BACKGROUND = (246, 247, 249)
+
 LEFT_WIDTH = 440.0
+"""Width of the panel with the plots, in pixels."""
+
 RIGHT_WIDTH = 320.0
-"""Of the panel with the plots, and of viser's main panel, pixels."""
+"""Width of viser's main panel, in pixels."""
+
 CAMERA_POSITION = np.array([0.1, -1.0, 1.05]) * SPAN
+"""Position of the camera for a picture of normal proportions."""
+
 CAMERA_TARGET = np.array([0.0, -0.04, 0.0]) * SPAN
-LOWER_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
-"""For phones: their panels cover the lower part of the picture, the skin is above them."""
-NEAREST, NEAREST_WIDTH = 0.95, 0.78
-"""How far the camera is, relative to CAMERA_POSITION, where the picture is wide enough; and where
-it is not, times its width over its height."""
-PAUSE, GO_ON = "pause the page", "go on"
-RECORD, STOP = "record", "stop recording"
-TARE, CLEAR_TARE = "tare", "undo tare"
+"""Point that the camera looks at."""
+
+PHONE_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
+"""Point that the camera looks at on a phone, whose panels cover the lower part of the picture."""
+
+MIN_CAMERA_DISTANCE = 0.95
+"""Smallest distance of the camera, relative to that of `CAMERA_POSITION`."""
+
+DISTANCE_PER_ASPECT = 0.78
+"""Distance of the camera, relative to that of `CAMERA_POSITION`, times the free width over the
+height of the picture. In narrow pictures the camera must be further away."""
+
+PAUSE = "pause the page"
+GO_ON = "go on"
+RECORD = "record"
+STOP = "stop recording"
+TARE = "tare"
+CLEAR_TARE = "undo tare"
+
 NOTE_S = 8.0
+"""Time, in seconds, for which a note is shown."""
 
 
 @dataclass(frozen=True)
 class Buttons:
-    """What the buttons of the page do. They are called in viser's threads and return at once."""
+    """What the buttons of the page do. They are called in threads of viser and return at once.
+
+    Attributes:
+        tare: Take the present load as zero load.
+        clear_tare: Undo that.
+        record: Begin or end a recording.
+        hold: Stop a replay or let it go on.
+        jump: Jump to a position of a replay, in seconds.
+    """
 
     tare: Callable[[], None]
     clear_tare: Callable[[], None]
@@ -59,14 +89,21 @@ class Buttons:
 class ShownSkin:
     """A skin as all pages show it.
 
-    names: of its cubes. surface: with points between the cubes, `depth` m above their centres.
-    history: of the last seconds.
+    Attributes:
+        name: Name of the skin.
+        names: Names of its cubes.
+        poses: Poses of its cubes.
+        surface: Points of the field, between the cubes.
+        top_view: The drawing from above.
+        history: The values of the last seconds.
     """
 
     def __init__(
         self, name: str, names: Sequence[str], poses: CubePoses, depth: float, history: History
     ) -> None:
-        points_per_side = np.clip(np.sqrt(MOST_POINTS / len(names)), 2, MOST_POINTS_PER_SIDE)
+        """depth: of the centres of the cubes below the surface, in metres."""
+        points_per_side = np.sqrt(MAX_SURFACE_POINTS / len(names))
+        points_per_side = np.clip(points_per_side, 2, MAX_POINTS_PER_SIDE)
         self.name, self.names, self.poses = name, list(names), poses
         self.surface = Surface(poses, depth, int(points_per_side))
         self.top_view = TopView(names, poses, self.surface)
@@ -81,10 +118,10 @@ class Page:
         self._skin = skin
         self._moment: Moment | None = None
         self._paused = False
-        self._complete = False
+        self._is_complete = False
         self._written = 0
         self._top = 0.0
-        self._said = ""
+        self._noted = ""
         set_up(client, skin.name)
         self._scene = Scene3D(client.scene, skin.names, skin.poses, skin.surface, self._choose)
         self._make_controls(client.gui, buttons)
@@ -92,63 +129,70 @@ class Page:
 
     @property
     def paused(self) -> bool:
+        """Whether the user has paused the page."""
         return self._paused
 
     def close(self) -> None:
+        """Remove everything from the browser."""
         self._client.scene.remove_click_callback()
         self._client.scene.reset()
         self._client.gui.reset()
 
-    def show_replay(self, replay: ReplayState | None) -> None:
+    def show_replay(self, replay: ReplayPosition | None) -> None:
         """Show where a replay is; None: there is none."""
         self._replay.show(replay)
 
-    def show(
-        self, moment: Moment, rate: NDArray[np.float64], status: PageStatus, with_numbers: bool
-    ) -> None:
-        """All that is shown of a moment; with_numbers: also what changes less often.
+    def show(self, moment: Moment, rate: Array, status: PageStatus, with_numbers: bool) -> None:
+        """Show a moment; while the page is paused it keeps the moment it has.
 
-        rate: (N,) rows per second. While the page is paused it keeps the moment it has.
+        Args:
+            moment: What is shown.
+            rate: (N,) rows per second of each cube.
+            status: Links, recording, and the last action of the user.
+            with_numbers: Whether to show what changes less often, too: numbers and plots.
         """
         with self._client.atomic():
             if not self._paused or self._moment is None:
                 self._moment = moment
                 self._draw(moment)
             self._write_first_lines(self._moment, rate, status)
-            if self._paused and not self._complete:
-                # So that all that is shown while paused is of one moment.
+            if self._paused and not self._is_complete:
+                # Then all that is shown while the page is paused is of one moment.
                 self._write_plots()
                 self._write_numbers(self._moment, rate, status)
-                self._complete = True
+                self._is_complete = True
             elif with_numbers and not self._paused:
                 self._write(self._moment, rate, status)
 
     def _draw(self, moment: Moment) -> None:
-        quantity, wanted = self._colours.quantity, self._colours.top
-        self._colouring = Colouring.of(moment, self._skin.surface, quantity, wanted, self._top)
+        controls = self._colours
+        self._colouring = Colouring.of(
+            moment, self._skin.surface, controls.quantity, controls.fixed_top, self._top
+        )
         self._top = self._colouring.top
         self._scene.draw(moment, self._colouring)
 
-    def _write_first_lines(
-        self, moment: Moment, rate: NDArray[np.float64], status: PageStatus
-    ) -> None:
-        held = self._paused or self._replay.held
+    def _write_first_lines(self, moment: Moment, rate: Array, status: PageStatus) -> None:
+        is_held = self._paused or self._replay.is_held
         hertz = float(np.fmax.reduce(rate, axis=None, initial=0.0))
-        line = markup.headline(moment.health, hertz, moment.contact, held, status.recording)
+        line = markup.headline(
+            moment.health, hertz, moment.strongest_contact, is_held, status.recording
+        )
         if line != self._headline.content:
             self._headline.content = line
         view = (GO_ON if self._paused else PAUSE, STOP if status.recording else RECORD)
         if tuple(self._view.options) != view:
             self._view.options = view
-        if status.action != self._said:
-            self._said = status.action
+        if status.action != self._noted:
+            self._noted = status.action
             self._action.content = markup.action_line(status.action)
             self._client.add_notification(
                 status.title, status.action, auto_close_seconds=NOTE_S, color=status.colour
             )
 
-    def _write(self, moment: Moment, rate: NDArray[np.float64], status: PageStatus) -> None:
-        """Plots and numbers in alternate calls: each costs a browser as much as a picture."""
+    def _write(self, moment: Moment, rate: Array, status: PageStatus) -> None:
+        """Write plots and numbers in alternate calls, because each costs a browser as much time
+        as a picture."""
         self._written += 1
         if self._written % 2:
             self._write_plots()
@@ -158,7 +202,7 @@ class Page:
     def _write_plots(self) -> None:
         self._charts.draw(self._skin.history, self._scene.selected)
 
-    def _write_numbers(self, moment: Moment, rate: NDArray[np.float64], status: PageStatus) -> None:
+    def _write_numbers(self, moment: Moment, rate: Array, status: PageStatus) -> None:
         history, cube = self._skin.history, self._scene.selected
         self._charts.offer_observed(history)
         self._colours.offer_known(history, moment.field)
@@ -172,7 +216,7 @@ class Page:
         self._above.content = self._skin.top_view.draw(self._colouring, moment.contacts, cube)
 
     def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
-        """The main panel, in the order in which it stands on the page."""
+        """Make the main panel, from top to bottom."""
         gui.add_html(markup.PHONE_STYLE)
         self._headline = gui.add_html("")
         self._make_buttons(gui, buttons)
@@ -193,12 +237,12 @@ class Page:
             self._numbers = gui.add_html("")
         with gui.add_folder("what is drawn"):
             self._meaning = gui.add_html("")
-            ShownControls(gui, self._scene.shown)
+            add_part_controls(gui, self._scene.shown)
         with gui.add_folder("health"):
             self._health = gui.add_html("")
 
     def _make_panel(self, gui: viser.GuiApi) -> None:
-        """The second panel: plots, and the skin from above."""
+        """Make the second panel: plots, and the skin from above."""
         panel = gui.add_panel()
         self._charts = Charts(
             gui, panel.add_tab("plots of 10 s", viser.Icon.CHART_LINE), self._skin.names
@@ -224,21 +268,21 @@ class Page:
 
         @self._view.on_click
         @zero.on_click
-        def _(event: viser.GuiEvent) -> None:
+        def _(event: viser.GuiEvent[Any]) -> None:
             # A browser may send any text.
             action = actions.get(str(event.target.value))
             if action is not None:
                 action()
 
     def _toggle_pause(self) -> None:
-        self._paused, self._complete = not self._paused, False
+        self._paused, self._is_complete = not self._paused, False
 
     def _quantity_changed(self) -> None:
-        """The range of another quantity does not follow on that of the last one."""
+        """Begin the automatic range anew: that of another quantity says nothing."""
         self._top = 0.0
 
     def _choose(self, cube: int) -> None:
-        # viser's handle has a setter
+        # viser's handle has a setter, which its type does not show.
         self._cube.value = self._skin.names[cube]  # type: ignore[misc]
 
 
@@ -253,12 +297,13 @@ class WaitingPage:
         )
 
     def close(self) -> None:
+        """Remove everything from the browser."""
         self._text.remove()
         self._label.remove()
 
 
 def set_up(client: viser.ClientHandle, name: str) -> None:
-    """Colours, panel and camera of a page."""
+    """Set colours, panel and camera of a page; name: title of the panel."""
     client.gui.configure_theme(
         dark_mode=False,
         show_logo=False,
@@ -269,11 +314,12 @@ def set_up(client: viser.ClientHandle, name: str) -> None:
     client.scene.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8), "png")
     client.gui.set_panel_label(name)
     client.gui.main_panel.dock_right()
+
     width, height = client.camera.image_width, client.camera.image_height
-    narrow = width < height
-    target = LOWER_TARGET if narrow else CAMERA_TARGET
+    is_phone = width < height
+    target = PHONE_TARGET if is_phone else CAMERA_TARGET
     # The skin and what stands beside it fill the width that the panels leave.
-    free = width if narrow else max(width - LEFT_WIDTH - RIGHT_WIDTH, 0.3 * width)
-    far = max(NEAREST, NEAREST_WIDTH * height / free)
-    client.camera.position = target + far * (CAMERA_POSITION - CAMERA_TARGET)
+    free_width = width if is_phone else max(width - LEFT_WIDTH - RIGHT_WIDTH, 0.3 * width)
+    distance = max(MIN_CAMERA_DISTANCE, DISTANCE_PER_ASPECT * height / free_width)
+    client.camera.position = target + distance * (CAMERA_POSITION - CAMERA_TARGET)
     client.camera.look_at = target

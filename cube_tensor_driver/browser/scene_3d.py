@@ -1,112 +1,84 @@
 """The skin in 3-D on the page: cubes, field, arrows, crosses, contact.
 
-A computer without a graphics card draws each instance of a batched mesh by itself. A thousand cubes
-twenty times a second are too many for it. So what grows with the skin is a single object: all
-arrows of one sort are one mesh, and the cubes of a large skin are squares in their colours.
+A computer without a graphics card draws each instance of a batched mesh separately, and a thousand
+cubes twenty times a second are too many for it. What grows with the skin is therefore a single
+object: all arrows of one kind are one mesh, and the cubes of a large skin are squares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from ..core.arrays import Array
+from ..core.arrays import AnyArray, Array
 from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
 from ..views import scene
 from ..views.scene import QUANTITIES, Quantity
 from . import markup
-from .meshes import CUBE, CUBE_EDGES, NOTHING, Mesh, arrows, hit, ring, rods
-from .moment import DEVIATION, Moment
-from .surface_layer import SquareLayer
+from .colouring import Colouring
+from .controls import Shown
+from .meshes import CUBE, CUBE_EDGES, NO_MESH, Mesh, SquareLayer, arrows, hit, ring, rods
+from .moment import Moment
 
 Colour = tuple[int, int, int]
 
 SPAN = 2.0
-"""The longest side of a skin in the scene. Cameras and clipping planes of viewers are made for
-metres, skins are centimetres long."""
-MOST_SOLID = 256
-"""Skins with more cubes show them as squares where their upper faces would be."""
-MOST_NAMES = 256
-"""Larger skins have no names in 3-D: they would cover it."""
-LEAST_ARROW = SPAN / 16
-"""Arrows are drawn as if the pitch were at least this, so that the direction of a touch is still
-seen among a thousand cubes."""
-THIN = SPAN / 1000
-"""Thinner lines are not seen on all screens."""
-AMBIENT, DIRECT = 2.4, 1.7
-"""Intensities of the lights with which colours look as in the legend."""
-DARK, BLUE, EDGE = (40, 44, 52), (25, 105, 210), (110, 114, 122)
-PULL, PUSH = (210, 40, 40), (40, 80, 220)
+"""Longest side of every skin in the scene. Cameras and clipping planes of viewers are made for
+metres, and skins are centimetres long."""
+
+MAX_SOLID_CUBES = 256
+"""Number of cubes above which squares are drawn where the upper faces of the cubes would be."""
+
+MAX_NAMED_CUBES = 256
+"""Number of cubes above which no names are drawn: they would cover the skin."""
+
+MIN_ARROW_UNIT = SPAN / 16
+"""Smallest unit length of arrows. With the pitch of a thousand cubes as the unit, the direction of
+a touch could not be seen."""
+
+MIN_THICKNESS = SPAN / 1000
+"""Smallest thickness of a line that is visible on every screen."""
+
+AMBIENT_LIGHT = 2.4
+"""Intensity of the ambient light. With it and `DIRECT_LIGHT` colours look as in the legend."""
+
+DIRECT_LIGHT = 1.7
+"""Intensity of the light from above."""
+
+DARK: Colour = (40, 44, 52)
+BLUE: Colour = (25, 105, 210)
+EDGE_COLOUR: Colour = (110, 114, 122)
+
+TENSION_COLOUR: Colour = (210, 40, 40)
+COMPRESSION_COLOUR: Colour = (40, 80, 220)
+
 FAULT_COLOURS = {DOUBTFUL: (230, 130, 0), FAULTY: (215, 25, 25), STALE: DARK}
+"""Health -> colour of the cross over a cube."""
+
 CROSS_HEIGHT = 0.75
-"""Of the middle of principal crosses above the cubes' centres, in pitches: outside the cubes."""
+"""Height of the middle of principal crosses above the centres of the cubes, in pitches. There they
+are outside of the cubes."""
+
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
-
-
-class Colouring(NamedTuple):
-    """What colours mean in one picture of a skin with N cubes and M points of its surface.
-
-    quantity: what is shown. cubes: (N,) and field: (M,) its values, SI. top: of its range, SI.
-    above: (N, 2) pressure on the surface above each cube, and its standard deviation, Pa; None:
-    the node `contacts` says nothing of it.
-    """
-
-    quantity: Quantity
-    cubes: Array
-    field: Array
-    top: float
-    above: Array | None
-
-    @classmethod
-    def of(
-        cls, moment: Moment, surface: Surface, quantity: Quantity, wanted: float, before: float
-    ) -> Colouring:
-        """wanted: top of the range, SI; 0: it follows what there is, and `before`."""
-        pressure, sigma = moment.field.pressure, moment.field.sigma
-        above = None
-        if sigma is not None:
-            above = np.stack([pressure, sigma], axis=1)[surface.middle]
-        cubes = quantity.of(moment.values, moment.residual)
-        if quantity is DEVIATION and above is not None:
-            cubes = above[:, 1]
-        field = _field(moment, surface, quantity, cubes)
-        top = wanted or scene.automatic(quantity, np.concatenate([cubes, field]), before)
-        return cls(quantity, cubes, field, top, above)
-
-    def text(self, cube: int) -> str:
-        """What is said of a cube: its value, and the pressure on the surface above it."""
-        value = markup.value(self.quantity, self.cubes[cube])
-        if self.above is None or self.quantity not in (QUANTITIES["pressure"], DEVIATION):
-            return value
-        surface = markup.surface_pressure(*self.above[cube])
-        return f"pressure {surface}" if self.quantity is DEVIATION else f"{value}, {surface}"
-
-
-def _field(moment: Moment, surface: Surface, quantity: Quantity, cubes: Array) -> Array:
-    """(M,) on the points of the surface: the field's if it has the quantity, otherwise the value
-    of the nearest cube."""
-    if quantity is QUANTITIES["pressure"]:
-        return moment.field.pressure
-    if quantity is QUANTITIES["shear"]:
-        return moment.field.shear
-    if quantity is DEVIATION and moment.field.sigma is not None:
-        return moment.field.sigma
-    return cubes[surface.cube]
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the skin's cubes are in the scene.
+    """Where the cubes of the skin are in the scene.
 
-    poses: in units of the scene. centre: the scene's origin in the parent frame, m. unit: scene
-    units per m. pitch: typical distance of neighbours in the scene. arrow: unit length of arrows.
+    Attributes:
+        poses: Poses of the cubes, in units of the scene.
+        centre: (3,) origin of the scene in the parent frame, in metres.
+        unit: Units of the scene per metre.
+        pitch: Typical distance of neighbouring cubes in the scene.
+        arrow: Unit length of arrows in the scene.
     """
 
     poses: CubePoses
@@ -117,35 +89,26 @@ class Placement:
 
     @classmethod
     def of(cls, poses: CubePoses) -> Placement:
-        """Of cubes at `poses` in the parent frame, m."""
+        """Scale cubes at `poses` in the parent frame, in metres, to `SPAN`."""
         low, high = poses.position.min(axis=0), poses.position.max(axis=0)
         centre = (low + high) / 2
         unit = SPAN / ((high - low).max() + poses.pitch)
         pitch = poses.pitch * unit
         scaled = CubePoses((poses.position - centre) * unit, poses.rotation, poses.half_side * unit)
-        return cls(scaled, centre, unit, pitch, max(pitch, LEAST_ARROW))
+        return cls(scaled, centre, unit, pitch, max(pitch, MIN_ARROW_UNIT))
 
     def point(self, position: Array) -> Array:
-        """A position (..., 3) in m of the parent frame, in the scene."""
+        """Transform positions (..., 3) in metres of the parent frame into the scene."""
         return (position - self.centre) * self.unit
-
-
-@dataclass
-class Shown:
-    """Which parts of the 3-D view are drawn."""
-
-    field: bool = True
-    traction: bool = True
-    gradient: bool = True
-    principal: bool = False
-    names: bool = False
 
 
 class Scene3D:
     """The 3-D part of the page.
 
-    shown: which parts are drawn; selected: the cube with a ring around it. Both may be set.
-    pick: called with a cube that was clicked.
+    Attributes:
+        shown: Which parts are drawn; it may be changed.
+        selected: Index of the cube with a ring around it; it may be set.
+        bar: Length of the scale bar, in metres.
     """
 
     def __init__(
@@ -156,6 +119,15 @@ class Scene3D:
         surface: Surface,
         pick: Callable[[int], None],
     ) -> None:
+        """Make all objects.
+
+        Args:
+            api: The scene of one browser.
+            names: Names of the cubes.
+            poses: Poses of the cubes in the parent frame, in metres.
+            surface: Points of the field.
+            pick: Called with the index of a cube that was clicked.
+        """
         placement = Placement.of(poses)
         self.shown = Shown()
         self.selected = int((placement.poses.position**2).sum(axis=1).argmin())
@@ -179,6 +151,7 @@ class Scene3D:
                 pick(cube)
 
     def draw(self, moment: Moment, colouring: Colouring) -> None:
+        """Draw a moment in the colours of `colouring`."""
         shown, values = self.shown, moment.values
         self._cubes.draw(colouring, with_field=shown.field)
         self._names.visible = shown.names
@@ -187,21 +160,23 @@ class Scene3D:
         self._crosses.draw(values, self._traction.longest, visible=shown.principal)
         self._faults.draw(moment.health)
         self._chosen.show(self.selected, colouring.text(self.selected))
-        self._label.show(moment.contact)
+        self._label.show(moment.strongest_contact)
 
     def bar_stress(self) -> float:
-        """The traction, Pa, whose arrow is as long as the scale bar."""
+        """Return the traction, in Pa, whose arrow is as long as the scale bar."""
         return self.bar * self._unit * self._traction.value_per_length
 
     def bar_gradient(self) -> float:
-        """The gradient, Pa/m, whose arrow is as long as the scale bar."""
+        """Return the gradient, in Pa/m, whose arrow is as long as the scale bar."""
         return self.bar * self._unit * self._gradient.value_per_length
 
 
 class ScaleBar:
     """A bar in front of the skin, and the axes of its parent frame beside it.
 
-    length: of the bar, m: 1, 2 or 5 times a power of ten, about a quarter of the skin.
+    Attributes:
+        length: Length of the bar, in metres: 1, 2 or 5 times a power of ten, about a quarter of
+            the skin.
     """
 
     def __init__(self, api: viser.SceneApi, placement: Placement, surface: Surface) -> None:
@@ -210,6 +185,7 @@ class ScaleBar:
         points = placement.point(surface.points)
         low, high = points.min(axis=0), points.max(axis=0)
         y, z = low[1] - 0.16 * SPAN, low[2] - float(placement.poses.half_side.max())
+
         start = np.array([low[0], y, z])
         end = start + np.array([self.length * placement.unit, 0, 0])
         _set_mesh(_add_mesh(api, "bar", DARK), rods(np.array([[start, end]]), 0.006 * SPAN))
@@ -217,6 +193,7 @@ class ScaleBar:
         api.add_label(
             "/bar/label", f"{1e3 * self.length:g} mm", position=middle, anchor="top-center"
         )
+
         corner, axis = np.array([high[0] - 0.05 * SPAN, y, z]), 0.1 * SPAN
         api.add_frame(
             "/axes",
@@ -235,13 +212,15 @@ class ScaleBar:
 
 
 def round_down(length: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is not above a length."""
+    """Return the largest of 1, 2 and 5 times a power of ten that is not above a length."""
     power = 10.0 ** np.floor(np.log10(length))
-    return float(power * max(k for k in (1, 2, 5) if k * power <= length * (1 + 1e-9)))
+    # The tolerance keeps a length of exactly 1, 2 or 5.
+    limit = length * (1 + 1e-9)
+    return float(power * max(factor for factor in (1, 2, 5) if factor * power <= limit))
 
 
 class Cubes:
-    """The cubes and the field below them, in colour."""
+    """The cubes and the field between them, in colours."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement, surface: Surface) -> None:
         poses, of_cube = placement.poses, surface.cube
@@ -255,11 +234,12 @@ class Cubes:
         )
         self._solid: viser.BatchedMeshHandle | None = None
         self._squares: SquareLayer | None = None
-        up = poses.rotation[:, :, 2] * poses.half_side[:, None]
-        if len(poses.position) > MOST_SOLID:
+        if len(poses.position) > MAX_SOLID_CUBES:
+            up = poses.rotation[:, :, 2] * poses.half_side[:, None]
             side = 2 * float(np.median(poses.half_side))
             self._squares = SquareLayer(api, "cubes", poses.position + up, poses.rotation, side)
             return
+
         self._solid = api.add_batched_meshes_simple(
             "/cubes",
             *CUBE,
@@ -274,10 +254,11 @@ class Cubes:
         edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
         lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
         api.add_line_segments(
-            "/edges", lines.reshape(-1, 2, 3), EDGE, thickness=1.5, thickness_units="screen"
+            "/edges", lines.reshape(-1, 2, 3), EDGE_COLOUR, thickness=1.5, thickness_units="screen"
         )
 
     def draw(self, colouring: Colouring, with_field: bool) -> None:
+        """Colour the cubes, and the field if it is wanted."""
         quantity, top = colouring.quantity, colouring.top
         if with_field:
             self._field.paint(quantity, colouring.field, top)
@@ -291,11 +272,11 @@ class Cubes:
 
 
 class Names:
-    """The names of all cubes of a skin that is not large, above them."""
+    """The names of the cubes above them, unless there are too many."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement, names: Sequence[str]) -> None:
         self._frame = api.add_frame("/names", show_axes=False, visible=False)
-        if len(names) > MOST_NAMES:
+        if len(names) > MAX_NAMED_CUBES:
             return
         for number, (name, point) in enumerate(zip(names, _above(placement, 1.3), strict=True)):
             api.add_label(
@@ -308,10 +289,12 @@ class Names:
 
     @property
     def visible(self) -> bool:
+        """Whether the names are drawn."""
         return bool(self._frame.visible)
 
     @visible.setter
     def visible(self, visible: bool) -> None:
+        # Setting a value sends it, even if it is the same.
         if visible != self._frame.visible:
             self._frame.visible = visible
 
@@ -320,9 +303,13 @@ class Names:
 class ArrowStyle:
     """What a set of arrows shows, and how.
 
-    full_length: of the arrow for the top of the range, in unit lengths. quantity: whose range that
-    is. measured: what the range follows, from values and residual. lines: tails and tips from
-    poses, values and a scale in length per SI unit.
+    Attributes:
+        name: Name in the scene.
+        colour: Colour of the arrows.
+        full_length: Length of the arrow for the top of the range, in unit lengths.
+        quantity: Quantity whose limit the automatic range of the lengths has.
+        measured: Function of values and residual; the values that the range follows.
+        lines: Function of poses, values and a scale in length per SI unit; tails and tips.
     """
 
     name: str
@@ -352,9 +339,10 @@ GRADIENT = ArrowStyle(
 
 
 class Arrows:
-    """An arrow on the upper face of each cube, all of them one mesh.
+    """An arrow on the upper face of each cube; all of them are one mesh.
 
-    longest: the value, SI, that an arrow of full length stands for. It follows what is measured.
+    Attributes:
+        longest: Value, in SI units, of an arrow of full length. It follows what is measured.
     """
 
     def __init__(self, api: viser.SceneApi, placement: Placement, style: ArrowStyle) -> None:
@@ -365,10 +353,11 @@ class Arrows:
 
     @property
     def value_per_length(self) -> float:
-        """SI units per unit of length in the scene."""
+        """Value, in SI units, of an arrow with a length of 1 in the scene."""
         return self.longest / (self._style.full_length * self._placement.arrow)
 
     def draw(self, values: Array, residual: Array, visible: bool) -> None:
+        """Follow the values, and draw the arrows if they are visible."""
         style, unit = self._style, self._placement.arrow
         measured = style.measured(values, residual)
         self.longest = scene.automatic(style.quantity, measured, self.longest)
@@ -385,32 +374,34 @@ class PrincipalCrosses:
         self._placement = placement
         self._frame = api.add_frame("/principal", show_axes=False, visible=False)
         self._lift = _above(placement, CROSS_HEIGHT, placement.pitch) - _above(placement, 1.0)
-        self._pulls = _add_mesh(api, "principal/pulls", PULL)
-        self._pushes = _add_mesh(api, "principal/pushes", PUSH)
+        self._tension = _add_mesh(api, "principal/pulls", TENSION_COLOUR)
+        self._compression = _add_mesh(api, "principal/pushes", COMPRESSION_COLOUR)
 
     def draw(self, values: Array, longest: float, visible: bool) -> None:
-        """longest: the stress, Pa, whose line is as long as the pitch."""
+        """Draw the crosses; longest: stress, in Pa, whose line is as long as the pitch."""
         self._frame.visible = visible
         if not visible:
             return
         pitch = self._placement.pitch
-        lines, pulls = scene.principal_crosses(self._placement.poses, values, pitch / longest)
+        scale = pitch / longest
+        lines, is_tension = scene.principal_crosses(self._placement.poses, values, scale)
         lines = lines + self._lift[:, None, None]
-        _set_mesh(self._pulls, rods(lines[pulls], 0.02 * pitch))
-        _set_mesh(self._pushes, rods(lines[~pulls], 0.02 * pitch))
+        _set_mesh(self._tension, rods(lines[is_tension], 0.02 * pitch))
+        _set_mesh(self._compression, rods(lines[~is_tension], 0.02 * pitch))
 
 
 class FaultCrosses:
-    """A cross over each cube that is not fine, in the colour of its health."""
+    """A cross over each cube with a fault, in the colour of its health."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
         self._placement = placement
-        self._drawn: NDArray[np.integer] | None = None
+        self._drawn: AnyArray | None = None
         self._meshes = {}
         for state, colour in FAULT_COLOURS.items():
             self._meshes[state] = _add_mesh(api, f"faults/{state}", colour)
 
-    def draw(self, health: NDArray[np.integer]) -> None:
+    def draw(self, health: AnyArray) -> None:
+        """Draw the crosses again if the health (N,) of any cube has changed."""
         if self._drawn is not None and np.array_equal(health, self._drawn):
             return
         self._drawn = health
@@ -430,13 +421,14 @@ class ChosenCube:
         self._orientations = quaternions(placement.poses.rotation)
         radius = 0.6 * placement.pitch + 0.01 * placement.arrow
         self._ring = _add_mesh(api, "chosen", DARK)
-        _set_mesh(self._ring, ring(radius, THIN + 0.005 * placement.arrow))
-        # Away from the viewer's side of a contact's label, which stands above its cube.
+        _set_mesh(self._ring, ring(radius, MIN_THICKNESS + 0.005 * placement.arrow))
+        # Below the ring: the label of a contact stands above its cube.
         self._label = api.add_label(
             "/chosen/label", "", position=(0.0, -radius, 0.0), anchor="top-center"
         )
 
     def show(self, cube: int, text: str) -> None:
+        """Move the ring to a cube and write a text beside it."""
         self._ring.position = self._upper_faces[cube]
         self._ring.wxyz = self._orientations[cube]
         self._label.text = f"{self._names[cube]}: {text}"
@@ -452,6 +444,7 @@ class ContactLabel:
         )
 
     def show(self, contact: Contact | None) -> None:
+        """Write the forces of a contact; None: there is none."""
         if contact is not None:
             above = 1.1 * self._placement.arrow * contact.normal
             self._label.text = markup.newtons(contact)
@@ -460,23 +453,29 @@ class ContactLabel:
 
 
 def _above(placement: Placement, factor: float, unit: float | None = None) -> Array:
-    """(N, 3) points above the cubes' centres: `factor` times half a side, or times a unit."""
+    """Return points (N, 3) above the centres of the cubes.
+
+    Args:
+        placement: The cubes.
+        factor: Height in multiples of the unit.
+        unit: Unit of the height; None: half the side of each cube.
+    """
     poses = placement.poses
     height = poses.half_side[:, None] if unit is None else unit
     return poses.position + factor * height * poses.rotation[:, :, 2]
 
 
 def _set_up_lights(api: viser.SceneApi) -> None:
-    """Without shadows and reflections: a computer without a graphics card draws them slowly."""
+    """Set lights without shadows and reflections, which a processor draws slowly."""
     api.configure_default_lights(enabled=False)
     api.configure_environment_map(None)
-    api.add_light_ambient("/light/all", intensity=AMBIENT)
-    api.add_light_directional("/light/above", intensity=DIRECT, position=(-0.4, -0.6, 1.0))
+    api.add_light_ambient("/light/all", intensity=AMBIENT_LIGHT)
+    api.add_light_directional("/light/above", intensity=DIRECT_LIGHT, position=(-0.4, -0.6, 1.0))
 
 
 def _add_mesh(api: viser.SceneApi, name: str, colour: Colour) -> viser.MeshHandle:
     return api.add_mesh_simple(
-        f"/{name}", *NOTHING, color=colour, flat_shading=True, side="double", **NO_SHADOWS
+        f"/{name}", *NO_MESH, color=colour, flat_shading=True, side="double", **NO_SHADOWS
     )
 
 
@@ -485,9 +484,9 @@ def _set_mesh(handle: viser.MeshHandle, mesh: Mesh) -> None:
 
 
 def linear_light(colours: Array) -> NDArray[np.uint8]:
-    """Bytes of sRGB colours (N, 3) from 0 to 1, as linear light.
+    """Convert sRGB colours (N, 3) from 0 to 1 into bytes of linear light.
 
-    The client takes the colours of batched meshes as such. Source: IEC 61966-2-1.
+    The browser takes the colours of batched meshes as linear light. Source: IEC 61966-2-1.
     """
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     return (255 * linear).astype(np.uint8)

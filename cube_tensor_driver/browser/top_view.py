@@ -1,4 +1,4 @@
-"""The skin seen from above, in two dimensions: its field as a heat map, its cubes and contacts."""
+"""The skin seen from above, as an SVG: its field as a heat map, its cubes and contacts."""
 
 from __future__ import annotations
 
@@ -10,33 +10,49 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..core.arrays import Array
 from ..core.poses import CubePoses
 from ..touch.surface import Contact, Surface
 from ..views import scene
 from ..views.figures.style import png_of_pixels
 from . import markup
-from .scene_3d import Colouring, round_down
+from .colouring import Colouring
+from .scene_3d import round_down
 
-Array = NDArray[np.floating]
+WIDTH = 400.0
+"""Width of the drawing, in its own units."""
 
-WIDTH, MARGIN = 400.0, 44.0
-"""Of the drawing, and of its axes' numbers, in units of the drawing."""
-MOST_PIXELS_PER_SIDE = 256
-MOST_NAMES = 100
+MARGIN = 44.0
+"""Room for the numbers and labels of the axes, in units of the drawing."""
+
+MAX_PIXELS_PER_SIDE = 256
+"""Number of pixels of the heat map along the longer side of the skin."""
+
+MAX_NAMED_CUBES = 100
+"""Number of cubes up to which their names are written beside them."""
+
 TICKS = 5
-"""About so many on an axis."""
+"""Approximate number of ticks of an axis."""
 
 
 class Raster:
     """An image of points seen along z: each pixel has the colour of the nearest point.
 
-    points: (M, 3). pixel: its side. reach: pixels further from every point are transparent.
-
-    low, high: (2,) corners of the image. owner: (rows, columns) number of the point whose colour a
-    pixel has, or M. The first row is at the greatest y.
+    Attributes:
+        low: (2,) corner of the image with the smallest x and y, in metres.
+        high: (2,) the opposite corner.
+        owner: (rows, columns) index of the point whose colour a pixel has, or the number of points
+            if none is near. The first row is at the largest y.
     """
 
     def __init__(self, points: Array, pixel: float, reach: float) -> None:
+        """Assign the pixels to points.
+
+        Args:
+            points: (M, 3) metres.
+            pixel: Side of a pixel, in metres.
+            reach: Distance in metres from every point above which a pixel is transparent.
+        """
         flat = points[:, :2]
         columns, rows = np.ceil((np.ptp(flat, axis=0) + 1.4 * reach) / pixel).astype(int)
         middle = (flat.min(axis=0) + flat.max(axis=0)) / 2
@@ -48,45 +64,45 @@ class Raster:
         self.owner[distance > reach] = len(points)
 
     def image(self, colours: Array) -> NDArray[np.uint8]:
-        """(rows, columns, 4) bytes; colours: (M, 3) from 0 to 1, NaN is transparent."""
+        """Return pixels (rows, columns, 4); colours: (M, 3) from 0 to 1, NaN is transparent."""
         table = np.zeros((len(colours) + 1, 4), np.uint8)
         table[:-1, :3] = np.round(255 * np.nan_to_num(colours))
         table[:-1, 3] = 255 * np.isfinite(colours[:, 0])
-        return table[self.owner]
+        return np.asarray(table[self.owner])
 
 
 class TopView:
-    """Draws the skin in the x-y plane of its parent frame as an SVG."""
+    """Draws the skin in the x-y plane of its parent frame."""
 
     def __init__(self, names: Sequence[str], poses: CubePoses, surface: Surface) -> None:
         self._names, self._poses = names, poses
         size = float(np.ptp(surface.points[:, :2], axis=0).max()) + surface.spacing
-        pixel = max(size / MOST_PIXELS_PER_SIDE, surface.spacing / 4)
+        pixel = max(size / MAX_PIXELS_PER_SIDE, surface.spacing / 4)
         self._raster = Raster(surface.points, pixel, 0.75 * surface.spacing)
-        low, high = self._raster.low, self._raster.high
-        self._scale = (WIDTH - MARGIN) / float((high - low)[0])
-        self._height = float((high - low)[1]) * self._scale
-        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-        turned = np.einsum("nij,qj->nqi", poses.rotation, corners)
-        self._corners = poses.position[:, None] + poses.half_side[:, None, None] * turned
+        extent = self._raster.high - self._raster.low
+        self._scale = (WIDTH - MARGIN) / float(extent[0])
+        self._height = float(extent[1]) * self._scale
+        square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        rotated = np.einsum("nij,qj->nqi", poses.rotation, square)
+        self._corners = poses.position[:, None] + poses.half_side[:, None, None] * rotated
+        # The axes do not change from picture to picture.
         self._axes = self._draw_axes()
 
     def draw(self, colouring: Colouring, contacts: Sequence[Contact], chosen: int) -> str:
-        """An SVG element."""
-        quantity, top = colouring.quantity, colouring.top
+        """Return an SVG element; chosen: index of the cube with a thick outline."""
         parts = [
-            self._heat_map(scene.colours(quantity, colouring.field, top)),
+            self._heat_map(scene.colours(colouring.quantity, colouring.field, colouring.top)),
             self._axes,
             *self._cubes(colouring, chosen),
-            *(self._contact(contact) for contact in contacts),
+            *map(self._contact, contacts),
         ]
         height = self._height + MARGIN
         head = f"<svg viewBox='0 -8 {WIDTH + 8:g} {height + 8:.1f}' style='width:100%'"
         font = "font-family='sans-serif' font-size='10'"
         return f"{head} {font}>{''.join(parts)}</svg>"
 
-    def _at(self, point: Array) -> tuple[float, float]:
-        """Of a point in m, in the drawing."""
+    def _drawn(self, point: Array) -> tuple[float, float]:
+        """Return the place of a point (2,) or (3,), in metres, in the drawing."""
         x = MARGIN + (point[0] - self._raster.low[0]) * self._scale
         return float(x), float((self._raster.high[1] - point[1]) * self._scale)
 
@@ -96,7 +112,7 @@ class TopView:
         return f"<image {place} preserveAspectRatio='none' href='data:image/png;base64,{data}'/>"
 
     def _draw_axes(self) -> str:
-        """Frame, ticks and labels, in mm."""
+        """Draw the frame, and ticks and labels in mm."""
         low, high = 1e3 * self._raster.low, 1e3 * self._raster.high
         bottom = self._height
         parts = [
@@ -105,48 +121,50 @@ class TopView:
         ]
         step = round_down(float((high - low).max()) / TICKS)
         for tick in _ticks(low[0], high[0], step):
-            x, _ = self._at(np.array([1e-3 * tick, 0.0]))
+            x, _ = self._drawn(np.array([1e-3 * tick, 0.0]))
             parts.append(f"<path d='M{x:.1f} {bottom:.1f}v4' stroke='#343a40'/>")
             parts.append(_text(x, bottom + 15, f"{tick:g}"))
         for tick in _ticks(low[1], high[1], step):
-            _, y = self._at(np.array([0.0, 1e-3 * tick]))
+            _, y = self._drawn(np.array([0.0, 1e-3 * tick]))
             parts.append(f"<path d='M{MARGIN:g} {y:.1f}h-4' stroke='#343a40'/>")
             parts.append(_text(MARGIN - 6, y + 3, f"{tick:g}", "end"))
         parts.append(_text((MARGIN + WIDTH) / 2, bottom + 30, "x / mm"))
-        turn = f"transform='rotate(-90 10 {bottom / 2:.1f})'"
-        parts.append(f"<g {turn}>{_text(10, bottom / 2, 'y / mm')}</g>")
+        rotated = f"transform='rotate(-90 10 {bottom / 2:.1f})'"
+        parts.append(f"<g {rotated}>{_text(10, bottom / 2, 'y / mm')}</g>")
         return "".join(parts)
 
     def _cubes(self, colouring: Colouring, chosen: int) -> list[str]:
-        colours = (255 * scene.colours(colouring.quantity, colouring.cubes, colouring.top)).astype(
-            int
-        )
+        """Draw the cubes in their colours, with a tool tip, and their names if they are few."""
+        colours = scene.colours(colouring.quantity, colouring.cubes, colouring.top)
+        rgb = (255 * colours).astype(int)
         parts = []
         for cube, (name, corners) in enumerate(zip(self._names, self._corners, strict=True)):
-            points = " ".join("{:.1f},{:.1f}".format(*self._at(corner)) for corner in corners)
+            points = " ".join("{:.1f},{:.1f}".format(*self._drawn(corner)) for corner in corners)
             width = 2.5 if cube == chosen else 0.7
             title = escape(f"{name}: {colouring.text(cube)}")
             parts.append(
-                f"<polygon points='{points}' fill='rgb({','.join(map(str, colours[cube]))})' "
+                f"<polygon points='{points}' fill='rgb({','.join(map(str, rgb[cube]))})' "
                 f"stroke='#212529' stroke-width='{width}'><title>{title}</title></polygon>"
             )
-            if len(self._names) <= MOST_NAMES:
-                x, y = self._at(corners.mean(axis=0))
+            if len(self._names) <= MAX_NAMED_CUBES:
+                x, y = self._drawn(corners.mean(axis=0))
                 half = self._poses.half_side[cube] * self._scale
                 parts.append(_text(x, y + half + 10, escape(name)))
         return parts
 
     def _contact(self, contact: Contact) -> str:
-        """A circle of the contact's area, its forces, and a line along its shear force."""
-        x, y = self._at(contact.position)
+        """Draw a circle of the area of a contact, its centre, and its forces as text."""
+        x, y = self._drawn(contact.position)
         radius = max(3.0, np.sqrt(contact.area / np.pi) * self._scale)
         circle = f"<circle cx='{x:.1f}' cy='{y:.1f}' r='{radius:.1f}'"
         parts = [f"{circle} fill='none' stroke='#1864ab' stroke-width='2'/>"]
         parts.append(f"<circle cx='{x:.1f}' cy='{y:.1f}' r='2.5' fill='#1864ab'/>")
-        above = y - radius - 6 > 8
-        text_y = y - radius - 6 if above else y + radius + 14
+        # Near the upper edge the text stands below the circle.
+        has_room_above = y - radius - 6 > 8
+        text_y = y - radius - 6 if has_room_above else y + radius + 14
+        text_x = min(max(x, MARGIN + 60), WIDTH - 60)
         halo = "paint-order='stroke' stroke='white' stroke-width='3' font-weight='bold'"
-        text = _text(min(max(x, MARGIN + 60), WIDTH - 60), text_y, markup.newtons(contact))
+        text = _text(text_x, text_y, markup.newtons(contact))
         return "".join(parts) + f"<g {halo}>{text}</g>"
 
 
@@ -155,5 +173,6 @@ def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
 
 
 def _ticks(low: float, high: float, step: float) -> list[float]:
+    """Return the multiples of a step between two numbers, without rounding errors."""
     numbers = np.arange(np.ceil(low / step), np.floor(high / step) + 1)
     return [float(f"{number * step:.6g}") for number in numbers]

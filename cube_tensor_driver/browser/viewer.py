@@ -1,6 +1,6 @@
-"""`./cube view`: serves a page that shows the running skin.
+"""`./cube view`: serve a page that shows the running skin.
 
-It is a process of its own, so that it slows nothing else down.
+It is a process of its own, so that it does not slow down the nodes.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import math
 import os
 import queue
 import secrets
-import signal
 import socket
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 
 from ..core.errors import ConfigError
 from ..core.latest_stress import STALE_S
+from ..processes.stop_signals import stop_event
 from ..ros.compat import make_executor
 from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros
@@ -34,36 +35,40 @@ from ..srv import Tare
 from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S
-from .contacts_client import ContactsClient
-from .gate import HOSTS, check_host, guarded_server
+from .clients import ContactsClient, ReplayClient, ServiceCalls
+from .gate import LOCAL_HOSTS, check_host, guarded_server
 from .history import History, RowRate
 from .markup import PageStatus
 from .moment import Moment
 from .page import Buttons, Page, ShownSkin, WaitingPage
-from .replay_client import ReplayClient
-from .service_calls import ServiceCalls
 
-WILDCARDS = ("0.0.0.0", "::")
-"""All addresses of this machine."""
-PICTURES_HZ, NUMBERS_HZ = 20.0, 4.0
-SAY_WAITING_S = 2.0
-"""Without a skin, until the terminal says that the page waits for one."""
+ALL_ADDRESSES = ("0.0.0.0", "::")
+"""Hosts that stand for all addresses of this machine, in IPv4 and IPv6."""
+
+PICTURE_PERIOD_S = 0.05
+"""Time, in seconds, from picture to picture."""
+
+NUMBERS_PERIOD_S = 0.25
+"""Time, in seconds, from one update of numbers and plots to the next. People cannot read faster."""
+
+WAITING_NOTE_S = 2.0
+"""Time, in seconds, without a skin, after which the terminal says that the page waits for one."""
+
 NEVER_STALE_S = 1e9
-"""For cubes while a replay is held."""
+"""Age, in seconds, above which a cube is stale while a replay is held: none is."""
 
 
 class Viewer:
-    """The node and the page.
+    """The node and the pages of all browsers.
 
-    All of it runs in the thread that calls `spin`, except that buttons are pressed in viser's
-    threads: what they ask for waits in a queue.
+    All of it runs in the thread that calls `spin`. Buttons are pressed in threads of viser, and
+    what they ask for waits in a queue.
     """
 
     def __init__(self, host: str, port: int, depth: float, recordings: Path) -> None:
-        """host, port: where the page is served, TCP. depth: from the cubes' centres to the surface,
-        m. recordings: the folder for bags."""
+        """Start the server and the node; arguments as of `run_view`."""
         self._host = host
-        self._token = "" if host in HOSTS else secrets.token_urlsafe(16)
+        self._token = "" if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
         self._server = _serve(host, port, self._token)
         self._depth = depth
         self._node = rclpy.create_node("view")
@@ -80,12 +85,12 @@ class Viewer:
         self._contacts = ContactsClient(self._node, self._guard)
         self._recorder = BagRecorder(recordings)
         self._links: dict[str, str] = {}
-        self._pressed: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._followed: FollowedSkin | None = None
         self._shown: ShownSkin | None = None
         self._rows = RowRate(0, time.monotonic())
         self._pages: dict[int, Page | WaitingPage] = {}
-        put = self._pressed.put
+        put = self._actions.put
         self._server.on_client_connect(lambda client: put(lambda: self._open_page(client)))
         self._server.on_client_disconnect(
             lambda client: put(lambda: self._forget_page(client.client_id))
@@ -95,46 +100,49 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """What to open in a browser; with the token, where one is needed."""
-        host = socket.gethostname() if self._host in WILDCARDS else self._host
+        """Address of the page, with the token where one is needed."""
+        host = socket.gethostname() if self._host in ALL_ADDRESSES else self._host
         name = f"[{host}]" if ":" in host else host
         query = f"/?token={self._token}" if self._token else ""
         return f"http://{name}:{self._server.get_port()}{query}"
 
-    def spin(self, stopping: Callable[[], bool]) -> None:
-        """Serve until `stopping` is true."""
-        next_picture = next_numbers = time.monotonic()
-        say_waiting_at = next_picture + SAY_WAITING_S
-        while not stopping():
-            wait = min(next_picture - time.monotonic(), 1 / PICTURES_HZ)
-            self._executor.spin_once(timeout_sec=max(0.0, wait))
-            while not self._pressed.empty():
-                self._guard.wrap(self._pressed.get())()
-            now = time.monotonic()
-            if now < next_picture:
+    def spin(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set."""
+        next_picture_s = next_numbers_s = time.monotonic()
+        waiting_note_s = next_picture_s + WAITING_NOTE_S
+        while not stop.is_set():
+            wait_s = min(next_picture_s - time.monotonic(), PICTURE_PERIOD_S)
+            self._executor.spin_once(timeout_sec=max(0.0, wait_s))
+            while not self._actions.empty():
+                self._guard.wrap(self._actions.get())()
+            now_s = time.monotonic()
+            if now_s < next_picture_s:
                 continue
-            # After a pause of the computer, pictures that were missed are not made up for.
-            next_picture = max(next_picture + 1 / PICTURES_HZ, now)
-            with_numbers = now >= next_numbers
+
+            # Pictures that were missed, while the computer slept for example, are left out.
+            next_picture_s = max(next_picture_s + PICTURE_PERIOD_S, now_s)
+            with_numbers = now_s >= next_numbers_s
             if with_numbers:
-                next_numbers = now + 1 / NUMBERS_HZ
+                next_numbers_s = now_s + NUMBERS_PERIOD_S
             if self._followed is not None and self._shown is not None:
                 self._guard.wrap(self._update)(self._followed, self._shown, with_numbers)
-            elif now >= say_waiting_at:
-                say_waiting_at = math.inf
+            elif now_s >= waiting_note_s:
+                waiting_note_s = math.inf
                 print(markup.waiting(_domain()), flush=True)
 
     def close(self) -> None:
+        """End a recording, the node and the server."""
         self._recorder.end()
         self._executor.remove_node(self._node)
-        self._node.destroy_node()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it has stopped
+        self._node.destroy_node()  # type: ignore[no-untyped-call]
+        # viser prints that it has stopped.
+        with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
     def _show_skin(self, skin: FollowedSkin) -> None:
-        """There is a skin, or another one: make its pages."""
+        """Make the pages of a skin that has appeared, or has taken the place of another one."""
         names = [cube.name for cube in skin.info.cubes]
-        history = History(len(names), round(HISTORY_S * PICTURES_HZ))
+        history = History(len(names), round(HISTORY_S / PICTURE_PERIOD_S))
         self._shown = ShownSkin(skin.info.name, names, skin.poses, self._depth, history)
         self._followed = skin
         self._rows = RowRate(len(names), time.monotonic())
@@ -145,7 +153,7 @@ class Viewer:
             self._open_page(client)
 
     def _open_page(self, client: viser.ClientHandle) -> None:
-        """The page of a browser that has come; safe to call again."""
+        """Make the page of a browser, unless it has one or has gone already."""
         if client.client_id in self._pages or client.client_id not in self._server.get_clients():
             return
         if self._shown is None:
@@ -165,7 +173,7 @@ class Viewer:
         def clear_tare() -> None:
             self._services.ask("undo tare", self._clear_tare, Trigger.Request())
 
-        put = self._pressed.put
+        put = self._actions.put
         return Buttons(
             tare=lambda: put(tare),
             clear_tare=lambda: put(clear_tare),
@@ -175,13 +183,13 @@ class Viewer:
         )
 
     def _update(self, followed: FollowedSkin, shown: ShownSkin, with_numbers: bool) -> None:
-        """One picture; with_numbers: and what stands beside it."""
+        """Show one picture, and with `with_numbers` the numbers and plots beside it."""
         if self._replay.update():
             shown.history.clear()
-        held = self._replay.held
+        is_held = self._replay.is_held
         now = self._subscriber.now()
-        health = followed.newest.health(now, NEVER_STALE_S if held else STALE_S)
-        if not held:
+        health = followed.newest.health(now, NEVER_STALE_S if is_held else STALE_S)
+        if not is_held:
             shown.history.add(now, followed.newest.usable_values(health), followed.newest.residual)
         if with_numbers:
             self._update_status()
@@ -192,10 +200,10 @@ class Viewer:
         moment = Moment.of(
             followed.newest, health, shown.surface, self._contacts.found(shown.surface)
         )
-        here = self._server.get_clients()
+        connected = self._server.get_clients()
         for client_id, page in self._pages.items():
-            if isinstance(page, Page) and client_id in here:
-                if with_numbers and not self._replay.jumping:
+            if isinstance(page, Page) and client_id in connected:
+                if with_numbers and not self._replay.is_jumping:
                     page.show_replay(self._replay.state)
                 page.show(moment, self._rows.rate, self._status, with_numbers)
 
@@ -233,13 +241,17 @@ def _domain() -> str:
 
 
 def _serve(host: str, port: int, token: str) -> viser.ViserServer:
-    """ConfigError: the host is no address of this machine, or the port is in use."""
+    """Start viser.
+
+    Raises:
+        ConfigError: The host is no address of this machine, or the port cannot be had.
+    """
     check_host(host)
     logging.getLogger("websockets").setLevel(logging.ERROR)
-    # A browser may leave while its picture is made.
+    # viser warns when a browser leaves while its picture is made, which is no fault.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     try:
-        # viser prints a banner
+        # viser prints a banner with an address without the token.
         with contextlib.redirect_stdout(io.StringIO()), guarded_server(token):
             return viser.ViserServer(host, port, label="cube_tensor_driver", verbose=False)
     except OSError as error:
@@ -249,22 +261,21 @@ def _serve(host: str, port: int, token: str) -> viser.ViserServer:
 def run_view(host: str, port: int, depth: float, recordings: Path) -> int:
     """Serve the page until Ctrl-C; returns the exit code.
 
-    host, port: where the page is served, TCP. depth: from the cubes' centres to the surface, m.
-    recordings: the folder for bags. Raises ConfigError if host or port cannot be had.
+    Args:
+        host: Address at which the page is served.
+        port: TCP port of the page.
+        depth: Depth of the centres of the cubes below the surface, in metres.
+        recordings: Folder for bags that are recorded from the page.
+
+    Raises:
+        ConfigError: Host or port cannot be had.
     """
-    stopping = False
-
-    def stop(*_: object) -> None:
-        nonlocal stopping
-        stopping = True
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, stop)
+    stop = stop_event()
     start_ros()
     try:
         with contextlib.closing(Viewer(host, port, depth, recordings)) as viewer:
             print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
-            viewer.spin(lambda: stopping)
+            viewer.spin(stop)
     finally:
-        rclpy.try_shutdown()
+        rclpy.try_shutdown()  # type: ignore[attr-defined]
     return 0

@@ -18,11 +18,10 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from cube_tensor_driver.browser.charts import csv_of, round_range
+from cube_tensor_driver.browser.charts import csv_of, draw_lines, round_range
 from cube_tensor_driver.browser.controls import ColourControls
 from cube_tensor_driver.browser.gate import check_host, guarded_server, refusal
 from cube_tensor_driver.browser.history import History
-from cube_tensor_driver.browser.plot_colours import draw_lines
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.views.figures.style import png
@@ -133,7 +132,7 @@ def test_values_that_no_control_offers_do_no_harm() -> None:
     )
     controls = ColourControls(gui, lambda: None)
     assert controls.quantity in QUANTITIES.values()
-    assert controls.top == 0.0
+    assert controls.fixed_top == 0.0
 
 
 def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:

@@ -9,10 +9,10 @@ pytest.importorskip("viser", reason="needs viser: pip install viser")
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 
-from cube_tensor_driver.browser import contacts_client
-from cube_tensor_driver.browser.contacts_client import ContactsClient
+from cube_tensor_driver.browser import clients
+from cube_tensor_driver.browser.clients import ContactsClient
+from cube_tensor_driver.browser.colouring import Colouring
 from cube_tensor_driver.browser.moment import DEVIATION, Moment, SurfaceField
-from cube_tensor_driver.browser.scene_3d import Colouring
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.messages.contacts import contacts_message, decode_traction, traction_message
@@ -70,7 +70,7 @@ def test_field_and_contacts_of_the_node_are_shown_until_they_are_old(poses, monk
     assert np.abs(field.pressure - true)[inside].max() < 0.05 * 1500
     np.testing.assert_allclose(field.shear, 0.3 * field.pressure, rtol=1e-5)
     np.testing.assert_allclose(field.sigma, 70.0 + 0.01 * field.pressure, rtol=1e-5)
-    monkeypatch.setattr(contacts_client, "OLD_S", -1.0)
+    monkeypatch.setattr(clients, "MAX_CONTACTS_AGE_S", -1.0)
     assert client.found(surface) == (None, None)
 
 

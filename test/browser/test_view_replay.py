@@ -10,10 +10,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 pytest.importorskip("viser", reason="needs viser")
 
-from cube_tensor_driver.browser import replay_client
+from cube_tensor_driver.browser import clients
+from cube_tensor_driver.browser.clients import MAX_ANSWER_S, ReplayClient, ServiceCalls
 from cube_tensor_driver.browser.controls import ReplayControls
-from cube_tensor_driver.browser.replay_client import ReplayClient
-from cube_tensor_driver.browser.service_calls import WAIT_S, ServiceCalls
 from cube_tensor_driver.core.latest_stress import STALE_S
 from cube_tensor_driver.msg import ReplayState
 from cube_tensor_driver.srv import SteerReplay
@@ -85,7 +84,7 @@ def clock(monkeypatch):
     """Time of the client, s; what is added to `late` passes at once."""
     here = SimpleNamespace(late=0.0)
     monkeypatch.setattr(
-        replay_client, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + here.late)
+        clients, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + here.late)
     )
     return here
 
@@ -129,24 +128,24 @@ def test_a_jump_waits_for_a_replay_that_is_silent_or_not_found_yet(ros, client, 
     clock.late += STALE_S + 0.1
     client.replay.forget_if_silent()
     # Meanwhile the page hides it, as it does all that is silent.
-    assert client.replay.state is None and not client.replay.jumping
+    assert client.replay.state is None and not client.replay.is_jumping
     asked = serve(ros)
     ros.wait(client.is_running)
-    assert client.replay.jumping
+    assert client.replay.is_jumping
     ros.wait(client.replay.update)
     ros.wait(lambda: asked == [0.0])
-    ros.wait(lambda: not client.replay.update() and not client.replay.jumping)
+    ros.wait(lambda: not client.replay.update() and not client.replay.is_jumping)
     assert client.said == []
 
 
 def test_a_jump_of_no_replay_is_said(ros, client, clock):
     client.replay.jump_to(0.0)
     assert not client.replay.update() and client.said == []
-    clock.late += WAIT_S + 0.1
+    clock.late += MAX_ANSWER_S + 0.1
     assert not client.replay.update()
     assert client.said == ["jump: no replay is running"]
     ros.wait(client.is_running)
-    assert not client.replay.jumping
+    assert not client.replay.is_jumping
 
 
 def test_a_jump_without_an_answer_is_said_and_the_next_one_is_asked_for(ros, client, clock):
@@ -157,7 +156,7 @@ def test_a_jump_without_an_answer_is_said_and_the_next_one_is_asked_for(ros, cli
     client.replay.jump_to(1.0)
     assert not client.replay.update()
     # Nothing is spun: the answer does not come.
-    clock.late += WAIT_S + 0.1
+    clock.late += MAX_ANSWER_S + 0.1
     assert client.replay.update()
     assert client.said == ["jump: no answer within 10 s"]
     ros.wait(lambda: asked == [0.0, 1.0])

@@ -74,8 +74,8 @@ def test_automatic_range_rises_at_once_and_falls_slowly():
     quantity = QUANTITIES["pressure"]
     top = scene.automatic(quantity, np.array([np.nan, 9e3, -2e3]))
     assert top == 9e3
-    assert scene.automatic(quantity, np.array([1.0]), top) == pytest.approx(9e3 * scene.FALL)
-    assert scene.automatic(quantity, np.array([np.nan])) == quantity.least
+    assert scene.automatic(quantity, np.array([1.0]), top) == pytest.approx(9e3 * scene.RANGE_DECAY)
+    assert scene.automatic(quantity, np.array([np.nan])) == quantity.min_top
 
 
 def test_health_says_doubtful_no_tensor_and_stale():
@@ -274,12 +274,12 @@ def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
 
 def test_rods_lie_around_their_lines_with_the_radii_asked_for():
     pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.browser.meshes import SIDES, rods
+    from cube_tensor_driver.browser.meshes import PRISM_SIDES, rods
 
     lines = np.random.default_rng(3).normal(size=(7, 2, 3))
     lines[0, 1] = lines[0, 0] + [0, 0, 2.0]  # along an axis
     vertices, faces = rods(lines, 0.2, 0.05)
-    rings = vertices.reshape(7, 2, SIDES, 3)
+    rings = vertices.reshape(7, 2, PRISM_SIDES, 3)
     np.testing.assert_allclose(rings.mean(axis=2), lines, atol=1e-12)
     way = lines[:, 1] - lines[:, 0]
     from_axis = rings - lines[:, :, None]
@@ -287,8 +287,8 @@ def test_rods_lie_around_their_lines_with_the_radii_asked_for():
     radii = np.linalg.norm(from_axis, axis=3)
     np.testing.assert_allclose(radii, np.broadcast_to([[[0.2], [0.05]]], radii.shape))
     # every face lies on one rod and touches both of its ends; every vertex has three
-    assert (faces // (2 * SIDES) == np.repeat(np.arange(7), 2 * SIDES)[:, None]).all()
-    assert {len(set(end)) for end in (faces // SIDES % 2).tolist()} == {2}
+    assert (faces // (2 * PRISM_SIDES) == np.repeat(np.arange(7), 2 * PRISM_SIDES)[:, None]).all()
+    assert {len(set(end)) for end in (faces // PRISM_SIDES % 2).tolist()} == {2}
     assert (np.bincount(faces.ravel()) == 3).all()
     # nothing to draw is a shape that is not seen
     vertices, faces = rods(np.zeros((0, 2, 3)), 0.2)

@@ -216,17 +216,17 @@ def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_i
 
 def test_the_view_s_squares_have_the_colour_of_their_value():
     pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.browser.surface_layer import STEPS, step_colours, steps_of
+    from cube_tensor_driver.browser.meshes import COLOUR_STEPS, colour_steps, step_colours
     from cube_tensor_driver.views import scene
 
     for name in ("pressure", "zz"):
         quantity = scene.QUANTITIES[name]
         shown = np.append(np.linspace(-12e3, 12e3, 301), np.nan)
-        colours = step_colours(quantity)[steps_of(quantity, shown, 10e3)]
+        colours = step_colours(quantity)[colour_steps(quantity, shown, 10e3)]
         expected = 255 * scene.colours(quantity, shown, 10e3)
         # half a step, where the scale is steepest
         scale = 255 * scene.colours(quantity, np.linspace(-10e3, 10e3, 2000), 10e3)
-        steepest = np.abs(np.diff(scale, axis=0)).max() * 2000 / STEPS
+        steepest = np.abs(np.diff(scale, axis=0)).max() * 2000 / COLOUR_STEPS
         assert np.abs(colours - expected).max() <= steepest / 2 + 1
 
 
