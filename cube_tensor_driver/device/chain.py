@@ -236,7 +236,11 @@ class LiveLinks:
         return now_ns, step_ns
 
     def _handle_frames(
-        self, link: int, arrival_ns: int, frames: Sequence[Frame], asked_ns: int
+        self,
+        link: int,
+        arrival_ns: int,
+        frames: Sequence[Frame],
+        asked_ns: int,
     ) -> None:
         """Count the frames of a link and add their samples to the scans."""
         record = self._records[link]
@@ -370,7 +374,11 @@ def _period_us(rate: float | None) -> int | None:
     return None if rate is None else round(1e6 / rate)
 
 
-def _report_values(link: Link, record: _LinkRecord, logger: LinkLogger) -> dict[str, object]:
+def _report_values(
+    link: Link,
+    record: _LinkRecord,
+    logger: LinkLogger,
+) -> dict[str, object]:
     """Return the counters and clock values of one link by name."""
     clock = record.clock
     bound_ns = clock.bound_ns

@@ -57,7 +57,11 @@ def open_links(
     return LinkSource(skin, links, skin.rate if rate is None else rate)
 
 
-def link_configs(skin: Skin, port: str = "", port_directory: str | Path = "") -> list[LinkConfig]:
+def link_configs(
+    skin: Skin,
+    port: str = "",
+    port_directory: str | Path = "",
+) -> list[LinkConfig]:
     """Return the place of each link of a skin.
 
     Args:
@@ -115,7 +119,12 @@ class LinkSource:
         LinkError: `bad_port`: a port can never be opened.
     """
 
-    def __init__(self, skin: Skin, links: Sequence[LinkConfig], rate: float | None) -> None:
+    def __init__(
+        self,
+        skin: Skin,
+        links: Sequence[LinkConfig],
+        rate: float | None,
+    ) -> None:
         self._skin = skin
         self._queue: deque[tuple[float, FrequencyRows]] = deque()  # with their arrival
         self._changed = threading.Condition()

@@ -133,7 +133,10 @@ class HubClock:
             self.problems.add(BAD_ANSWERS)
 
     def update(
-        self, device_us: Sequence[int], arrival_ns: int, numbers: Sequence[int] = ()
+        self,
+        device_us: Sequence[int],
+        arrival_ns: int,
+        numbers: Sequence[int] = (),
     ) -> list[int]:
         """Learn from samples that arrived together, and convert their device times.
 

@@ -142,7 +142,13 @@ class StepDecision:
     """
 
     def __init__(
-        self, *, step_us: int, newest_ns: int, before_ns: int, since_ns: int, usual_delay_ns: float
+        self,
+        *,
+        step_us: int,
+        newest_ns: int,
+        before_ns: int,
+        since_ns: int,
+        usual_delay_ns: float,
     ) -> None:
         self.step_us = step_us
         self.newest_ns = newest_ns
@@ -154,7 +160,11 @@ class StepDecision:
         self._n_reads = 0
 
     def was_set(
-        self, device_ns: int, delay_ns: float, arrival_ns: int, mean_delay_ns: float
+        self,
+        device_ns: int,
+        delay_ns: float,
+        arrival_ns: int,
+        mean_delay_ns: float,
     ) -> bool | None:
         """Decide after one more sample.
 

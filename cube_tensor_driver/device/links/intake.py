@@ -19,7 +19,10 @@ ReadResult = list[Frame] | LinkError | None
 lost, or None if there were no bytes."""
 
 
-def read_links(links: Sequence[Link], clock_ns: Callable[[], int]) -> tuple[int, list[ReadResult]]:
+def read_links(
+    links: Sequence[Link],
+    clock_ns: Callable[[], int],
+) -> tuple[int, list[ReadResult]]:
     """Read each link once and decode its bytes.
 
     Args:
@@ -50,7 +53,8 @@ def read_links(links: Sequence[Link], clock_ns: Callable[[], int]) -> tuple[int,
 
 
 def _read_in_python(
-    links: Sequence[Link], clock_ns: Callable[[], int]
+    links: Sequence[Link],
+    clock_ns: Callable[[], int],
 ) -> tuple[int, list[ReadResult]]:
     """Read each link once and decode its bytes, without the wire module in C."""
     reads: list[bytes | LinkError] = []

@@ -38,7 +38,12 @@ class LinkLogger:
         left_out: Number of lines left out so far.
     """
 
-    def __init__(self, name: str, log: Log, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        name: str,
+        log: Log,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.left_out = 0
         self._name = name
         self._log = log

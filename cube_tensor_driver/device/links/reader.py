@@ -232,7 +232,9 @@ class Reader:
                     self._check_timers(i, now)
 
     def _read_ready(
-        self, ready: list[tuple[selectors.SelectorKey, int]], wake_read: int
+        self,
+        ready: list[tuple[selectors.SelectorKey, int]],
+        wake_read: int,
     ) -> list[LinkRead]:
         """Read and decode all links that are ready, and send the bytes that wait."""
         reads: list[LinkRead] = []
@@ -258,7 +260,10 @@ class Reader:
                     reads.append(LinkRead(i, arrival_ns, result))
         return reads
 
-    def _handle_reads(self, reads: list[LinkRead]) -> tuple[list[LinkFrames], dict[int, LinkError]]:
+    def _handle_reads(
+        self,
+        reads: list[LinkRead],
+    ) -> tuple[list[LinkFrames], dict[int, LinkError]]:
         """Handle all reads of a wake-up.
 
         They are handled together, because after each wait Python's code and data have left the

@@ -56,7 +56,11 @@ class Session:
     """
 
     def __init__(
-        self, link: Link, period_us: int | None, clock_ns: Callable[[], int], on_state: OnState
+        self,
+        link: Link,
+        period_us: int | None,
+        clock_ns: Callable[[], int],
+        on_state: OnState,
     ) -> None:
         self.link = link
         self.actual_us = period_us or 0

@@ -22,7 +22,8 @@ def split_into_scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
         (S,) in s of the first row of each scan.
     """
     # A scan begins where the index of the cube does not increase.
-    is_first = np.diff(rows.cube.astype(int), prepend=n_cubes) <= 0
+    cube = rows.cube.astype(int)
+    is_first = np.diff(cube, prepend=n_cubes) <= 0
     scan = np.cumsum(is_first) - 1
     n_scans = int(is_first.sum())
     n_pads = rows.frequency.shape[1]
@@ -33,7 +34,9 @@ def split_into_scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
 
 
 def average_over_time(
-    source: Iterable[FrequencyRows], n_cubes: int, duration_s: float
+    source: Iterable[FrequencyRows],
+    n_cubes: int,
+    duration_s: float,
 ) -> Iterator[Array]:
     """Yield the mean frequency of each pad over successive durations.
 
@@ -54,5 +57,6 @@ def average_over_time(
         is_measured = np.isfinite(values)
         total = np.where(is_measured, values, 0).sum(axis=0)
         count = is_measured.sum(axis=0)
-        yield np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+        mean = np.full(total.shape, np.nan)
+        yield np.divide(total, count, out=mean, where=count > 0)
         parts, begin_s = [], None

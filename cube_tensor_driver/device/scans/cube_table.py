@@ -21,6 +21,12 @@ ABSENT = -1
 _OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
 
 
+HubIndex = NDArray[np.int32]
+"""Index in the skin of each cube of a hub (n_cubes,), or `ABSENT`."""
+RowIndex = NDArray[np.uint16]
+"""Index in the skin of each row of a sample (n_cubes,)."""
+
+
 @dataclass(frozen=True)
 class CubeAddress:
     """Place of a cube, as the skin file gives it: by uid, or by link and index.
@@ -60,8 +66,8 @@ class _HubCubes:
     hello: Hello | None = None
     is_present: bool = False
     waits_for_cube: bool = False
-    cubes: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
-    complete: tuple[NDArray[np.uint16], tuple[int, int]] | None = None
+    cubes: HubIndex = field(default_factory=lambda: np.empty(0, np.int32))
+    complete: tuple[RowIndex, tuple[int, int]] | None = None
 
 
 class CubeTable:
@@ -105,11 +111,15 @@ class CubeTable:
             return None
         hub.cubes = cubes
         hub.complete = None
-        if (cubes != ABSENT).all() and (self._pads[cubes] == hello.n_pads).all():
-            hub.complete = cubes.astype(np.uint16), (len(cubes), hello.n_pads)
+        is_known = cubes != ABSENT
+        fits = self._pads[cubes] == hello.n_pads
+        if is_known.all() and fits.all():
+            shape = hello.n_cubes, hello.n_pads
+            hub.complete = cubes.astype(np.uint16), shape
+
+        known_uids = hello.cube_uids[is_known].tolist()
         uids = dict(self.uids)
-        for index in np.flatnonzero(cubes != ABSENT).tolist():
-            uids[int(cubes[index])] = int(hello.cube_uids[index])
+        uids.update(zip(cubes[is_known].tolist(), known_uids, strict=True))
         # The table is replaced in one step, because other threads read it.
         self.uids = uids
         return problems
@@ -118,7 +128,7 @@ class CubeTable:
         """Let other links take over the cubes of a link, because it was closed or is silent."""
         self._hubs[link].is_present = False
 
-    def find(self, link: int, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
+    def find(self, link: int, sample: Sample) -> tuple[RowIndex, Sample] | None:
         """Find the cubes of the skin in a sample.
 
         Returns:
@@ -128,37 +138,45 @@ class CubeTable:
         if not sample.n_cubes:
             return None
         hub = self._hubs[link]
+        # The usual sample holds all cubes of the hub, and all of them are in the skin.
         if hub.complete is not None and sample.first_cube == 0:
             cubes, shape = hub.complete
             if sample.shape == shape:
                 return cubes, sample
         return self._select(hub, sample)
 
-    def _select(self, hub: _HubCubes, sample: Sample) -> tuple[NDArray[np.uint16], Sample] | None:
+    def _select(
+        self,
+        hub: _HubCubes,
+        sample: Sample,
+    ) -> tuple[RowIndex, Sample] | None:
         """Find the cubes of the skin in a sample with other rows, and count these."""
         end = sample.first_cube + sample.n_cubes
         cubes = hub.cubes[sample.first_cube : end]
-        known = cubes != ABSENT
-        fits = known & (self._pads[cubes] == sample.n_pads)
+        is_known = cubes != ABSENT
+        fits = is_known & (self._pads[cubes] == sample.n_pads)
         if len(cubes) == sample.n_cubes and fits.all():
             return cubes.astype(np.uint16), sample
-        n_known = int(known.sum())
+
+        # A sample may also hold more cubes than the hub has reported; they are unknown, too.
+        n_known = int(is_known.sum())
+        n_fitting = int(fits.sum())
         self.unknown_cube += sample.n_cubes - n_known
-        self.wrong_pads += n_known - int(fits.sum())
+        self.wrong_pads += n_known - n_fitting
         if not fits.any():
             return None
         rows = np.flatnonzero(fits)
         kept = Sample(
-            sample.sequence,
-            sample.first_cube,
-            sample.device_us,
-            sample.frequency[rows],
-            sample.pad_fault[rows],
-            sample.temperature[rows],
+            sequence=sample.sequence,
+            first_cube=sample.first_cube,
+            device_us=sample.device_us,
+            frequency=sample.frequency[rows],
+            pad_fault=sample.pad_fault[rows],
+            temperature=sample.temperature[rows],
         )
         return cubes[rows].astype(np.uint16), kept
 
-    def _match(self, link: int, hello: Hello) -> tuple[NDArray[np.int32], list[str]]:
+    def _match(self, link: int, hello: Hello) -> tuple[HubIndex, list[str]]:
         """Return the index in the skin of each cube of a hub, and what does not fit."""
         uids = hello.cube_uids.tolist()
         index_of_uid: dict[int, int] = {}
@@ -203,7 +221,9 @@ class CubeTable:
 
 def _has_same_cubes(one: Hello, other: Hello) -> bool:
     """Return whether two HELLOs report the same cubes."""
-    return one.n_pads == other.n_pads and np.array_equal(one.cube_uids, other.cube_uids)
+    if one.n_pads != other.n_pads:
+        return False
+    return np.array_equal(one.cube_uids, other.cube_uids)
 
 
 def _locate(

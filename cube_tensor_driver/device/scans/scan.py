@@ -12,12 +12,12 @@ from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...core.arrays import AnyArray
 from ...core.rows import FrequencyRows
 from ..wire.native import wire
 from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample, join
-from .cube_table import CubeAddress, CubeTable
+from .cube_table import CubeAddress, CubeTable, RowIndex
 
 MAX_SCANS_AHEAD = 4
 """Number of scans that one link may be ahead of another. Beyond it all scans are built as they
@@ -32,7 +32,8 @@ MIN_PERIODS_EARLIER = 0.75
 sample at different phases, and stamps jitter."""
 
 # Temperature, in °C, of each of the 65536 bit patterns of a SAMPLE.
-_CELSIUS = np.arange(1 << 16, dtype=np.uint16).view(np.int16) * np.float32(0.01)
+_PATTERNS = np.arange(1 << 16, dtype=np.uint16)
+_CELSIUS = _PATTERNS.view(np.int16) * np.float32(0.01)
 _CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
 
 MakeRows = Callable[[int, int], FrequencyRows]
@@ -76,7 +77,7 @@ class _SampleRows(NamedTuple):
         status: Status bits of all rows.
     """
 
-    cubes: NDArray[np.uint16]
+    cubes: RowIndex
     sample: Sample
     stamp_ns: int
     status: int
@@ -116,7 +117,11 @@ class ScanBuilder:
             self.cubes.forget(link)
 
     def add(
-        self, link: int, samples: Sequence[Sample], stamps_ns: Sequence[int], status: int = 0
+        self,
+        link: int,
+        samples: Sequence[Sample],
+        stamps_ns: Sequence[int],
+        status: int = 0,
     ) -> None:
         """Add samples of one link.
 
@@ -160,7 +165,9 @@ class ScanBuilder:
         return n_scans == 1 and self._holds_late_sample(missing)
 
     def build(
-        self, make_rows: MakeRows = empty_rows, max_scans: int | None = None
+        self,
+        make_rows: MakeRows = empty_rows,
+        max_scans: int | None = None,
     ) -> FrequencyRows | None:
         """Build the rows of the oldest scans.
 
@@ -229,11 +236,14 @@ class ScanBuilder:
         since has a built sample that is nearer to it in time than its own last one.
         """
         limits_ns: list[float] = []
-        for link, (_, stamp_ns, _) in self._pending[0].items():
-            last_ns = self._built_ns[link]
-            # Another frame of the sample that was built last is late, too.
-            limits_ns.append((stamp_ns + last_ns) / 2 if stamp_ns > last_ns else 0.0)
-        return min(self._built_ns[link] for link in missing) > min(limits_ns)
+        for link, stamped in self._pending[0].items():
+            last_ns, stamp_ns = self._built_ns[link], stamped.stamp_ns
+            if stamp_ns > last_ns:
+                limits_ns.append((stamp_ns + last_ns) / 2)
+            else:
+                limits_ns.append(0.0)  # another frame of the sample that was built last
+        oldest_ns = min(self._built_ns[link] for link in missing)
+        return oldest_ns > min(limits_ns)
 
     def _n_scans_to_build(self) -> int:
         """Return the number of scans that every live link has reached.
@@ -270,21 +280,26 @@ class ScanBuilder:
         self._pending_ns = [
             min(stamped.stamp_ns for stamped in scan.values()) for scan in self._pending
         ]
-        self._n_pending = [len(queues.get(link, ())) for link in range(len(self._n_pending))]
+        n_links = len(self._n_pending)
+        self._n_pending = [len(queues.get(link, ())) for link in range(n_links)]
 
     def _first_scan_at(self, stamp_ns: int) -> int:
         """Return the first of several pending scans that is not clearly earlier than a sample."""
         times = self._pending_ns
-        period = (times[-1] - times[0]) / (len(times) - 1)
-        return bisect_left(times, stamp_ns - MIN_PERIODS_EARLIER * period)
+        n_periods = len(times) - 1
+        period = (times[-1] - times[0]) / n_periods
+        tolerance = MIN_PERIODS_EARLIER * period
+        return bisect_left(times, stamp_ns - tolerance)
 
 
 def _split_by_span(parts: list[_SampleRows]) -> tuple[list[_SampleRows], list[_SampleRows]]:
     """Return the samples within `MAX_SPAN_NS` of the earliest, and the others."""
+    if not parts:
+        return [], []
     stamps_ns = [part.stamp_ns for part in parts]
-    if not parts or max(stamps_ns) - min(stamps_ns) <= MAX_SPAN_NS:
-        return parts, []
     end_ns = min(stamps_ns) + MAX_SPAN_NS
+    if max(stamps_ns) <= end_ns:
+        return parts, []
     within = [part for part in parts if part.stamp_ns <= end_ns]
     return within, [part for part in parts if part.stamp_ns > end_ns]
 
@@ -300,9 +315,8 @@ def _fill(
     """
     np.concatenate([part.cubes for part in parts], out=rows.cube)
     counts = [len(part.cubes) for part in parts]
-    rows.status[:] = 0
-    if any(part.status for part in parts):
-        rows.status[:] = np.repeat([part.status for part in parts], counts)
+    statuses = [part.status for part in parts]
+    rows.status[:] = np.repeat(statuses, counts) if any(statuses) else 0
 
     raws = [part.sample.raw for part in parts]
     if wire is None or not all(raws):
@@ -310,7 +324,8 @@ def _fill(
         return
     n_rows, n_pads = rows.frequency.shape
     columns = columns_of(n_rows, n_pads)
-    wire.place_rows(raws, [part.stamp_ns for part in parts], n_pads, columns.memory)
+    stamps_ns = [part.stamp_ns for part in parts]
+    wire.place_rows(raws, stamps_ns, n_pads, columns.memory)
     columns.copy_to(rows)
 
 
@@ -318,12 +333,19 @@ class _Columns:
     """Memory for the columns of rows that `wire.place_rows` writes one after the other."""
 
     def __init__(self, n_rows: int, n_pads: int) -> None:
-        self.memory = bytearray(n_rows * (20 + 4 * n_pads))
-        self._stamp_ns = np.ndarray(n_rows, np.int64, self.memory)
-        self._sequence = np.ndarray(n_rows, np.uint32, self.memory, 8 * n_rows)
-        self._pad_fault = np.ndarray(n_rows, np.uint32, self.memory, 12 * n_rows)
-        self._temperature = np.ndarray(n_rows, np.float32, self.memory, 16 * n_rows)
-        self._frequency = np.ndarray((n_rows, n_pads), np.float32, self.memory, 20 * n_rows)
+        bytes_per_row = 8 + 4 + 4 + 4 + 4 * n_pads
+        self.memory = bytearray(n_rows * bytes_per_row)
+        # The positions and types are those of `wire.place_rows`.
+        self._stamp_ns = self._view(0, n_rows, np.int64)
+        self._sequence = self._view(8 * n_rows, n_rows, np.uint32)
+        self._pad_fault = self._view(12 * n_rows, n_rows, np.uint32)
+        self._temperature = self._view(16 * n_rows, n_rows, np.float32)
+        frequency = self._view(20 * n_rows, n_rows * n_pads, np.float32)
+        self._frequency = frequency.reshape(n_rows, n_pads)
+
+    def _view(self, offset: int, count: int, dtype: type[np.generic]) -> AnyArray:
+        """Return a part of the memory as an array."""
+        return np.frombuffer(self.memory, dtype, count, offset)
 
     def copy_to(self, rows: FrequencyRows) -> None:
         """Copy the columns into rows of the same shape."""
@@ -335,16 +357,21 @@ class _Columns:
 
 
 def _fill_in_python(
-    rows: FrequencyRows, parts: Sequence[_SampleRows], counts: Sequence[int]
+    rows: FrequencyRows,
+    parts: Sequence[_SampleRows],
+    counts: Sequence[int],
 ) -> None:
     """Write the values of samples into rows, without the wire module in C."""
     samples = [part.sample for part in parts]
-    rows.sequence[:] = np.repeat([sample.sequence for sample in samples], counts)
-    rows.stamp_ns[:] = np.repeat([part.stamp_ns for part in parts], counts)
+    numbers = [sample.sequence for sample in samples]
+    rows.sequence[:] = np.repeat(numbers, counts)
+    stamps_ns = [part.stamp_ns for part in parts]
+    rows.stamp_ns[:] = np.repeat(stamps_ns, counts)
 
     frequency, pad_fault, temperature = join(samples)
     rows.pad_fault[:] = pad_fault
-    _CELSIUS.take(temperature.view(np.uint16), out=rows.temperature, mode="clip")
+    patterns = temperature.view(np.uint16)
+    _CELSIUS.take(patterns, out=rows.temperature, mode="clip")
 
     width = frequency.shape[1]
     measured = rows.frequency[:, :width]

@@ -13,11 +13,13 @@ from dataclasses import dataclass
 
 from . import cobs
 from .native import SLOWER, wire
-from .protocol import HEADER, MAX_FRAME, OVERHEAD, REQUEST, UNPACK, VERSION, Frame
+from .protocol import HEADER, MAX_FRAME, OVERHEAD, UNPACK, VERSION, Frame
 
 MAX_RUN = MAX_FRAME + (MAX_FRAME + 253) // 254
 """Length of the longest run of bytes that can be a frame. COBS adds one byte to each 254."""
-MIN_RUN = OVERHEAD + REQUEST.size + 1
+MIN_PAYLOAD = 5
+"""Smallest payload in bytes of every protocol version, that of a REQUEST."""
+MIN_RUN = OVERHEAD + MIN_PAYLOAD + 1
 """Length of the shortest run of bytes that can be a frame of any protocol version."""
 _CRC_RESIDUE = 0x2144DF1C
 """CRC-32 of any data followed by its own CRC-32. So the CRC need not be cut off for the check."""
@@ -73,6 +75,7 @@ class PythonDecoder:
         *runs, rest = bytes(data).split(b"\0")
         frames: list[Frame] = []
         if runs:
+            # The first zero ends the run that earlier bytes began.
             runs[0] = b"" if self._discarding else bytes(self._tail + runs[0])
             self._tail.clear()
             self._discarding = False
@@ -83,6 +86,7 @@ class PythonDecoder:
 
         if not self._discarding:
             self._tail += rest
+            # A longer run cannot become a frame, so its bytes need no memory.
             if len(self._tail) > MAX_RUN:
                 self.counters.overrun += 1
                 self._tail.clear()
@@ -111,6 +115,8 @@ class PythonDecoder:
         if zlib.crc32(raw) != _CRC_RESIDUE:
             counters.crc += 1
             return None
+
+        # From here on the bytes are as they were sent, and the checks tell what the sender is.
         code, version, size = HEADER.unpack_from(raw)
         if version != VERSION:
             counters.version += 1

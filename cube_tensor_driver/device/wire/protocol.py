@@ -15,10 +15,10 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,15 +39,10 @@ NOT_MEASURED = 0
 
 HEADER = struct.Struct("<BBH")
 """Type, version and length of a frame."""
-REQUEST = struct.Struct("<BI")
-"""Payload of a REQUEST."""
 OVERHEAD = HEADER.size + 4
 """Bytes of a frame beside its payload: header and CRC."""
 _HELLO = struct.Struct("<QIHBBI")
 _SAMPLE = struct.Struct("<IHHQB3x")
-_STATS = struct.Struct("<QIIH")
-_ACK = struct.Struct("<BBI")
-_TIME = struct.Struct("<IQ")
 _FREQUENCY = HEADER.size + _SAMPLE.size
 """Position of the frequencies in a decoded SAMPLE."""
 _U32 = np.dtype("<u4")
@@ -102,18 +97,26 @@ class Hello:
         return len(self.cube_uids)
 
     def _pack(self) -> bytes:
-        uids = _check_array("cube_uids", self.cube_uids, _U64, (len(self.cube_uids),))
-        numbers = self.n_pads, self.flags, self.period_us
-        return _HELLO.pack(self.hub_uid, self.firmware, len(uids), *numbers) + uids.tobytes()
+        uids = _check_array("cube_uids", self.cube_uids, _U64, (self.n_cubes,))
+        numbers = _HELLO.pack(
+            self.hub_uid,
+            self.firmware,
+            self.n_cubes,
+            self.n_pads,
+            self.flags,
+            self.period_us,
+        )
+        return numbers + uids.tobytes()
 
     @classmethod
     def _unpack(cls, raw: bytes, size: int) -> Hello | None:
         if size < _HELLO.size:
             return None
-        hub_uid, firmware, n_cubes, n_pads, flags, period_us = _HELLO.unpack_from(raw, 4)
+        hub_uid, firmware, n_cubes, n_pads, flags, period_us = _HELLO.unpack_from(raw, HEADER.size)
         if size != _HELLO.size + 8 * n_cubes:
             return None
-        uids: NDArray[np.uint64] = np.ndarray((n_cubes,), _U64, raw, 4 + _HELLO.size)
+        first_uid = HEADER.size + _HELLO.size
+        uids: NDArray[np.uint64] = np.frombuffer(raw, _U64, n_cubes, first_uid)
         return cls(hub_uid, firmware, n_pads, period_us, uids, flags)
 
 
@@ -146,8 +149,10 @@ class Sample:
         self.raw = b""
 
     def __repr__(self) -> str:
-        numbers = f"{self.sequence}, {self.first_cube}, {self.device_us}"
-        return f"Sample({numbers}, {self.frequency!r}, {self.pad_fault!r}, {self.temperature!r})"
+        return (
+            f"Sample(sequence={self.sequence}, first_cube={self.first_cube}, "
+            f"device_us={self.device_us}, shape={self.shape})"
+        )
 
     @property
     def n_cubes(self) -> int:
@@ -194,8 +199,15 @@ class Sample:
         frequency = _check_array("frequency", self.frequency, _U32, (n_cubes, n_pads))
         pad_fault = _check_array("pad_fault", self.pad_fault, _U32, (n_cubes,))
         temperature = _check_array("temperature", self.temperature, _I16, (n_cubes,))
-        head = _SAMPLE.pack(self.sequence, self.first_cube, n_cubes, self.device_us, n_pads)
-        return b"".join((head, frequency.tobytes(), pad_fault.tobytes(), temperature.tobytes()))
+        numbers = _SAMPLE.pack(
+            self.sequence,
+            self.first_cube,
+            n_cubes,
+            self.device_us,
+            n_pads,
+        )
+        arrays = frequency, pad_fault, temperature
+        return numbers + b"".join(array.tobytes() for array in arrays)
 
     @classmethod
     def _unpack(cls, raw: bytes, size: int) -> Sample | None:
@@ -230,20 +242,45 @@ def join(samples: Sequence[Sample]) -> _Arrays:
     if not all(sample.raw for sample in samples):
         arrays = [sample._make_arrays() for sample in samples]
         frequency, pad_fault, temperature = zip(*arrays, strict=True)
-        return np.concatenate(frequency), np.concatenate(pad_fault), np.concatenate(temperature)
+        return (
+            np.concatenate(frequency),
+            np.concatenate(pad_fault),
+            np.concatenate(temperature),
+        )
 
     parts: list[bytes] = []
     for sample in samples:
         parts += _split_fields(*sample.shape).unpack(sample.raw)
-    n_rows = sum(sample.n_cubes for sample in samples)
-    values = np.frombuffer(b"".join(parts[::3]), _U32)
+    # Each sample gave three parts: frequencies, pad faults and temperatures.
+    frequencies = np.frombuffer(b"".join(parts[::3]), _U32)
     pad_faults = np.frombuffer(b"".join(parts[1::3]), _U32)
     temperatures = np.frombuffer(b"".join(parts[2::3]), _I16)
-    return values.reshape(n_rows, samples[0].n_pads), pad_faults, temperatures
+    shape = len(pad_faults), samples[0].n_pads
+    return frequencies.reshape(shape), pad_faults, temperatures
+
+
+_Fixed = TypeVar("_Fixed", bound="_FixedFrame")
+
+
+class _FixedFrame:
+    """A frame whose payload is a fixed sequence of numbers, the fields in their order."""
+
+    __slots__ = ()
+    _PAYLOAD: ClassVar[struct.Struct]
+
+    def _pack(self) -> bytes:
+        numbers = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
+        return self._PAYLOAD.pack(*numbers)
+
+    @classmethod
+    def _unpack(cls: type[_Fixed], raw: bytes, size: int) -> _Fixed | None:
+        if size != cls._PAYLOAD.size:
+            return None
+        return cls(*cls._PAYLOAD.unpack_from(raw, HEADER.size))
 
 
 @dataclass(frozen=True, slots=True)
-class Stats:
+class Stats(_FixedFrame):
     """Counters of a hub.
 
     Attributes:
@@ -253,21 +290,16 @@ class Stats:
         supply_mv: Supply voltage, in mV, u16; 0 if unknown.
     """
 
+    _PAYLOAD = struct.Struct("<QIIH")
+
     uptime_ms: int
     taken: int
     dropped: int
     supply_mv: int = 0
 
-    def _pack(self) -> bytes:
-        return _STATS.pack(self.uptime_ms, self.taken, self.dropped, self.supply_mv)
-
-    @classmethod
-    def _unpack(cls, raw: bytes, size: int) -> Stats | None:
-        return cls(*_STATS.unpack_from(raw, 4)) if size == _STATS.size else None
-
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class Request(_FixedFrame):
     """Request of the host to a hub.
 
     Attributes:
@@ -275,19 +307,14 @@ class Request:
         argument: Argument of the command, u32.
     """
 
+    _PAYLOAD = struct.Struct("<BI")
+
     request: int
     argument: int = 0
 
-    def _pack(self) -> bytes:
-        return REQUEST.pack(self.request, self.argument)
-
-    @classmethod
-    def _unpack(cls, raw: bytes, size: int) -> Request | None:
-        return cls(*REQUEST.unpack_from(raw, 4)) if size == REQUEST.size else None
-
 
 @dataclass(frozen=True, slots=True)
-class Ack:
+class Ack(_FixedFrame):
     """Answer of a hub to a request other than TIME.
 
     Attributes:
@@ -296,20 +323,15 @@ class Ack:
         argument: The value that is now in force, u32.
     """
 
+    _PAYLOAD = struct.Struct("<BBI")
+
     request: int
     result: int = 0
     argument: int = 0
 
-    def _pack(self) -> bytes:
-        return _ACK.pack(self.request, self.result, self.argument)
-
-    @classmethod
-    def _unpack(cls, raw: bytes, size: int) -> Ack | None:
-        return cls(*_ACK.unpack_from(raw, 4)) if size == _ACK.size else None
-
 
 @dataclass(frozen=True, slots=True)
-class Time:
+class Time(_FixedFrame):
     """Answer of a hub to the request TIME, in place of an `Ack`.
 
     Attributes:
@@ -318,15 +340,10 @@ class Time:
             µs, u64.
     """
 
+    _PAYLOAD = struct.Struct("<IQ")
+
     number: int
     device_us: int
-
-    def _pack(self) -> bytes:
-        return _TIME.pack(self.number, self.device_us)
-
-    @classmethod
-    def _unpack(cls, raw: bytes, size: int) -> Time | None:
-        return cls(*_TIME.unpack_from(raw, 4)) if size == _TIME.size else None
 
 
 Frame = Hello | Sample | Stats | Time | Request | Ack
@@ -383,12 +400,15 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
             f"the limit is {MAX_PAYLOAD}: split the cubes over several frames with first_cube"
         )
     body = HEADER.pack(code, version, len(payload)) + payload
-    code_words = cobs.encode(body + zlib.crc32(body).to_bytes(4, "little"))
-    return b"\0" + code_words + b"\0"
+    crc = zlib.crc32(body).to_bytes(4, "little")
+    return b"\0" + cobs.encode(body + crc) + b"\0"
 
 
 def _check_array(
-    name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]
+    name: str,
+    value: Any,
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
 ) -> NDArray[Any]:
     """Return a field that is an array of this dtype and shape; raise ProtocolError otherwise."""
     if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape:
