@@ -40,8 +40,9 @@ from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
+from cube_tensor_driver.ros.compat import make_executor
 from cube_tensor_driver.ros.messages import info_message
-from cube_tensor_driver.ros.node import LATCHED, make_executor, queue
+from cube_tensor_driver.ros.qos import LATCHED, batch_profile
 from cube_tensor_driver.simulation.load import Load, default_script
 
 RATE, INSTANTS, START_S, SETTLE_S, MEASURE_S = 100.0, 200, 30.0, 6.0, 15.0
@@ -117,7 +118,7 @@ class SkinSender:
     def __init__(self, node: Node, skin: Skin) -> None:
         info = node.create_publisher(SkinInfo, "info", LATCHED)
         info.publish(info_message(skin, Pipeline(skin.calibrations), time.time_ns()))
-        self._publisher = node.create_publisher(SkinStress, "stress", queue(RATE))
+        self._publisher = node.create_publisher(SkinStress, "stress", batch_profile(RATE))
         load = Load(skin, default_script())
         self._frame_id = skin.parent_frame.encode() + b"\0"
         self._instants = [

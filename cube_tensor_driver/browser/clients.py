@@ -16,7 +16,7 @@ from ..core.arrays import Array
 from ..core.latest_stress import STALE_S
 from ..messages.contacts import decode_contacts, decode_traction
 from ..msg import ReplayState, SkinContacts
-from ..ros.guard import CallbackGuard
+from ..ros.callbacks import CallbackErrors
 from ..srv import SteerReplay
 from ..touch.surface import Contact, Surface
 from .markup import NoteColour
@@ -179,9 +179,9 @@ class ReplayClient:
 class ContactsClient:
     """Listens to what the node `contacts` finds, if it runs."""
 
-    def __init__(self, node: Node, guard: CallbackGuard) -> None:
-        node.create_subscription(SkinContacts, "contacts", guard.wrap(self._receive_contacts), 2)
-        node.create_subscription(PointCloud2, "traction", guard.wrap(self._receive_traction), 2)
+    def __init__(self, node: Node, errors: CallbackErrors) -> None:
+        node.create_subscription(SkinContacts, "contacts", errors.catch(self._receive_contacts), 2)
+        node.create_subscription(PointCloud2, "traction", errors.catch(self._receive_traction), 2)
         self._contacts: list[Contact] = []
         self._cloud = np.empty((0, 6))
         self._contacts_s = self._cloud_s = -np.inf

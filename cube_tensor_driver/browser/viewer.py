@@ -27,8 +27,8 @@ from std_srvs.srv import Trigger
 from ..core.errors import ConfigError
 from ..core.latest_stress import STALE_S
 from ..processes.stop_signals import stop_event
+from ..ros.callbacks import CallbackErrors
 from ..ros.compat import make_executor
-from ..ros.guard import CallbackGuard
 from ..ros.session import start_ros
 from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from ..srv import Tare
@@ -72,17 +72,20 @@ class Viewer:
         self._server = _serve(host, port, self._token)
         self._depth = depth
         self._node = rclpy.create_node("view")
-        self._guard = CallbackGuard(self._node)
+        self._callback_errors = CallbackErrors(self._node)
         self._subscriber = SkinSubscriber(self._node, self._show_skin)
         self._node.create_subscription(
-            DiagnosticArray, "/diagnostics", self._guard.wrap(self._receive_diagnostics), 10
+            DiagnosticArray,
+            "/diagnostics",
+            self._callback_errors.catch(self._receive_diagnostics),
+            10,
         )
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
         self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
         self._replay = ReplayClient(self._node, self._services, self._status.say)
-        self._contacts = ContactsClient(self._node, self._guard)
+        self._contacts = ContactsClient(self._node, self._callback_errors)
         self._recorder = BagRecorder(recordings)
         self._links: dict[str, str] = {}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -114,7 +117,7 @@ class Viewer:
             wait_s = min(next_picture_s - time.monotonic(), PICTURE_PERIOD_S)
             self._executor.spin_once(timeout_sec=max(0.0, wait_s))
             while not self._actions.empty():
-                self._guard.wrap(self._actions.get())()
+                self._callback_errors.catch(self._actions.get())()
             now_s = time.monotonic()
             if now_s < next_picture_s:
                 continue
@@ -125,7 +128,7 @@ class Viewer:
             if with_numbers:
                 next_numbers_s = now_s + NUMBERS_PERIOD_S
             if self._followed is not None and self._shown is not None:
-                self._guard.wrap(self._update)(self._followed, self._shown, with_numbers)
+                self._callback_errors.catch(self._update)(self._followed, self._shown, with_numbers)
             elif now_s >= waiting_note_s:
                 waiting_note_s = math.inf
                 print(markup.waiting(_domain()), flush=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .parser import Parser
 
 if TYPE_CHECKING:
-    from ..ros.commands.listening import StressReading
+    from ..ros.commands.echo import StressReading
 
 
 def arguments(parser: Parser) -> None:
@@ -25,7 +25,7 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Print until Ctrl-C, or until the reader of a pipe closes it: neither is an error."""
     from ..config.yaml import to_yaml
-    from ..ros.commands.listening import StressReading, listen
+    from ..ros.commands.echo import StressReading, listen
 
     try:
         for items in listen(options.topic, options.once):

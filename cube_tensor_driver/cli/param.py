@@ -14,7 +14,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..ros.commands.live_parameters import list_nodes, read_parameters, set_parameter
+    from ..ros.commands.services import list_nodes, read_parameters, set_parameter
 
     if options.node is None:
         print("\n".join(list_nodes()))

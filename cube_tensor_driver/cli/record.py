@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from .parser import Parser, positive
 
 if TYPE_CHECKING:
-    from ..ros.commands.recorder import Recorder
+    from ..ros.commands.record import Recorder
 
 
 def arguments(parser: Parser) -> None:
@@ -52,7 +52,7 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Return 1 if messages were dropped, else 0."""
-    from ..ros.commands.recording import record
+    from ..ros.commands.record import record
 
     with RecordingStatus(options.output) as status:
         recorder = record(

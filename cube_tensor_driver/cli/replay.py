@@ -16,7 +16,7 @@ from .parser import Parser, not_negative, positive
 if TYPE_CHECKING:
     from ..bags.read import Bag
     from ..processes.children import Children
-    from ..ros.commands.player import Player
+    from ..ros.commands.replay import Player
 
 MAX_START_S = 30.0
 """Time, in seconds, that the browser view may take to start."""
@@ -55,7 +55,7 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ..bags.read import Bag
-    from ..ros.commands.replaying import replay
+    from ..ros.commands.replay import replay
 
     with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as has_keys:
         length_s = (bag.end_ns - bag.start_ns) * 1e-9

@@ -22,7 +22,7 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """1 if a reconstruction refuses, else 0."""
     from ..core.errors import TareError
-    from ..ros.commands.tare_request import request_tare
+    from ..ros.commands.services import request_tare
 
     if options.clear and options.cubes:
         raise TareError(

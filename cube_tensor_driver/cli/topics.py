@@ -15,7 +15,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ..ros.commands.topic_list import list_topics
+    from ..ros.commands.topics import list_topics
 
     topics = list_topics()
     width = max(len(topic.name) for topic in topics)

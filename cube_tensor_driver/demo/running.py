@@ -16,12 +16,8 @@ from rclpy.qos import QoSProfile
 from ..config.output_files import write_json
 from ..core.errors import CubeError
 from ..processes.children import Children
-from ..ros.session import node_session
+from ..ros.session import STEP_S, node_session, spin_until
 from ..simulation.sample_log import SampleLog
-
-STEP_S = 0.05
-"""Period, in seconds, at which a loop that spins checks whether it is done, interrupted, or whether
-a process has ended."""
 
 
 class Interrupted(CubeError):
@@ -66,16 +62,17 @@ class Observer:
             Interrupted: A signal asked to end.
             ChildError: A process has ended.
         """
-        until_s = time.monotonic() + seconds
-        while not done() and (left_s := until_s - time.monotonic()) > 0:
+
+        def check() -> None:
             if self._interrupted is not None and self._interrupted.is_set():
                 raise Interrupted("interrupted")
-            self._executor.spin_once(timeout_sec=min(left_s, STEP_S))
             # Once per message would cost more than the message.
             if time.monotonic() - self._checked_s > STEP_S:
                 self._checked_s = time.monotonic()
                 self._children.check()
             self._on_step()
+
+        spin_until(self._executor, done, seconds, on_step=check)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from ..core.errors import CubeError, MessageError
 from ..messages.codec import frequency_codec, stress_codec
 from ..msg import SkinFrequencies, SkinStress
 from ..processes.children import Children
-from ..ros.node import queue
+from ..ros.qos import batch_profile
 from ..simulation.imperfections import read_imperfections
 from ..simulation.load import AnyLoad, Load, default_script
 from ..views.terminal.live_table import LiveTable
@@ -177,9 +177,11 @@ class SkinWatcher:
         self._sees_other_skin = False
         self._made_s = time.monotonic()
         self._crc_errors: dict[str, int] = {}
-        observer.listen(SkinStress, "stress", self._on_stress, queue(rate))
+        observer.listen(SkinStress, "stress", self._on_stress, batch_profile(rate))
         if verification is not None:
-            observer.listen(SkinFrequencies, "frequencies", self._on_frequencies, queue(rate))
+            observer.listen(
+                SkinFrequencies, "frequencies", self._on_frequencies, batch_profile(rate)
+            )
             observer.node.create_subscription(
                 DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
             )

@@ -7,13 +7,15 @@ import threading
 from collections.abc import Callable
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Ctrl-C, a polite kill, and the end of the terminal."""
+"""Ctrl-C, the request of another process, and the end of the terminal."""
 
 
 def on_stop_signal(stop: Callable[[], None]) -> None:
     """Call `stop` for each signal that asks this process to end, instead of ending at once."""
     for number in STOP_SIGNALS:
-        signal.signal(number, lambda *_: stop())
+        # nohup has the end of the terminal ignored, and that stays.
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda *_: stop())
 
 
 def stop_event() -> threading.Event:

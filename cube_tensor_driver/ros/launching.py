@@ -55,7 +55,7 @@ def switch(name: str, description: str, default: str = "false") -> DeclareLaunch
     )
 
 
-class FromSkin(Substitution):
+class FromSkin(Substitution):  # type: ignore[misc]
     """A text that is made from the skin file of the launch argument `config`."""
 
     def __init__(self, make: Callable[[Skin], str]) -> None:
@@ -70,7 +70,7 @@ class FromSkin(Substitution):
         return self._make(read_skin(Path(_given(context, "config"))))
 
 
-class GivenParameters(Substitution):
+class GivenParameters(Substitution):  # type: ignore[misc]
     """The path of a parameter file with the launch arguments of these names that are not empty.
 
     The others are left to the including launch file: what a node is passed beats its SetParameter.

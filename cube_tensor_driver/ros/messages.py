@@ -14,22 +14,37 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, WrenchStamped
-from numpy.typing import NDArray
+from rclpy.node import Node
 from std_msgs.msg import Header
 
 from ..config.calibration import calibration_text
-from ..config.skin import Skin
-from ..core.errors import BagError
+from ..config.skin import Skin, SkinCube
+from ..core.arrays import AnyArray, Array
+from ..core.errors import BagError, CubeError
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
 from ..core.tensor import quaternion_from_rpy
 from ..messages.codec import SECOND
 from ..msg import CubeInfo, SkinInfo, StressTensor, StressTensorStamped
+from .callbacks import LOG_PERIOD_S
 
 
-def message_class(topic: str, msgtype: str) -> Any:
-    """The message class of pkg/msg/Name. BagError: not installed."""
-    package, _, name = msgtype.split("/")
+def log_refused_message(node: Node, topic: str, error: CubeError) -> None:
+    """Log from time to time that messages of a topic are damaged or contradict themselves."""
+    node.get_logger().error(f"{topic}: {error}", throttle_duration_sec=LOG_PERIOD_S)
+
+
+def message_class(topic: str, type_name: str) -> Any:
+    """Return the class of a message type.
+
+    Args:
+        topic: Topic of the message, for the error message.
+        type_name: Full name of the type, as in std_msgs/msg/Header.
+
+    Raises:
+        BagError: The package of the message is not installed here.
+    """
+    package, _, name = type_name.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError):
@@ -39,36 +54,42 @@ def message_class(topic: str, msgtype: str) -> Any:
         ) from None
 
 
-def make_message(kind: str, **fields: Any) -> Any:
-    """A message of rclpy from its type and its fields, whose arrays may be numpy's."""
+def make_message(type_name: str, **fields: Any) -> Any:
+    """Return a message of rclpy. Fields may be numpy arrays."""
     arrays = {
-        name: packed(value.dtype.char, value)
+        name: pack_array(value.dtype.char, value)
         for name, value in fields.items()
         if isinstance(value, np.ndarray)
     }
-    return message_class("make_message", kind)(**fields | arrays)
+    return message_class("make_message", type_name)(**fields | arrays)
 
 
-def to_time(stamp_ns: int) -> Time:
-    return Time(sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
+def pack_array(code: str, values: AnyArray) -> array[Any]:
+    """Return values as an array field of a message, row by row.
 
-
-def to_ns(stamp: Time) -> int:
-    return int(stamp.sec) * SECOND + int(stamp.nanosec)
-
-
-def packed(code: str, values: NDArray[Any]) -> array[Any]:
-    """A message's array field of the values, row-major; code is the field's type as `array` spells
-    it."""
+    Args:
+        code: Type of the field, as a type code of the module `array`.
+        values: The values, which are converted to this type.
+    """
     field = array(code)
     field.frombytes(np.ascontiguousarray(values, dtype=code).tobytes())
     return field
 
 
+def to_time(stamp_ns: int) -> Time:
+    """Return a time in ns as a message."""
+    return Time(sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
+
+
+def to_ns(stamp: Time) -> int:
+    """Return the time of a message in ns."""
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
+
+
 def tensor_message(
-    header: Header, rows: StressRows, row: int, covariance: NDArray[np.float64]
+    header: Header, rows: StressRows, row: int, covariance: Array
 ) -> StressTensorStamped:
-    """One row as a message of its own; covariance (15, 15)."""
+    """Return one row as a message of its own. The covariance is (15, 15)."""
     xx, yy, zz, yz, zx, xy = rows.stress[row].tolist()
     tensor = StressTensor(
         normal=Vector3(x=xx, y=yy, z=zz),
@@ -82,10 +103,8 @@ def tensor_message(
     return StressTensorStamped(header=header, tensor=tensor)
 
 
-def wrench_message(
-    header: Header, force_n: NDArray[np.float64], torque_nm: NDArray[np.float64]
-) -> WrenchStamped:
-    """Force (3,) in N and torque (3,) in N m."""
+def wrench_message(header: Header, force_n: Array, torque_nm: Array) -> WrenchStamped:
+    """Return a wrench of a force (3,) in N and a torque (3,) in N m."""
     message = WrenchStamped(header=header)
     force, torque = message.wrench.force, message.wrench.torque
     force.x, force.y, force.z = force_n.tolist()
@@ -100,40 +119,47 @@ def info_message(
     uids: Mapping[int, int] = MappingProxyType({}),
     sender: str = "reconstruction",
 ) -> SkinInfo:
-    """What is fixed about a skin, with the rest frequencies that the pipeline uses now.
+    """Return what is fixed about a skin, with the rest frequencies that the pipeline uses now.
 
-    uids: of cubes by their index in the skin, as their hubs say, where the skin file does not.
-    sender: driver or reconstruction.
+    Args:
+        skin: The skin.
+        pipeline: Gives the rest frequencies and covariances.
+        stamp_ns: Time from which on this holds, in ns.
+        uids: Index of a cube in the skin -> the uid that its hub reports, which fills the gaps of
+            the skin file.
+        sender: driver or reconstruction.
     """
     message = SkinInfo(version=SkinInfo.VERSION, name=skin.name, sender=sender)
     message.header = Header(stamp=to_time(stamp_ns), frame_id=skin.parent_frame)
     rest_frequency = pipeline.rest_frequency
-    covariance = []
+    covariances = []
     for number, cube in enumerate(skin.cubes):
         calibration = cube.calibration
-        x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
-        pose = Pose(
-            position=Point(x=cube.xyz[0], y=cube.xyz[1], z=cube.xyz[2]),
-            orientation=Quaternion(x=x, y=y, z=z, w=w),
-        )
-        message.cubes.append(
-            CubeInfo(
-                name=cube.name,
-                frame_id=skin.frame(cube),
-                pose=pose,
-                link=cube.link or "",
-                index=cube.index or 0,
-                uid=cube.uid or uids.get(number, 0),
-                layout=calibration.layout.name,
-                pads=list(calibration.layout.pads),
-                half_side=calibration.half_side,
-                calibration_id=calibration.id,
-                rest_frequency=rest_frequency[number, : calibration.layout.n_pads].tolist(),
-            )
-        )
+        info = _cube_info(cube, skin.frame(cube))
+        info.uid = cube.uid or uids.get(number, 0)
+        info.rest_frequency = rest_frequency[number, : calibration.layout.n_pads].tolist()
+        message.cubes.append(info)
         if calibration.id not in message.calibration_ids:
             message.calibration_ids.append(calibration.id)
             message.calibrations.append(calibration_text(calibration))
-            covariance.append(pipeline.covariance(number))
-    message.covariance = packed("d", np.array(covariance))
+            covariances.append(pipeline.covariance(number))
+    message.covariance = pack_array("d", np.array(covariances))
     return message
+
+
+def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
+    """Return what the skin file says of a cube."""
+    calibration = cube.calibration
+    x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
+    position = Point(x=cube.xyz[0], y=cube.xyz[1], z=cube.xyz[2])
+    return CubeInfo(
+        name=cube.name,
+        frame_id=frame_id,
+        pose=Pose(position=position, orientation=Quaternion(x=x, y=y, z=z, w=w)),
+        link=cube.link or "",
+        index=cube.index or 0,
+        layout=calibration.layout.name,
+        pads=list(calibration.layout.pads),
+        half_side=calibration.half_side,
+        calibration_id=calibration.id,
+    )

@@ -37,7 +37,7 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.messages import to_ns
-from cube_tensor_driver.ros.node import queue
+from cube_tensor_driver.ros.qos import batch_profile
 from cube_tensor_driver.simulation.inject import inject
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
@@ -240,7 +240,8 @@ def test_killed_recordings_lose_less_than_a_second(running, tmp_path):
 
 
 def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, monkeypatch):
-    from cube_tensor_driver.ros.commands import recording
+    from cube_tensor_driver.ros import session
+    from cube_tensor_driver.ros.commands import record
 
     now = [100.0]
     recorder = SimpleNamespace(error=None, counts={"/stress": 0})
@@ -250,13 +251,14 @@ def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, mon
         now[0] += timeout_sec
         recorder.counts["/stress"] += now[0] >= 103.0  # found late
 
-    monkeypatch.setattr(recording, "Recorder", lambda *_: recorder)
-    monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(record, "Recorder", lambda *_: recorder)
+    for module in (record, session):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     bag = SimpleNamespace(folder=tmp_path, messages=1)
     executor = SimpleNamespace(spin_once=spin_once)
     stop, show = threading.Event(), lambda *_: None
-    recording.fill(bag, None, executor, [], stop=stop, duration=5.0, show=show)
-    assert now[0] == pytest.approx(108.0, abs=2 * recording.SPIN_S)
+    record.fill(bag, None, executor, [], stop=stop, duration=5.0, show=show)
+    assert now[0] == pytest.approx(108.0, abs=2 * session.STEP_S)
 
 
 def test_record_says_what_is_wrong(domain, tmp_path):
@@ -332,7 +334,7 @@ def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, co
     """
     made = {"left_out": stuck, "tare": (90, 1.001)} if config == "bag" else {}
     path = make_bag(tmp_path / "bag", SKIN, 150, **made)
-    batches = ros.listen(SkinStress, "stress", queue(None))
+    batches = ros.listen(SkinStress, "stress", batch_profile(None))
     infos = ros.listen(SkinInfo, "info", LATCHED)
     clock = ros.listen(
         Clock, "/clock", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -370,7 +372,7 @@ def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, co
 def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
     """Keys through a terminal of its own."""
     path = make_bag(tmp_path / "bag", SKIN, 300)
-    raw = ros.listen(SkinFrequencies, "frequencies", queue(None))
+    raw = ros.listen(SkinFrequencies, "frequencies", batch_profile(None))
     infos = ros.listen(SkinInfo, "info", LATCHED)
     near, far = pty.openpty()
     player = subprocess.Popen(

@@ -419,7 +419,7 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
-    from cube_tensor_driver.ros.diagnostics.cube_health import CubeHealth
+    from cube_tensor_driver.ros.diagnostics.reconstruction import CubeHealth
 
     skin = Skin(16)
     words = CubeHealth(read_skin(package_data() / "config" / "skin_demo.yaml"), skin.reconstructor)
@@ -441,7 +441,7 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
 def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():
     """Statuses say it at once, the log when hubs had time to start."""
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from cube_tensor_driver.ros.diagnostics.cube_health import TIMES_TO_START, CubeHealth
+    from cube_tensor_driver.ros.diagnostics.reconstruction import MIN_UPDATES_TO_LOG, CubeHealth
 
     skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     n = len(skin.cubes)
@@ -458,9 +458,9 @@ def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():
     statuses, lines = words.statuses({})
     assert len(statuses) == n and all("missing" in one.message for one in statuses)
     assert not lines
-    for number in range(2, TIMES_TO_START + 1):
+    for number in range(2, MIN_UPDATES_TO_LOG + 1):
         assert not step(number, n - 1)
     late = [(f"cube {skin.cubes[-1].name}: missing: no row yet, see its link", True)]
-    assert step(TIMES_TO_START + 1, n - 1) == late
-    assert not step(TIMES_TO_START + 2, n - 1)
-    assert step(TIMES_TO_START + 3, n) == [(f"cube {skin.cubes[-1].name}: fine", False)]
+    assert step(MIN_UPDATES_TO_LOG + 1, n - 1) == late
+    assert not step(MIN_UPDATES_TO_LOG + 2, n - 1)
+    assert step(MIN_UPDATES_TO_LOG + 3, n) == [(f"cube {skin.cubes[-1].name}: fine", False)]

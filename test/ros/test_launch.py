@@ -173,7 +173,8 @@ def test_a_bag_as_config_names_the_missing_library(robot, tmp_path):
         node.kill()
         node.communicate()
     output = "".join(lines)
-    assert "needs the Python package rosbags" in output and "Traceback" not in output
+    assert re.search("needs the Python package (rosbags|mcap|zstandard)", output), output
+    assert "Traceback" not in output
 
 
 @needs_launch
@@ -185,13 +186,15 @@ def test_the_recording_follows_namespace_and_remaps():
     from cube_tensor_driver.ros.launching import record_skin
 
     context = LaunchContext()
-    context.launch_configurations |= {
-        "config": str(SKIN),
-        "namespace": "hand",
-        "ros_namespace": "/robot1",
-        "ros_remaps": [("stress", "touch")],
-        "global_params": [("qos_reliability", "best_effort")],
-    }
+    context.launch_configurations.update(
+        {
+            "config": str(SKIN),
+            "namespace": "hand",
+            "ros_namespace": "/robot1",
+            "ros_remaps": [("stress", "touch")],
+            "global_params": [("qos_reliability", "best_effort")],
+        }
+    )
     (action,) = record_skin(context)
     command = [words[0].perform(context) for words in action.cmd]
     names = ["frequencies", "touch", "info", "driver/info"]

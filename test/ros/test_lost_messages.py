@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import UInt32
 
 from cube_tensor_driver.ros.compat import make_executor, with_number
-from cube_tensor_driver.ros.diagnostics.lost_messages import LostMessages
+from cube_tensor_driver.ros.diagnostics.reconstruction import LostMessages
 
 DEPTH = 10
 
@@ -26,7 +26,7 @@ def test_what_a_late_subscriber_loses_is_counted(ros, executor):
     lost, came = LostMessages(), []
 
     def take(message, number):
-        lost.came(number)
+        lost.note_arrival(number)
         came.append(message.data)
 
     node = rclpy.create_node("late")
@@ -73,9 +73,9 @@ def test_what_a_late_subscriber_loses_is_counted(ros, executor):
 def test_a_publisher_that_begins_again_is_no_loss():
     lost = LostMessages()
     for number in (5, 6, 7, 1, 2, 3, 6, 7, 8, 11, 12):
-        lost.came(number)
+        lost.note_arrival(number)
     assert lost.count == 4
     lost.new_subscription()
     for number in (40, 41, 44, 45):
-        lost.came(number)
+        lost.note_arrival(number)
     assert lost.count == 6

@@ -29,7 +29,7 @@ from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.device.wire.protocol import Command
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
-from cube_tensor_driver.ros.commands.listening import StressReading
+from cube_tensor_driver.ros.commands.echo import StressReading
 
 pytestmark = pytest.mark.xdist_group("ros commands")
 STILL = {
@@ -75,7 +75,7 @@ def signals():
 @pytest.fixture
 def nobody(domain, monkeypatch):
     """A domain without a skin, where commands do not wait as long as they would."""
-    monkeypatch.setattr("cube_tensor_driver.ros.commands.asking.FIND_S", 0.5)
+    monkeypatch.setattr("cube_tensor_driver.ros.commands.services.MAX_DISCOVERY_S", 0.5)
     return domain
 
 
@@ -272,9 +272,9 @@ def test_parameters_of_nobody(nobody, capfd):
 
 def test_nodes_that_are_found_late_are_listed_too(monkeypatch):
     """Each of three comes a little later than the one before, as on a busy machine."""
-    from cube_tensor_driver.ros.commands import asking
+    from cube_tensor_driver.ros.commands import services
 
-    monkeypatch.setattr(asking, "SETTLE_S", 0.02)
+    monkeypatch.setattr(services, "SETTLE_S", 0.02)
     rounds: list[int] = []
     executor = types.SimpleNamespace(spin_once=lambda timeout_sec: rounds.append(1))
 
@@ -282,5 +282,5 @@ def test_nodes_that_are_found_late_are_listed_too(monkeypatch):
         return ["/demo", "/driver", "/reconstruction"][: len(seen)]
 
     seen: list[list[str]] = []
-    assert asking.discover_all(executor, lambda: seen.append(found()) or seen[-1])
+    assert services.discover_all(executor, lambda: seen.append(found()) or seen[-1])
     assert seen[-1] == ["/demo", "/driver", "/reconstruction"] and rounds

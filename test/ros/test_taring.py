@@ -40,6 +40,9 @@ class Node:
     def create_service(self, _, name, callback):
         self.services[name] = callback
 
+    def own(self, entity):
+        return entity
+
     def get_logger(self):
         return logging.getLogger()
 

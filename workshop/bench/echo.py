@@ -13,8 +13,9 @@ from std_msgs.msg import Header
 
 from cube_tensor_driver.config.parameters import AUTOSTART, Parameter
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
-from cube_tensor_driver.ros.messages import packed
-from cube_tensor_driver.ros.node import CubeNode, queue, run
+from cube_tensor_driver.ros.messages import pack_array
+from cube_tensor_driver.ros.node import CubeNode, run
+from cube_tensor_driver.ros.qos import batch_profile
 
 PADS, STRESS, GRADIENT = 8, 6, 9
 PARAMETERS = (
@@ -33,7 +34,7 @@ class BareSource(CubeNode):
     def configure(self) -> None:
         n, rate = int(self.value("cubes")), float(self.value("rate"))
         self._publisher = self.create_lifecycle_publisher(
-            SkinFrequencies, "frequencies", queue(rate)
+            SkinFrequencies, "frequencies", batch_profile(rate)
         )
         self._cube = np.arange(n, dtype=np.uint16)
         self._zeros = np.zeros(n, np.uint32)
@@ -44,14 +45,14 @@ class BareSource(CubeNode):
     def _publish(self) -> None:
         message = SkinFrequencies(
             header=Header(frame_id="skin"),
-            cube=packed("H", self._cube),
-            sequence=packed("I", self._zeros),
-            time_offset=packed("i", self._zeros),
+            cube=pack_array("H", self._cube),
+            sequence=pack_array("I", self._zeros),
+            time_offset=pack_array("i", self._zeros),
             n_pads=PADS,
-            frequency=packed("f", self._frequency),
-            temperature=packed("f", self._temperature),
-            pad_fault=packed("I", self._zeros),
-            status=packed("H", self._zeros),
+            frequency=pack_array("f", self._frequency),
+            temperature=pack_array("f", self._temperature),
+            pad_fault=pack_array("I", self._zeros),
+            status=pack_array("H", self._zeros),
         )
         self._publisher.publish(message)
 
@@ -63,7 +64,7 @@ class BareEcho(CubeNode):
         super().__init__("echo", PARAMETERS)
 
     def configure(self) -> None:
-        n, quality = int(self.value("cubes")), queue(float(self.value("rate")))
+        n, quality = int(self.value("cubes")), batch_profile(float(self.value("rate")))
         self._publisher = self.create_lifecycle_publisher(SkinStress, "stress", quality)
         self._zeros = np.zeros((n, GRADIENT), np.float32)
         self._subscription = self.create_subscription(
@@ -76,12 +77,12 @@ class BareEcho(CubeNode):
             cube=message.cube,
             sequence=message.sequence,
             time_offset=message.time_offset,
-            stress=packed("f", zeros[:, :STRESS]),
-            gradient=packed("f", zeros),
-            residual=packed("f", zeros[:, 0]),
-            status=packed("H", zeros[:, 0]),
-            observed=packed("H", zeros[:, 0]),
-            left_out=packed("I", zeros[:, 0]),
+            stress=pack_array("f", zeros[:, :STRESS]),
+            gradient=pack_array("f", zeros),
+            residual=pack_array("f", zeros[:, 0]),
+            status=pack_array("H", zeros[:, 0]),
+            observed=pack_array("H", zeros[:, 0]),
+            left_out=pack_array("I", zeros[:, 0]),
         )
         self._publisher.publish(answer)
 

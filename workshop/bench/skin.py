@@ -33,7 +33,7 @@ from cube_tensor_driver.msg import SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
-from cube_tensor_driver.ros.node import queue
+from cube_tensor_driver.ros.qos import batch_profile
 from cube_tensor_driver.simulation.sample_log import SampleTable
 from cube_tensor_driver.views.figures.style import save
 from cube_tensor_hub.firmware import FirmwareError
@@ -309,7 +309,7 @@ def _measure(
     names = [process.executable for process in processes]
     task = progress.add_task(what, total=duration)
     with observing("bench", children) as observer:
-        observer.listen(SkinStress, "stress", on_stress, queue(rate))
+        observer.listen(SkinStress, "stress", on_stress, batch_profile(rate))
         observer.spin(FIRST_S, lambda: messages > 0)
         if not messages:
             logs = "\n".join(children.log(name)[-800:] for name in names)

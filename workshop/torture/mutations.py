@@ -27,12 +27,11 @@ from cube_tensor_driver.device.links import link
 from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
 from cube_tensor_driver.device.wire import decoder
 from cube_tensor_driver.processes.skin_processes import Process
-from cube_tensor_driver.ros import node
-from cube_tensor_driver.ros.diagnostics.lost_messages import LostMessages
-from cube_tensor_driver.ros.nodes import cube_topics
-from cube_tensor_driver.ros.nodes.cube_topics import CubeTopics
-from cube_tensor_driver.ros.nodes.frequencies_publisher import FrequenciesPublisher
-from cube_tensor_driver.ros.nodes.stress_publisher import StressPublisher
+from cube_tensor_driver.ros import qos
+from cube_tensor_driver.ros.diagnostics.reconstruction import LostMessages
+from cube_tensor_driver.ros.nodes import stress_publisher
+from cube_tensor_driver.ros.nodes.driver import FrequenciesPublisher
+from cube_tensor_driver.ros.nodes.stress_publisher import CubeTopics, StressPublisher
 from cube_tensor_driver.ros.nodes.taring import Taring
 
 Patch = Callable[[], None]
@@ -291,8 +290,8 @@ def _no_tare(original: Any, self: Any, *arguments: Any) -> Any:
 
 
 def _short_queue() -> None:
-    node.PAUSE_S = 0.1
-    _around(LostMessages, "came", _nothing)()
+    qos.MAX_PAUSE_S = 0.1
+    _around(LostMessages, "note_arrival", _nothing)()
 
 
 def _nothing(*_: Any) -> None:
@@ -453,7 +452,7 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
     "other cube": (
         "the topic of a cube has the tensor of another one",
         _around(
-            cube_topics,
+            stress_publisher,
             "tensor_message",
             lambda original, header, rows, row, covariance: original(
                 header, rows, row - 1, covariance
@@ -464,7 +463,7 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
 RESTARTED: dict[str, tuple[str, Patch]] = {
     "tare not restored": (
         "a tare is not restored at the start",
-        _around(Taring, "_restore_cube", _nothing),
+        _around(Taring, "_restore_tare", _nothing),
     ),
 }
 MUTATIONS: dict[str, Mutation] = {

@@ -27,7 +27,7 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.messages import to_ns
-from cube_tensor_driver.ros.node import queue
+from cube_tensor_driver.ros.qos import batch_profile
 from cube_tensor_driver.simulation.inject import fault_line
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.simulator import FAULT_PIPE
@@ -193,7 +193,7 @@ class _Recorder:
 
     def __init__(self, observer: Observer, node: Node, skin: Skin) -> None:
         self.observer, self._skin = observer, skin
-        quality = queue(RATE)
+        quality = batch_profile(RATE)
         quality.depth = DEPTH
         self.frequencies = Tape(
             node, SkinFrequencies, "frequencies", frequency_codec, quality, skin

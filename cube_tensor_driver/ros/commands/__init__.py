@@ -1,1 +1,1 @@
-"""What commands do in the ROS graph: record, replay, listen, tare, list topics, set parameters."""
+"""What commands do in the ROS graph: record, replay, echo, list topics, call services."""

@@ -15,26 +15,28 @@ LEVELS = {
     LinkState.SILENT: DiagnosticStatus.STALE,
     LinkState.CLOSED: DiagnosticStatus.WARN,
 }
+"""State of a link -> level of its status."""
 
 
-class LinkStatuses:
-    """Makes the driver's diagnostics, once a second."""
+class LinkDiagnostics:
+    """Makes the driver's statuses, once a second."""
 
     def __init__(self, skin_name: str) -> None:
         self._skin_name = skin_name
-        self._before = RowCounts()
+        self._counts_before = RowCounts()
 
-    def __call__(self, links: LiveLinks, with_links: bool) -> list[DiagnosticStatus]:
-        """The status of all rows, and of each link if with_links."""
+    def statuses(self, links: LiveLinks, with_links: bool) -> list[DiagnosticStatus]:
+        """Return the status of all rows, and of each link if `with_links`."""
         counts = links.row_counts()
-        statuses = [_rows_status(self._skin_name, counts, self._before)]
-        self._before = counts
+        statuses = [_rows_status(self._skin_name, counts, self._counts_before)]
+        self._counts_before = counts
         if with_links:
             statuses += [_link_status(report) for report in links.report()]
         return statuses
 
 
 def _rows_status(skin_name: str, counts: RowCounts, before: RowCounts) -> DiagnosticStatus:
+    """Return the status of all rows, with what happened since the counts `before`."""
     level, text = DiagnosticStatus.OK, ""
     if counts.unaccounted:
         level = DiagnosticStatus.ERROR
@@ -55,7 +57,7 @@ def _rows_status(skin_name: str, counts: RowCounts, before: RowCounts) -> Diagno
 
 
 def _link_status(report: LinkReport) -> DiagnosticStatus:
-    """How one link is doing. The level is that of its worst state since the last report."""
+    """Return the status of one link. Its level is that of the worst state since the last report."""
     levels = [LEVELS[state] for state in (report.state, *report.past_states)]
     if report.notes:
         levels.append(DiagnosticStatus.WARN)

@@ -13,7 +13,7 @@ try:
 except ModuleNotFoundError:
 
     class Updater:  # type: ignore[no-redef]
-        """The part of diagnostic_updater's that is used here."""
+        """The part of diagnostic_updater's class that is used here."""
 
         def __init__(self, node: Node, period: float = 1.0) -> None:
             self.node, self.node_name = node, node.get_name()
@@ -21,9 +21,10 @@ except ModuleNotFoundError:
             self.timer = node.create_timer(period, self.update)
 
         def update(self) -> None:
-            """Called by the timer."""
+            """Publish the statuses. Called by the timer."""
 
         def publish(self, statuses: list[DiagnosticStatus]) -> None:
+            """Publish these statuses under the name of the node."""
             message = DiagnosticArray(status=statuses)
             message.header.stamp = self.node.get_clock().now().to_msg()
             for status in statuses:
@@ -32,10 +33,7 @@ except ModuleNotFoundError:
 
 
 class Diagnostics(Updater):  # type: ignore[misc]
-    """Publishes the statuses that `statuses` returns, if any, as long as the node lives.
-
-    The first one also says how many callbacks of the node have failed (`count_errors`).
-    """
+    """Publishes statuses of a node once a second, for as long as the node lives."""
 
     def __init__(
         self,
@@ -43,6 +41,14 @@ class Diagnostics(Updater):  # type: ignore[misc]
         statuses: Callable[[], list[DiagnosticStatus]],
         count_errors: Callable[[], int],
     ) -> None:
+        """Begin to publish.
+
+        Args:
+            node: The node.
+            statuses: Returns what to publish; nothing is published where it returns none.
+            count_errors: Returns how many callbacks of the node have failed so far, which the
+                first status also says.
+        """
         super().__init__(node)
         self._statuses, self._count_errors = statuses, count_errors
         self._errors_before = 0
@@ -51,7 +57,7 @@ class Diagnostics(Updater):  # type: ignore[misc]
         self.node_name = node.get_fully_qualified_name()
 
     def update(self) -> None:
-        """Called by the timer."""
+        """Publish the statuses. Called by the timer."""
         statuses = self._statuses()
         if statuses:
             self._add_errors(statuses[0])
@@ -70,20 +76,22 @@ class Diagnostics(Updater):  # type: ignore[misc]
 def make_status(
     name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]
 ) -> DiagnosticStatus:
-    """The status of one part of the node."""
-    pairs = [_pair(name, key, str(value)) for key, value in values.items()]
+    """Return the status of one part of a node."""
+    pairs = [_make_pair(name, key, str(value)) for key, value in values.items()]
     return DiagnosticStatus(
         name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
     )
 
 
-_newest: dict[tuple[str, str], KeyValue] = {}
+_newest_pairs: dict[tuple[str, str], KeyValue] = {}
 
 
-def _pair(name: str, key: str, value: str) -> KeyValue:
-    """A key with its value. The last one is used again if the value has not changed, because rclpy
-    takes 2 µs to make one."""
-    pair = _newest.get((name, key))
+def _make_pair(name: str, key: str, value: str) -> KeyValue:
+    """Return a key with its value.
+
+    The last pair is used again if the value has not changed, because rclpy takes 2 µs to make one.
+    """
+    pair = _newest_pairs.get((name, key))
     if pair is None or pair.value != value:
-        pair = _newest[name, key] = KeyValue(key=key, value=value)
+        pair = _newest_pairs[name, key] = KeyValue(key=key, value=value)
     return pair

@@ -10,14 +10,14 @@ from .driver import Driver
 from .reconstruction import Reconstruction
 
 
-def nodes() -> list[CubeNode]:
-    """Both nodes; the driver calls the reconstruction with its rows."""
+def make_nodes() -> list[CubeNode]:
+    """Make both nodes; the driver calls the reconstruction with its rows."""
     reconstruction = Reconstruction(subscribes=False)
     return [reconstruction, Driver(reconstruction.on_rows)]
 
 
 def main() -> None:
-    run(nodes)
+    run(make_nodes)
 
 
 if __name__ == "__main__":

@@ -6,10 +6,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from typing import Any
 
-import numpy as np
 from sensor_msgs.msg import PointCloud2
 
 from ...config.parameters import CONTACTS
+from ...core.arrays import Index
 from ...core.errors import CubeError
 from ...messages.contacts import contacts_message, traction_message
 from ...messages.skin_info import cube_calibrations
@@ -23,9 +23,9 @@ from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 class Contacts(SkinSubscriberNode):
     """Publishes `contacts` for the newest `stress`, at most `rate` times a second.
 
-    The arrays of a message are empty where nothing presses. The method `inverse` publishes the
-    surface's `traction`, too. The method is set up beside the node's thread: nothing is published
-    before.
+    The arrays of a message are empty where nothing presses. The method `inverse` also publishes the
+    surface's `traction`. The method is set up in another thread, so that the node answers
+    meanwhile; nothing is published before.
     """
 
     def __init__(self) -> None:
@@ -35,49 +35,47 @@ class Contacts(SkinSubscriberNode):
     def configure(self) -> None:
         self._traction = None
         if self.value("method") == INVERSE:
-            self._traction = self.create_lifecycle_publisher(PointCloud2, "traction", 2)
-            self._configured.callback(self.destroy_publisher, self._traction)
+            self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))
         super().configure()
 
-    def is_wanted(self, publisher: Any) -> bool:
-        return self._traction_is_wanted() or super().is_wanted(publisher)
+    def has_listeners(self, publisher: Any) -> bool:
+        return self._has_traction_listeners() or super().has_listeners(publisher)
 
-    def set_up(self, skin: FollowedSkin) -> None:
+    def prepare(self, skin: FollowedSkin) -> None:
         names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
         calibrations = cube_calibrations(skin.info)
-        self._seen = 0
+        self._processed_messages = 0
         self._finder: ContactFinder | None = None
-        self._coming: Future[ContactFinder] | None = self._worker.submit(
+        self._future_finder: Future[ContactFinder] | None = self._worker.submit(
             contact_finder, settings, skin.poses, calibrations
         )
 
-    def message(self, skin: FollowedSkin, health: np.ndarray) -> SkinContacts | None:
-        finder = self._ready()
-        if finder is None or skin.messages == self._seen:
+    def compute_message(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
+        finder = self._take_finder()
+        if finder is None or skin.messages == self._processed_messages:
             return None
-        self._seen = skin.messages
+        self._processed_messages = skin.messages
         values, frame_id = skin.newest.usable_values(health), skin.info.header.frame_id
         contacts = finder.update(values, skin.newest.left_out)
-        if self._traction is not None and self._traction_is_wanted():
+        if self._traction is not None and self._has_traction_listeners():
             cloud = finder.cloud(values)
             if cloud is not None:
-                self._traction.publish(
-                    traction_message(make_message, skin.stamp_ns, frame_id, cloud)
-                )
+                message = traction_message(make_message, skin.stamp_ns, frame_id, cloud)
+                self._traction.publish(message)
         return contacts_message(make_message, skin.stamp_ns, frame_id, contacts)
 
-    def _ready(self) -> ContactFinder | None:
-        """None while it is being set up, or if it could not be: that is logged once."""
-        if self._coming is not None and self._coming.done():
-            coming, self._coming = self._coming, None
+    def _take_finder(self) -> ContactFinder | None:
+        """Return the finder, or None while it is set up or if it could not be, which is logged."""
+        if self._future_finder is not None and self._future_finder.done():
+            future, self._future_finder = self._future_finder, None
             try:
-                self._finder = coming.result()
+                self._finder = future.result()
             except CubeError as error:
                 self.get_logger().error(str(error))
         return self._finder
 
-    def _traction_is_wanted(self) -> bool:
+    def _has_traction_listeners(self) -> bool:
         return self._traction is not None and self._traction.get_subscription_count() > 0
 
 

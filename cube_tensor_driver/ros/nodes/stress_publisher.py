@@ -1,50 +1,80 @@
-"""The sink of a running skin: publishes `stress`, and the topics of single cubes to who listens."""
+"""Publishes stress rows: all on `stress`, forces, and single cubes on topics of their own."""
 
 from __future__ import annotations
 
+import array
 from functools import lru_cache
+from typing import Any
 
-from rclpy.lifecycle import LifecycleNode
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
 
 from ...config.skin import Skin
+from ...core.arrays import Array
+from ...core.forces import Forces
 from ...core.reconstructor import Reconstructor
 from ...core.rows import StressRows
+from ...core.status import INVALID
+from ...core.tensor import contact_wrench
 from ...messages.codec import stress_codec
-from ...msg import SkinStress
-from ..node import BUFFERS_KEPT
-from .cube_topics import CubeTopics
-from .force_cloud import ForceCloud
+from ...msg import SkinStress, StressTensorStamped
+from ..messages import tensor_message, to_time, wrench_message
+from ..node import MAX_BUFFERS, CubeNode
 
-LISTENERS_S = 0.5
-"""How often the node looks up which cubes' own topics anybody listens to."""
+LISTENERS_PERIOD_S = 0.5
+"""Time, in seconds, between two looks for listeners of single cubes' topics."""
+
+MAX_ANNOUNCED_CUBES = 64
+"""Skins with up to this many cubes announce all topics of single cubes.
+
+In larger ones a topic is announced once somebody asks for it, because DDS tells every process of
+the domain about every topic.
+"""
+
+MAX_COVARIANCES = 4096
+"""Number of covariances that are kept. Each stands for a cube and the pads that it leaves out."""
+
+CUBE_TOPIC_DEPTH = 10
+"""Depth of the queues of single cubes' topics, in messages."""
+
+FORCE_FIELDS = ("x", "y", "z", "fx", "fy", "fz")
+"""Fields of a point of `forces`, float32: position in m and force in N in the parent frame."""
 
 
 class StressPublisher:
-    """Publishers of one reconstruction.
-
-    side: of the face that wrenches and forces refer to, m; None: each cube's own
-    forces: publish one force per cube, too
-    """
+    """Publishes the rows of one reconstruction until its node cleans up."""
 
     def __init__(
         self,
-        node: LifecycleNode,
+        node: CubeNode,
         skin: Skin,
         reconstructor: Reconstructor,
-        quality: QoSProfile,
+        profile: QoSProfile,
+        *,
         side: float | None,
-        forces: bool,
+        with_forces: bool,
     ) -> None:
-        self._node = node
-        self._buffer = lru_cache(maxsize=BUFFERS_KEPT)(stress_codec.buffer)
-        self._publisher = node.create_lifecycle_publisher(SkinStress, "stress", quality)
+        """Announce the topics.
+
+        Args:
+            node: The node, which is being configured.
+            skin: The skin.
+            reconstructor: Gives the covariances.
+            profile: Quality of service of `stress` and `forces`.
+            side: Side of the face that wrenches and forces refer to, in m; None: each cube's own.
+            with_forces: Whether `forces` is published, too.
+        """
+        self._buffer = lru_cache(maxsize=MAX_BUFFERS)(stress_codec.buffer)
+        self._publisher = node.own(node.create_lifecycle_publisher(SkinStress, "stress", profile))
         self._cubes = CubeTopics(node, skin, reconstructor, side)
-        self._forces = ForceCloud(node, skin, quality, side) if forces else None
-        self._timer = node.create_timer(LISTENERS_S, self._cubes.find_listeners)
+        self._forces = ForceCloud(node, skin, profile, side) if with_forces else None
+        node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
     def publish(self, stress: StressRows, stamp_ns: int, frame_id: bytes) -> None:
-        """Send rows in one message with this stamp, and cube by cube what somebody listens to."""
+        """Send rows as one message with this stamp and frame, and cubes that have listeners."""
         message = self._buffer(frame_id, len(stress))
         message.fill(stress)
         self._publisher.publish(message.data(stamp_ns))
@@ -52,9 +82,125 @@ class StressPublisher:
         if self._forces is not None:
             self._forces.publish(stress, stamp_ns)
 
-    def close(self) -> None:
-        self._node.destroy_timer(self._timer)
-        self._node.destroy_publisher(self._publisher)
-        self._cubes.close()
-        if self._forces is not None:
-            self._forces.close()
+
+class ForceCloud:
+    """Publishes `forces` while somebody listens: one force per cube, in the order of the skin.
+
+    It is a point cloud, which other tactile stacks take.
+    """
+
+    def __init__(self, node: CubeNode, skin: Skin, profile: QoSProfile, side: float | None) -> None:
+        self._forces = Forces(skin, side)
+        self._publisher = node.own(node.create_lifecycle_publisher(PointCloud2, "forces", profile))
+        self._n_cubes = len(skin.cubes)
+        item = np.dtype("<f4").itemsize
+        step = item * len(FORCE_FIELDS)
+        self._message = PointCloud2(
+            height=1, width=self._n_cubes, point_step=step, row_step=step * self._n_cubes
+        )
+        self._message.header.frame_id = skin.parent_frame
+        self._message.fields = [
+            PointField(name=name, offset=item * k, datatype=PointField.FLOAT32, count=1)
+            for k, name in enumerate(FORCE_FIELDS)
+        ]
+
+    def publish(self, rows: StressRows, stamp_ns: int) -> None:
+        """Send the last row of each cube; NaN for cubes without one."""
+        if not self._publisher.get_subscription_count():
+            return
+        force = self._forces.of_skin(rows.select(rows.cube < self._n_cubes))
+        cloud = np.hstack([self._forces.position, force]).astype("<f4")
+        data = array.array("B")
+        data.frombytes(cloud.tobytes())
+        self._message.data = data
+        self._message.is_dense = bool(np.isfinite(force).all())
+        self._message.header.stamp = to_time(stamp_ns)
+        self._publisher.publish(self._message)
+
+
+class CubeTopics:
+    """The topics of single cubes, `cubes/<name>/stress` and `cubes/<name>/wrench`.
+
+    They are sent only while somebody listens.
+    """
+
+    def __init__(
+        self, node: CubeNode, skin: Skin, reconstructor: Reconstructor, side: float | None
+    ) -> None:
+        self._node, self._skin, self._reconstructor = node, skin, reconstructor
+        self._sides = np.array([side or 2 * cube.calibration.half_side for cube in skin.cubes])
+        self._covariances: dict[tuple[int, int], Array] = {}
+        # Index of a cube -> its publisher.
+        self._tensors: dict[int, Any] = {}
+        self._wrenches: dict[int, Any] = {}
+        # Topic that is not announced yet -> its type, where its publisher goes, its cube.
+        self._unannounced: dict[str, tuple[type, dict[int, Any], int]] = {}
+        for number, cube in enumerate(skin.cubes):
+            for message_type, publishers, what in (
+                (StressTensorStamped, self._tensors, "stress"),
+                (WrenchStamped, self._wrenches, "wrench"),
+            ):
+                topic = node.resolve_topic_name(f"cubes/{cube.name}/{what}")
+                self._unannounced[topic] = message_type, publishers, number
+        if len(skin.cubes) <= MAX_ANNOUNCED_CUBES:
+            self._announce(set(self._unannounced))
+        self._listened_tensors: list[int] = []
+        self._listened_wrenches: list[int] = []
+
+    def find_listeners(self) -> None:
+        """Find out which topics anybody listens to. Called from time to time."""
+        if self._unannounced:
+            known_topics = {name for name, _ in self._node.get_topic_names_and_types()}
+            self._announce(known_topics & self._unannounced.keys())
+        self._listened_tensors = _find_listened(self._tensors)
+        self._listened_wrenches = _find_listened(self._wrenches)
+
+    def publish(self, rows: StressRows) -> None:
+        """Send the rows of cubes that somebody listens to; wrenches of valid rows only."""
+        # The timer may replace these lists meanwhile.
+        tensors, wrenches = self._listened_tensors, self._listened_wrenches
+        if wrenches:
+            self._publish_wrenches(rows, wrenches)
+        if tensors:
+            for row in np.flatnonzero(np.isin(rows.cube, tensors)).tolist():
+                cube = int(rows.cube[row])
+                covariance = self._covariance(cube, int(rows.left_out[row]))
+                header = self._header(rows, row, cube)
+                self._tensors[cube].publish(tensor_message(header, rows, row, covariance))
+
+    def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
+        is_chosen = np.isin(rows.cube, listened) & (rows.status & INVALID == 0)
+        chosen = np.flatnonzero(is_chosen)
+        cubes = rows.cube[chosen].tolist()
+        forces, torques = contact_wrench(
+            rows.stress[chosen], rows.gradient[chosen], self._sides[cubes][:, None]
+        )
+        each = zip(chosen.tolist(), cubes, forces, torques, strict=True)
+        for row, cube, force, torque in each:
+            header = self._header(rows, row, cube)
+            self._wrenches[cube].publish(wrench_message(header, force, torque))
+
+    def _announce(self, topics: set[str]) -> None:
+        for topic in sorted(topics):
+            message_type, publishers, number = self._unannounced.pop(topic)
+            publisher = self._node.create_publisher(message_type, topic, CUBE_TOPIC_DEPTH)
+            publishers[number] = self._node.own(publisher)
+
+    def _header(self, rows: StressRows, row: int, cube: int) -> Header:
+        stamp = to_time(int(rows.stamp_ns[row]))
+        return Header(stamp=stamp, frame_id=self._skin.frame(self._skin.cubes[cube]))
+
+    def _covariance(self, cube: int, left_out: int) -> Array:
+        key = cube, left_out
+        if key not in self._covariances:
+            if len(self._covariances) >= MAX_COVARIANCES:
+                self._covariances.clear()
+            self._covariances[key] = self._reconstructor.covariance(cube, left_out)
+        return self._covariances[key]
+
+
+def _find_listened(publishers: dict[int, Any]) -> list[int]:
+    """Return the cubes whose publishers have a subscriber."""
+    return [
+        number for number, publisher in publishers.items() if publisher.get_subscription_count()
+    ]

@@ -1,0 +1,259 @@
+"""Records topics into a bag, in the bytes in which messages arrive.
+
+The main thread receives messages, a separate thread writes them.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from ...bags.metadata import quality
+from ...bags.repair import repair
+from ...bags.write import BagWriter
+from ...core.errors import BagError
+from ...processes.stop_signals import stop_event
+from ..messages import message_class
+from ..qos import offered_profile
+from ..session import domain_text, node_session, spin_until
+from .echo import resolve_topics
+
+QUEUE_DEPTH = 2000
+"""Depth of the queues of recorded topics, in messages."""
+
+WRITE_PERIOD_S = 0.05
+"""Time, in seconds, between two looks of the writing thread for messages.
+
+It is long, so that the thread does not contend for the interpreter.
+"""
+
+FLUSH_PERIOD_S = 0.25
+"""Time, in seconds, between two hand-overs of written data to the system.
+
+A kill -9 costs at most twice this time.
+"""
+
+MAX_WAITING_BYTES = 256 << 20
+"""Maximum size of messages that wait for the disk. Those beyond it are dropped and counted."""
+
+FIND_PERIOD_S = 0.2
+"""Time, in seconds, between two looks for new topics."""
+
+SHOW_PERIOD_S = 1.0
+"""Time, in seconds, between two calls of `show`."""
+
+
+class Recorder:
+    """Records topics of a node's graph into a bag from now until `close`.
+
+    Call `find_topics` from time to time: it subscribes to topics that have appeared.
+
+    Attributes:
+        received: Number of messages that came.
+        dropped: Number of messages that were not recorded, because the disk is too slow.
+        counts: Topic -> number of its messages.
+        refused: Topic -> why it is not recorded.
+        error: Error that ended the writing thread; None: there is none.
+    """
+
+    def __init__(self, node: Node, topics: Sequence[str], bag: BagWriter) -> None:
+        """Begin to record topics, which are full names."""
+        self.received = self.dropped = 0
+        self.counts: dict[str, int] = {}
+        self.refused: dict[str, str] = {}
+        self.error: BagError | None = None
+        self._node, self._bag = node, bag
+        self._wanted = list(topics)
+        self._subscriptions: list[Any] = []
+        self._waiting: deque[tuple[str, int, bytes]] = deque()
+        # Each of these two counts is changed by one thread only, so they need no lock.
+        self._received_bytes = self._written_bytes = 0
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._write, name="bag writer")
+        self._thread.start()
+
+    @property
+    def missing(self) -> list[str]:
+        """Topics that nobody offers yet."""
+        known = self.counts.keys() | self.refused.keys()
+        return [topic for topic in self._wanted if topic not in known]
+
+    def find_topics(self) -> None:
+        """Subscribe to the wanted topics that have a publisher by now. Main thread only."""
+        for topic in self.missing:
+            offers = self._node.get_publishers_info_by_topic(topic)
+            if offers:
+                try:
+                    self._subscribe(topic, offers)
+                except BagError as error:
+                    self.refused[topic] = str(error)
+
+    def close(self) -> None:
+        """Write what waits and complete the bag. BagError: why it could not be."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+        self._closing.set()
+        self._thread.join()
+        if self.error is not None:
+            raise self.error
+
+    def _subscribe(self, topic: str, offers: list[TopicEndpointInfo]) -> None:
+        type_name = offers[0].topic_type
+        profile = offered_profile(offers, QUEUE_DEPTH)
+        recorded_profile = quality(
+            latched=profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+            reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
+            depth=QUEUE_DEPTH,
+        )
+        with self._lock:
+            self._bag.add_topic(topic, type_name, [recorded_profile])
+        clock = self._node.get_clock()
+        self.counts[topic] = 0
+
+        def receive(data: bytes) -> None:
+            self.received += 1
+            self.counts[topic] += 1
+            waiting_bytes = self._received_bytes - self._written_bytes
+            if waiting_bytes + len(data) > MAX_WAITING_BYTES or self.error is not None:
+                self.dropped += 1
+                return
+            self._received_bytes += len(data)
+            self._waiting.append((topic, clock.now().nanoseconds, data))
+
+        kind = message_class(topic, type_name)
+        self._subscriptions.append(
+            self._node.create_subscription(kind, topic, receive, profile, raw=True)
+        )
+
+    def _write(self) -> None:
+        try:
+            flushed = time.monotonic()
+            is_last = False
+            while not is_last:
+                is_last = self._closing.wait(WRITE_PERIOD_S)
+                with self._lock:
+                    self._write_waiting()
+                    if time.monotonic() - flushed >= FLUSH_PERIOD_S:
+                        self._bag.flush()
+                        flushed = time.monotonic()
+            self._bag.close()
+        except BagError as error:
+            self.error = error
+
+    def _write_waiting(self) -> None:
+        while self._waiting:
+            topic, time_ns, data = self._waiting.popleft()
+            self._bag.write(topic, time_ns, data)
+            self._written_bytes += len(data)
+
+
+def record(
+    folder: Path,
+    topics: Sequence[str],
+    *,
+    storage: str,
+    max_bytes: int,
+    max_seconds: float,
+    duration: float | None,
+    show: Callable[[Recorder, float], None],
+) -> Recorder:
+    """Record topics into a new bag, until a signal or the end of the duration.
+
+    Args:
+        folder: Folder of the bag, which must not exist.
+        topics: The topics.
+        storage: mcap or sqlite3.
+        max_bytes: Maximum size of one file of the bag; 0: no limit.
+        max_seconds: Maximum duration of one file of the bag; 0: no limit.
+        duration: Time in s from the first message on; None: until a signal. Without any message
+            recording ends after the same time.
+        show: Called once a second with the recorder and the seconds since the start.
+
+    Raises:
+        BagError: The bag cannot be written; what was written before is made readable. Or nothing
+            came: then there is no bag.
+        ConfigError: ROS does not allow the name of a topic, or does not start.
+    """
+    stop = stop_event()
+    with node_session("recorder") as (node, executor):
+        names = resolve_topics(node, list(topics))
+        bag = BagWriter(folder, storage, max_bytes, max_seconds)
+        return fill(bag, node, executor, names, stop=stop, duration=duration, show=show)
+
+
+def fill(
+    bag: BagWriter,
+    node: Node,
+    executor: Any,
+    names: Sequence[str],
+    *,
+    stop: threading.Event,
+    duration: float | None,
+    show: Callable[[Recorder, float], None],
+) -> Recorder:
+    """Record the topics `names` until `stop` is set, and close the bag; the rest as in `record`."""
+    recorder = Recorder(node, names, bag)
+    begin = find_at = show_at = time.monotonic()
+    until = float("inf") if duration is None else begin + duration
+    has_come = False
+
+    def is_done() -> bool:
+        nonlocal has_come, until
+        now = time.monotonic()
+        if not has_come and any(recorder.counts.values()):
+            # Finding the topics takes up to seconds on a busy machine, which the duration excludes.
+            has_come, until = True, until + now - begin
+        return stop.is_set() or recorder.error is not None or now >= until
+
+    def find_and_show() -> None:
+        nonlocal find_at, show_at
+        now = time.monotonic()
+        if now >= find_at:
+            find_at = now + FIND_PERIOD_S
+            recorder.find_topics()
+        if now >= show_at:
+            show_at = now + SHOW_PERIOD_S
+            show(recorder, now - begin)
+
+    try:
+        spin_until(executor, is_done, on_step=find_and_show)
+    finally:
+        _close(recorder, bag.folder)
+    if not bag.messages:
+        shutil.rmtree(bag.folder, ignore_errors=True)
+        raise BagError(f"nothing recorded, no bag made: {_why_nothing(recorder)}")
+    return recorder
+
+
+def _why_nothing(recorder: Recorder) -> str:
+    if recorder.refused:
+        return "; ".join(recorder.refused.values())
+    if recorder.counts:
+        return f"no message came on {', '.join(sorted(recorder.counts))}"
+    missing = ", ".join(recorder.missing)
+    return f"nobody offers {missing} in {domain_text()}; start the skin, or correct --topics"
+
+
+def _close(recorder: Recorder, folder: Path) -> None:
+    """Complete the bag, or repair it if that fails."""
+    try:
+        recorder.close()
+    except BagError as error:
+        # Most likely the disk is full: without the last, incomplete chunk there is room for the
+        # summary.
+        try:
+            done = repair(folder, keep_rest=False)
+        except BagError as worse:
+            raise BagError(f"{error}\n{worse}") from None
+        raise BagError(f"{error}. The {done.messages} messages written before are valid") from None

@@ -1,0 +1,347 @@
+"""Publishes a bag on its topics again: the recorded bytes at the recorded intervals.
+
+The player publishes in a thread of its own. The main thread spins a node with a topic that tells
+the player's state, and a service that pauses and jumps.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+
+from ...bags.read import Bag, Entry
+from ...core.errors import BagError
+from ...messages.codec import SECOND
+from ...messages.types import FREQUENCIES, PACKAGE, STRESS
+from ...msg import ReplayState
+from ...processes.stop_signals import on_stop_signal
+from ...srv import SteerReplay
+from ..messages import message_class, to_time
+from ..qos import NEWEST, make_profile
+from ..session import node_session, spin_until
+
+QUEUE_DEPTH = 2000
+"""Depth of the queues of published topics, in messages."""
+
+CLOCK_PERIOD_S = 0.01
+"""Maximum time, in seconds, between two messages of /clock. One comes before every message, too."""
+
+SETTLE_S = 1.0
+"""Time, in seconds, without a new subscriber after which the first message is published.
+
+Each topic is discovered separately: a subscriber to `info` need not have found `frequencies` yet.
+"""
+
+MAX_WAIT_S = 3.0
+"""Time, in seconds, after which the replay begins even if nobody subscribes to frequencies."""
+
+LOOK_PERIOD_S = 0.1
+"""Time, in seconds, between two looks for subscribers."""
+
+SHOWN_NS = 100_000_000
+"""Length of bag, in ns, that is published after a jump while the player is paused.
+
+It is enough for a row of every link.
+"""
+
+STATE_PERIOD_S = 0.1
+"""Time, in seconds, between two messages of the player's state."""
+
+RECONSTRUCTED_TYPES = (
+    STRESS,
+    f"{PACKAGE}/msg/StressTensorStamped",
+    "geometry_msgs/msg/WrenchStamped",
+)
+"""Types that a reconstruction publishes. Their topics are left out unless stress is asked for."""
+
+
+class Player:
+    """Publishes a bag. `run` is called once, from one thread; the other methods from any.
+
+    Attributes:
+        position: Position of the last message, in s after the begin of the bag.
+        length: Length of the bag, in s.
+        published: Number of messages published.
+        stop: Set when `run` shall end.
+    """
+
+    def __init__(self, node: Node, bag: Bag, *, rate: float, stress: bool, clock: bool) -> None:
+        """Announce the topics of the bag.
+
+        Args:
+            node: The node that publishes.
+            bag: The bag.
+            rate: Speed, in times the recorded one.
+            stress: Whether to publish what a reconstruction made, too.
+            clock: Whether to publish /clock.
+
+        Raises:
+            BagError: The bag cannot be read, or has nothing to publish.
+        """
+        self.stop = threading.Event()
+        self.published = 0
+        self.position, self.length = 0.0, (bag.end_ns - bag.start_ns) / SECOND
+        self._paused, self._steps = False, 0
+        self._jump_ns: int | None = None
+        self._shown_until_ns = 0
+        # Guards these states, and wakes `run` when one changes.
+        self._wake = threading.Condition()
+        self._node, self._bag, self._rate = node, bag, rate
+        self._publishers: dict[str, Any] = {}
+        self._latched: set[str] = set()
+        skins = [topic.removesuffix("frequencies") for topic in bag.topics(FREQUENCIES)]
+        for connection in bag.connections:
+            topic = connection.topic
+            is_chosen = stress or not _is_reconstructed(connection, skins)
+            if topic not in self._publishers and topic != "/clock" and is_chosen:
+                self._announce(topic, connection)
+        if not self._publishers:
+            there = "in it"
+            if bag.connections:
+                there = "but what a reconstruction makes; --stress publishes that too"
+            raise BagError(f"{bag.path}: nothing to publish {there}")
+        self._clock = node.create_publisher(Clock, "/clock", NEWEST) if clock else None
+
+    @property
+    def paused(self) -> bool:
+        """Whether the player is paused."""
+        return self._paused
+
+    def pause(self, paused: bool) -> None:
+        """Pause, or go on."""
+        with self._wake:
+            self._paused, self._steps = paused, 0
+            self._wake.notify()
+
+    def step(self) -> None:
+        """While paused: publish the next message of frequencies, and what comes before it."""
+        with self._wake:
+            self._steps += 1
+            self._wake.notify()
+
+    def jump(self, position: float, paused: bool) -> None:
+        """Go on from a position, or pause there after `SHOWN_NS` of the bag.
+
+        Raises:
+            BagError: The position is not in the bag.
+        """
+        to_ns = max(self._bag.start_ns, min(self._to_ns(position), self._bag.end_ns - SHOWN_NS))
+        with self._wake:
+            self._jump_ns, self._paused, self._steps = to_ns, paused, 0
+            self._wake.notify()
+
+    def end(self) -> None:
+        """Let `run` end soon."""
+        with self._wake:
+            self.stop.set()
+            self._wake.notify()
+
+    def run(self, start: float, loop: bool, hold: bool = False) -> None:
+        """Publish the bag to its end.
+
+        Args:
+            start: Where to begin, in s after the begin of the bag.
+            loop: Whether to begin there again at the end.
+            hold: Whether to pause at the end and wait for `jump` or `end`.
+
+        Raises:
+            BagError: The bag is damaged, or `start` is not in the bag.
+        """
+        begin_ns: int | None = self._to_ns(start)
+        self._await_subscribers()
+        next_ns = begin_ns
+        while next_ns is not None and not self.stop.is_set():
+            self._publish_from(next_ns)
+            with self._wake:
+                if hold and not loop and self._jump_ns is None:
+                    self._paused = True
+                    self._wake.wait_for(
+                        lambda: self.stop.is_set() or self._jump_ns is not None or not self._paused
+                    )
+                next_ns, self._shown_until_ns = begin_ns if loop or hold else None, 0
+                if self._jump_ns is not None:
+                    next_ns, self._jump_ns = self._jump_ns, None
+                    self._shown_until_ns = next_ns + SHOWN_NS
+
+    def _announce(self, topic: str, connection: Any) -> None:
+        """Make the publisher of a topic, with the quality of service that was recorded."""
+        profile = make_profile(
+            QUEUE_DEPTH,
+            is_latched=connection.is_latched,
+            is_best_effort=connection.is_best_effort,
+        )
+        kind = message_class(topic, connection.msgtype)
+        self._publishers[topic] = self._node.create_publisher(kind, topic, profile)
+        if connection.is_latched:
+            self._latched.add(topic)
+
+    def _await_subscribers(self) -> None:
+        """Wait until subscribers have found the publishers."""
+        everything = [*self._publishers.values(), *([self._clock] if self._clock else [])]
+        needed = [self._publishers[name] for name in self._publishers if _is_frequencies(name)]
+        found, since, wait_s = 0, time.monotonic(), MAX_WAIT_S
+        while time.monotonic() - since < wait_s and not self.stop.wait(LOOK_PERIOD_S):
+            now = sum(publisher.get_subscription_count() for publisher in everything)
+            if now != found:
+                found, since = now, time.monotonic()
+                all_heard = all(one.get_subscription_count() for one in needed or everything)
+                wait_s = SETTLE_S if all_heard else MAX_WAIT_S
+
+    def _to_ns(self, position: float) -> int:
+        """Return the time of the bag at a position. BagError: it is not in the bag."""
+        if not 0 <= position <= self.length:
+            raise BagError(
+                f"{self._bag.path}: {position:g} s is not in the bag, which is "
+                f"{self.length:.3f} s long"
+            )
+        return self._bag.start_ns + round(position * SECOND)
+
+    def _publish_from(self, start_ns: int) -> None:
+        """Publish the bag from a time on, until its end or until a jump or the end is asked for."""
+        # What was latched before the start holds at the start.
+        for entry in self._bag.entries(self._latched, None, start_ns):
+            self._publish(entry)
+        self._set_time(start_ns)
+        for entry in self._bag.entries(set(self._publishers), start_ns):
+            if not self._wait_until_due(entry.time_ns):
+                return
+            self._publish_clock(entry.time_ns)
+            self._publish(entry)
+            self.position = (entry.time_ns - self._bag.start_ns) / SECOND
+            if self._steps and _is_frequencies(entry.topic):
+                with self._wake:
+                    self._steps -= 1
+
+    def _set_time(self, bag_ns: int) -> None:
+        """Let this time of the bag be now."""
+        self._anchor_ns, self._anchor_s = bag_ns, time.monotonic()
+
+    def _wait_until_due(self, bag_ns: int) -> bool:
+        """Wait until a message is due, and return False if the player shall end or jump."""
+        with self._wake:
+            while not self.stop.is_set() and self._jump_ns is None:
+                if self._paused:
+                    if self._steps or bag_ns <= self._shown_until_ns:
+                        self._set_time(bag_ns)
+                        return True
+                    self._wake.wait()
+                    self._set_time(bag_ns)
+                    continue
+                due_s = self._anchor_s + (bag_ns - self._anchor_ns) / SECOND / self._rate
+                left_s = due_s - time.monotonic()
+                if left_s <= 0:
+                    return True
+                if self._clock is not None:
+                    self._publish_clock(bag_ns - round(left_s * self._rate * SECOND))
+                    left_s = min(left_s, CLOCK_PERIOD_S)
+                self._wake.wait(left_s)
+        return False
+
+    def _publish_clock(self, bag_ns: int) -> None:
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=to_time(bag_ns)))
+
+    def _publish(self, entry: Entry) -> None:
+        self._publishers[entry.topic].publish(entry.data)
+        self.published += 1
+
+
+def _is_reconstructed(connection: Any, skins: list[str]) -> bool:
+    """Return whether a reconstruction made a topic of a bag.
+
+    Wrenches have a common type, so they count only below the `cubes` of a skin in the bag.
+    """
+    if connection.msgtype not in RECONSTRUCTED_TYPES:
+        return False
+    is_own_type = connection.msgtype.startswith(PACKAGE)
+    return is_own_type or any(connection.topic.startswith(f"{skin}cubes/") for skin in skins)
+
+
+def _is_frequencies(topic: str) -> bool:
+    return topic.endswith("frequencies")
+
+
+class ReplayControl:
+    """The topic `~/state` and the service `~/steer` of the node of a player."""
+
+    def __init__(self, node: Node, player: Player) -> None:
+        self._player = player
+        self._state = node.create_publisher(ReplayState, "~/state", 1)
+        node.create_service(SteerReplay, "~/steer", self._steer)
+        node.create_timer(STATE_PERIOD_S, self._publish_state)
+
+    def _publish_state(self) -> None:
+        player = self._player
+        self._state.publish(
+            ReplayState(position=player.position, length=player.length, paused=player.paused)
+        )
+
+    def _steer(
+        self, request: SteerReplay.Request, answer: SteerReplay.Response
+    ) -> SteerReplay.Response:
+        try:
+            if math.isnan(request.position):
+                self._player.pause(request.paused)
+            else:
+                self._player.jump(request.position, request.paused)
+        except BagError as error:
+            answer.message = str(error)
+            return answer
+        answer.success, answer.message = True, "holds" if request.paused else "goes on"
+        return answer
+
+
+def replay(
+    bag: Bag,
+    *,
+    rate: float,
+    loop: bool,
+    start: float,
+    clock: bool,
+    stress: bool,
+    hold: bool,
+    each: Callable[[Player], None],
+) -> None:
+    """Publish a bag until its end or a signal.
+
+    Args:
+        bag: The bag.
+        rate: Speed, in times the recorded one.
+        loop: Whether to begin again at the end.
+        start: Where to begin, in s after the begin of the bag.
+        clock: Whether to publish /clock.
+        stress: Whether to publish what a reconstruction made, too.
+        hold: Whether to wait at the end to be steered.
+        each: Called in the main thread after every step of spinning.
+
+    Raises:
+        BagError: The bag cannot be read, or has nothing to publish.
+    """
+    errors: list[BagError] = []
+    with node_session("player") as (node, executor):
+        player = Player(node, bag, rate=rate, stress=stress, clock=clock)
+        ReplayControl(node, player)
+        on_stop_signal(player.end)
+
+        def play() -> None:
+            try:
+                player.run(start, loop, hold=hold)
+            except BagError as error:
+                errors.append(error)
+
+        thread = threading.Thread(target=play, name="player")
+        thread.start()
+        try:
+            spin_until(executor, lambda: not thread.is_alive(), on_step=lambda: each(player))
+        finally:
+            player.end()
+            thread.join()
+        each(player)
+    if errors:
+        raise errors[0]

@@ -1,0 +1,250 @@
+"""The picture of a skin as a serialised MarkerArray: cubes, arrows, crosses and contacts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from geometry_msgs.msg import Quaternion, Vector3
+from visualization_msgs.msg import Marker
+
+from ...core.arrays import Array, Index
+from ...core.poses import CubePoses, quaternions
+from ...msg import SkinContacts
+from ...views import scene
+from .legend import (
+    GRADIENT_COLOUR,
+    GRADIENT_LENGTH,
+    TRACTION_COLOUR,
+    TRACTION_LENGTH,
+    UPSIDE_DOWN,
+    Legend,
+    LegendPlace,
+    four_characters,
+    legend_markers,
+)
+from .serialised import Colour, SerialisedMarkers, allocate, make_marker, make_text
+
+PLATE_SIDE = 2.04
+"""Side of the plate that has the colour of a cube, in half sides of the cube.
+
+The plate covers the upper face, so that the cube of the robot model is seen below it.
+"""
+
+PLATE_THICKNESS = 0.3
+"""Thickness of the plate, in half sides of the cube."""
+
+PLATE_HEIGHT = 0.9
+"""Height of the plate's centre above the cube's centre, in half sides of the cube."""
+
+LINE_WIDTH = 0.05
+"""Width of lines, in pitches."""
+
+PULL_COLOUR: Colour = (0.9, 0.3, 0.2)
+PUSH_COLOUR: Colour = (0.3, 0.5, 1.0)
+CONTACT_COLOUR: Colour = (1.0, 0.45, 0.75)
+
+MAX_CONTACTS = 8
+"""Number of contacts that are drawn. A message has those with the largest forces first."""
+
+RING_CORNERS = 24
+"""Number of corners of the ring around a contact."""
+
+RING_WIDTH = 0.06
+"""Width of the line of a ring, in pitches."""
+
+FORCE_TEXT_HEIGHT = 0.3
+"""Height of the text with the force of a contact, in pitches."""
+
+MIN_TEXT_DISTANCE_M = 2e-3
+"""Minimum distance, in m, of the text with the force of a contact from its centre."""
+
+HIDDEN_OPACITY = 0.001
+"""Opacity of a text without a contact. RViz warns of a colour whose opacity is 0."""
+
+
+class Ranges(NamedTuple):
+    """Values that the top of the colours and the longest arrows stand for.
+
+    Attributes:
+        colours: In SI units of the quantity that is shown.
+        traction: In Pa.
+        gradient: In Pa/m.
+    """
+
+    colours: float = 0.0
+    traction: float = 0.0
+    gradient: float = 0.0
+
+
+class Canvas:
+    """The picture of a skin. Each marker has its name as namespace.
+
+    Attributes:
+        legend: The legend beside the skin.
+    """
+
+    def __init__(self, frame_id: str, poses: CubePoses, *, crosses: bool, signed: bool) -> None:
+        """Make the markers.
+
+        Args:
+            frame_id: The parent frame of the skin.
+            poses: Poses of the cubes.
+            crosses: Whether principal stresses are drawn.
+            signed: Whether colours lie about zero.
+        """
+        self._poses = poses
+        self._pitch = poses.pitch
+        self._health: Index | None = None
+        self._groups, rotations = _group_by_orientation(poses.rotation)
+        place = LegendPlace.beside(poses)
+        markers = [
+            *self._make_cubes(frame_id, rotations),
+            *self._make_lines(frame_id, crosses),
+            *_make_contacts(frame_id, self._pitch),
+            *legend_markers(frame_id, place, signed),
+        ]
+        self._markers = SerialisedMarkers(markers)
+        heights = PLATE_HEIGHT * poses.half_side[:, None]
+        plates = poses.position + heights * poses.rotation[:, :, 2]
+        for group, (members, rotation) in enumerate(zip(self._groups, rotations, strict=True)):
+            # The points of a marker are in the frame of its pose.
+            self._markers[f"cubes {group}"].points[:] = plates[members] @ rotation
+        for marker in markers:
+            self._markers[marker.ns].colours[:, 3] = 1.0
+        self.legend = Legend(self._markers, place)
+        self.draw_contacts(None)
+
+    @property
+    def data(self) -> bytearray:
+        """The serialised message."""
+        return self._markers.data
+
+    def draw_cubes(self, colours: Array) -> None:
+        """Give each cube its colour, (cubes, 3)."""
+        for group, members in enumerate(self._groups):
+            self._markers[f"cubes {group}"].colours[:, :3] = colours[members]
+
+    def draw_arrows(self, values: Array, ranges: Ranges) -> None:
+        """Draw traction and gradient of each cube, from its stress and gradients (cubes, 15)."""
+        normal = self._poses.rotation[:, :, 2]
+        metres_per_pa = TRACTION_LENGTH * self._pitch / ranges.traction
+        traction = scene.traction_arrows(self._poses, values, metres_per_pa)
+        metres_per_gradient = GRADIENT_LENGTH * self._pitch / ranges.gradient
+        gradient = scene.gradient_arrows(self._poses, values, metres_per_gradient)
+        for name, arrows in (("traction", traction), ("gradient", gradient)):
+            self._markers[name].points[:] = scene.heads(arrows, normal).reshape(-1, 3)
+
+    def draw_faults(self, health: Index) -> None:
+        """Draw crosses over cubes that are not fine, if the health has changed."""
+        if self._health is not None and np.array_equal(health, self._health):
+            return
+        self._health = health
+        faults = self._markers["faults"]
+        faults.points[:] = scene.fault_crosses(self._poses, health).reshape(-1, 3)
+        faults.colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
+
+    def draw_crosses(self, values: Array, longest_pa: float) -> None:
+        """Draw principal stresses, if the picture has them.
+
+        Args:
+            values: Stress and gradients of each cube, (cubes, 15).
+            longest_pa: Stress, in Pa, whose line is as long as the pitch.
+        """
+        if "crosses" not in self._markers:
+            return
+        crosses = self._markers["crosses"]
+        scale = self._pitch / longest_pa
+        lines, is_pull = scene.principal_crosses(self._poses, values, scale)
+        crosses.points[:] = lines.reshape(-1, 3)
+        colours = np.where(is_pull.reshape(-1, 1), PULL_COLOUR, PUSH_COLOUR)
+        crosses.colours[:, :3] = np.repeat(colours, 2, axis=0)
+
+    def draw_contacts(self, contacts: SkinContacts | None) -> None:
+        """Draw a ring as large as each contact, and its forces; None: there is no contact."""
+        rings = np.zeros((MAX_CONTACTS, RING_CORNERS, 2, 3))
+        count = 0 if contacts is None else len(contacts.position)
+        for number in range(MAX_CONTACTS):
+            label = self._markers[f"contact {number}"]
+            label.colour[3] = HIDDEN_OPACITY
+            if contacts is None or number >= count:
+                continue
+            centre, n = contacts.position[number], contacts.normal[number]
+            position, normal = np.array([centre.x, centre.y, centre.z]), np.array([n.x, n.y, n.z])
+            radius = float(np.sqrt(max(0.0, contacts.area[number]) / np.pi))
+            rings[number] = _make_ring(position, normal, radius)
+            label.colour[3] = 1.0
+            label.position[:] = position + max(radius, MIN_TEXT_DISTANCE_M) * normal
+            text = _force_text(contacts.normal_force[number], contacts.shear_force[number])
+            self._markers.write_text(f"contact {number}", text)
+        self._markers["contacts"].points[:] = rings.reshape(-1, 3)
+
+    def _make_cubes(self, frame_id: str, rotations: Array) -> list[Marker]:
+        """Return a marker for each orientation, because all boxes of a CUBE_LIST are parallel."""
+        markers = []
+        for group, (w, x, y, z) in enumerate(quaternions(rotations).tolist()):
+            members = self._groups[group]
+            half_side = float(self._poses.half_side[members].max())
+            side, thickness = PLATE_SIDE * half_side, PLATE_THICKNESS * half_side
+            marker = make_marker(frame_id, f"cubes {group}", Marker.CUBE_LIST)
+            marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
+            marker.scale = Vector3(x=side, y=side, z=thickness)
+            allocate(marker, len(members), with_colours=True)
+            markers.append(marker)
+        return markers
+
+    def _make_lines(self, frame_id: str, crosses: bool) -> list[Marker]:
+        """Return arrows of three lines, fault crosses of two, and principal crosses of three."""
+        n_cubes = len(self._poses.position)
+        traction = make_marker(frame_id, "traction", Marker.LINE_LIST, TRACTION_COLOUR)
+        gradient = make_marker(frame_id, "gradient", Marker.LINE_LIST, GRADIENT_COLOUR)
+        faults = make_marker(frame_id, "faults", Marker.LINE_LIST)
+        principal = make_marker(frame_id, "crosses", Marker.LINE_LIST)
+        allocate(traction, 6 * n_cubes, with_colours=False)
+        allocate(gradient, 6 * n_cubes, with_colours=False)
+        allocate(faults, 4 * n_cubes, with_colours=True)
+        allocate(principal, 6 * n_cubes, with_colours=True)
+        markers = [traction, gradient, faults, *([principal] if crosses else [])]
+        for marker in markers:
+            marker.scale.x = LINE_WIDTH * self._pitch
+        return markers
+
+
+def _group_by_orientation(rotation: Array) -> tuple[list[Index], Array]:
+    """Return the cubes of each orientation, and the orientations upside down, (G, 3, 3)."""
+    flat = rotation.round(6).reshape(len(rotation), 9)
+    unique, group = np.unique(flat, axis=0, return_inverse=True)
+    members = [np.flatnonzero(group.ravel() == number) for number in range(len(unique))]
+    return members, unique.reshape(-1, 3, 3) * UPSIDE_DOWN
+
+
+def _make_contacts(frame_id: str, pitch: float) -> list[Marker]:
+    """Return rings and texts for the contacts of a skin with this pitch, in m."""
+    rings = make_marker(frame_id, "contacts", Marker.LINE_LIST, CONTACT_COLOUR)
+    rings.scale.x = RING_WIDTH * pitch
+    allocate(rings, 2 * MAX_CONTACTS * RING_CORNERS, with_colours=False)
+    markers = [rings]
+    for number in range(MAX_CONTACTS):
+        height, placeholder = FORCE_TEXT_HEIGHT * pitch, _force_text(0.0, 0.0)
+        text = make_text(frame_id, f"contact {number}", height, placeholder)
+        text.color.r, text.color.g, text.color.b = CONTACT_COLOUR
+        markers.append(text)
+    return markers
+
+
+def _force_text(normal_n: float, shear_n: float) -> str:
+    """Return forces in N as a text of constant length. A force that is not observed is NaN."""
+    return f"{four_characters(normal_n)} N, shear {four_characters(shear_n)} N"
+
+
+def _make_ring(centre: Array, normal: Array, radius: float) -> Array:
+    """Return the lines of a ring, (RING_CORNERS, 2, 3), perpendicular to a unit normal (3,)."""
+    # The axis that is closest to perpendicular gives the most accurate cross product.
+    aside = np.eye(3)[np.abs(normal).argmin()]
+    first = np.cross(normal, aside)
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    angle = 2 * np.pi * np.arange(RING_CORNERS) / RING_CORNERS
+    direction = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+    corners = centre + radius * direction
+    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
