@@ -160,6 +160,8 @@ KEYS = {
         "dask",
         "mcap",
         "zstandard",
+        "selenium",
+        "msgspec",
         "websockets",
     )
 )

@@ -38,7 +38,6 @@ WHEELS = {
 DEBIAN_PACKAGES = {
     "PIL": "python3-pil",
     "jsonschema": "python3-jsonschema",
-    "lz4": "python3-lz4",
     "matplotlib": "python3-matplotlib",
     "numpy": "python3-numpy",
     "psutil": "python3-psutil",
@@ -48,6 +47,7 @@ DEBIAN_PACKAGES = {
     "transforms3d": "python3-transforms3d",
     "websockets": "python3-websockets",
     "yaml": "python3-yaml",
+    "zstandard": "python3-zstandard",
 }
 """Name of a module -> its package in Debian and Ubuntu, where there is one."""
 

@@ -29,6 +29,7 @@ from cube_tensor_design.studies.pads_example import planar_calibration, sweep
 from cube_tensor_design.studies.pads_study import coarse_influence, layer_example, study_pads
 from cube_tensor_design.studies.traction_study import MAIN, PITCHES, SHAPED, WRONG, traction_example
 from cube_tensor_design.studies.traction_study import study as traction_study
+from cube_tensor_driver.cli import ROOT
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError, CubeError
@@ -159,15 +160,10 @@ def _demo_skin() -> Iterator[Children]:
 def _photograph(children: Children, path: Path) -> None:
     """The browser view. CubeError: no picture came."""
     url = children.wait_for_line("view", "http://", START_S).split()[0]
-    # A tool of the repository, not of the package: only it needs a browser's driver.
-    command = [
-        sys.executable,
-        str(package_data() / "tools" / "photograph.py"),
-        url,
-        str(path.resolve()),
-    ]
+    # In a process of its own, so that only a machine with Chromium needs selenium.
+    command = [sys.executable, "-m", "workshop.pictures.photograph", url, str(path.resolve())]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=PHOTOGRAPH_S, check=False
+        command, cwd=ROOT, capture_output=True, text=True, timeout=PHOTOGRAPH_S, check=False
     )
     if done.returncode:
         raise CubeError(f"no picture of {url}:\n{done.stderr[-500:]}")

@@ -1,9 +1,8 @@
-"""Measures what views cost: the nodes markers and contacts and the browser view, beside a skin that
-sends at 100 Hz.
+"""What views cost: the nodes markers and contacts and the browser view of a skin at 100 Hz.
 
-`measure_views.py CUBES [chromium]` prints one line of figures. A client that draws nothing reads
-the page. With `chromium`, headless Chromium shows it too and draws on the processor; then shown_hz
-is how often it drew something new.
+`python -m workshop.bench.views CUBES [chromium]` prints one line of figures. A client that draws
+nothing reads the page. With `chromium`, headless Chromium shows it too and draws on the processor;
+then shown_hz is how often it drew something new.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import psutil
 import rclpy
 import viser
 import zstandard
-from photograph import chromium
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from selenium import webdriver
@@ -45,7 +43,23 @@ from cube_tensor_driver.ros.messages import info_message
 from cube_tensor_driver.ros.qos import LATCHED, batch_profile
 from cube_tensor_driver.simulation.load import Load, default_script
 
-RATE, INSTANTS, START_S, SETTLE_S, MEASURE_S = 100.0, 200, 30.0, 6.0, 15.0
+from ..pictures.photograph import chromium
+
+RATE = 100.0
+"""Samples per second of each cube."""
+
+INSTANTS = 200
+"""Number of instants of the load that are computed in advance and repeated."""
+
+MAX_START_S = 30.0
+"""Time, in seconds, that the browser view may take to start."""
+
+SETTLE_S = 6.0
+"""Time, in seconds, between the start and the measurement."""
+
+MEASURE_S = 15.0
+"""Duration of the measurement, in seconds."""
+
 SHOWN = """(() => {
   window.shown_ = 0
   let come = false, drawn = false
@@ -72,7 +86,7 @@ SHOWN = """(() => {
     requestAnimationFrame(next)
   })()
 })()"""
-"""Counts the pictures that the browser draws after new data has come."""
+"""JavaScript that counts the pictures that the browser draws after new data has come."""
 CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": (1, 0, 0, 0),
@@ -85,11 +99,11 @@ CAMERA = {
     "look_at": (0, 0, 0),
     "up_direction": (0, 0, 1),
 }
-"""The view draws only for pages that have said where they look from."""
+"""Message of a client about its camera. The view draws only for clients that have sent one."""
 
 
 class PictureCounter:
-    """A client of the page that draws nothing and counts the pictures it gets."""
+    """A client of the page that draws nothing and counts the pictures that it receives."""
 
     def __init__(self, url: str) -> None:
         self.pictures = 0
@@ -110,9 +124,9 @@ class PictureCounter:
 
 
 class SkinSender:
-    """Publishes the info of a skin, and its stress under a load that moves.
+    """Publishes the info of a skin, and its stress under a load that moves; a context manager.
 
-    A context manager: a thread of its own sends while it is entered.
+    A thread of its own publishes the stress inside the block.
     """
 
     def __init__(self, node: Node, skin: Skin) -> None:
@@ -147,7 +161,7 @@ class SkinSender:
 
 
 class MessageCounter:
-    """Counts the messages of a topic."""
+    """Counts the messages of a topic without decoding them."""
 
     def __init__(self, node: Node, message_type: type, topic: str) -> None:
         self.count = 0
@@ -158,24 +172,30 @@ class MessageCounter:
 
 
 class BrowserMeter:
-    """What a browser does with the page."""
+    """Counts what a browser does with the page."""
 
     def __init__(self, page: webdriver.Chrome) -> None:
         self._page = page
         page.execute_cdp_cmd("Performance.enable", {})
 
     def pictures(self) -> int:
-        """Pictures drawn so far after new data had come."""
+        """Return the number of pictures drawn so far after new data had come."""
         return int(self._page.execute_script("return window.shown_"))
 
     def script_seconds(self) -> float:
-        """Time that the page's main thread has spent in its own code, without drawing."""
+        """Return the time, in seconds, that the main thread of the page has spent in scripts."""
         metrics = self._page.execute_cdp_cmd("Performance.getMetrics", {})["metrics"]
         durations = {metric["name"]: metric["value"] for metric in metrics}
         return float(durations["ScriptDuration"])
 
 
 def measure(cubes: int, browser: bool) -> dict[str, float]:
+    """Return rates (Hz), processor time (percent of one core) and memory (MiB) of the views.
+
+    Args:
+        cubes: Number of cubes of the skin.
+        browser: Whether Chromium shows the page.
+    """
     with tempfile.TemporaryDirectory(prefix="cube_views_") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         skin = make_skin(folder, cubes)
@@ -193,7 +213,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
         for topic in counters:
             children.start(Process(topic, f"cube_tensor_driver.ros.nodes.{topic}"))
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
-        url = children.wait_for_line("view", "http://", START_S).split()[0]
+        url = children.wait_for_line("view", "http://", MAX_START_S).split()[0]
         pictures = PictureCounter(url)
         meter = BrowserMeter(stack.enter_context(chromium(url, SHOWN))) if browser else None
 
@@ -203,7 +223,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
                 executor.spin_once(timeout_sec=0.1)
 
         def read() -> dict[str, float]:
-            """Everything that is counted, so far."""
+            """Return everything that is counted, so far."""
             counted: dict[str, float] = {}
             for topic, counter in counters.items():
                 counted[f"{topic}_hz"] = counter.count
@@ -228,7 +248,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
 
 
 def make_skin(folder: Path, cubes: int) -> Skin:
-    """A grid that is as nearly square as the number of cubes allows."""
+    """Make a grid that is as nearly square as the number of cubes allows."""
     nx = math.ceil(math.sqrt(cubes))
     while cubes % nx:
         nx += 1
@@ -238,7 +258,7 @@ def make_skin(folder: Path, cubes: int) -> Skin:
 
 
 def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
-    """Rows as planar cubes would give them, which do not observe all components."""
+    """Return rows as planar cubes would give them, which do not observe all components."""
     n = len(stress)
     stress = stress.astype(np.float32)
     gradient = gradient[:, :3].reshape(n, 9).astype(np.float32)
@@ -258,7 +278,7 @@ def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
 
 
 def cpu(pid: int) -> float:
-    """Processor time of a process, s."""
+    """Return the processor time of a process, in seconds."""
     times = psutil.Process(pid).cpu_times()
     return float(times.user + times.system)
 
