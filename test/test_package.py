@@ -59,7 +59,7 @@ HOMES = {
     "skfem": {"cube_tensor_design"},
     "transforms3d": {"core"},
     "launch": {"ros"},
-    "viser": {"browser"},
+    "viser": {"browser", "workshop"},
     "mujoco": {"simulation"},
 }
 """Each heavy library -> the few folders of the driver, and the other packages, that import it."""
