@@ -35,8 +35,8 @@ from .robust import (
     compute_weights,
     estimate_scatter,
     find_undetermined,
-    hidden_directions,
     least_squares,
+    null_space,
     robust_covariance,
 )
 
@@ -79,7 +79,12 @@ class Fit:
     undetermined: tuple[str, ...]
     advice: tuple[str, ...]
 
-    def calibration(self, base: Calibration, created: str = "", source: str = "") -> Calibration:
+    def calibration(
+        self,
+        base: Calibration,
+        created: str = "",
+        source: str = "",
+    ) -> Calibration:
         """Return a calibration with the fitted values.
 
         Args:
@@ -110,7 +115,9 @@ class Fit:
 
 
 def measured_stress(
-    base: Calibration, frequency: ArrayLike, temperature: Array | None = None
+    base: Calibration,
+    frequency: ArrayLike,
+    temperature: Array | None = None,
 ) -> Array:
     """Compute pad stresses (N, P), in Pa, by the pad law of a calibration.
 
@@ -140,7 +147,11 @@ def measured_stress(
     return v
 
 
-def loads_from_forces(modes: Modes, force: ArrayLike, area: float) -> Array:
+def loads_from_forces(
+    modes: Modes,
+    force: ArrayLike,
+    area: float,
+) -> Array:
     """Compute the states of forces that a reference sensor measured on the face +z.
 
     The stress is uniform in zz, yz and zx. The stresses along the skin are taken as 0, because
@@ -199,11 +210,11 @@ def fit(
     theta, weights, scale = model.solve(design, y)
 
     jacobian = model.jacobian(theta, design)
-    hidden = hidden_directions(jacobian)
+    null = null_space(jacobian)
     n_free = len(model.free)
-    is_open = find_undetermined(hidden, n_free)
+    is_open = find_undetermined(null, n_free)
     names = [structure.names[k] for k in model.free]
-    advice = _advise(model, theta, x, hidden, is_open)
+    advice = _advise(model, theta, x, null, is_open)
     if names and is_open.all():
         raise FitError(f"these loads determine no coefficient: {'; '.join(advice)}")
 
@@ -221,7 +232,7 @@ def fit(
     fitted = model.predict(theta, design)
     is_used = weights > 0
     whitened = (y - fitted) / sigma
-    n_determined = jacobian.shape[1] - hidden.shape[1]
+    n_determined = jacobian.shape[1] - null.shape[1]
     return Fit(
         structure=structure,
         coefficients=dict(zip(structure.names, coefficients.tolist(), strict=True)),
@@ -250,7 +261,11 @@ class _Model:
     """
 
     def __init__(
-        self, structure: Structure, noise: Array, fixed: Mapping[str, float], gains: bool
+        self,
+        structure: Structure,
+        noise: Array,
+        fixed: Mapping[str, float],
+        gains: bool,
     ) -> None:
         self.structure, self.noise = structure, noise
         self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
@@ -265,7 +280,7 @@ class _Model:
         self.gains: Array = np.array(columns).reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """Return all coefficients (K,) and gains (P,)."""
+        """Return the coefficients (K,), including fixed ones, and the gains (P,) of parameters."""
         coefficients = self._fixed.copy()
         coefficients[self.free] = theta[: len(self.free)]
         return coefficients, 1 + self.gains @ theta[len(self.free) :]
@@ -282,7 +297,12 @@ class _Model:
         readings: Array = gain * (design @ coefficients)
         return readings
 
-    def residuals(self, theta: Array, design: Array, y: Array) -> Array:
+    def residuals(
+        self,
+        theta: Array,
+        design: Array,
+        y: Array,
+    ) -> Array:
         """Return the whitened residuals (N P,)."""
         residuals: Array = (y - self.predict(theta, design)) / self.noise
         return residuals.ravel()
@@ -357,7 +377,11 @@ def _check_inputs(
     return x, y, np.broadcast_to(sigma, (n_pads,))
 
 
-def _refuse_unknown(kind: str, values: Array, columns: tuple[str, ...]) -> None:
+def _refuse_unknown(
+    kind: str,
+    values: Array,
+    columns: tuple[str, ...],
+) -> None:
     """Raise FitError that names the first value that is not finite."""
     for row, column in np.argwhere(~np.isfinite(values)).tolist():
         raise FitError(
@@ -366,7 +390,12 @@ def _refuse_unknown(kind: str, values: Array, columns: tuple[str, ...]) -> None:
         )
 
 
-def _cross_validate(model: _Model, design: Array, y: Array, is_used: Mask) -> float:
+def _cross_validate(
+    model: _Model,
+    design: Array,
+    y: Array,
+    is_used: Mask,
+) -> float:
     """Return the ratio of the rms error on loads that are left out to the rms reading."""
     if len(y) < 2 or not np.any(y[is_used]):
         return float("nan")
@@ -381,14 +410,20 @@ def _cross_validate(model: _Model, design: Array, y: Array, is_used: Mask) -> fl
     return float(np.sqrt(mean_square_error / np.mean(y[is_used] ** 2)))
 
 
-def _advise(model: _Model, theta: Array, x: Array, hidden: Array, is_open: Mask) -> list[str]:
-    """Find single-mode loads that would determine what is open, one after the other.
+def _advise(
+    model: _Model,
+    theta: Array,
+    x: Array,
+    null: Array,
+    is_open: Mask,
+) -> list[str]:
+    """Find loads of a single mode that would determine the undetermined coefficients.
 
     Args:
         model: The model.
         theta: Fitted parameters.
         x: Loads (N, M), in Pa.
-        hidden: Directions of the parameters that change no reading.
+        null: Directions of the parameters that change no reading.
         is_open: Which free coefficients the loads do not determine.
 
     Returns:
@@ -404,12 +439,14 @@ def _advise(model: _Model, theta: Array, x: Array, hidden: Array, is_open: Mask)
     while is_open.any():
         candidates = [np.vstack([loads, load]) for load in size * np.eye(x.shape[1])]
         jacobians = [model.jacobian(theta, model.design(candidate)) for candidate in candidates]
-        hiddens = [hidden_directions(jacobian) for jacobian in jacobians]
-        opens = [find_undetermined(each, len(names)) for each in hiddens]
+        null_spaces = [null_space(jacobian) for jacobian in jacobians]
+        opens = [find_undetermined(each, len(names)) for each in null_spaces]
         # The best load determines most coefficients, then most directions of the parameters.
-        left = [(open_.sum(), each.shape[1]) for open_, each in zip(opens, hiddens, strict=True)]
+        left = [
+            (open_.sum(), each.shape[1]) for open_, each in zip(opens, null_spaces, strict=True)
+        ]
         best = min(range(len(left)), key=left.__getitem__)
-        if hiddens[best].shape[1] >= hidden.shape[1]:
+        if null_spaces[best].shape[1] >= null.shape[1]:
             advice.append(
                 f"no load determines {', '.join(names[is_open])}: "
                 "give them as fixed, or choose a larger symmetry"
@@ -423,7 +460,7 @@ def _advise(model: _Model, theta: Array, x: Array, hidden: Array, is_open: Mask)
             f"these loads do not determine {', '.join(subject)}: add a load of {mode} "
             f"alone, {describe_mode(mode)}, of about {size:.3g} Pa"
         )
-        loads, hidden, is_open = candidates[best], hiddens[best], opens[best]
+        loads, null, is_open = candidates[best], null_spaces[best], opens[best]
     return advice
 
 

@@ -49,7 +49,11 @@ class Loads:
         return mean
 
 
-def read_loads(path: Path, layout: Layout, area: float | None = None) -> Loads:
+def read_loads(
+    path: Path,
+    layout: Layout,
+    area: float | None = None,
+) -> Loads:
     """Read a table with a line of column names, then one load per line.
 
     The columns are:
@@ -78,7 +82,12 @@ def read_loads(path: Path, layout: Layout, area: float | None = None) -> Loads:
     return Loads(state, frequency, columns.get(TEMPERATURE))
 
 
-def _check_columns(path: Path, header: list[str], layout: Layout, modes: Modes) -> None:
+def _check_columns(
+    path: Path,
+    header: list[str],
+    layout: Layout,
+    modes: Modes,
+) -> None:
     allowed = {*layout.pads, *modes.names, *FORCE, TEMPERATURE}
     mistakes = {
         "unknown": [name for name in header if name not in allowed],
@@ -95,7 +104,10 @@ def _check_columns(path: Path, header: list[str], layout: Layout, modes: Modes) 
 
 
 def _read_states(
-    path: Path, columns: Mapping[str, Array], modes: Modes, area: float | None
+    path: Path,
+    columns: Mapping[str, Array],
+    modes: Modes,
+    area: float | None,
 ) -> Array:
     """Return amplitudes (N, M), in Pa, from the columns of modes or of forces."""
     forces = [name for name in FORCE if name in columns]

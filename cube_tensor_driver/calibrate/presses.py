@@ -31,7 +31,10 @@ from ..core.tensor import rotate_gradient, rotate_stress
 from ..mechanics.contact import disc, field
 
 MIN_PRESS_NOISE_RATIO = 30.0
-"""Smallest frequency change of a press, as a multiple of the pads' noise."""
+"""Smallest frequency change of a press, as a multiple of the median noise of the pads.
+
+Noise, and vibration of the table, stay below it.
+"""
 
 MIN_PRESS_CHANGE = 2e-4
 """Smallest relative frequency change of a press, whatever the noise is."""
@@ -40,7 +43,10 @@ STEADY_SHARE = 0.1
 """Largest difference of two successive averages of a steady press, as a share of the press."""
 
 RELEASED_SHARE = 0.4
-"""Share of the smallest change below which a press has ended."""
+"""Ratio of the frequency change to the smallest change of a press, below which a press has ended.
+
+It is below 1, so that a press near the limit is not read twice.
+"""
 
 FINGER_RADIUS = 3e-3
 """Radius of the contact of a fingertip, in m."""
@@ -93,7 +99,12 @@ class PressDetector:
         is_held: Whether the press that was read last continues.
     """
 
-    def __init__(self, rest: Array, noise: Array, works: Mask) -> None:
+    def __init__(
+        self,
+        rest: Array,
+        noise: Array,
+        works: Mask,
+    ) -> None:
         """Prepare the detection.
 
         Args:
@@ -184,7 +195,7 @@ class Explanation:
 
     Attributes:
         rotation: Rotation (3, 3) of the cube from its intended to its real orientation.
-        places: Number of the layout's pad that each measured pad is (P,).
+        places: Number of the pad in the layout to which each wire of the hub leads (P,).
         misfit: Unexplained share of the measured stresses: 0 is perfect, 1 explains nothing.
         is_certain: Whether no other explanation with as few changes fits as well.
     """
@@ -259,7 +270,11 @@ def _find_order(measured: Array, expected: Array) -> tuple[Index, float]:
     return places, lowest
 
 
-def _misfit(measured: Array, expected: Array, places: Index) -> Array:
+def _misfit(
+    measured: Array,
+    expected: Array,
+    places: Index,
+) -> Array:
     """Compute the misfit (S,) of S orders of the pads (S, P)."""
     works = np.isfinite(measured).all(axis=0)
     m = measured[:, works]

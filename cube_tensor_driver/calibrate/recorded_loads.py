@@ -32,14 +32,21 @@ Nothing is interpolated over a longer one.
 """
 
 MAX_LOADS = 4000
-"""Maximum number of loads that a fit is given. Neighbours of more samples are averaged."""
+"""Maximum number of loads that a fit is given, because its time grows with them.
+
+If there are more samples, neighbouring samples are averaged.
+"""
 
 MAX_LISTED_CUBES = 20
 """Number of cubes that an error message lists."""
 
 
 def read_recorded_loads(
-    path: Path, name: str | None, reference: str, layout: Layout, area: float | None
+    path: Path,
+    name: str | None,
+    reference: str,
+    layout: Layout,
+    area: float | None,
 ) -> tuple[Loads, Calibration]:
     """Read the loads of a cube from a bag.
 
@@ -96,7 +103,11 @@ def read_recorded_loads(
     return loads, replace(calibration, rest_frequency=rest)
 
 
-def _find_cube(source: BagSource, path: Path, name: str | None) -> int:
+def _find_cube(
+    source: BagSource,
+    path: Path,
+    name: str | None,
+) -> int:
     """Return the number of a cube. BagError: there is no such cube, or more than one."""
     names = [cube.name for cube in source.skin.cubes]
     listed = ", ".join(names[:MAX_LISTED_CUBES])
@@ -107,7 +118,11 @@ def _find_cube(source: BagSource, path: Path, name: str | None) -> int:
     return 0 if name is None else names.index(name)
 
 
-def _read_samples(source: BagSource, number: int, n_pads: int) -> tuple[Times, AnyArray, AnyArray]:
+def _read_samples(
+    source: BagSource,
+    number: int,
+    n_pads: int,
+) -> tuple[Times, AnyArray, AnyArray]:
     """Return time stamps (N,), frequencies (N, P) and temperatures (N,) of a cube.
 
     Samples with a pad that the device reports as broken are left out.
@@ -123,7 +138,12 @@ def _read_samples(source: BagSource, number: int, n_pads: int) -> tuple[Times, A
 
 
 def _read_reference(
-    bag: Bag, topic: str, number: int, layout: Layout, area: float | None, half_side: float
+    bag: Bag,
+    topic: str,
+    number: int,
+    layout: Layout,
+    area: float | None,
+    half_side: float,
 ) -> tuple[Times, Array]:
     """Return times (N,), rising, in ns, and states (N, M), in Pa. BagError: see the caller."""
     types = {one.msgtype for one in bag.connections if one.topic == topic}
@@ -167,7 +187,11 @@ def _read_reference(
     return stamp_ns, np.nan_to_num(state)
 
 
-def _read_batches(bag: Bag, topic: str, number: int) -> tuple[Times, Array]:
+def _read_batches(
+    bag: Bag,
+    topic: str,
+    number: int,
+) -> tuple[Times, Array]:
     """Return times (N,), in ns, and components (N, 15) of a cube in SkinStress messages."""
     parts = []
     for messages, _ in bag.stress(topic):

@@ -66,8 +66,8 @@ def least_squares(a: Array, b: Array) -> Array:
     return solution
 
 
-def hidden_directions(jacobian: Array) -> Array:
-    """Return the directions (parameters, H) of the scaled parameters that change no reading."""
+def null_space(jacobian: Array) -> Array:
+    """Return a basis (parameters, H) of the changes of scaled parameters that no reading shows."""
     scaled, _ = _scale_columns(jacobian)
     _, s, vt = np.linalg.svd(scaled, full_matrices=True)
     rank = int(np.sum(s > DIRECTION_TOLERANCE * s[0])) if s[0] > 0 else 0
@@ -75,13 +75,17 @@ def hidden_directions(jacobian: Array) -> Array:
     return directions
 
 
-def find_undetermined(hidden: Array, count: int) -> Mask:
-    """Return which of the first parameters (count,) a hidden direction changes."""
-    undetermined: Mask = np.linalg.norm(hidden[:count], axis=1) > DIRECTION_TOLERANCE
+def find_undetermined(null: Array, count: int) -> Mask:
+    """Return which of the first parameters (count,) a direction of the null space changes."""
+    undetermined: Mask = np.linalg.norm(null[:count], axis=1) > DIRECTION_TOLERANCE
     return undetermined
 
 
-def robust_covariance(jacobian: Array, r: Array, scale: float) -> Array:
+def robust_covariance(
+    jacobian: Array,
+    r: Array,
+    scale: float,
+) -> Array:
     """Compute Huber's covariance scale^2 <psi^2> / <psi'>^2 (J'J)^-1 of Tukey's estimate.
 
     It is corrected for the number of parameters.
@@ -97,7 +101,7 @@ def robust_covariance(jacobian: Array, r: Array, scale: float) -> Array:
     u = np.where(np.abs(r) < TUKEY_LIMIT, (r / TUKEY_LIMIT) ** 2, 1)
     psi_squared = np.mean((r * (1 - u) ** 2) ** 2)
     psi_slope = np.mean((1 - u) * (1 - 5 * u))
-    rank = jacobian.shape[1] - hidden_directions(jacobian).shape[1]
+    rank = jacobian.shape[1] - null_space(jacobian).shape[1]
     dof = max(len(r) - rank, 1)
     factor = psi_squared / psi_slope**2 * len(r) / dof
 

@@ -24,7 +24,11 @@ StatusBits = NDArray[np.uint16]
 AnyArray = NDArray[Any]
 
 
-def pad_table(values: Sequence[Array], n_pads: int, fill: float) -> Array:
+def pad_table(
+    values: Sequence[Array],
+    n_pads: int,
+    fill: float,
+) -> Array:
     """Stack arrays of different lengths (P_i,) into a table (len(values), n_pads).
 
     Cubes of one skin may have different numbers of pads. The places of pads that a cube does not

@@ -277,7 +277,9 @@ class Calibration:
 
 
 def illustrative(
-    layout_name: str, neglect: Sequence[str] = (), uid: int | None = None
+    layout_name: str,
+    neglect: Sequence[str] = (),
+    uid: int | None = None,
 ) -> Calibration:
     """Return the illustrative calibration of a built-in layout.
 
@@ -302,7 +304,7 @@ def illustrative(
         rest_frequency=np.array(REST_FREQUENCY),
         beta=np.array(BETA),
         modulus=np.array(FOAM_MODULUS),
-        # The slope dv/df at rest is E (1 + beta) / f0.
+        # An error of the frequency, times the slope E (1 + beta) / f0, is an error of the stress.
         noise=np.array(FOAM_MODULUS * (1 + BETA) * FREQUENCY_NOISE),
         source="illustrative",
     )
@@ -349,7 +351,11 @@ def _read_coefficients(value: Any) -> dict[str, float]:
     return {name: _read_number(item, f"coefficient {name!r}") for name, item in value.items()}
 
 
-def _read_array(value: Any, shape: tuple[int, ...] | None, name: str) -> Array:
+def _read_array(
+    value: Any,
+    shape: tuple[int, ...] | None,
+    name: str,
+) -> Array:
     """Return numbers as a read-only array of a shape (None: of any shape).
 
     Raises:

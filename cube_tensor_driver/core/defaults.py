@@ -22,7 +22,7 @@ POISSONS_RATIO = 0.48
 """Poisson's ratio of the elastomer, which is nearly incompressible."""
 
 HALF_SIDE = 2e-3
-"""Half side d0 of a cube, in m."""
+"""Half side d0 of a cube (half its edge length), in m."""
 
 REST_FREQUENCY = 100e3
 """Frequency of a pad without load, in Hz."""

@@ -33,8 +33,11 @@ A combination of modes below it moves the pads so little that its amplitude woul
 """
 
 LEAK_TOLERANCE = 1e-3
-"""Largest part of a component, relative to its size, that may lie along combinations of modes that
-the pads do not respond to. A component with a larger part is not observed."""
+"""Largest relative part of an observed component that may be invisible to the pads.
+
+A component is a sum of modes. The part of the sum that lies along combinations of modes to which no
+pad responds cannot be measured.
+"""
 
 FALSE_ALARM = 1e-3
 """Probability that pads with nothing but their stated noise set the residual bit."""
@@ -74,12 +77,6 @@ class Estimator:
     def dof(self) -> int:
         """Number of degrees of freedom of chi-square."""
         return len(self.null)
-
-    def chi2(self, pad_stress: Array) -> Array:
-        """Compute chi-square (N,) of pad stresses (N, P); missing pads may hold any number."""
-        whitened = np.asarray(pad_stress) @ self.null.T
-        chi2: Array = np.sum(whitened**2, axis=-1)
-        return chi2
 
     def suspects(self, pad_stress: Array) -> Mask:
         """Find the pads that, broken alone, explain a high chi-square.
@@ -179,7 +176,9 @@ def make_estimator(
 
 
 def summarize_response(
-    structure: Structure, response: Array, neglect: Sequence[str] = ()
+    structure: Structure,
+    response: Array,
+    neglect: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Summarise, in plain types, which modes a response determines and how well.
 

@@ -190,7 +190,11 @@ def _parse_terms(name: str) -> list[tuple[float, int]]:
     return terms
 
 
-def _make_modes(names: Sequence[str], axes: str, symmetric: bool = True) -> Modes:
+def _make_modes(
+    names: Sequence[str],
+    axes: str,
+    symmetric: bool = True,
+) -> Modes:
     """Construct modes from their names.
 
     Args:

@@ -29,7 +29,12 @@ from .arrays import Array, Real
 from .errors import CalibrationError
 
 
-def pad_stress(frequency: ArrayLike, rest_frequency: ArrayLike, beta: Real, modulus: Real) -> Array:
+def pad_stress(
+    frequency: ArrayLike,
+    rest_frequency: ArrayLike,
+    beta: Real,
+    modulus: Real,
+) -> Array:
     """Compute normal stresses in Pa, tension positive, from frequencies in Hz."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
@@ -41,7 +46,12 @@ def pad_stress(frequency: ArrayLike, rest_frequency: ArrayLike, beta: Real, modu
         return np.where(is_possible, v, np.nan)
 
 
-def pad_frequency(stress: ArrayLike, rest_frequency: Real, beta: Real, modulus: Real) -> Array:
+def pad_frequency(
+    stress: ArrayLike,
+    rest_frequency: Real,
+    beta: Real,
+    modulus: Real,
+) -> Array:
     """Compute frequencies in Hz from stresses in Pa, the inverse of `pad_stress`.
 
     The result is NaN at or below -E, where no thickness is left.
@@ -54,7 +64,10 @@ def pad_frequency(stress: ArrayLike, rest_frequency: Real, beta: Real, modulus: 
 
 
 def stress_slope(
-    frequency: ArrayLike, rest_frequency: ArrayLike, beta: Real, modulus: Real
+    frequency: ArrayLike,
+    rest_frequency: ArrayLike,
+    beta: Real,
+    modulus: Real,
 ) -> Array:
     """Compute the derivative dv/df in Pa/Hz; at rest it is E (1 + beta) / f0."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)

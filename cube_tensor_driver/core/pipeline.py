@@ -40,9 +40,9 @@ With it every pad has a highest frequency. It changes the strain by 1e-12.
 """
 
 LOWEST_STRESS_MARGIN = 1e-6
-"""Relative margin, a few roundings of float32, within which a pad stress is close to that of f = 0.
+"""Relative distance from the pad stress of f = 0 within which a row is examined pad by pad.
 
-Such rows are examined again, pad by pad.
+It covers a few rounding errors of float32.
 """
 
 MAX_SEPARATE_PRODUCTS = 8
@@ -489,7 +489,11 @@ class Pipeline:
         )
 
     def _make_blocks(self, group: Index) -> list[_Block]:
-        """Divide a scan into products, by calibration or (if these are many) by number of pads."""
+        """Divide the rows of a scan into blocks that share a matrix product.
+
+        A block holds the rows of one calibration or, if there are many calibrations, all rows with
+        the same number of pads.
+        """
         is_separate = len(self._groups) <= MAX_SEPARATE_PRODUCTS
         n_pads = self._exists.sum(axis=1)[group]
         shared = group if is_separate else n_pads
@@ -568,7 +572,9 @@ def _pack_bits(bits: Mask) -> Times:
 
 
 def _group_by_mask(
-    group: Index, mask: Times, also_good: bool = False
+    group: Index,
+    mask: Times,
+    also_good: bool = False,
 ) -> Iterator[tuple[int, int, Index]]:
     """Collect the rows of each distinct pair of group and bit mask of bad pads.
 

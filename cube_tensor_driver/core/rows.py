@@ -172,7 +172,11 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
     return kind(*columns)
 
 
-def _fill_column(cube: AnyArray, values: Any, dtype: type) -> AnyArray:
+def _fill_column(
+    cube: AnyArray,
+    values: Any,
+    dtype: type,
+) -> AnyArray:
     """Return a column (N,) of values (N,), or of one value for all rows."""
     return np.array(np.broadcast_to(values, cube.shape), dtype)
 

@@ -166,7 +166,11 @@ def default_modes(layout: Layout) -> Modes:
     return PLANE if layout.planar else SPACE
 
 
-def find_structure(layout: Layout, symmetry: str = "full", modes: Modes | None = None) -> Structure:
+def find_structure(
+    layout: Layout,
+    symmetry: str = "full",
+    modes: Modes | None = None,
+) -> Structure:
     """Derive the response matrices that a symmetry allows for a layout.
 
     Args:
@@ -181,7 +185,11 @@ def find_structure(layout: Layout, symmetry: str = "full", modes: Modes | None =
 
 
 @lru_cache(maxsize=64)
-def _derive_structure(layout: Layout, symmetry: str, modes: Modes) -> Structure:
+def _derive_structure(
+    layout: Layout,
+    symmetry: str,
+    modes: Modes,
+) -> Structure:
     elements = find_layout_group(layout, symmetry)
     pad_images = np.array([map_pads(layout, element) for element in elements])
     mode_images, mode_signs = _read_signed_permutations(

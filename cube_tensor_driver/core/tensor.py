@@ -103,7 +103,11 @@ def rotate_gradient(gradient: Array, rotation: ArrayLike) -> Array:
     return rotated
 
 
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+def rotation_from_rpy(
+    roll: float,
+    pitch: float,
+    yaw: float,
+) -> Array:
     """Return Rz(yaw) Ry(pitch) Rx(roll) (3, 3) of angles in rad, fixed axes as in URDF.
 
     It takes coordinates of the cube to those of its parent frame.
@@ -112,7 +116,11 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     return rotation
 
 
-def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+def quaternion_from_rpy(
+    roll: float,
+    pitch: float,
+    yaw: float,
+) -> Array:
     """Return the quaternion x, y, z, w (4,) of `rotation_from_rpy`, with w not negative."""
     w, x, y, z = euler.euler2quat(roll, pitch, yaw, _FIXED_AXES)
     # Both signs are the same rotation; choosing one makes equal rotations equal numbers.
@@ -168,7 +176,11 @@ def face_force(stress: Real, side: Array | float) -> Array:
     return force
 
 
-def contact_wrench(stress: Real, gradient: Real, side: float) -> tuple[Array, Array]:
+def contact_wrench(
+    stress: Real,
+    gradient: Real,
+    side: float,
+) -> tuple[Array, Array]:
     """Compute force and torque on a square in the plane of the face +z.
 
         force  = w^2 sigma n

@@ -26,16 +26,19 @@ SECOND = 1_000_000_000
 """One second, in ns."""
 
 MAX_CACHED_LAYOUTS = 32
-"""Number of layouts of messages that a codec keeps in memory."""
+"""Number of layouts of messages that a codec keeps in memory.
+
+There is one per skin and number of scans in a message.
+"""
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 """First bytes of a message in little-endian CDR."""
 
 PER_PAD = -1
-"""Width of a field that has one value per pad in each row."""
+"""Value of `_Field.width` for a field that has one value per pad in each row."""
 
 PER_MESSAGE = 0
-"""Width of a field that has one value per message."""
+"""Value of `_Field.width` for a field that has one value per message."""
 
 _SECONDS_AT = len(LITTLE_ENDIAN)
 _NANOSECONDS_AT = _SECONDS_AT + 4
@@ -170,7 +173,12 @@ class MessageBuffer(Generic[AnyRows]):
         rows: Rows to write into. All columns but `stamp_ns` are views of the bytes of the message.
     """
 
-    def __init__(self, codec: MessageCodec[AnyRows], layout: _Layout, frame_id: bytes) -> None:
+    def __init__(
+        self,
+        codec: MessageCodec[AnyRows],
+        layout: _Layout,
+        frame_id: bytes,
+    ) -> None:
         self._record = np.zeros(1, layout.record)
         codec.write_constants(self._record, layout, frame_id)
         stamp_ns = np.zeros(layout.shape.rows, np.int64)
@@ -181,7 +189,7 @@ class MessageBuffer(Generic[AnyRows]):
         self._columns = [getattr(self.rows, name) for name in self._names]
 
     def fill(self, rows: AnyRows) -> None:
-        """Copy as many rows as the buffer was made for."""
+        """Copy rows into the message; their number must be that of the buffer."""
         for name, column in zip(self._names, self._columns, strict=True):
             column[:] = getattr(rows, name)
 
@@ -202,7 +210,12 @@ class MessageBuffer(Generic[AnyRows]):
 class MessageCodec(Generic[AnyRows]):
     """Decodes and encodes one type of message."""
 
-    def __init__(self, name: str, rows: type[AnyRows], message_fields: tuple[_Field, ...]) -> None:
+    def __init__(
+        self,
+        name: str,
+        rows: type[AnyRows],
+        message_fields: tuple[_Field, ...],
+    ) -> None:
         """Describe a type of message.
 
         Args:
@@ -247,7 +260,12 @@ class MessageCodec(Generic[AnyRows]):
         end = _align(_FRAME_AT + frame) + 4
         return data[SHAPE_AT:end]
 
-    def buffer(self, frame_id: bytes, rows: int, pads: int = 0) -> MessageBuffer[AnyRows]:
+    def buffer(
+        self,
+        frame_id: bytes,
+        rows: int,
+        pads: int = 0,
+    ) -> MessageBuffer[AnyRows]:
         """Return a message to fill.
 
         Args:
@@ -258,7 +276,12 @@ class MessageCodec(Generic[AnyRows]):
         layout = self._find_layout(_Shape(len(frame_id), rows, pads))
         return MessageBuffer(self, layout, frame_id)
 
-    def encode(self, rows: AnyRows, frame_id: bytes, stamp_ns: int | None = None) -> bytes:
+    def encode(
+        self,
+        rows: AnyRows,
+        frame_id: bytes,
+        stamp_ns: int | None = None,
+    ) -> bytes:
         """Encode rows as one message.
 
         Args:
@@ -270,7 +293,12 @@ class MessageCodec(Generic[AnyRows]):
             stamp_ns = int(rows.stamp_ns.min())
         return self.encode_many(rows, np.array([stamp_ns]), frame_id)[0]
 
-    def encode_many(self, rows: AnyRows, stamp_ns: Times, frame_id: bytes) -> list[bytes]:
+    def encode_many(
+        self,
+        rows: AnyRows,
+        stamp_ns: Times,
+        frame_id: bytes,
+    ) -> list[bytes]:
         """Encode rows as M messages of one shape.
 
         Args:
@@ -298,7 +326,12 @@ class MessageCodec(Generic[AnyRows]):
         }
         return self._rows(**columns)
 
-    def write_constants(self, record: AnyArray, layout: _Layout, frame_id: bytes) -> None:
+    def write_constants(
+        self,
+        record: AnyArray,
+        layout: _Layout,
+        frame_id: bytes,
+    ) -> None:
         """Write what all messages of a layout have in common into records (M,)."""
         record["encapsulation"] = LITTLE_ENDIAN
         record["frame_id"] = np.void(frame_id)
@@ -355,10 +388,16 @@ class MessageCodec(Generic[AnyRows]):
             )
         return shape
 
-    def _check_counts(self, layout: _Layout, data: bytes, count: int) -> None:
+    def _check_counts(
+        self,
+        layout: _Layout,
+        data: bytes,
+        count: int,
+    ) -> None:
         """Raise MessageError if a sequence does not have as many values as the rows need."""
         size, expected = layout.record.itemsize, layout.counts
-        # A message may end between two words, so each row of the view has its own length.
+        # The size of a message need not be a multiple of 4, so the rows of this view of words are
+        # `size` bytes apart.
         words = np.ndarray((count, size // 4), "<u4", data, 0, (size, 4))
         counts = words.take(layout.count_words, axis=1)
         # Comparing bytes takes a third of the time that comparing arrays takes.
@@ -455,7 +494,7 @@ def _read_column(record: AnyArray, name: str) -> AnyArray:
 
 
 def _align(place: int) -> int:
-    """Return the next multiple of 4."""
+    """Round a place up to a multiple of 4."""
     return -(-place // 4) * 4
 
 

@@ -68,7 +68,12 @@ def contacts_message(
     return make(CONTACTS, header=_make_header(make, stamp_ns, frame_id), **fields)
 
 
-def traction_message(make: MakeMessage, stamp_ns: int, frame_id: str, cloud: Array) -> Any:
+def traction_message(
+    make: MakeMessage,
+    stamp_ns: int,
+    frame_id: str,
+    cloud: Array,
+) -> Any:
     """Make a PointCloud2.
 
     Args:
@@ -136,12 +141,20 @@ def _collect(contacts: Sequence[Any], name: str) -> Array:
     return np.array([getattr(contact, name) for contact in contacts], float)
 
 
-def _make_header(make: MakeMessage, stamp_ns: int, frame_id: str) -> Any:
+def _make_header(
+    make: MakeMessage,
+    stamp_ns: int,
+    frame_id: str,
+) -> Any:
     seconds, nanoseconds = divmod(stamp_ns, SECOND)
     stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
-def _make_xyz(make: MakeMessage, kind: str, vector: Array) -> Any:
+def _make_xyz(
+    make: MakeMessage,
+    kind: str,
+    vector: Array,
+) -> Any:
     x, y, z = vector.tolist()
     return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)

@@ -16,7 +16,10 @@ HOLD_WINDOWS = 3
 while a pad has an intermittent contact."""
 
 MIN_COUNT = 20
-"""Minimum number of rows in a window for its statistics to be used."""
+"""Minimum number of rows in a window for its statistics to be used.
+
+With fewer rows, the noise is too uncertain for the limits below.
+"""
 
 NOISY_ENTER = 10.0
 """Ratio of a pad's noise to its usual noise above which the pad becomes noisy.
@@ -73,7 +76,7 @@ class Conditions:
 
     def add(self, cube: Index, bits: StatusBits) -> None:
         """Add conditions (n, P) that were just found on cubes (n,)."""
-        # A pad that is broken for good brings nothing new in each row, and this saves the work.
+        # A pad that is broken for good brings the same bits with every row, which need no work.
         if (bits & ~self._recent[0][cube]).any():
             np.bitwise_or.at(self._recent[0], cube, bits)
             self._combine()
@@ -122,8 +125,10 @@ class PadDiagnosis:
         """
         self._exists = exists
         self.still: Mask = np.zeros(len(exists), bool)
-        self._mean_at_rest = np.full(exists.shape, np.nan)  # NaN while the cube moves
-        self._mean_before = self._mean_at_rest.copy()  # mean of the last window with rows
+        # Mean frequencies of the first window since the cube is still; NaN while it moves.
+        self._mean_at_rest = np.full(exists.shape, np.nan)
+        # Mean frequencies of the last window with rows.
+        self._mean_before = self._mean_at_rest.copy()
 
     def set_reference(self, rest_frequency: Array, noise: Array) -> None:
         """Set rest frequency and noise of the pads (cubes, P), in Hz, NaN for missing pads."""
@@ -172,7 +177,11 @@ class PadDiagnosis:
         return stuck
 
     def _update_still(
-        self, window: Window, span: Real, has_enough_rows: Mask, state: StatusBits
+        self,
+        window: Window,
+        span: Real,
+        has_enough_rows: Mask,
+        state: StatusBits,
     ) -> None:
         limit = STILL_MAX_SPAN * self.noise
         # A step between two windows is visible in the span of neither.
@@ -195,7 +204,11 @@ class PadDiagnosis:
         return drifting
 
 
-def has_high_residual(was_high: Mask, over_limit: Index, rows: Index) -> Mask:
+def has_high_residual(
+    was_high: Mask,
+    over_limit: Index,
+    rows: Index,
+) -> Mask:
     """Decide, with hysteresis, which cubes have a high residual after a window.
 
     Noise alone exceeds the limit in one row of a thousand, so a share of the rows decides. Cubes

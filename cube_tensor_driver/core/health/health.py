@@ -98,8 +98,9 @@ class Health:
         self.closed = 0
         self.newest_ns = 0
         self._window_end_ns: int | None = None
-        self._over_limit = np.zeros(n_cubes, int)  # rows of this window with a high residual
-        # These two gather what `collect` returns.
+        # Number of rows in the present window with a residual above its limit.
+        self._over_limit = np.zeros(n_cubes, int)
+        # The next two gather what `collect` returns.
         self._rows = np.zeros(n_cubes, int)
         self._had_high_residual = np.zeros(n_cubes, bool)
         self.refresh()
@@ -280,8 +281,13 @@ class Health:
         self._conditions.end_window(found, window.rows > 0)
         self._clear_window()
 
-    def _mark_impossible(self, cube: Index, frequency: Single, is_possible: Mask) -> None:
-        """Add the conditions of pads whose frequency (n, P) no thickness explains."""
+    def _mark_impossible(
+        self,
+        cube: Index,
+        frequency: Single,
+        is_possible: Mask,
+    ) -> None:
+        """Add OPEN, SHORT or RANGE for pads whose frequency (n, P), in Hz, is impossible."""
         is_impossible = ~is_possible & self._exists[cube]
         rows = np.flatnonzero(is_impossible.any(axis=1))
         cube, frequency = cube[rows], frequency[rows]

@@ -113,7 +113,8 @@ class WindowStatistics:
         # Time stamp of the newest row of each cube, and the interval before it; 0 is unknown.
         self._time_ns = np.zeros(n_cubes, np.int64)
         self._interval_ns = np.zeros(n_cubes, np.int64)
-        self._is_doubtful = np.zeros(n_cubes, bool)  # stamp of the newest row
+        # Whether the newest stamp of each cube is doubtful; then so is the interval after it.
+        self._is_doubtful = np.zeros(n_cubes, bool)
         self._waiting = _WaitingScans(slice(0), (0, 0))
         self.clear()
 
@@ -156,7 +157,11 @@ class WindowStatistics:
         self._gap_within[:] = 0
 
     def add(
-        self, cubes: Cubes, frequency: Single, stamp_ns: Times, doubtful: Mask | None = None
+        self,
+        cubes: Cubes,
+        frequency: Single,
+        stamp_ns: Times,
+        doubtful: Mask | None = None,
     ) -> None:
         """Add B scans of the same N cubes.
 
@@ -188,7 +193,11 @@ class WindowStatistics:
             self._add(waiting.cubes, waiting.frequency[:count], waiting.stamp_ns[:count])
 
     def _add(
-        self, cubes: Cubes, frequency: Single, stamp_ns: Times, doubtful: Mask | None = None
+        self,
+        cubes: Cubes,
+        frequency: Single,
+        stamp_ns: Times,
+        doubtful: Mask | None = None,
     ) -> None:
         chosen = self._pads[:, cubes]
         last, difference, first_squares, second_squares, bounded_squares = chosen[:5]
@@ -240,7 +249,10 @@ class WindowStatistics:
         )
 
     def _find_doubtful_intervals(
-        self, cubes: Cubes, doubtful: Mask | None, scans: int
+        self,
+        cubes: Cubes,
+        doubtful: Mask | None,
+        scans: int,
     ) -> Mask | None:
         """Return which intervals have a doubtful stamp at an end (B, N); None stands for none."""
         before = self._is_doubtful[cubes]
@@ -253,7 +265,10 @@ class WindowStatistics:
         return intervals
 
     def _measure_pace(
-        self, cubes: Cubes, stamp_ns: Times, doubtful: Mask | None
+        self,
+        cubes: Cubes,
+        stamp_ns: Times,
+        doubtful: Mask | None,
     ) -> tuple[Single, Single] | None:
         """Compute r and w of B scans from the intervals between the rows of a cube.
 

@@ -84,7 +84,11 @@ class _Check(NamedTuple):
 
 
 def measure_rest(
-    pipeline: Pipeline, health: Health, cubes: Sequence[int], duration: float, names: Sequence[str]
+    pipeline: Pipeline,
+    health: Health,
+    cubes: Sequence[int],
+    duration: float,
+    names: Sequence[str],
 ) -> Array:
     """Compute the rest frequencies that a tare sets.
 
@@ -124,12 +128,15 @@ def measure_rest(
 
 
 def _select_windows(
-    health: Health, chosen: Index, duration: float, names: Sequence[str]
+    health: Health,
+    chosen: Index,
+    duration: float,
+    names: Sequence[str],
 ) -> list[Window]:
     """Return the windows to average. TareError: there are not enough data."""
     if not 0 < duration <= MAX_DURATION_S:
         raise TareError(f"tare over {duration:g} s; allowed: above 0 to {MAX_DURATION_S:g} s")
-    # A duration such as 0.1 + 0.2 + 0.2 must not take another window for its last bit.
+    # The rounding error of a duration such as 0.1 + 0.2 + 0.2 must not add a window.
     count = math.ceil(duration / WINDOW_S - 1e-9)
     if len(health.history) < count:
         raise TareError(
@@ -154,7 +161,11 @@ def _select_windows(
 
 
 def _refuse_gaps(
-    health: Health, chosen: Index, windows: Sequence[Window], rows: Index, names: Sequence[str]
+    health: Health,
+    chosen: Index,
+    windows: Sequence[Window],
+    rows: Index,
+    names: Sequence[str],
 ) -> None:
     """Raise TareError if rows of a cube are too far apart in time to be averaged.
 
@@ -199,7 +210,11 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
 
 
 def _list_checks(
-    pipeline: Pipeline, health: Health, chosen: Index, rest: Array, means: _Means
+    pipeline: Pipeline,
+    health: Health,
+    chosen: Index,
+    rest: Array,
+    means: _Means,
 ) -> list[_Check]:
     calibrations = [pipeline.calibrations[cube] for cube in chosen.tolist()]
     frequencies = [calibration.rest_frequency for calibration in calibrations]
@@ -232,7 +247,11 @@ def _list_checks(
 
 
 def _apply_check(
-    check: _Check, used: Mask, chosen: Index, pipeline: Pipeline, names: Sequence[str]
+    check: _Check,
+    used: Mask,
+    chosen: Index,
+    pipeline: Pipeline,
+    names: Sequence[str],
 ) -> None:
     """Raise TareError that names the worst pad, if one of the used pads exceeds the limit."""
     # Written so that NaN exceeds every limit.
