@@ -136,8 +136,9 @@ print(*tops - sys.stdlib_module_names)
     assert set(python(script).split()) <= {"cube_tensor_driver", "numpy", "transforms3d"}
 
 
-# Module -> wheel -> rosdep key, where the names differ. rosdep has no key for the last ones: the
-# commands that need them say so where they are missing.
+# Module -> wheel -> rosdep key, where the names differ. package.xml does not name the last ones:
+# rosdep has no key for them, or only commands that display something need them. Those commands say
+# what is missing.
 WHEELS = {
     "serial": "pyserial",
     "yaml": "pyyaml",
@@ -148,9 +149,12 @@ WHEELS = {
 KEYS = {
     "pyserial": "python3-serial",
     "pyyaml": "python3-yaml",
-    "pillow": "python3-pil",
 } | dict.fromkeys(
     (
+        "rich",
+        "psutil",
+        "matplotlib",
+        "pillow",
         "rosbags",
         "scikit-fem",
         "pyarrow",

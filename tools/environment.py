@@ -48,13 +48,12 @@ NEEDED = {
     "transforms3d": "python3-transforms3d",
     "yaml": "python3-yaml",
     "jsonschema": "python3-jsonschema",
-    "rich": "python3-rich",
-    "psutil": "python3-psutil",
     "scipy": "python3-scipy",
-    "matplotlib": "python3-matplotlib",
-    "PIL": "python3-pil",
 }
-"""Module -> rosdep key, of all that a sourced ROS 2 may lack."""
+"""Module -> rosdep key, of all that package.xml names and a sourced ROS 2 may lack.
+
+Commands that need more, such as rich to display something, name themselves what is missing.
+"""
 
 
 PIP_OPTIONS = (

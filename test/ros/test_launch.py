@@ -149,6 +149,22 @@ def test_every_node_runs_with_what_package_xml_installs(ros, robot, tmp_path):
         children.check()
 
 
+@pytest.mark.parametrize("node", ["driver", "reconstruction", "composed"])
+def test_a_node_imports_nothing_that_it_does_not_use(node):
+    """No scipy and nothing that only displays, so that it starts soon."""
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    program = f"import sys, cube_tensor_driver.ros.nodes.{node}; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert {"numpy", "rclpy"} <= loaded and not loaded & set(MODULES)
+    ours = {
+        name.split(".")[1] for name in done.stdout.split() if name.startswith("cube_tensor_driver.")
+    }
+    assert not ours & {"bags", "browser", "cli", "mechanics", "simulation", "touch", "views"}
+
+
 @pytest.mark.usefixtures("domain")
 def test_a_bag_as_config_names_the_missing_library(robot, tmp_path):
     bag = tmp_path / "run1.mcap"
