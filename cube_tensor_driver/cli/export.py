@@ -80,8 +80,8 @@ def run(options: argparse.Namespace) -> int:
         CubeError: The options or the output cannot be used; nothing was begun.
     """
     from ..bags.reprocess.all_bags import RECIPE
-    from ..lerobot.choices import Choices
     from ..lerobot.export import check_empty, export_lerobot
+    from ..lerobot.plan import Choices
     from ..views.terminal.output import progress_bar
 
     if options.what in TABLES:

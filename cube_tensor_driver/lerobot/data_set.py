@@ -1,67 +1,139 @@
-"""A data set that is being written: its frames, and all that is said about them."""
+"""The files of a LeRobot data set, version 3.0: Parquet in data/ and meta/, and JSON in meta/.
+
+Source: `lerobot.datasets` of the package lerobot 0.4.4, which reads and writes them.
+"""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pyarrow
+import pyarrow.parquet
 
 from ..config.skin import Skin
+from ..core.arrays import AnyArray
 from ..core.modes import COMPONENTS, STRESS
-from .files import COUNTED, DataFiles, feature, info, write_episodes, write_json, write_tasks
-from .others import Topic
+from .images import IMAGES, EncodedImage
 from .plan import BagPlan, Episode
 from .statistics import Statistics
-from .topics import IMAGES
+from .topics import Topic
 from .windows import COLUMNS, TACTILE
+
+VERSION = "v3.0"
+"""Version of LeRobot's format."""
+
+MAX_FILES_PER_CHUNK = 1000
+"""Largest number of files in one folder."""
+
+MAX_FILE_MB = 100
+"""Size, in MB, from which on the next episode begins a new file; an episode is never divided."""
+
+FILE_NAME = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+"""Name of the Parquet files in data/ and in meta/episodes/."""
+
+COUNTED = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+"""Features that every data set has, with their types."""
+
+_IMAGE = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
 
 
 class DataSet:
-    """Written episode after episode.
+    """A data set that is written episode after episode; a context manager.
 
-    fps: frames per second; depth: samples in a window
-    frames: written so far; episodes: descriptions of those that are complete
-    widths: columns of the features that have statistics, by name
+    Attributes:
+        fps: Frames per second.
+        depth: Number of samples in a window.
+        widths: Number of columns of each feature that has statistics.
+        frames: Number of frames written so far.
+        episodes: Descriptions of the complete episodes.
     """
 
     def __init__(
-        self, folder: Path, skin: Skin, topics: list[Topic], fps: int, depth: int, samples: int
+        self, folder: Path, skin: Skin, topics: list[Topic], *, fps: int, depth: int, samples: int
     ) -> None:
-        """samples: of cubes, to come."""
+        """Create the folder.
+
+        Args:
+            folder: Folder of the data set.
+            skin: Skin of all bags.
+            topics: Other topics.
+            fps: Frames per second.
+            depth: Number of samples in a window.
+            samples: Number of samples of cubes that are to come.
+        """
         (folder / "meta").mkdir(parents=True)
         self.fps, self.depth = fps, depth
-        self.files = DataFiles(folder)
         self.frames = 0
         self.episodes: list[dict[str, Any]] = []
         self.widths = {TACTILE: len(COMPONENTS), f"{TACTILE}.residual": 1}
         self.widths |= {topic.key: topic.shape[2] or len(topic.names) for topic in topics}
         self.widths |= dict.fromkeys(COUNTED, 1)
         self._folder, self._skin, self._topics = folder, skin, topics
-        self._total = {key: Statistics(width, samples) for key, width in self.widths.items()}
+        self._image_keys = {topic.key for topic in topics if topic.msgtype in IMAGES}
+        self._statistics = {key: Statistics(width, samples) for key, width in self.widths.items()}
         self._tasks: list[str] = []
         self._calibrations: list[dict[str, Any]] = []
+        self._writer: Any = None
+        self._path = folder
+        self._file_number = -1
+
+    def __enter__(self) -> DataSet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close_file()
 
     def begin_episode(self, task: str) -> tuple[dict[str, int], int]:
-        """In which file it goes, and the number of its task."""
+        """Return the place of the next episode's file, and the number of its task."""
         if task not in self._tasks:
             self._tasks.append(task)
-        return self.files.begin_episode(), self._tasks.index(task)
+        if self._writer is None or self._path.stat().st_size >= MAX_FILE_MB << 20:
+            self._close_file()
+            self._file_number += 1
+        chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
+        place = {"chunk_index": chunk, "file_index": file}
+        if self._writer is None:
+            self._path = self._folder / "data" / FILE_NAME.format(**place)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+        return {f"data/{name}": number for name, number in place.items()}, self._tasks.index(task)
 
-    def write(self, columns: dict[str, Any]) -> None:
-        """Frames that follow each other."""
-        self.files.write(columns)
-        self.frames += len(columns[TACTILE])
+    def write(self, columns: dict[str, AnyArray | list[EncodedImage]]) -> None:
+        """Write frames that follow each other, as one row group."""
+        table = pyarrow.table({name: _column(values) for name, values in columns.items()})
+        if self._writer is None:
+            # Measured numbers hardly repeat: a dictionary of them only costs time.
+            self._writer = pyarrow.parquet.ParquetWriter(
+                self._path, table.schema, compression="zstd", use_dictionary=False
+            )
+        self._writer.write_table(table)
+        self.frames += len(table)
+
+    def count(self, key: str, rows: AnyArray, of_episode: dict[str, Statistics]) -> None:
+        """Add rows (n, D) of a feature to the statistics of the data set and of an episode."""
+        self._statistics[key].add(rows)
+        of_episode[key].add(rows)
 
     def end_episode(
-        self, plan: BagPlan, episode: Episode, place: dict[str, int], stats: dict[str, Statistics]
+        self,
+        plan: BagPlan,
+        episode: Episode,
+        place: dict[str, int],
+        statistics: dict[str, Statistics],
     ) -> None:
-        """Describe an episode whose frames are written. place: the file it is in."""
+        """Describe an episode whose frames are written; `place` is that of its file."""
         frames = len(episode.counts)
         described = {
             "episode_index": len(self.episodes),
-            "tasks": [episode.span.task],
+            "tasks": [episode.task],
             "length": frames,
             **place,
             "dataset_from_index": self.frames - frames,
@@ -69,67 +141,87 @@ class DataSet:
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
             "bag": plan.path.name,
-            "begin_ns": episode.frames.begin_ns,
+            "begin_ns": episode.begin_ns,
         }
-        for key, one in stats.items():
-            self._total[key].add_all(one)
-            for name, values in self._shaped(key, one.result(frames)).items():
+        for key, one in statistics.items():
+            for name, values in self._as_lists(key, one.result(frames)).items():
                 described[f"stats/{key}/{name}"] = values
         self.episodes.append(described)
 
     def note_calibrations(self, bag: str, since_ns: int, ids: list[str]) -> None:
-        """With which calibrations of the cubes the samples of a bag are made from a stamp on."""
+        """Note with which calibrations of the cubes the stress of a bag is made from a stamp on."""
         if not self._calibrations or self._calibrations[-1]["ids"] != ids:
             self._calibrations.append({"bag": bag, "since_ns": since_ns, "ids": ids})
 
     def write_meta(self) -> None:
-        """What describes the data, once it is complete."""
-        write_episodes(self._folder, self.episodes)
-        write_tasks(self._folder, self._tasks)
-        counts = (len(self.episodes), self.frames, len(self._tasks))
-        described = info(self._features(), self.fps, self._skin.name, *counts)
-        write_json(self._folder / "meta" / "info.json", described)
-        stats = {
-            key: self._shaped(key, one.result(self.frames)) for key, one in self._total.items()
+        """Write what describes the data, once it is complete."""
+        meta = self._folder / "meta"
+        path = meta / "episodes" / FILE_NAME.format(chunk_index=0, file_index=0)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(self.episodes), path)
+        pyarrow.parquet.write_table(_task_table(self._tasks), meta / "tasks.parquet")
+        _write_json(
+            meta / "info.json",
+            {
+                "codebase_version": VERSION,
+                "robot_type": self._skin.name,
+                "total_episodes": len(self.episodes),
+                "total_frames": self.frames,
+                "total_tasks": len(self._tasks),
+                "chunks_size": MAX_FILES_PER_CHUNK,
+                "data_files_size_in_mb": MAX_FILE_MB,
+                "video_files_size_in_mb": 2 * MAX_FILE_MB,
+                "fps": self.fps,
+                "splits": {"train": f"0:{len(self.episodes)}"},
+                "data_path": f"data/{FILE_NAME}",
+                "video_path": None,
+                "features": self._features(),
+            },
+        )
+        statistics = {
+            key: self._as_lists(key, one.result(self.frames))
+            for key, one in self._statistics.items()
         }
-        write_json(self._folder / "meta" / "stats.json", stats)
+        _write_json(meta / "stats.json", statistics)
 
-    def _shaped(self, key: str, result: dict[str, NDArray[Any]]) -> dict[str, Any]:
-        """Statistics as lists; those of images (bands, 1, 1)."""
-        image = any(topic.key == key and topic.kind in IMAGES for topic in self._topics)
+    def _close_file(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def _as_lists(self, key: str, result: dict[str, AnyArray]) -> dict[str, Any]:
+        """Return statistics as lists; those of images have the shape (bands, 1, 1)."""
+        is_image = key in self._image_keys
         return {
-            name: (values[:, None, None] if image and name != "count" else values).tolist()
+            name: (values[:, None, None] if is_image and name != "count" else values).tolist()
             for name, values in result.items()
         }
 
     def _features(self) -> dict[str, Any]:
-        """As in info.json. What is said of the skin stands where LeRobot says what is special
-        about a feature, so that its tools carry it on."""
+        """Describe the features as info.json does.
+
+        The skin is described in ``info`` of a feature, which LeRobot's tools carry on.
+        """
         cubes = len(self._skin.cubes)
         window = (self.depth, cubes)
-        features = {
-            TACTILE: feature(
-                "float32",
-                (*window, len(COMPONENTS)),
-                ["sample", "cube", "component"],
-                info=describe_skin(self._skin) | {"calibrations": self._calibrations},
-            )
-        }
+        about = describe_skin(self._skin) | {"calibrations": self._calibrations}
+        tactile = _feature("float32", (*window, len(COMPONENTS)), ["sample", "cube", "component"])
+        features = {TACTILE: tactile | {"info": about}}
         for name, kind in COLUMNS.items():
-            key, dtype = f"{TACTILE}.{name}", np.dtype(kind).name
-            features[key] = feature(dtype, window, ["sample", "cube"])
-        features[f"{TACTILE}.count"] = feature("int64", (cubes,), list(self._skin.names))
+            dtype = np.dtype(kind).name
+            features[f"{TACTILE}.{name}"] = _feature(dtype, window, ["sample", "cube"])
+        features[f"{TACTILE}.count"] = _feature("int64", (cubes,), list(self._skin.names))
         for topic in self._topics:
-            if topic.kind in IMAGES:
+            if topic.key in self._image_keys:
                 names = ["height", "width", "channels"]
-                features[topic.key] = feature("image", topic.shape, names)
+                features[topic.key] = _feature("image", topic.shape, names)
             else:
-                features[topic.key] = feature("float32", (len(topic.names),), topic.names)
-        return features | {key: feature(kind, (1,)) for key, kind in COUNTED.items()}
+                features[topic.key] = _feature("float32", (len(topic.names),), topic.names)
+        return features | {key: _feature(kind, (1,), None) for key, kind in COUNTED.items()}
 
 
 def describe_skin(skin: Skin) -> dict[str, Any]:
-    """What the numbers of `observation.tactile` mean: components, units, cubes and their poses."""
+    """Describe the numbers of `observation.tactile`: components, units, cubes and their poses."""
     cubes = [
         {
             "name": cube.name,
@@ -151,3 +243,43 @@ def describe_skin(skin: Skin) -> dict[str, Any]:
         "pose_units": "m, rad (fixed axes x y z)",
         "cubes": cubes,
     }
+
+
+def _feature(dtype: str, shape: tuple[int, ...], names: list[str] | None) -> dict[str, Any]:
+    """Describe a feature as info.json does."""
+    return {"dtype": dtype, "shape": list(shape), "names": names}
+
+
+def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
+    """Return (n, ...) as lists of lists, (n, 1) as n numbers, and images as their bytes."""
+    if isinstance(values, list):
+        return pyarrow.array([{"bytes": image.data, "path": None} for image in values], _IMAGE)
+    array = pyarrow.array(np.ascontiguousarray(values).reshape(-1))
+    shape = values.shape[1:]
+    if shape == (1,):
+        return array
+    for size in reversed(shape):
+        offsets = np.arange(0, len(array) + 1, size, dtype=np.int32)
+        array = pyarrow.ListArray.from_arrays(offsets, array)
+    return array
+
+
+def _task_table(tasks: list[str]) -> pyarrow.Table:
+    """Return the numbers of the tasks, with the texts as what pandas reads as the table's index."""
+
+    def column(name: str, pandas_type: str, numpy_type: str) -> dict[str, Any]:
+        kinds = {"pandas_type": pandas_type, "numpy_type": numpy_type}
+        return {"name": name, "field_name": name, **kinds, "metadata": None}
+
+    described = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [column("task_index", "int64", "int64"), column("task", "unicode", "object")],
+        "pandas_version": "2.0.0",
+    }
+    table = pyarrow.table({"task_index": range(len(tasks)), "task": tasks})
+    return table.replace_schema_metadata({"pandas": json.dumps(described)})
+
+
+def _write_json(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,36 +1,47 @@
-"""Bags to one data set: plan all bags, then reconstruct each and write its frames."""
+"""Bags exported to one data set: plan all bags, then reconstruct each and write its frames."""
 
 from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
+
+import numpy as np
 
 from ..bags.read import Bag
 from ..bags.reprocess.job import reconstruct, settings_with
 from ..bags.source import open_bag
 from ..config.skin import Skin
+from ..core.arrays import AnyArray
 from ..core.errors import BagError
 from ..core.rows import StressRows
-from .choices import Choices
 from .data_set import DataSet
-from .episode_writer import EpisodeWriter
-from .others import Others, Topic, find_topics
-from .plan import BagPlan, plan_bag
+from .plan import BagPlan, Choices, Episode, Report, plan_bag
+from .statistics import Statistics
+from .topics import Topic, TopicReader, find_topics
+from .windows import TACTILE, Windows
 
-Report = Callable[[float, float, str], None]
-"""Called with what is done, the total, and what is being done."""
+MAX_SAMPLED_IMAGES = 20
+"""Number of images of an episode from which statistics are taken."""
+PIXEL_STRIDE = 4
+"""Distance of the pixels from which statistics are taken, along height and width."""
 
 
-class Exported(NamedTuple):
-    """What was written, and what was not.
+@dataclass(frozen=True)
+class Exported:
+    """What was exported, and what was left out.
 
-    rows: samples of cubes; features: of the other topics
-    depth: samples in a window; usual: samples in most windows
-    outside, unknown, empty: as in `BagPlan`, of all bags
+    Attributes:
+        episodes: Number of episodes.
+        frames: Number of frames.
+        rows: Number of samples of cubes.
+        depth: Number of samples in a window.
+        usual: Number of samples in most windows.
+        features: Names of the features of other topics.
+        outside, unknown, empty: As in `BagPlan`, summed over all bags.
     """
 
     episodes: int
@@ -47,27 +58,40 @@ class Exported(NamedTuple):
 def export_lerobot(
     bags: Sequence[Path], folder: Path, choices: Choices, report: Report
 ) -> Exported:
-    """Write a data set into a folder that is empty or not there yet. It appears when it is
-    complete.
+    """Write a data set, which appears when it is complete.
 
-    BagError: what is wrong with a bag, the choices or the folder.
+    Args:
+        bags: Folders or files of bags.
+        folder: Folder of the data set, empty or not there yet.
+        choices: What goes into it, and how.
+        report: Function that is told about progress.
+
+    Raises:
+        BagError: A bag is damaged, the choices do not fit, or the folder cannot be written.
     """
     check_empty(folder)
-    plans = [_plan(path, choices, report) for path in bags]
-    skin = _one_skin(plans)
+    plans = [plan_bag(path, choices, report) for path in bags]
+    skin = _check_same_skin(plans)
     episodes = [episode for plan in plans for episode in plan.episodes]
     if not episodes:
         raise BagError(f"{bags[0]}: no sample lies between the marks; nothing to export")
     topics = find_topics(bags, choices)
     depth = max(int(episode.counts.max()) for episode in episodes)
-    rows = sum(int(episode.counts.sum()) for episode in episodes)
+    samples = sum(episode.rows for episode in episodes)
     partial = folder.absolute().parent / f"{folder.absolute().name}.partial"
     try:
         shutil.rmtree(partial, ignore_errors=True)
-        data_set = DataSet(partial, skin, list(topics.values()), choices.fps, depth, rows)
-        with data_set.files:
+        data_set = DataSet(
+            partial,
+            skin,
+            list(topics.values()),
+            fps=choices.fps,
+            depth=depth,
+            samples=samples,
+        )
+        with data_set:
             for plan in plans:
-                _add_bag(data_set, plan, topics, choices, report)
+                _write_bag(data_set, plan, topics, choices, report)
         data_set.write_meta()
         partial.replace(folder)
     except OSError as error:
@@ -77,76 +101,137 @@ def export_lerobot(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return Exported(
-        len(episodes),
-        data_set.frames,
-        rows,
-        depth,
-        math.ceil(max(plan.rate for plan in plans) / choices.fps),
-        [topic.key for topic in topics.values()],
-        sum(plan.outside for plan in plans),
-        sum(plan.unknown for plan in plans),
-        sum(plan.empty for plan in plans),
+        episodes=len(episodes),
+        frames=data_set.frames,
+        rows=samples,
+        depth=depth,
+        usual=math.ceil(max(plan.rate for plan in plans) / choices.fps),
+        features=[topic.key for topic in topics.values()],
+        outside=sum(plan.outside for plan in plans),
+        unknown=sum(plan.unknown for plan in plans),
+        empty=sum(plan.empty for plan in plans),
     )
 
 
 def check_empty(folder: Path) -> None:
-    """BagError: there is something in a folder for results."""
+    """Check that a folder for results has no content.
+
+    Raises:
+        BagError: It has.
+    """
     if folder.is_dir() and any(folder.iterdir()):
         raise BagError(f"{folder} is not empty; name another folder, or remove what is in it")
 
 
-def _plan(path: Path, choices: Choices, report: Report) -> BagPlan:
-    def counted(done: int, total: int) -> None:
-        report(done, total, f"counting {path}")
+class EpisodeWriter:
+    """Writes one episode: rows of stress go in, frames with all features come out."""
 
-    return plan_bag(path, choices.fps, choices.frequencies, choices.task, choices.marks, counted)
+    def __init__(
+        self, data_set: DataSet, plan: BagPlan, episode: Episode, topics: TopicReader
+    ) -> None:
+        """Prepare an episode of a bag, whose other topics `topics` reads."""
+        self._data_set, self._plan, self._episode = data_set, plan, episode
+        self._topics = topics
+        self._windows = Windows(episode.counts, data_set.depth)
+        self._place: dict[str, int] = {}
+        self._task = 0
+        self._statistics = {
+            key: Statistics(width, episode.rows if key.startswith(TACTILE) else len(episode.counts))
+            for key, width in data_set.widths.items()
+        }
+
+    def add(self, rows: StressRows) -> int:
+        """Take the rows that belong to the episode, and return their number."""
+        inside = self._episode.contains(rows.stamp_ns)
+        if not inside.any():
+            return 0
+        rows = rows.select(inside)
+        self._windows.add(self._episode.sample_frame_of(rows.stamp_ns), rows)
+        self._count(TACTILE, np.hstack([rows.stress, rows.gradient]))
+        self._count(f"{TACTILE}.residual", rows.residual[:, np.newaxis])
+        return len(rows)
+
+    def write(self) -> bool:
+        """Write the frames that are complete, and return whether all are.
+
+        Only one episode can be written at a time: the first one that is not complete.
+        """
+        for windows in self._windows.complete():
+            if not self._place:
+                self._place, self._task = self._data_set.begin_episode(self._episode.task)
+            self._write_frames(windows)
+        is_complete = self._windows.done == len(self._episode.counts)
+        if is_complete:
+            self._data_set.end_episode(self._plan, self._episode, self._place, self._statistics)
+        return is_complete
+
+    def _write_frames(self, windows: dict[str, AnyArray]) -> None:
+        """Write the frames of windows that have just been made."""
+        data_set, last = self._data_set, self._windows.done
+        first = last - len(windows[TACTILE])
+        frame = np.arange(first, last)
+        counted: dict[str, Any] = {
+            "timestamp": (frame / data_set.fps).astype(np.float32),
+            "frame_index": frame,
+            "episode_index": np.full(len(frame), len(data_set.episodes)),
+            "index": np.arange(data_set.frames, data_set.frames + len(frame)),
+            "task_index": np.full(len(frame), self._task),
+        }
+        columns = self._topics.at(self._episode, first, last)
+        columns |= {key: values[:, np.newaxis] for key, values in counted.items()}
+        data_set.write(windows | columns)
+
+        # Reading every pixel would take longer than everything else.
+        stride = -(-len(self._episode.counts) // MAX_SAMPLED_IMAGES)
+        for key, values in columns.items():
+            if isinstance(values, np.ndarray):
+                self._count(key, values)
+                continue
+            for image in values[-first % stride :: stride]:
+                pixels = image.pixels()[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+                self._count(key, pixels.reshape(-1, pixels.shape[2]))
+
+    def _count(self, key: str, rows: AnyArray) -> None:
+        self._data_set.count(key, rows, self._statistics)
 
 
-def _one_skin(plans: list[BagPlan]) -> Skin:
-    """BagError: the bags were recorded with different cubes, or in other places."""
+def _check_same_skin(plans: list[BagPlan]) -> Skin:
+    """Return the skin of all bags, which must have the same cubes in the same places."""
     first = plans[0]
-    for plan in plans[1:]:
-        for cube, other in zip(first.skin.cubes, plan.skin.cubes, strict=False):
-            if (cube.name, cube.xyz, cube.rpy) != (other.name, other.xyz, other.rpy):
-                raise BagError(
-                    f"{plan.path}: cube {other.name} at {other.xyz}, in {first.path} {cube.name} "
-                    f"at {cube.xyz}; export them into two folders"
-                )
-        if len(first.skin.cubes) != len(plan.skin.cubes):
+    places = [[(one.name, one.xyz, one.rpy) for one in plan.skin.cubes] for plan in plans]
+    for plan, place in zip(plans, places, strict=True):
+        if place != places[0]:
+            cube = next((one for one in place if one not in places[0]), ("none", "", ""))
             raise BagError(
-                f"{plan.path} has {len(plan.skin.cubes)} cubes, {first.path} "
-                f"{len(first.skin.cubes)}; export them into two folders"
+                f"{plan.path}: {len(place)} cubes, among them {cube[0]} at {cube[1]}; {first.path} "
+                f"has {len(places[0])} cubes in other places; export them into two folders"
             )
     return first.skin
 
 
-def _add_bag(
+def _write_bag(
     data_set: DataSet, plan: BagPlan, topics: dict[str, Topic], choices: Choices, report: Report
 ) -> None:
-    """All episodes of a bag. BagError: damaged, or the overrides do not fit."""
-    with ExitStack() as stack:
-        others = Others(stack.enter_context(Bag(plan.path)), topics)
-        writers = [EpisodeWriter(data_set, plan, one, others) for one in plan.episodes]
-        waiting = iter(writers)
-        now = next(waiting, None)
-        total = sum(int(one.counts.sum()) for one in plan.episodes)
+    """Write all episodes of a bag."""
+    with Bag(plan.path) as bag:
+        reader = TopicReader(bag, topics)
+        waiting = [EpisodeWriter(data_set, plan, episode, reader) for episode in plan.episodes]
+        total = sum(episode.rows for episode in plan.episodes)
         done = 0
-        for rows in _rows(data_set, plan, choices):
-            for writer in writers:
-                done += writer.add(rows)
-            while now is not None and now.write():
-                now = next(waiting, None)
+        for rows in _stress_rows(data_set, plan, choices):
+            # Rows of links that are late may belong to the episode before.
+            done += sum(writer.add(rows) for writer in waiting)
+            while waiting and waiting[0].write():
+                waiting.pop(0)
             report(done, total, f"exporting {plan.path}")
 
 
-def _rows(data_set: DataSet, plan: BagPlan, choices: Choices) -> Iterator[StressRows]:
-    """The stress of all rows of cubes that the skin has."""
+def _stress_rows(data_set: DataSet, plan: BagPlan, choices: Choices) -> Iterator[StressRows]:
+    """Yield the stress of all rows of cubes that the skin has."""
     with open_bag(plan.path, choices.frequencies) as source:
         settings = settings_with(source, choices.overrides)
         for segment, rows in reconstruct(source, choices.overrides):
-            known = rows.cube < len(source.skin.cubes)
-            if not known.all():
-                rows = rows.select(known)
+            rows = rows.select(rows.cube < len(source.skin.cubes))
             if len(rows):
                 ids = [one.id for one in settings[segment.number].calibrations]
                 data_set.note_calibrations(plan.path.name, int(rows.stamp_ns.min()), ids)

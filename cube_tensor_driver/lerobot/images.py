@@ -5,126 +5,152 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from ..bags.read import Bag
+from ..bags.recording import stamp_ns
+from ..core.arrays import Single
 from ..core.errors import BagError
-from .frames import Frames
-from .topics import stamp_ns
+from .plan import Episode
 
-ENCODINGS: dict[str, tuple[str, list[int] | None]] = {
-    "rgb8": ("RGB", None),
-    "8UC3": ("RGB", None),
-    "bgr8": ("RGB", [2, 1, 0]),
-    "rgba8": ("RGBA", None),
-    "bgra8": ("RGBA", [2, 1, 0, 3]),
-    "mono8": ("L", None),
-    "8UC1": ("L", None),
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+"""Types of messages with an image."""
+
+MODES = {
+    "rgb8": ("RGB", "RGB"),
+    "8UC3": ("RGB", "RGB"),
+    "bgr8": ("RGB", "BGR"),
+    "rgba8": ("RGBA", "RGBA"),
+    "bgra8": ("RGBA", "BGRA"),
+    "mono8": ("L", "L"),
+    "8UC1": ("L", "L"),
 }
-"""Of sensor_msgs/Image -> mode of Pillow, and the order of its bands in the message."""
-BANDS = {"L": 1, "RGB": 3, "RGBA": 4}
+"""Pillow's mode of each encoding of sensor_msgs/Image, and the order of the bands in a message."""
+
+MODE_OF_BANDS = {1: "L", 3: "RGB", 4: "RGBA"}
+"""Pillow's mode by the number of bands."""
+
+Shape = tuple[int, int, int]
+"""Height, width and number of bands of an image."""
 
 
 @dataclass(frozen=True)
-class Encoded:
-    """An image in a file format. shape: height, width, bands."""
+class EncodedImage:
+    """An image in a file format.
+
+    Attributes:
+        data: Content of the file.
+        shape: Its height, width and number of bands.
+    """
 
     data: bytes
-    shape: tuple[int, int, int]
+    shape: Shape
 
-    def pixels(self) -> NDArray[np.float32]:
-        """(H, W, bands) from 0 to 1."""
+    def pixels(self) -> Single:
+        """Return the pixels (H, W, bands) from 0 to 1."""
         with Image.open(io.BytesIO(self.data)) as image:
-            return np.asarray(image, np.float32).reshape(self.shape) / np.float32(255)
+            pixels: Single = np.asarray(image, np.float32) / np.float32(255)
+        return pixels.reshape(self.shape)
 
 
 class ImageStream:
-    """The images on one topic of a bag, in the order of recording; of a bag without it, none.
+    """The images on one topic of a bag in the order of recording; none where it lacks the topic.
 
-    shape: of all images; None: of the first. BagError: one cannot be read, or has another shape.
+    Attributes:
+        shape: Shape of all images.
     """
 
-    def __init__(
-        self, bag: Bag, topic: str, kind: str, shape: tuple[int, int, int] | None = None
-    ) -> None:
+    def __init__(self, bag: Bag, topic: str, shape: Shape | None = None) -> None:
+        """Read the first image.
+
+        Args:
+            bag: Open bag.
+            topic: Topic of the images.
+            shape: Shape that all images must have; None: that of the first.
+
+        Raises:
+            BagError: The image cannot be read.
+        """
         self._bag, self._topic = bag, topic
-        self._raw = kind.endswith("/Image")
-        self._coming = self._read()
-        self._next = next(self._coming, None)
-        self._newest: Encoded | None = None
-        self._black: Encoded | None = None
-        if shape is None:
-            shape = self._encode(self._next[1]).shape if self._next else (1, 1, 1)
-        self.shape = shape
+        self._unread = self._read()
+        self._next = next(self._unread, None)
+        self.shape = shape or (self._encode(self._next[1]).shape if self._next else (1, 1, 1))
+        # Black stands where no image has come yet.
+        mode = MODE_OF_BANDS[self.shape[2]]
+        self._latest = _as_png(Image.new(mode, (self.shape[1], self.shape[0])))
 
-    def at(self, frames: Frames, first: int, last: int) -> list[Encoded]:
-        """The newest image before the end of each frame; black before the first."""
-        return [self._at(frames, number) for number in range(first, last)]
+    def at(self, episode: Episode, first: int, last: int) -> list[EncodedImage]:
+        """Return the newest image before the end of each frame from first to before last.
 
-    def _at(self, frames: Frames, number: int) -> Encoded:
+        Raises:
+            BagError: An image cannot be read, or has another shape.
+        """
+        return [self._newest_in(episode, frame) for frame in range(first, last)]
+
+    def _newest_in(self, episode: Episode, frame: int) -> EncodedImage:
+        """Read on until the end of a frame."""
         message = None
-        while self._next and frames.number_of(np.array(self._next[0])) <= number:
+        while self._next and episode.frame_of(np.array(self._next[0])) <= frame:
             message = self._next[1]
-            self._next = next(self._coming, None)
+            self._next = next(self._unread, None)
         if message is not None:
-            self._newest = self._encode(message)
-            if self._newest.shape != self.shape:
-                raise BagError(
-                    f"{self._bag.path}: {self._topic}: an image of {self._newest.shape} after "
-                    f"ones of {self.shape}; leave the topic out by naming the others with --topics"
-                )
-        if self._newest is None and self._black is None:
-            self._black = black(self.shape)
-        return self._newest or self._black  # type: ignore[return-value]
+            self._latest = self._encode(message)
+            if self._latest.shape != self.shape:
+                self._fail(f"an image of {self._latest.shape} after ones of {self.shape}")
+        return self._latest
 
     def _read(self) -> Iterator[tuple[int, Any]]:
+        """Yield stamp and message."""
         for entry in self._bag.entries({self._topic}):
             message = self._bag.decode(entry)
             yield stamp_ns(message), message
 
-    def _encode(self, message: Any) -> Encoded:
-        where = f"{self._bag.path}: {self._topic}"
+    def _encode(self, message: Any) -> EncodedImage:
+        """Return the image of a message."""
         try:
-            return as_png(message) if self._raw else as_it_is(message)
+            return encode_raw(message) if hasattr(message, "encoding") else keep_encoded(message)
         except (UnidentifiedImageError, OSError, ValueError) as error:
-            raise BagError(
-                f"{where}: {error}; leave the topic out by naming the others with --topics"
-            ) from None
+            self._fail(str(error))
+
+    def _fail(self, reason: str) -> NoReturn:
+        raise BagError(
+            f"{self._bag.path}: {self._topic}: {reason}; leave the topic out by naming the others "
+            "with --topics"
+        ) from None
 
 
-def as_png(message: Any) -> Encoded:
-    """A sensor_msgs/Image. ValueError: an encoding that PNG does not have, or too few bytes."""
-    if message.encoding not in ENCODINGS:
-        raise ValueError(f"encoding {message.encoding}; known: {', '.join(ENCODINGS)}")
-    mode, order = ENCODINGS[message.encoding]
-    shape = (int(message.height), int(message.width), BANDS[mode])
-    size = shape[1] * shape[2]
-    if message.step < size or len(message.data) < message.step * shape[0] or not size * shape[0]:
-        raise ValueError(f"{len(message.data)} bytes for an image of {shape}")
-    lines = np.asarray(message.data)[: message.step * shape[0]].reshape(shape[0], message.step)
-    pixels = lines[:, :size].reshape(shape)
-    return _png(pixels if order is None else pixels[..., order], mode)
+def encode_raw(message: Any) -> EncodedImage:
+    """Encode a sensor_msgs/Image as PNG.
+
+    Raises:
+        ValueError: PNG does not have its encoding, or it has too few bytes.
+    """
+    if message.encoding not in MODES:
+        raise ValueError(f"encoding {message.encoding}; known: {', '.join(MODES)}")
+    mode, order = MODES[message.encoding]
+    size = int(message.width), int(message.height)
+    if not all(size):
+        raise ValueError(f"an image of {size[0]} x {size[1]} pixels")
+    # Pillow checks the number of bytes; lines may be longer than their pixels.
+    data = np.asarray(message.data).tobytes()
+    return _as_png(Image.frombuffer(mode, size, data, "raw", order, int(message.step), 1))
 
 
-def as_it_is(message: Any) -> Encoded:
-    """A sensor_msgs/CompressedImage. OSError: no image that Pillow knows."""
+def keep_encoded(message: Any) -> EncodedImage:
+    """Take a sensor_msgs/CompressedImage as it is.
+
+    Raises:
+        OSError: Pillow does not know the format.
+    """
     data = bytes(message.data)
     with Image.open(io.BytesIO(data)) as image:
-        return Encoded(data, (image.height, image.width, len(image.getbands())))
+        return EncodedImage(data, (image.height, image.width, len(image.getbands())))
 
 
-def black(shape: tuple[int, int, int]) -> Encoded:
-    """What stands where no image had come yet."""
-    mode = next(mode for mode, bands in BANDS.items() if bands == shape[2])
-    return _png(np.zeros(shape, np.uint8), mode)
-
-
-def _png(pixels: NDArray[np.uint8], mode: str) -> Encoded:
+def _as_png(image: Image.Image) -> EncodedImage:
     file = io.BytesIO()
-    image = Image.fromarray(np.ascontiguousarray(pixels.squeeze(-1) if mode == "L" else pixels))
     image.save(file, "PNG", compress_level=1)
-    return Encoded(file.getvalue(), (pixels.shape[0], pixels.shape[1], BANDS[mode]))
+    return EncodedImage(file.getvalue(), (image.height, image.width, len(image.getbands())))

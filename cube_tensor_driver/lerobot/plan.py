@@ -1,71 +1,165 @@
-"""The first pass over a bag: its episodes, and how many samples of each cube every frame holds.
+"""The first pass over a bag: its episodes, and how many samples of each cube every frame has.
 
-A window has one size in the whole data set, so it must be known before the first is written.
+A frame is one step of a data set. Frame k of an episode contains what was measured in a period::
+
+    begin + k / fps <= t < begin + (k + 1) / fps
+
+The window of samples has one size in the whole data set, so this size must be known before the
+first frame is written.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bags.read import Bag
+from ..bags.reprocess.job import AS_RECORDED, Overrides
 from ..bags.source import BagSource, open_bag
 from ..config.skin import Skin
+from ..core.arrays import AnyArray, Index, Mask, Times
 from ..core.errors import BagError
-from .frames import SECOND, Frames
+from ..messages.codec import SECOND
 
 MARK = "std_msgs/msg/String"
-FIRST_NS, LAST_NS = -(1 << 63), (1 << 63) - 1
-LONGEST = 10
-"""How many times as long as the recording the stamps may last: replayed bags may be faster."""
-DEEPEST = 10
-"""How many times as many samples as usual a frame may hold."""
-SLACK = 100
-"""Frames, or samples, that short recordings may have more than these bounds."""
-BLOCK = 256
-"""Frames that are counted in one array."""
+"""Type of the messages that divide a bag into episodes."""
+
+MIN_NS, MAX_NS = -(1 << 63), (1 << 63) - 1
+"""Smallest and largest time in 64 bits, in ns: the bounds of an episode without marks."""
+
+MAX_TIME_NS = 1 << 62
+"""Largest product of a time, in ns, and the frame rate. A stamp of a clock that was not set is
+limited to it, so that the product does not overflow."""
+
+MAX_STAMP_RATIO = 10
+"""Largest ratio of the time that stamps cover to the time of recording. Stamps of a bag that is
+replayed faster cover more time than its recording takes."""
+
+MAX_DEPTH_RATIO = 10
+"""Largest ratio of the samples in one frame to the usual number. Above it, one damaged stamp would
+make every window of the data set long."""
+
+TOLERANCE = 100
+"""Number of frames, or of samples, by which short recordings may exceed these two limits."""
+
+Report = Callable[[float, float, str], None]
+"""Function that is told what is done, the total, and what is being done."""
 
 
 @dataclass(frozen=True)
-class Span:
-    """When an episode was recorded, since_ns <= t < until_ns, and what was done in it."""
+class Choices:
+    """What a person chooses for a data set.
 
-    since_ns: int
-    until_ns: int
+    Attributes:
+        fps: Frames per second.
+        task: Task of every episode without a mark.
+        marks: Topic of the marks; None: each bag is one episode.
+        frequencies: Topic of the frequencies, where a bag has those of several skins.
+        topics: Other topics to add; None: all that can be added.
+        state: Topic that becomes observation.state; None: the only topic of joint states.
+        action: Topic that becomes action; None: there is none.
+        overrides: What differs from the recording, as for `reprocess`.
+    """
+
+    fps: int
     task: str
+    marks: str | None = None
+    frequencies: str | None = None
+    topics: Sequence[str] | None = None
+    state: str | None = None
+    action: str | None = None
+    overrides: Overrides = AS_RECORDED
 
 
-@dataclass(frozen=True, eq=False)
 class Episode:
-    """An episode of a bag. counts: (frames, cubes) samples of each cube in each frame."""
+    """An episode of a bag, and how many samples it has.
 
-    span: Span
-    frames: Frames
-    counts: NDArray[np.uint32]
+    Attributes:
+        task: What was done in it.
+        begin_ns: Stamp of its first sample, in ns, at which frame 0 begins.
+        rows: Number of samples of cubes.
+        counts: (frames, cubes) number of samples of each cube in each frame.
+    """
 
-    def rows_in(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(N,) which samples belong to it."""
-        return (stamp_ns >= self.span.since_ns) & (stamp_ns < self.span.until_ns)
+    def __init__(self, since_ns: int, until_ns: int, task: str, fps: int) -> None:
+        """Make an episode without samples, of the time since_ns <= t < until_ns."""
+        self.task = task
+        self.begin_ns = self.rows = 0
+        self.counts: AnyArray = np.zeros((0, 1), np.uint32)
+        self._since_ns, self._until_ns, self._fps = since_ns, until_ns, fps
 
-    def frame_of(self, stamp_ns: NDArray[np.int64]) -> NDArray[Any]:
-        """(N,) the frame of each sample. Some links sample a little before the first row."""
-        return np.maximum(self.frames.number_of(stamp_ns), 0)
+    def contains(self, stamp_ns: Times) -> Mask:
+        """Return which samples (N,) belong to the episode."""
+        return (stamp_ns >= self._since_ns) & (stamp_ns < self._until_ns)
+
+    def frame_of(self, stamp_ns: Times) -> Index:
+        """Return the frame of each instant (N,); it is below 0 before the episode."""
+        limit = MAX_TIME_NS // self._fps
+        since_ns = np.clip(stamp_ns - self.begin_ns, -limit, limit)
+        frames: Index = since_ns * self._fps // SECOND
+        return frames
+
+    def sample_frame_of(self, stamp_ns: Times) -> Index:
+        """Return the frame of each sample (N,); some links sample a little before the first row."""
+        return np.maximum(self.frame_of(stamp_ns), 0)
+
+    def count(self, cube: Index, stamp_ns: Times, n_cubes: int, max_frames: float) -> None:
+        """Count samples.
+
+        Args:
+            cube: (N,) index of the cube of each sample.
+            stamp_ns: (N,) stamps, in ns.
+            n_cubes: Number of cubes of the skin.
+            max_frames: Number of frames that the recording can have.
+
+        Raises:
+            BagError: A stamp is too far from the first one.
+        """
+        inside = self.contains(stamp_ns)
+        cube, stamp_ns = cube[inside], stamp_ns[inside]
+        if not len(cube):
+            return
+        if not self.rows:
+            self.begin_ns = int(stamp_ns.min())
+        frame = self.sample_frame_of(stamp_ns)
+        n_frames = int(frame.max()) + 1
+        if n_frames > max_frames:
+            late_s = (int(stamp_ns.max()) - self.begin_ns) / SECOND
+            raise BagError(
+                f"a sample is stamped {late_s:.0f} s after the first of its episode, "
+                "which is longer than was recorded: a clock was set; leave it out with --marks"
+            )
+        if n_frames > len(self.counts):
+            # The number of frames is known only at the end: the table grows by half each time.
+            larger = np.zeros((n_frames + n_frames // 2, n_cubes), np.uint32)
+            larger[: len(self.counts)] = self.counts
+            self.counts = larger
+        self.rows += len(cube)
+        np.add.at(self.counts.reshape(-1), frame * n_cubes + cube, 1)
+
+    def finish(self) -> None:
+        """Remove the frames behind the last sample."""
+        last = np.flatnonzero(self.counts.any(axis=1))[-1]
+        self.counts = self.counts[: last + 1]
 
 
 @dataclass(frozen=True, eq=False)
 class BagPlan:
     """What is exported of a bag.
 
-    rate: samples of a cube per second, the median of all cubes
-    outside: rows outside of all episodes; unknown: rows of cubes that the skin does not have
-    empty: marks without a sample
+    Attributes:
+        path: The bag.
+        skin: Its skin.
+        episodes: Its episodes that have samples.
+        rate: Samples of a cube per second, the median of all cubes.
+        outside: Number of rows outside of all episodes.
+        unknown: Number of rows of cubes that the skin does not have.
+        empty: Number of marks without a sample.
     """
 
     path: Path
@@ -77,153 +171,111 @@ class BagPlan:
     empty: int
 
 
-def plan_bag(
-    path: Path,
-    fps: int,
-    topic: str | None,
-    task: str,
-    marks: str | None,
-    report: Callable[[int, int], None],
-) -> BagPlan:
+def plan_bag(path: Path, choices: Choices, report: Report) -> BagPlan:
     """Count the samples of a bag.
 
-    topic: of the frequencies; marks: topic of the marks, None: the bag is one episode
-    BagError: no frequencies, no marks, stamps that do not follow time, fps above the sample rate.
+    Raises:
+        BagError: There are no frequencies or no marks, the stamps do not follow time, or there are
+            more frames than samples.
     """
-    with open_bag(path, topic) as source:
-        total = sum(c.msgcount for c in source.bag.connections if c.topic == source.topic)
-        spans = [Span(FIRST_NS, LAST_NS, task)] if marks is None else marked(source.bag, marks)
-        cubes = len(source.skin.cubes)
-        seconds = (source.bag.end_ns - source.bag.start_ns) / SECOND
-        counters = [_Counter(span, fps, cubes, seconds, path) for span in spans]
-        unknown = 0
-        samples = np.zeros(cubes, np.int64)
-        first_ns, last_ns = LAST_NS, FIRST_NS
+    with open_bag(path, choices.frequencies) as source:
+        total = sum(one.msgcount for one in source.bag.connections if one.topic == source.topic)
+        spans = [(MIN_NS, MAX_NS, choices.task)]
+        if choices.marks is not None:
+            spans = _marked_spans(source.bag, choices.marks)
+        episodes = [Episode(*span, choices.fps) for span in spans]
+        n_cubes = len(source.skin.cubes)
+        recorded_s = (source.bag.end_ns - source.bag.start_ns) / SECOND
+        max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + TOLERANCE
+
+        samples = np.zeros(n_cubes, np.int64)
+        first_ns, last_ns = MAX_NS, MIN_NS
         for rows in source:
-            known = rows.cube < cubes
-            unknown += int(len(rows) - known.sum())
-            cube, stamp_ns = rows.cube[known], rows.stamp_ns[known]
+            known = rows.cube < n_cubes
+            cube, stamp_ns = rows.cube[known].astype(np.intp), rows.stamp_ns[known]
             if len(cube):
-                samples += np.bincount(cube, minlength=cubes)
+                samples += np.bincount(cube, minlength=n_cubes)
                 first_ns = min(first_ns, int(stamp_ns.min()))
                 last_ns = max(last_ns, int(stamp_ns.max()))
-                for counter in counters:
-                    counter.add(cube, stamp_ns)
-            report(source.messages, total)
-        return _plan(source, counters, samples, (first_ns, last_ns), unknown, fps)
+                for episode in episodes:
+                    try:
+                        episode.count(cube, stamp_ns, n_cubes, max_frames)
+                    except BagError as error:
+                        raise BagError(f"{path}: {error}") from None
+            report(source.messages, total, f"counting {path}")
+
+    rate = _check_rate(source, samples, (last_ns - first_ns) / SECOND, choices.fps)
+    used = [episode for episode in episodes if episode.rows]
+    for episode in used:
+        episode.finish()
+        _check_depth(source, episode, math.ceil(rate / choices.fps))
+    return BagPlan(
+        path=path,
+        skin=source.skin,
+        episodes=used,
+        rate=rate,
+        outside=int(samples.sum()) - sum(episode.rows for episode in used),
+        unknown=source.rows - int(samples.sum()),
+        empty=len(episodes) - len(used),
+    )
 
 
-def _plan(
-    source: BagSource,
-    counters: list[_Counter],
-    samples: NDArray[np.int64],
-    covered_ns: tuple[int, int],
-    unknown: int,
-    fps: int,
-) -> BagPlan:
-    """BagError: as `plan_bag`."""
+def _check_rate(source: BagSource, samples: Index, seconds: float, fps: int) -> float:
+    """Return the sample rate of a bag, in Hz, if every frame can have a sample.
+
+    Args:
+        source: The bag.
+        samples: (cubes,) number of samples.
+        seconds: Time that the stamps cover, in s.
+        fps: Frames per second.
+    """
     path = source.bag.path
-    seconds = (covered_ns[1] - covered_ns[0]) / SECOND
-    there = samples[samples > 1]
-    if not len(there) or seconds <= 0:
+    several = samples[samples > 1]
+    if not len(several) or seconds <= 0:
         raise BagError(
             f"{path}: {samples.sum()} samples on {source.topic}, and no two of one cube; "
             "record longer"
         )
-    rate = float(np.median(there - 1)) / seconds
-    most = math.floor(rate * (1 + 1 / min(there)))
-    if fps > most:
+    rate = float(np.median(several - 1)) / seconds
+    # n samples bound n - 1 periods.
+    max_fps = math.floor(rate * (1 + 1 / int(several.min())))
+    if max_fps < 1:
         raise BagError(
-            f"{path}: --fps {fps}: the cubes were sampled {rate:.4g} times per second, so that "
-            f"frames would be without a sample; give at most {most}"
-            if most
-            else f"{path}: the cubes were sampled {rate:.2g} times per second; LeRobot counts "
+            f"{path}: the cubes were sampled {rate:.2g} times per second; LeRobot counts "
             "whole frames per second, and needed is at least one sample in each"
         )
-    episodes = [counter.episode() for counter in counters if counter.rows]
-    usual = math.ceil(rate / fps)
-    for episode in episodes:
-        deepest = int(episode.counts.max())
-        if deepest > DEEPEST * usual + SLACK:
-            frame, cube = np.unravel_index(episode.counts.argmax(), episode.counts.shape)
-            raise BagError(
-                f"{path}: {deepest} samples of cube {source.skin.names[cube]} in frame {frame}, "
-                f"usual are {usual}: stamps do not follow time; leave that time out with --marks"
-            )
-    inside = sum(counter.rows for counter in counters)
-    return BagPlan(
-        path,
-        source.skin,
-        episodes,
-        rate,
-        int(samples.sum()) - inside,
-        unknown,
-        len(counters) - len(episodes),
-    )
+    if fps > max_fps:
+        raise BagError(
+            f"{path}: --fps {fps}: the cubes were sampled {rate:.4g} times per second, so that "
+            f"frames would be without a sample; give at most {max_fps}"
+        )
+    return rate
 
 
-class _Counter:
-    """Counts the samples of one episode while its number of frames is not known yet."""
-
-    def __init__(self, span: Span, fps: int, cubes: int, seconds: float, path: Path) -> None:
-        """seconds: how long the recording lasts."""
-        self.rows = 0
-        self._span, self._fps, self._cubes, self._path = span, fps, cubes, path
-        self._most = LONGEST * seconds * fps + SLACK
-        self._blocks: dict[int, NDArray[np.uint32]] = {}
-        self._frames: Frames | None = None
-        self._last = 0
-
-    def add(self, cube: NDArray[np.uint16], stamp_ns: NDArray[np.int64]) -> None:
-        """BagError: a stamp is too far from the first."""
-        inside = (stamp_ns >= self._span.since_ns) & (stamp_ns < self._span.until_ns)
-        if not inside.all():
-            cube, stamp_ns = cube[inside], stamp_ns[inside]
-        if not len(cube):
-            return
-        if self._frames is None:
-            self._frames = Frames(int(stamp_ns.min()), self._fps)
-        number = np.maximum(self._frames.number_of(stamp_ns), 0)
-        self._last = max(self._last, int(number.max()))
-        if self._last > self._most:
-            late = (int(stamp_ns.max()) - self._frames.begin_ns) / SECOND
-            raise BagError(
-                f"{self._path}: a sample is stamped {late:.0f} s after the first of its episode, "
-                "which is longer than was recorded: a clock was set; leave it out with --marks"
-            )
-        self.rows += len(cube)
-        for block in np.unique(number // BLOCK).tolist():
-            counts = self._blocks.setdefault(block, np.zeros((BLOCK, self._cubes), np.uint32))
-            mine = number // BLOCK == block
-            places = (number[mine] - block * BLOCK) * self._cubes + cube[mine]
-            np.add.at(counts.reshape(-1), places, 1)
-
-    def episode(self) -> Episode:
-        """Once all rows were added; some were."""
-        counts = np.zeros((self._last + 1, self._cubes), np.uint32)
-        for block, part in self._blocks.items():
-            some = counts[block * BLOCK : (block + 1) * BLOCK]
-            some[:] = part[: len(some)]
-        return Episode(self._span, self._frames or Frames(0, self._fps), counts)
+def _check_depth(source: BagSource, episode: Episode, usual: int) -> None:
+    """Check that no frame has far more samples than usual, which would lengthen every window."""
+    depth = int(episode.counts.max())
+    if depth > MAX_DEPTH_RATIO * usual + TOLERANCE:
+        frame, cube = np.unravel_index(episode.counts.argmax(), episode.counts.shape)
+        raise BagError(
+            f"{source.bag.path}: {depth} samples of cube {source.skin.names[cube]} in frame "
+            f"{frame}, usual are {usual}: stamps do not follow time; leave that time out with "
+            "--marks"
+        )
 
 
-def marked(bag: Bag, topic: str) -> list[Span]:
-    """The episodes that marks bound. BagError: there are none.
+def _marked_spans(bag: Bag, topic: str) -> list[tuple[int, int, str]]:
+    """Return begin, end and task of the episodes that marks bound.
 
-    A mark is a text at the time when it was recorded: it begins an episode with this task, and
-    ends the one before. An empty text only ends one.
+    A mark is a text at the time when it was recorded: it begins an episode with this task, and ends
+    the one before. An empty text only ends one.
     """
     if topic not in bag.topics(MARK):
         names = ", ".join(bag.topics(MARK)) or "none"
         raise BagError(f"{bag.path}: no marks ({MARK}) on {topic}; topics of that type: {names}")
     marks = [(entry.time_ns, bag.decode(entry).data.strip()) for entry in bag.entries({topic})]
-    spans = list(_spans([*marks, (LAST_NS, "")]))
+    bounded = pairwise([*marks, (MAX_NS, "")])
+    spans = [(since_ns, until_ns, task) for (since_ns, task), (until_ns, _) in bounded if task]
     if not spans:
         raise BagError(f"{bag.path}: no mark on {topic} begins an episode; publish its task there")
     return spans
-
-
-def _spans(marks: list[tuple[int, str]]) -> Iterator[Span]:
-    for (since_ns, task), (until_ns, _) in pairwise(marks):
-        if task:
-            yield Span(since_ns, until_ns, task)

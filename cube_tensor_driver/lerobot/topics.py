@@ -1,118 +1,232 @@
-"""The other topics of a bag: numbers with a stamp, each frame with the newest before its end."""
+"""Other topics of the bags in a data set: images, joint states and numbers with a stamp.
+
+Each frame gets the newest message that is stamped before the end of the frame.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
 from ..bags.read import Bag
+from ..bags.recording import stamp_ns
+from ..core.arrays import Single, Times
 from ..core.errors import BagError
 from ..messages.types import PACKAGE
-from .frames import SECOND, Frames
+from .images import IMAGES, ImageStream, Shape
+from .plan import Choices, Episode
 
 JOINTS = "sensor_msgs/msg/JointState"
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 HEADER = "std_msgs/msg/Header"
-OF_JOINTS = ("position", "velocity", "effort")
+JOINT_FIELDS = ("position", "velocity", "effort")
+STATE, ACTION = "observation.state", "action"
+
+
+class Topic(NamedTuple):
+    """A topic that is added to a data set.
+
+    Attributes:
+        key: Name of its feature.
+        msgtype: Type of its messages.
+        names: Names of its numbers; empty for images.
+        shape: Shape of its images; zeros for numbers.
+    """
+
+    key: str
+    msgtype: str
+    names: list[str]
+    shape: Shape
 
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """Numbers on a topic. stamp_ns: (M,) ascending; names: of the D values; values: (M, D)."""
+    """The numbers on a topic.
+
+    Attributes:
+        names: Names of the D numbers.
+        stamp_ns: (M,) stamps in ascending order, in ns.
+        values: (M, D) values.
+    """
 
     names: list[str]
-    stamp_ns: NDArray[np.int64]
-    values: NDArray[np.float32]
+    stamp_ns: Times
+    values: Single
 
-    def at(self, frames: Frames, first: int, last: int, names: list[str]) -> NDArray[np.float32]:
-        """(last - first, names) the newest values before the end of each frame; NaN before the
-        first message, and for names that the bag does not have."""
-        # What is stamped in a frame belongs to it, as samples do.
-        number = frames.number_of(self.stamp_ns)
-        newest = np.searchsorted(number, np.arange(first, last), side="right") - 1
-        found = np.full((last - first, len(names)), np.nan, np.float32)
-        columns = [self.names.index(name) if name in self.names else -1 for name in names]
-        there = np.array(columns) >= 0
-        values = self.values[np.maximum(newest, 0)][:, columns]
-        known = (newest >= 0)[:, None] & there
-        found[known] = values[known]
+    def at(self, episode: Episode, first: int, last: int, names: list[str]) -> Single:
+        """Return the newest values (last - first, len(names)) before the end of each frame.
+
+        They are NaN before the first message, and for names that the bag does not have.
+        """
+        frames = np.arange(first, last)
+        newest = np.searchsorted(episode.frame_of(self.stamp_ns), frames, side="right") - 1
+        has_value = newest >= 0
+        found = np.full((len(frames), len(names)), np.nan, np.float32)
+        for column, name in enumerate(names):
+            if name in self.names:
+                values = self.values[:, self.names.index(name)]
+                found[has_value, column] = values[newest[has_value]]
         return found
 
 
-def stamped_topics(bag: Bag, skin: str) -> dict[str, str]:
-    """Topic -> type, of images, joint states and other messages of numbers behind a header.
+class TopicReader:
+    """The added topics of one bag."""
 
-    skin: prefix of the skin's own topics, which say nothing that the stress does not.
+    def __init__(self, bag: Bag, topics: dict[str, Topic]) -> None:
+        """Read the numbers, and prepare to read the images.
+
+        Args:
+            bag: Open bag.
+            topics: The topics by their names.
+        """
+        self._topics = topics
+        self._sources: dict[str, Signal | ImageStream] = {
+            name: ImageStream(bag, name, topic.shape)
+            if topic.msgtype in IMAGES
+            else read_signal(bag, name, topic.msgtype)
+            for name, topic in topics.items()
+        }
+
+    def at(self, episode: Episode, first: int, last: int) -> dict[str, Any]:
+        """Return the values in the frames from first to before last, by the features' names."""
+        found: dict[str, Any] = {}
+        for name, topic in self._topics.items():
+            source = self._sources[name]
+            if isinstance(source, Signal):
+                found[topic.key] = source.at(episode, first, last, topic.names)
+            else:
+                found[topic.key] = source.at(episode, first, last)
+        return found
+
+
+def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
+    """Find the topics that are added, by their names.
+
+    Raises:
+        BagError: A chosen topic is not there, or bags differ in its type.
     """
-    found = {}
-    for connection in bag.connections:
-        topic, kind = connection.topic, connection.msgtype
-        if not connection.msgcount or topic.startswith(f"{skin}cubes/"):
-            continue
-        if kind in (JOINTS, *IMAGES) or number_names(bag, kind):
-            found[topic] = kind
-    return dict(sorted(found.items()))
+    msgtypes: dict[str, str] = {}
+    names: dict[str, dict[str, None]] = {}
+    shapes: dict[str, Shape] = {}
+    existing: set[str] = set()
+    wanted = {*(choices.topics or ()), choices.state, choices.action} - {None}
+    for path in paths:
+        with Bag(path) as bag:
+            prefix = (choices.frequencies or f"{bag.skin()}frequencies").removesuffix("frequencies")
+            for topic, msgtype in _stamped_topics(bag, prefix):
+                existing.add(topic)
+                if choices.topics is not None and topic not in wanted:
+                    continue
+                if msgtypes.setdefault(topic, msgtype) != msgtype:
+                    raise BagError(
+                        f"{path}: {topic} is {msgtype}, in other bags {msgtypes[topic]}; leave it "
+                        "out by naming the others with --topics"
+                    )
+                if msgtype in IMAGES:
+                    shapes.setdefault(topic, ImageStream(bag, topic).shape)
+                else:
+                    found = read_signal(bag, topic, msgtype).names
+                    names.setdefault(topic, {}).update(dict.fromkeys(found))
+    missing = sorted(topic for topic in wanted if topic and topic not in msgtypes)
+    if missing:
+        raise BagError(
+            f"{paths[0]}: no images and no stamped numbers on {', '.join(missing)}; there are "
+            f"{', '.join(sorted(existing)) or 'none'}"
+        )
+    used = {
+        topic: msgtype for topic, msgtype in msgtypes.items() if shapes.get(topic) or names[topic]
+    }
+    joints = [
+        topic for topic, msgtype in used.items() if msgtype == JOINTS and topic != choices.action
+    ]
+    state = choices.state or (joints[0] if len(joints) == 1 else None)
+    keys = {state: STATE, choices.action: ACTION}
+    return {
+        topic: Topic(
+            keys.get(topic) or _feature_name(topic, msgtype),
+            msgtype,
+            list(names.get(topic, ())),
+            shapes.get(topic, (0, 0, 0)),
+        )
+        for topic, msgtype in used.items()
+    }
 
 
-def number_names(bag: Bag, kind: str) -> list[str]:
-    """The numbers of a type whose messages have a header and always the same numbers, else []."""
-    fields = bag.fields(kind)
-    if kind.startswith(PACKAGE) or not fields or fields[0][1] != (Nodetype.NAME, HEADER):
-        return []
-    try:
-        return list(_numbers(bag, fields[1:], ""))
-    except _NotFixedError:
-        return []
+def read_signal(bag: Bag, topic: str, msgtype: str) -> Signal:
+    """Read the numbers of all messages on a topic.
 
-
-class _NotFixedError(Exception):
-    """A type has a list of any length."""
-
-
-def _numbers(bag: Bag, fields: list[tuple[str, Any]], prefix: str) -> Iterator[str]:
-    for name, (node, what) in fields:
-        if node == Nodetype.NAME:
-            yield from _numbers(bag, bag.fields(what), f"{prefix}{name}.")
-        elif node == Nodetype.BASE:
-            if what[0] != "string":
-                yield f"{prefix}{name}"
-        elif node == Nodetype.ARRAY and what[0][0] == Nodetype.BASE:
-            yield from (f"{prefix}{name}.{k}" for k in range(what[1]))
-        else:
-            raise _NotFixedError
-
-
-def read_signal(bag: Bag, topic: str, kind: str) -> Signal:
-    """All messages of a topic with numbers. BagError: damaged, or a joint has no name."""
+    Raises:
+        BagError: The bag is damaged, or a joint has no name.
+    """
     names: dict[str, int] = {}
     messages: list[tuple[int, dict[str, float]]] = []
-    fixed = number_names(bag, kind)
+    fixed = _number_names(bag, msgtype)
     for entry in bag.entries({topic}):
         message = bag.decode(entry)
-        if kind == JOINTS:
-            numbers = joint_numbers(message, f"{bag.path}: {topic}")
+        if msgtype == JOINTS:
+            numbers = _joint_numbers(message, f"{bag.path}: {topic}")
         else:
             numbers = {name: _value(message, name) for name in fixed}
         for name in numbers:
             names.setdefault(name, len(names))
         messages.append((stamp_ns(message), numbers))
     messages.sort(key=lambda one: one[0])
+
     values = np.full((len(messages), len(names)), np.nan, np.float32)
     for row, (_, numbers) in zip(values, messages, strict=True):
         row[[names[name] for name in numbers]] = list(numbers.values())
-    _hold(values)
+    # A message about some of the joints leaves the others as they were.
+    rows = np.arange(len(values))[:, np.newaxis]
+    newest = np.maximum.accumulate(np.where(np.isnan(values), 0, rows), axis=0)
+    values = np.take_along_axis(values, newest, axis=0)
     return Signal(list(names), np.array([stamp for stamp, _ in messages], np.int64), values)
 
 
-def joint_numbers(message: Any, where: str) -> dict[str, float]:
-    """The numbers of a JointState, which may be about some of the joints only."""
+def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
+    """Return name and type of the topics with images, joint states or other stamped numbers.
+
+    The topics of single cubes, below the prefix `skin`, repeat what the stress says.
+    """
+    return sorted(
+        (one.topic, one.msgtype)
+        for one in bag.connections
+        if one.msgcount
+        and not one.topic.startswith(f"{skin}cubes/")
+        and (one.msgtype in (JOINTS, *IMAGES) or _number_names(bag, one.msgtype))
+    )
+
+
+def _number_names(bag: Bag, msgtype: str) -> list[str]:
+    """Return the names of a type's numbers; none without a header, or with a list of any length."""
+    fields = bag.fields(msgtype)
+    if msgtype.startswith(PACKAGE) or not fields or fields[0][1] != (Nodetype.NAME, HEADER):
+        return []
+    names = list(_numbers(bag, fields[1:], ""))
+    return [] if None in names else [name for name in names if name]
+
+
+def _numbers(bag: Bag, fields: list[tuple[str, Any]], prefix: str) -> Iterator[str | None]:
+    """Yield the names of the numbers in fields; None stands for a list of any length."""
+    for name, (node, kind) in fields:
+        if node == Nodetype.NAME:
+            yield from _numbers(bag, bag.fields(kind), f"{prefix}{name}.")
+        elif node == Nodetype.BASE:
+            if kind[0] != "string":
+                yield f"{prefix}{name}"
+        elif node == Nodetype.ARRAY and kind[0][0] == Nodetype.BASE:
+            yield from (f"{prefix}{name}.{k}" for k in range(kind[1]))
+        else:
+            yield None
+
+
+def _joint_numbers(message: Any, where: str) -> dict[str, float]:
+    """Return the numbers of a JointState, which may be about some of the joints only."""
     numbers = {}
-    for field in OF_JOINTS:
+    for field in JOINT_FIELDS:
         values = getattr(message, field)
         if len(values) and len(values) != len(message.name):
             raise BagError(
@@ -124,20 +238,14 @@ def joint_numbers(message: Any, where: str) -> dict[str, float]:
     return numbers
 
 
-def stamp_ns(message: Any) -> int:
-    """Of a message with a header."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * SECOND + int(stamp.nanosec)
-
-
 def _value(message: Any, name: str) -> float:
+    """Return the number of a message that a path such as ``wrench.force.x`` names."""
     for part in name.split("."):
         message = message[int(part)] if part.isdigit() else getattr(message, part)
     return float(message)
 
 
-def _hold(values: NDArray[np.float32]) -> None:
-    """Fill what a message does not say with what the one before said."""
-    rows = np.arange(len(values))[:, None]
-    newest = np.maximum.accumulate(np.where(np.isnan(values), 0, rows), axis=0)
-    values[:] = np.take_along_axis(values, newest, axis=0)
+def _feature_name(topic: str, msgtype: str) -> str:
+    """Return the name of a topic's feature."""
+    name = topic.strip("/").replace("/", ".")
+    return f"observation.images.{name}" if msgtype in IMAGES else f"observation.topics.{name}"

@@ -1,16 +1,19 @@
-"""Rows of stress to windows: for each frame, all samples of each cube since the frame before."""
+"""Rows of stress arranged in windows: for each frame, all samples of each cube in it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.modes import COMPONENTS, STRESS
-from ..core.rows import StressRows
+from ..core.arrays import AnyArray, Index
+from ..core.modes import COMPONENTS
+from ..core.rows import StressRows, concatenate
 
 TACTILE = "observation.tactile"
+"""Name of the feature with the stress of all cubes."""
+
 COLUMNS: dict[str, Any] = {
     "stamp_ns": np.int64,
     "sequence": np.uint32,
@@ -19,82 +22,81 @@ COLUMNS: dict[str, Any] = {
     "observed": np.uint16,
     "left_out": np.uint32,
 }
-"""What a window has beside the tensors, as in `StressRows`."""
-TOGETHER_BYTES, TOGETHER = 32 << 20, 128
-"""Windows that are handed on at a time, and how many at most: images may go with them."""
+"""Columns of `StressRows` that a window has beside the stress, with their types."""
+
+MAX_BLOCK_BYTES = 32 << 20
+"""Largest size of the windows that are made at a time."""
+MAX_BLOCK_FRAMES = 128
+"""Largest number of frames that are made at a time: images may go with them."""
 
 
 class Windows:
-    """The windows of one episode, filled in any order, taken in the order of the frames.
+    """The windows of one episode: rows are added in any order, windows come in that of the frames.
 
-    The samples of a cube are in the order of recording, the newest at the end. Where a frame holds
-    fewer than the window, those in front are NaN, and 0 where numbers are whole.
+    The samples of a cube stand in the order of recording, the newest at the end. Where a frame has
+    fewer samples than the window, the places in front are NaN, and 0 where numbers are whole.
+
+    Attributes:
+        done: Number of frames whose windows have been made.
     """
 
-    def __init__(self, counts: NDArray[np.uint32], depth: int) -> None:
-        """counts: (frames, cubes) samples to come; depth: samples in a window."""
-        self.frames, cubes = counts.shape
-        self.taken = 0
-        self._counts, self._depth, self._cubes = counts, depth, cubes
-        self._due = counts.sum(axis=1, dtype=np.int64)
-        values = depth * cubes * (len(COMPONENTS) + 6)
-        most = max(1, TOGETHER_BYTES // (4 * values))
-        self._together = min(self.frames, most, TOGETHER)
-        self._arrays: dict[str, NDArray[Any]] = {}
-        self._filled = np.zeros((0, cubes), np.int64)
-        self._make(2 * self._together)
+    def __init__(self, counts: AnyArray, depth: int) -> None:
+        """Prepare the windows of an episode.
 
-    def add(self, frame: NDArray[Any], rows: StressRows) -> None:
-        """Place rows, each in its frame."""
-        needed = int(frame.max()) + 1 - self.taken
-        if needed > len(self._filled):
-            self._make(2 * needed)
-        at = (frame - self.taken) * self._cubes + rows.cube
-        order = np.argsort(at, kind="stable")
-        cells, begins, sizes = np.unique(at[order], return_index=True, return_counts=True)
-        rank = np.arange(len(at)) - np.repeat(begins, sizes)
-        filled = self._filled.reshape(-1)
-        before = filled[cells] - self._counts[self.taken :].reshape(-1)[cells].astype(np.int64)
-        slot = self._depth + np.repeat(before, sizes) + rank
-        frame, cube = np.divmod(at[order], self._cubes)
-        place = (frame * self._depth + slot) * self._cubes + cube
-        filled[cells] += sizes
-        rows = rows.select(order)
-        tactile = self._arrays[TACTILE].reshape(-1, len(COMPONENTS))
-        tactile[place, : len(STRESS)] = rows.stress
-        tactile[place, len(STRESS) :] = rows.gradient
-        for name in COLUMNS:
-            self._arrays[f"{TACTILE}.{name}"].reshape(-1)[place] = getattr(rows, name)
+        Args:
+            counts: (frames, cubes) number of samples to come.
+            depth: Number of samples in a window.
+        """
+        self.done = 0
+        self._counts, self._depth = counts, depth
+        values = depth * counts.shape[1] * (len(COMPONENTS) + len(COLUMNS))
+        self._block = min(MAX_BLOCK_FRAMES, max(1, MAX_BLOCK_BYTES // (4 * values)))
+        self._waiting: list[tuple[Index, StressRows]] = []
 
-    def take(self) -> dict[str, NDArray[Any]]:
-        """Windows (n, depth, cubes, ...) by their names, of the next frames that are complete: none
-        while there are few, until the last."""
-        due = self._due[self.taken : self.taken + len(self._filled)]
-        complete = self._filled.sum(axis=1)[: len(due)] == due
-        ready = len(due) if complete.all() else int(complete.argmin())
-        if ready < min(self._together, self.frames - self.taken):
-            ready = 0
-        ready = min(ready, self._together)
-        windows = {name: array[:ready].copy() for name, array in self._arrays.items()}
-        counts = self._counts[self.taken : self.taken + ready]
-        windows[f"{TACTILE}.count"] = counts.astype(np.int64)
-        if ready:
-            self.taken += ready
-            self._make(len(self._filled), ready)
-        return windows
+    def add(self, frame: Index, rows: StressRows) -> None:
+        """Add rows, each with the frame it belongs to."""
+        self._waiting.append((frame, rows))
 
-    def _make(self, frames: int, drop: int = 0) -> None:
-        """Room for more frames, without the first ones."""
-        shape = (frames, self._depth, self._cubes)
-        made: dict[str, NDArray[Any]] = {
-            TACTILE: np.full((*shape, len(COMPONENTS)), np.nan, np.float32)
-        }
+    def complete(self) -> Iterator[dict[str, AnyArray]]:
+        """Yield blocks of windows (n, depth, cubes, ...) by name, as far as rows are there."""
+        while self.done < len(self._counts):
+            block = self._counts[self.done : self.done + self._block]
+            end = self.done + len(block)
+            ready = sum(int(np.count_nonzero(frame < end)) for frame, _ in self._waiting)
+            if ready < int(block.sum(dtype=np.int64)):
+                return
+            frame = np.concatenate([one for one, _ in self._waiting])
+            rows = concatenate([one for _, one in self._waiting])
+            inside = frame < end
+            windows = self._arrange(block, frame[inside] - self.done, rows.select(inside))
+            self._waiting = [(frame[~inside], rows.select(~inside))]
+            self.done = end
+            yield windows
+
+    def _arrange(self, counts: AnyArray, frame: Index, rows: StressRows) -> dict[str, AnyArray]:
+        """Arrange all rows of some frames.
+
+        Args:
+            counts: (n, cubes) number of samples in each frame.
+            frame: (N,) frame of each row, counted from the first of these frames.
+            rows: N rows.
+        """
+        n_frames, n_cubes = counts.shape
+        cell = frame * n_cubes + rows.cube
+        order = np.argsort(cell, kind="stable")
+        cell = cell[order]
+        # Rows of one cell stand together now: a row's rank in it is its distance from the first.
+        rank = np.arange(len(cell)) - np.searchsorted(cell, cell)
+        slot = self._depth - counts.reshape(-1).astype(np.intp)[cell] + rank
+        place = cell // n_cubes, slot, cell % n_cubes
+
+        shape = (n_frames, self._depth, n_cubes)
+        tactile = np.full((*shape, len(COMPONENTS)), np.nan, np.float32)
+        tactile[place] = np.hstack([rows.stress, rows.gradient])[order]
+        windows: dict[str, AnyArray] = {TACTILE: tactile}
         for name, kind in COLUMNS.items():
-            empty = np.nan if kind is np.float32 else 0
-            made[f"{TACTILE}.{name}"] = np.full(shape, empty, kind)
-        filled = np.zeros((frames, self._cubes), np.int64)
-        kept = len(self._filled) - drop
-        for name, array in self._arrays.items():
-            made[name][:kept] = array[drop:]
-        filled[:kept] = self._filled[drop:]
-        self._arrays, self._filled = made, filled
+            column = np.full(shape, np.nan if kind is np.float32 else 0, kind)
+            column[place] = getattr(rows, name)[order]
+            windows[f"{TACTILE}.{name}"] = column
+        windows[f"{TACTILE}.count"] = counts.astype(np.int64)
+        return windows

@@ -279,6 +279,18 @@ def test_marks_divide_a_bag_into_episodes(made, tmp_path):
     assert list(frames)[8:-5] == ["observation.state"]
 
 
+def test_a_topic_that_one_of_two_bags_lacks_is_unknown_there(made, tmp_path):
+    bag, plain = made[0], made[0].with_name("plain")
+    command = ["export", "lerobot", str(plain), str(bag), "-o", str(tmp_path / "set")]
+    assert main([*command, "--fps", "30", "--topics", JOINTS, RAW]) == 0
+    frames = read_frames(tmp_path / "set")
+    state = frames["observation.state"]
+    assert state.shape == (180, 3)
+    assert np.isnan(state[:90]).all() and np.isfinite(state[100:]).all()
+    first, *_, last = frames["observation.images.camera.image_raw"]
+    assert not Image.open(io.BytesIO(first)).getbbox() and Image.open(io.BytesIO(last)).getbbox()
+
+
 def test_windows_take_samples_in_any_order():
     """Late links, frames without samples, frames far ahead: as a loop would place them."""
     random = np.random.default_rng(5)
@@ -291,15 +303,14 @@ def test_windows_take_samples_in_any_order():
     value = random.normal(size=(4000, 15))
     rows = StressRows.of(cube, value[:, :6], value[:, 6:], sequence=np.arange(4000))
     windows = Windows(counts, depth)
-    windows._together = 7
+    windows._block = 7
     parts, begin = [], 0
     while begin < 4000:
         end = begin + int(random.integers(1, 60))
         windows.add(frame[begin:end], rows.select(slice(begin, end)))
         begin = end
-        while len((part := windows.take())[TACTILE]):
-            parts.append(part)
-    assert windows.taken == windows.frames == len(counts)
+        parts += windows.complete()
+    assert windows.done == len(counts)
     placed = np.concatenate([part[TACTILE] for part in parts])
     expected = np.full((len(counts), depth, 3, 15), np.nan, np.float32)
     for f in range(len(counts)):
@@ -312,11 +323,10 @@ def test_windows_take_samples_in_any_order():
 def test_statistics_of_parts_are_those_of_the_whole():
     values = np.random.default_rng(2).normal(1e6, 3, (5000, 2))
     values[::7, 0] = np.nan
-    parts = [Statistics(2, 5000) for _ in range(2)]
-    for number, part in enumerate(np.split(values, 10)):
-        parts[number % 2].add(part)
-    parts[0].add_all(parts[1])
-    result = parts[0].result(40)
+    statistics = Statistics(2, 5000)
+    for part in np.split(values, 10):
+        statistics.add(part)
+    result = statistics.result(40)
     np.testing.assert_allclose(result["mean"], np.nanmean(values, axis=0), rtol=1e-12)
     np.testing.assert_allclose(result["std"], np.nanstd(values, axis=0), rtol=1e-6)
     np.testing.assert_array_equal(result["q90"], np.nanquantile(values, 0.9, axis=0))
