@@ -74,7 +74,9 @@ class McapReader:
             _check_summary(self._stream)
             self._stream.seek(0)
             index = SeekingReader(
-                self._stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
+                self._stream,
+                validate_crcs=True,
+                record_size_limit=MAX_CHUNK_BYTES,
             ).get_summary()
             if index is None or index.statistics is None:
                 raise McapError("the file has no summary")
@@ -94,7 +96,10 @@ class McapReader:
         self._stream.close()
 
     def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
+        self,
+        topics: Collection[str],
+        start_ns: int,
+        stop_ns: int,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Read messages in the order of their times.
 
@@ -119,7 +124,10 @@ class McapReader:
                 yield channels[channel], time_ns, data
 
     def _in_order(
-        self, channels: Collection[int], start_ns: int, stop_ns: int
+        self,
+        channels: Collection[int],
+        start_ns: int,
+        stop_ns: int,
     ) -> Iterator[StoredMessage]:
         """Read the chunks that matter and merge messages of chunks whose times overlap."""
         chunks = [
@@ -164,12 +172,17 @@ class McapReader:
         return messages
 
     def _unindexed_messages(
-        self, channels: dict[int, Connection], start_ns: int, stop_ns: int
+        self,
+        channels: dict[int, Connection],
+        start_ns: int,
+        stop_ns: int,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Read a file without index (rosbag2's preset ``fastwrite``) in the order of writing."""
         self._stream.seek(0)
         reader = NonSeekingReader(
-            self._stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
+            self._stream,
+            validate_crcs=True,
+            record_size_limit=MAX_CHUNK_BYTES,
         )
         for _, channel, message in reader.iter_messages(log_time_order=False):
             if channel.id in channels and start_ns <= message.log_time < stop_ns:
@@ -191,7 +204,11 @@ class McapWriter:
         self._schemas: dict[str, int] = {}
 
     def add_topic(
-        self, topic: str, msgtype: str, definition: str, qos: Sequence[QosProfile]
+        self,
+        topic: str,
+        msgtype: str,
+        definition: str,
+        qos: Sequence[QosProfile],
     ) -> int:
         """Add a topic.
 
@@ -204,7 +221,12 @@ class McapWriter:
         about = {"offered_qos_profiles": to_yaml(list(qos)) if qos else ""}
         return self._writer.register_channel(topic, "cdr", self._schemas[msgtype], about)
 
-    def write(self, channel: int, time_ns: int, data: bytes) -> None:
+    def write(
+        self,
+        channel: int,
+        time_ns: int,
+        data: bytes,
+    ) -> None:
         """Add a serialised message that was received at a time, in ns."""
         self._writer.add_message(channel, time_ns, data, time_ns)
 

@@ -105,7 +105,12 @@ class BagFiles:
     compression: str
 
 
-def quality(*, latched: bool = False, reliable: bool = True, depth: int = 10) -> QosProfile:
+def quality(
+    *,
+    latched: bool = False,
+    reliable: bool = True,
+    depth: int = 10,
+) -> QosProfile:
     """Describe a quality of service.
 
     Args:
@@ -172,7 +177,11 @@ def read_metadata(folder: Path) -> BagFiles:
     return BagFiles(paths, "" if mode == "none" else mode)
 
 
-def write_metadata(folder: Path, storage: str, files: Sequence[FileSummary]) -> None:
+def write_metadata(
+    folder: Path,
+    storage: str,
+    files: Sequence[FileSummary],
+) -> None:
     """Write metadata.yaml of a bag whose storage files are complete."""
     try:
         information = bag_information(storage, files)

@@ -290,7 +290,10 @@ class Bag:
             yield columns
 
     def _messages(
-        self, topics: set[str] | None, start_ns: int | None = None, stop_ns: int | None = None
+        self,
+        topics: set[str] | None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Read messages file by file and count them."""
         wanted = {one.topic for one in self.connections if topics is None or one.topic in topics}
@@ -313,7 +316,10 @@ class Bag:
             )
 
     def _decoded(
-        self, topic: str, codec: MessageCodec[Any], decode: Callable[..., Any]
+        self,
+        topic: str,
+        codec: MessageCodec[Any],
+        decode: Callable[..., Any],
     ) -> Iterator[tuple[Any, Stamps]]:
         """Decode messages of one shape together, and say when they were recorded."""
         waiting: list[bytes] = []

@@ -116,7 +116,11 @@ class RecordedHealthReader:
                 yield _StressBatch(cube, sequence, stamp_ns, left_out, status & HEALTH_BITS)
 
 
-def _copy_matching(batch: _StressBatch, rows: FrequencyRows, health: RecordedHealth) -> None:
+def _copy_matching(
+    batch: _StressBatch,
+    rows: FrequencyRows,
+    health: RecordedHealth,
+) -> None:
     """Copy the health of the rows that a batch contains."""
     match = match_rows(batch, rows)
     # The same number with another stamp is a sample from before a restart of the hub.

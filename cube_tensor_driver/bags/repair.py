@@ -217,7 +217,12 @@ class _Salvaged:
                 self._open_chunk = None
                 self.damaged += 1
 
-    def _take(self, opcode: int, start: int, content: bytes) -> None:
+    def _take(
+        self,
+        opcode: int,
+        start: int,
+        content: bytes,
+    ) -> None:
         """Take in one record of the file.
 
         Raises:
@@ -278,7 +283,11 @@ class _Salvaged:
             self.index.channels.setdefault(record.id, record)
 
 
-def _write_summary(stream: BinaryIO, name: str, salvaged: _Salvaged) -> None:
+def _write_summary(
+    stream: BinaryIO,
+    name: str,
+    salvaged: _Salvaged,
+) -> None:
     """Write everything that follows the chunks of a complete file."""
     index, chunks = salvaged.index, salvaged.index.chunk_indexes
     index.statistics = statistics = Statistics(

@@ -56,7 +56,11 @@ class SqliteReader:
         """
         # "immutable" also reads from a folder in which SQLite cannot create its lock files.
         uri = f"{path.resolve().as_uri()}?immutable=1"
-        self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        self._database = sqlite3.connect(
+            uri,
+            uri=True,
+            check_same_thread=False,
+        )
         try:
             self._connections = self._read_connections()
             (span,) = self._database.execute("SELECT min(timestamp), max(timestamp) FROM messages")
@@ -71,7 +75,10 @@ class SqliteReader:
         self._database.close()
 
     def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
+        self,
+        topics: Collection[str],
+        start_ns: int,
+        stop_ns: int,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Read messages in the order of their times; arguments as in `McapReader.messages`."""
         numbers = [
@@ -138,7 +145,11 @@ class SqliteWriter:
         self._topics = 0
 
     def add_topic(
-        self, topic: str, msgtype: str, definition: str, qos: Sequence[QosProfile]
+        self,
+        topic: str,
+        msgtype: str,
+        definition: str,
+        qos: Sequence[QosProfile],
     ) -> int:
         """Add a topic.
 
@@ -161,7 +172,12 @@ class SqliteWriter:
         )
         return self._topics
 
-    def write(self, channel: int, time_ns: int, data: bytes) -> None:
+    def write(
+        self,
+        channel: int,
+        time_ns: int,
+        data: bytes,
+    ) -> None:
         """Add a serialised message that was received at a time, in ns."""
         self._database.execute(
             "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)",

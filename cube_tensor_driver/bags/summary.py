@@ -43,7 +43,11 @@ class CubeSummary:
     longest_gap: float | None = None
 
 
-def cube_summaries(bag: Bag, topic: str, info: Any) -> Iterator[CubeSummary]:
+def cube_summaries(
+    bag: Bag,
+    topic: str,
+    info: Any,
+) -> Iterator[CubeSummary]:
     """Summarise every cube of a SkinInfo from the frequencies on a topic."""
     cube, sequence, stamp_ns = _columns(bag, topic)
     for number, one in enumerate(info.cubes):
@@ -61,7 +65,12 @@ def last_diagnostics(bag: Bag) -> list[Any]:
     return [last[name] for name in sorted(last)]
 
 
-def _summarise(name: str, uid: int, sequence: AnyArray, stamp_ns: Times) -> CubeSummary:
+def _summarise(
+    name: str,
+    uid: int,
+    sequence: AnyArray,
+    stamp_ns: Times,
+) -> CubeSummary:
     """Summarise the samples of one cube."""
     if len(sequence) < 2:
         return CubeSummary(name, uid, len(sequence))

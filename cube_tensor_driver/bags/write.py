@@ -51,7 +51,12 @@ class _Part:
     messages: int = 0
     bytes: int = 0
 
-    def count(self, topic: str, time_ns: int, size: int) -> None:
+    def count(
+        self,
+        topic: str,
+        time_ns: int,
+        size: int,
+    ) -> None:
         """Take note of a message."""
         if not self.messages:
             self.first_ns = self.start_ns = self.end_ns = time_ns
@@ -77,7 +82,11 @@ class BagWriter:
     """
 
     def __init__(
-        self, folder: Path, storage: str = "mcap", max_bytes: int = 0, max_seconds: float = 0.0
+        self,
+        folder: Path,
+        storage: str = "mcap",
+        max_bytes: int = 0,
+        max_seconds: float = 0.0,
     ) -> None:
         """Create the folder and the first storage file.
 
@@ -116,7 +125,12 @@ class BagWriter:
         if error is None or not issubclass(error, BagError):
             self.close()
 
-    def add_topic(self, topic: str, msgtype: str, qos: Sequence[QosProfile] = ()) -> None:
+    def add_topic(
+        self,
+        topic: str,
+        msgtype: str,
+        qos: Sequence[QosProfile] = (),
+    ) -> None:
         """Add a topic before its first message.
 
         Args:
@@ -138,7 +152,12 @@ class BagWriter:
         self._topics.append(one)
         self._attempt(lambda: self._connect(self._open_part(), one))
 
-    def write(self, topic: str, time_ns: int, data: bytes) -> None:
+    def write(
+        self,
+        topic: str,
+        time_ns: int,
+        data: bytes,
+    ) -> None:
         """Add a message.
 
         Args:

@@ -87,7 +87,11 @@ class ZarrWriter:
         self._waiting, self._waiting_rows = [], 0
 
 
-def _create_column(group: Any, name: str, cubes: list[str]) -> Any:
+def _create_column(
+    group: Any,
+    name: str,
+    cubes: list[str],
+) -> Any:
     """Create the array of one column, with attributes that state what it means."""
     components = _COMPONENTS.get(name, ())
     width = (len(components),) if components else ()

@@ -58,7 +58,14 @@ class DataSet:
     """
 
     def __init__(
-        self, folder: Path, skin: Skin, topics: list[Topic], *, fps: int, depth: int, samples: int
+        self,
+        folder: Path,
+        skin: Skin,
+        topics: list[Topic],
+        *,
+        fps: int,
+        depth: int,
+        samples: int,
     ) -> None:
         """Create the folder.
 
@@ -112,12 +119,20 @@ class DataSet:
         if self._writer is None:
             # Measured numbers hardly repeat: a dictionary of them only costs time.
             self._writer = pyarrow.parquet.ParquetWriter(
-                self._path, table.schema, compression="zstd", use_dictionary=False
+                self._path,
+                table.schema,
+                compression="zstd",
+                use_dictionary=False,
             )
         self._writer.write_table(table)
         self.frames += len(table)
 
-    def count(self, key: str, rows: AnyArray, of_episode: dict[str, Statistics]) -> None:
+    def count(
+        self,
+        key: str,
+        rows: AnyArray,
+        of_episode: dict[str, Statistics],
+    ) -> None:
         """Add rows (n, D) of a feature to the statistics of the data set and of an episode."""
         self._statistics[key].add(rows)
         of_episode[key].add(rows)
@@ -148,7 +163,12 @@ class DataSet:
                 described[f"stats/{key}/{name}"] = values
         self.episodes.append(described)
 
-    def note_calibrations(self, bag: str, since_ns: int, ids: list[str]) -> None:
+    def note_calibrations(
+        self,
+        bag: str,
+        since_ns: int,
+        ids: list[str],
+    ) -> None:
         """Note with which calibrations of the cubes the stress of a bag is made from a stamp on."""
         if not self._calibrations or self._calibrations[-1]["ids"] != ids:
             self._calibrations.append({"bag": bag, "since_ns": since_ns, "ids": ids})
@@ -245,7 +265,11 @@ def describe_skin(skin: Skin) -> dict[str, Any]:
     }
 
 
-def _feature(dtype: str, shape: tuple[int, ...], names: list[str] | None) -> dict[str, Any]:
+def _feature(
+    dtype: str,
+    shape: tuple[int, ...],
+    names: list[str] | None,
+) -> dict[str, Any]:
     """Describe a feature as info.json does."""
     return {"dtype": dtype, "shape": list(shape), "names": names}
 
@@ -267,7 +291,11 @@ def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
 def _task_table(tasks: list[str]) -> pyarrow.Table:
     """Return the numbers of the tasks, with the texts as what pandas reads as the table's index."""
 
-    def column(name: str, pandas_type: str, numpy_type: str) -> dict[str, Any]:
+    def column(
+        name: str,
+        pandas_type: str,
+        numpy_type: str,
+    ) -> dict[str, Any]:
         kinds = {"pandas_type": pandas_type, "numpy_type": numpy_type}
         return {"name": name, "field_name": name, **kinds, "metadata": None}
 
@@ -282,4 +310,12 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
 
 
 def _write_json(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(
+        json.dumps(
+            value,
+            indent=4,
+            ensure_ascii=False,
+        )
+        + "\n",
+        encoding="utf-8",
+    )

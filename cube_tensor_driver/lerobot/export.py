@@ -56,7 +56,10 @@ class Exported:
 
 
 def export_lerobot(
-    bags: Sequence[Path], folder: Path, choices: Choices, report: Report
+    bags: Sequence[Path],
+    folder: Path,
+    choices: Choices,
+    report: Report,
 ) -> Exported:
     """Write a data set, which appears when it is complete.
 
@@ -127,7 +130,11 @@ class EpisodeWriter:
     """Writes one episode: rows of stress go in, frames with all features come out."""
 
     def __init__(
-        self, data_set: DataSet, plan: BagPlan, episode: Episode, topics: TopicReader
+        self,
+        data_set: DataSet,
+        plan: BagPlan,
+        episode: Episode,
+        topics: TopicReader,
     ) -> None:
         """Prepare an episode of a bag, whose other topics `topics` reads."""
         self._data_set, self._plan, self._episode = data_set, plan, episode
@@ -210,7 +217,11 @@ def _check_same_skin(plans: list[BagPlan]) -> Skin:
 
 
 def _write_bag(
-    data_set: DataSet, plan: BagPlan, topics: dict[str, Topic], choices: Choices, report: Report
+    data_set: DataSet,
+    plan: BagPlan,
+    topics: dict[str, Topic],
+    choices: Choices,
+    report: Report,
 ) -> None:
     """Write all episodes of a bag."""
     with Bag(plan.path) as bag:
@@ -226,7 +237,11 @@ def _write_bag(
             report(done, total, f"exporting {plan.path}")
 
 
-def _stress_rows(data_set: DataSet, plan: BagPlan, choices: Choices) -> Iterator[StressRows]:
+def _stress_rows(
+    data_set: DataSet,
+    plan: BagPlan,
+    choices: Choices,
+) -> Iterator[StressRows]:
     """Yield the stress of all rows of cubes that the skin has."""
     with open_bag(plan.path, choices.frequencies) as source:
         settings = settings_with(source, choices.overrides)

@@ -63,7 +63,12 @@ class ImageStream:
         shape: Shape of all images.
     """
 
-    def __init__(self, bag: Bag, topic: str, shape: Shape | None = None) -> None:
+    def __init__(
+        self,
+        bag: Bag,
+        topic: str,
+        shape: Shape | None = None,
+    ) -> None:
         """Read the first image.
 
         Args:
@@ -82,7 +87,12 @@ class ImageStream:
         mode = MODE_OF_BANDS[self.shape[2]]
         self._latest = _as_png(Image.new(mode, (self.shape[1], self.shape[0])))
 
-    def at(self, episode: Episode, first: int, last: int) -> list[EncodedImage]:
+    def at(
+        self,
+        episode: Episode,
+        first: int,
+        last: int,
+    ) -> list[EncodedImage]:
         """Return the newest image before the end of each frame from first to before last.
 
         Raises:

@@ -86,7 +86,13 @@ class Episode:
         counts: (frames, cubes) number of samples of each cube in each frame.
     """
 
-    def __init__(self, since_ns: int, until_ns: int, task: str, fps: int) -> None:
+    def __init__(
+        self,
+        since_ns: int,
+        until_ns: int,
+        task: str,
+        fps: int,
+    ) -> None:
         """Make an episode without samples, of the time since_ns <= t < until_ns."""
         self.task = task
         self.begin_ns = self.rows = 0
@@ -108,7 +114,13 @@ class Episode:
         """Return the frame of each sample (N,); some links sample a little before the first row."""
         return np.maximum(self.frame_of(stamp_ns), 0)
 
-    def count(self, cube: Index, stamp_ns: Times, n_cubes: int, max_frames: float) -> None:
+    def count(
+        self,
+        cube: Index,
+        stamp_ns: Times,
+        n_cubes: int,
+        max_frames: float,
+    ) -> None:
         """Count samples.
 
         Args:
@@ -171,7 +183,11 @@ class BagPlan:
     empty: int
 
 
-def plan_bag(path: Path, choices: Choices, report: Report) -> BagPlan:
+def plan_bag(
+    path: Path,
+    choices: Choices,
+    report: Report,
+) -> BagPlan:
     """Count the samples of a bag.
 
     Raises:
@@ -220,7 +236,12 @@ def plan_bag(path: Path, choices: Choices, report: Report) -> BagPlan:
     )
 
 
-def _check_rate(source: BagSource, samples: Index, seconds: float, fps: int) -> float:
+def _check_rate(
+    source: BagSource,
+    samples: Index,
+    seconds: float,
+    fps: int,
+) -> float:
     """Return the sample rate of a bag, in Hz, if every frame can have a sample.
 
     Args:
@@ -252,7 +273,11 @@ def _check_rate(source: BagSource, samples: Index, seconds: float, fps: int) -> 
     return rate
 
 
-def _check_depth(source: BagSource, episode: Episode, usual: int) -> None:
+def _check_depth(
+    source: BagSource,
+    episode: Episode,
+    usual: int,
+) -> None:
     """Check that no frame has far more samples than usual, which would lengthen every window."""
     depth = int(episode.counts.max())
     if depth > MAX_DEPTH_RATIO * usual + TOLERANCE:

@@ -57,7 +57,13 @@ class Signal:
     stamp_ns: Times
     values: Single
 
-    def at(self, episode: Episode, first: int, last: int, names: list[str]) -> Single:
+    def at(
+        self,
+        episode: Episode,
+        first: int,
+        last: int,
+        names: list[str],
+    ) -> Single:
         """Return the newest values (last - first, len(names)) before the end of each frame.
 
         They are NaN before the first message, and for names that the bag does not have.
@@ -91,7 +97,12 @@ class TopicReader:
             for name, topic in topics.items()
         }
 
-    def at(self, episode: Episode, first: int, last: int) -> dict[str, Any]:
+    def at(
+        self,
+        episode: Episode,
+        first: int,
+        last: int,
+    ) -> dict[str, Any]:
         """Return the values in the frames from first to before last, by the features' names."""
         found: dict[str, Any] = {}
         for name, topic in self._topics.items():
@@ -156,7 +167,11 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
     }
 
 
-def read_signal(bag: Bag, topic: str, msgtype: str) -> Signal:
+def read_signal(
+    bag: Bag,
+    topic: str,
+    msgtype: str,
+) -> Signal:
     """Read the numbers of all messages on a topic.
 
     Raises:
@@ -209,7 +224,11 @@ def _number_names(bag: Bag, msgtype: str) -> list[str]:
     return [] if None in names else [name for name in names if name]
 
 
-def _numbers(bag: Bag, fields: list[tuple[str, Any]], prefix: str) -> Iterator[str | None]:
+def _numbers(
+    bag: Bag,
+    fields: list[tuple[str, Any]],
+    prefix: str,
+) -> Iterator[str | None]:
     """Yield the names of the numbers in fields; None stands for a list of any length."""
     for name, (node, kind) in fields:
         if node == Nodetype.NAME:

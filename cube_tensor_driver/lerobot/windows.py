@@ -73,7 +73,12 @@ class Windows:
             self.done = end
             yield windows
 
-    def _arrange(self, counts: AnyArray, frame: Index, rows: StressRows) -> dict[str, AnyArray]:
+    def _arrange(
+        self,
+        counts: AnyArray,
+        frame: Index,
+        rows: StressRows,
+    ) -> dict[str, AnyArray]:
         """Arrange all rows of some frames.
 
         Args:

@@ -59,7 +59,10 @@ def make_jobs(
 
 
 def write_recipe(
-    folder: Path, form: str, overrides: Overrides, contacts: ContactsOverTime | None = None
+    folder: Path,
+    form: str,
+    overrides: Overrides,
+    contacts: ContactsOverTime | None = None,
 ) -> None:
     """Create the folder and note how its results are made, so that a restart continues alike.
 
@@ -103,7 +106,8 @@ def remove_without_results(folder: Path) -> None:
 
 
 def reprocess_all(
-    jobs: Sequence[ReprocessJob], executor: Executor
+    jobs: Sequence[ReprocessJob],
+    executor: Executor,
 ) -> Iterator[tuple[ReprocessJob, ReprocessResult | CubeError]]:
     """Do jobs in parallel and yield each, as it ends, with its result or its error."""
     futures = {executor.submit(reprocess, job): job for job in jobs}

@@ -35,7 +35,12 @@ class ContactsOverTime:
 class ContactWriter:
     """Writes `contacts` and `traction` of one skin into a bag, as the node publishes them."""
 
-    def __init__(self, writer: BagWriter, topics: str, wanted: ContactsOverTime) -> None:
+    def __init__(
+        self,
+        writer: BagWriter,
+        topics: str,
+        wanted: ContactsOverTime,
+    ) -> None:
         """Add the topics to a bag.
 
         Args:
@@ -64,12 +69,19 @@ class ContactWriter:
         if self._geometry == geometry(info):
             return
         self._finder = contact_finder(
-            self._wanted.settings, cube_poses(info), cube_calibrations(info)
+            self._wanted.settings,
+            cube_poses(info),
+            cube_calibrations(info),
         )
         self._latest = LatestStress(len(info.cubes))
         self._geometry, self._frame_id = geometry(info), info.header.frame_id
 
-    def write(self, stress: StressRows, messages: Decoded[Any], recorded_ns: Times) -> None:
+    def write(
+        self,
+        stress: StressRows,
+        messages: Decoded[Any],
+        recorded_ns: Times,
+    ) -> None:
         """Compute the contacts of M messages and write them when each message was recorded.
 
         Args:

@@ -145,7 +145,8 @@ def make_table(path: Path, cubes: list[str]) -> TableWriter | ZarrWriter:
 
 
 def reconstruct(
-    source: BagSource, overrides: Overrides = AS_RECORDED
+    source: BagSource,
+    overrides: Overrides = AS_RECORDED,
 ) -> Iterator[tuple[Segment, StressRows]]:
     """Yield each segment of a bag with its stress.
 
@@ -174,7 +175,11 @@ def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
     return settings
 
 
-def _reprocess(bag: Bag, job: ReprocessJob, output: Path) -> ReprocessResult:
+def _reprocess(
+    bag: Bag,
+    job: ReprocessJob,
+    output: Path,
+) -> ReprocessResult:
     """Write the output of a job."""
     topics = bag.topics(FREQUENCIES)
     if not topics:
@@ -200,7 +205,11 @@ def _reprocess(bag: Bag, job: ReprocessJob, output: Path) -> ReprocessResult:
     )
 
 
-def _write_skin(source: BagSource, job: ReprocessJob, writer: BagWriter) -> None:
+def _write_skin(
+    source: BagSource,
+    job: ReprocessJob,
+    writer: BagWriter,
+) -> None:
     """Write info and stress of one skin into a bag, and its contacts if they are wanted."""
     bag, skin = source.bag, source.topic.removesuffix("frequencies")
     settings = settings_with(source, job.overrides)
@@ -224,7 +233,10 @@ def _write_skin(source: BagSource, job: ReprocessJob, writer: BagWriter) -> None
 
 
 def _reconstruct(
-    source: BagSource, settings: list[Settings], *, use_health: bool
+    source: BagSource,
+    settings: list[Settings],
+    *,
+    use_health: bool,
 ) -> Iterator[tuple[Segment, StressRows]]:
     """Reconstruct each segment of a bag.
 
@@ -257,7 +269,10 @@ def _reconstruct(
 
 
 def _recalibrate(
-    source: BagSource, info: Any, recorded: Settings, overrides: Overrides
+    source: BagSource,
+    info: Any,
+    recorded: Settings,
+    overrides: Overrides,
 ) -> Settings:
     """Replace the calibrations of an info by those of the overrides."""
     path = source.bag.path
@@ -275,7 +290,11 @@ def _recalibrate(
 
     rest_frequency = recorded.rest_frequency.copy()
     for cube, old, new, rest in zip(
-        info.cubes, recorded.calibrations, calibrations, rest_frequency, strict=True
+        info.cubes,
+        recorded.calibrations,
+        calibrations,
+        rest_frequency,
+        strict=True,
     ):
         try:
             new.check(old.layout, cube.uid or None)
@@ -288,7 +307,12 @@ def _recalibrate(
     return Settings(tuple(calibrations), rest_frequency)
 
 
-def _measure_rest(source: BagSource, settings: Settings, begin_s: float, end_s: float) -> Array:
+def _measure_rest(
+    source: BagSource,
+    settings: Settings,
+    begin_s: float,
+    end_s: float,
+) -> Array:
     """Measure the rest frequencies in a span of a bag in which nothing touched the skin.
 
     Args:
@@ -352,7 +376,10 @@ def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
                 rest_frequency=rest[: calibration.layout.n_pads],
             )
             for cube, calibration, rest in zip(
-                info.cubes, current.calibrations, current.rest_frequency, strict=True
+                info.cubes,
+                current.calibrations,
+                current.rest_frequency,
+                strict=True,
             )
         ]
         yield replace(
