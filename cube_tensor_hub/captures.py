@@ -1,7 +1,7 @@
-"""What the timers of a board would capture of oscillators, for firmware that runs without them.
+"""Simulated captures of the pads' oscillators, for firmware in an emulator without them.
 
-An emulated hub asks for each window over a line of its own, and gets the edges that its counter
-would have seen. firmware/an386/captures.c describes the bytes.
+An emulated hub asks for each measuring window over a separate line, and receives the edges that
+its counter would have captured. firmware/an386/captures.c describes the bytes.
 """
 
 from __future__ import annotations
@@ -19,10 +19,15 @@ from cube_tensor_driver.simulation.cubes import HubCubes
 from cube_tensor_driver.simulation.load import AnyLoad, LoadMemory
 
 COUNTER_HZ = 25_000_000
+"""Frequency of the counter of the board, in Hz."""
+
 WINDOW_US = 2_500
+"""Length of a measuring window, in µs."""
+
 EDGES = np.dtype([("first", "<u2"), ("last", "<u2"), ("periods", "<u2")])
-"""Of one pad: ticks of the counter from the begin of the window to its first and to its last edge,
-and the periods between these two."""
+"""Captures of one pad: ticks of the counter from the beginning of the window to the first and to
+the last edge, and the number of periods between these two."""
+
 _QUESTION = struct.Struct("<IQI")
 
 
@@ -32,12 +37,18 @@ def edges(
     counter_hz: int = COUNTER_HZ,
     window_us: int = WINDOW_US,
 ) -> NDArray[np.void]:
-    """What is captured of pads within a window: EDGES (pads,).
+    """Return what is captured of pads within a window.
 
-    millihertz: (pads,), 0 for a pad that does not oscillate
-    phase: (pads,) periods from the begin of the window to the first edge, 0 to 1
+    The n-th edge is at the time (phase + n) / f. The counter shows the ticks completed by then.
 
-    The n-th edge is at (phase + n) / f. The counter shows the ticks that are complete by then.
+    Args:
+        millihertz: (pads,) frequencies in mHz; 0 for a pad that does not oscillate.
+        phase: (pads,) time from the beginning of the window to the first edge, in periods.
+        counter_hz: Frequency of the counter, in Hz.
+        window_us: Length of the window, in µs.
+
+    Returns:
+        (pads,) of the type `EDGES`.
     """
     found = np.zeros(len(millihertz), EDGES)
     hertz = 1e-3 * millihertz.astype(float)
@@ -52,10 +63,13 @@ def edges(
 
 @dataclass
 class Oscillators:
-    """The pads of one hub under a load, as its counter sees them.
+    """The pads of one hub under a load, as its counter captures them.
 
-    windows: device time of the middle of each window that was asked for, µs, in order; the load
-        script runs in device time
+    Attributes:
+        hub: The hub and its cubes.
+        load: The load; its script runs in the device time of the hub.
+        windows: Device time of the middle of each window that was asked for, in µs, in order.
+        seed: Seed of the random phases.
     """
 
     hub: HubCubes
@@ -69,14 +83,17 @@ class Oscillators:
         self._unread = b""
 
     def answer(self, data: bytes) -> bytes:
-        """What goes back to the hub for bytes that came from it. A damaged question has no answer:
-        the hub asks again."""
+        """Return the answers to the questions that are completed by bytes from the hub.
+
+        A damaged question has no answer, because the hub asks again.
+        """
         self._unread += data
         answers = b""
         while len(self._unread) >= _QUESTION.size:
             question = self._unread[: _QUESTION.size]
             number, middle_us, crc = _QUESTION.unpack(question)
             if crc != zlib.crc32(question[:-4]):
+                # The next question may begin at any byte.
                 self._unread = self._unread[1:]
                 continue
             self._unread = self._unread[_QUESTION.size :]
@@ -86,7 +103,7 @@ class Oscillators:
         return answers
 
     def serve(self, line: socket.socket) -> None:
-        """Answer until the line ends."""
+        """Answer questions until the line is closed."""
         with contextlib.suppress(OSError):
             while data := line.recv(4096):
                 line.sendall(self.answer(data))

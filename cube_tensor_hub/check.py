@@ -1,4 +1,4 @@
-"""All rules on one conversation."""
+"""A conversation with a hub, checked by all rules."""
 
 from __future__ import annotations
 
@@ -9,69 +9,73 @@ from cube_tensor_driver.device.wire.protocol import Hello
 
 from . import rules
 from .conversation import Report, Wire, converse
-from .transcript import Transcript
-from .verdict import ANY_FRAME, RULES, SECTIONS, Outcome, Rule, Verdict, not_tried
+from .rule import RULES, SECTIONS, Outcome, Rule, RuleResult
 
-__all__ = ["Checked", "check", "judge", "rules"]
+__all__ = ["Checked", "check", "in_order", "rules"]
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found. hello: of the hub, None if none came."""
+    """What a check found.
+
+    Attributes:
+        port: Port of the hub.
+        hello: Last HELLO of the hub; None: none came.
+        results: Number of a rule -> its result.
+    """
 
     port: str
     hello: Hello | None
-    verdicts: dict[str, Verdict]
+    results: dict[str, RuleResult]
 
     def count(self, outcome: Outcome) -> int:
-        return sum(verdict.outcome is outcome for verdict in self.verdicts.values())
+        """Return the number of rules with an outcome."""
+        return sum(result.outcome is outcome for result in self.results.values())
 
     def failed(self) -> list[str]:
-        """The numbers of the rules that the hub broke."""
+        """Return the numbers of the rules that the hub broke."""
         return [
-            number for number, verdict in self.verdicts.items() if verdict.outcome is Outcome.FAILED
+            number for number, result in self.results.items() if result.outcome is Outcome.FAILED
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the content of the JSON file."""
+        hello = self.hello
         return {
             "port": self.port,
-            "hub_uid": None if self.hello is None else f"0x{self.hello.hub_uid:x}",
-            "firmware": None if self.hello is None else f"0x{self.hello.firmware:x}",
+            "hub_uid": None if hello is None else f"0x{hello.hub_uid:x}",
+            "firmware": None if hello is None else f"0x{hello.firmware:x}",
             **{outcome.value: self.count(outcome) for outcome in Outcome},
             "rules": [
                 {
                     "rule": number,
                     "section": RULES[number].section,
                     "says": RULES[number].says,
-                    "outcome": verdict.outcome.value,
-                    "text": verdict.text,
+                    "outcome": result.outcome.value,
+                    "text": result.text,
                 }
-                for number, verdict in self.verdicts.items()
+                for number, result in self.results.items()
             ],
         }
 
 
 def check(wire: Wire, report: Report = lambda done, total, what: None) -> Checked:
-    """Talk to a hub and judge it by every rule.
+    """Talk to a hub and check every rule.
 
-    LinkError: the line was lost. CubeError: the hub floods.
+    Args:
+        wire: The line to the hub.
+        report: Shows the progress.
+
+    Raises:
+        LinkError: The line was lost.
+        CubeError: The hub sends without end.
     """
-    talk = converse(wire, report)
-    verdicts = {one.number: judge(one, talk) for one in in_order()}
-    return Checked(talk.port, talk.hello, verdicts)
+    transcript = converse(wire, report)
+    results = {one.number: one.check(transcript) for one in in_order()}
+    return Checked(transcript.port, transcript.hello, results)
 
 
 def in_order() -> list[Rule]:
-    """All rules, as they stand on the page."""
+    """Return all rules in the order of the page."""
     sections = list(SECTIONS)
     return sorted(RULES.values(), key=lambda one: (sections.index(one.number[0]), one.number))
-
-
-def judge(one: Rule, talk: Transcript) -> Verdict:
-    """The verdict of a rule, where there is something to judge."""
-    for kind in one.needs:
-        if not any(isinstance(heard.frame, kind) for heard in talk.heard()):
-            name = "frame" if kind is ANY_FRAME else kind.__name__.upper()
-            return not_tried(f"no {name} came")
-    return one.judge(talk)

@@ -1,7 +1,7 @@
-"""What a check says to a hub, step by step, and how long it listens.
+"""What a check sends to a hub, step by step, and how long it listens.
 
-Every step has a name, by which the rules find what they judge. A step with requests ends when each
-was answered, or after ANSWER_S; then it listens on for as long as it says.
+Every step has a name, by which the rules find what they check. A step with requests first waits
+until each is answered, or for `ANSWER_S`; then it listens for as long as the step says.
 """
 
 from __future__ import annotations
@@ -24,61 +24,124 @@ from cube_tensor_driver.device.wire.protocol import (
     encode,
 )
 
-from .transcript import Ear, Step, Transcript
+from .transcript import CheckStep, FrameListener, Transcript
 
 ANSWER_S = 1.0
-"""How long a hub may take to answer; the host asks again after that."""
+"""Time, in seconds, that a hub may take to answer. The driver asks again after that."""
+
 GRACE_S = 0.15
-"""How long an answer too many may take to come."""
-PERIOD_US, SLOWER_US = 40_000, 60_000
-"""Sample periods that any hub can do, on any line, and in an emulator."""
+"""Time, in seconds, for which a step listens on after the answers, for answers too many."""
+
+PERIOD_US = 40_000
+"""Sample period, in µs, that every hub can do, on any line, and in an emulator."""
+
+SLOWER_US = 60_000
+"""Another such sample period, in µs."""
+
 FAST_US = 1_000
-"""A period at which the line and all buffers are soon full when nobody reads."""
-QUIET_S, FLOW_S, NEW_PERIOD_S = 3.4, 4.4, 0.8
-"""Three of the once-a-second frames come in the first two."""
-UNREAD_S, SETTLE_S, AWAY_S = 3.0, 2.3, 1.5
+"""Sample period, in µs, at which the line and all buffers are soon full when nobody reads."""
+
+QUIET_S = 3.4
+"""Time, in seconds, for which a stopped hub is listened to. Three of the frames that come once a
+second arrive."""
+
+FLOW_S = 4.4
+"""Time, in seconds, for which samples are listened to. Three of the frames that come once a second
+arrive, and 100 samples."""
+
+NEW_PERIOD_S = 0.8
+"""Time, in seconds, for which samples with a new period are listened to."""
+
+SAMPLES_S = 1.2
+"""Time, in seconds, after which a frame that comes once a second must have arrived."""
+
+STOPPED_S = 0.3
+"""Time, in seconds, in which samples after a STOP would be noticed."""
+
+UNREAD_S = 3.0
+"""Time, in seconds, for which nobody reads what the hub sends."""
+
+SETTLE_S = 2.3
+"""Time, in seconds, that the hub has afterwards to empty its buffers and send two STATS."""
+
+AWAY_S = 1.5
+"""Time, in seconds, for which the port is closed."""
+
 DURATION_S = 25.0
-"""Of a whole conversation with a hub that answers, roughly."""
+"""Approximate duration of a whole conversation, in seconds, for the progress bar."""
+
 ANY_ARGUMENT = 0xFF0D0A40
-"""With bytes that Telnet, terminals and flow control treat in their own way."""
+"""An argument whose bytes Telnet, terminals and flow control treat in their own way."""
+
 BETWEEN_START_S = 0.212
-"""No whole number of periods, so that each START falls into another part of a period."""
+"""Time between repeated STARTs, in seconds. It is no whole number of periods, so that each START
+falls into another part of a period."""
+
 MAX_FRAMES = 200_000
-"""Far more than a hub can be asked for; a conversation is kept in memory."""
+"""Number of frames after which a check gives up: far more than a hub is asked for, and they are
+kept in memory."""
+
 DAMAGED = {231: "that is cut off", 232: "with a wrong CRC", 233: "of version 2"}
-"""Requests that no hub knows, so that an answer names the one that it belongs to."""
-AFTER_DAMAGE, AFTER_WRONG_WAY, UNKNOWN = 234, 235, 236
+"""Request that is sent damaged -> how. No hub knows these numbers, so that an ACK tells which of
+them was taken for a valid request."""
+
+AFTER_DAMAGE = 234
+"""Unknown request that is sent behind the damaged ones."""
+
+AFTER_WRONG_WAY = 235
+"""Unknown request that is sent behind frames that only hubs send."""
+
+UNKNOWN = 236
+"""Unknown request that is sent alone."""
+
+N_FIRST_BYTES = 16
+"""Number of bytes of the beginning that are kept."""
+
+XON = b"\x11\0"
+XOFF = b"\x13\0"
 
 
 class Wire(Protocol):
-    """The bytes to and from a hub, and the time."""
+    """The line to a hub, and a clock.
+
+    Attributes:
+        port: Name of the port.
+        is_tcp: Whether it is a TCP address.
+    """
 
     port: str
     is_tcp: bool
 
     def now(self) -> float:
-        """Host's clock, s."""
+        """Return the time on the host's clock, in seconds."""
 
     def send(self, data: bytes) -> None:
-        """Without waiting."""
+        """Send bytes without waiting until they are gone."""
 
     def listen(self, seconds: float) -> bytes:
-        """What came, as soon as something comes; b"" if nothing does."""
+        """Return what comes as soon as something does, b"" if nothing does in this time."""
 
     def ignore(self, seconds: float) -> None:
         """Let time pass without reading."""
 
     def reopen(self, seconds: float) -> None:
-        """Close, and open again after so long."""
+        """Close the port, and open it again after a time."""
 
 
 Report = Callable[[float, float, str], None]
+"""Shows the progress: time done, whole time, and name of the step."""
 
 
 def converse(wire: Wire, report: Report = lambda done, total, what: None) -> Transcript:
-    """Go through all steps. report: of a progress bar.
+    """Go through all steps.
 
-    LinkError: the line was lost. CubeError: the hub floods.
+    Args:
+        wire: The line to the hub.
+        report: Shows the progress.
+
+    Raises:
+        LinkError: The line was lost.
+        CubeError: The hub sends more than `MAX_FRAMES`.
     """
     return Conversation(wire, report).run()
 
@@ -88,17 +151,18 @@ class Conversation:
 
     def __init__(self, wire: Wire, report: Report) -> None:
         self._wire, self._report = wire, report
-        self._ear = Ear()
+        self._listener = FrameListener()
         self._begin_s = wire.now()
         self._n_frames = 0
-        self._step = Step("")
+        self._step = CheckStep("")
         self._transcript = Transcript(wire.port, wire.is_tcp)
 
     def run(self) -> Transcript:
+        """Go through all steps; without an answer to the first ones the others are left out."""
         try:
-            self._ask("opened", seconds=1.2)
+            self._ask("opened", seconds=SAMPLES_S)
             self._ask("hello", Request(Command.HELLO))
-            if self._n_frames:  # else nobody is there to talk to
+            if self._n_frames:
                 self._requests()
                 self._samples()
                 self._host_that_does_not_read()
@@ -110,11 +174,12 @@ class Conversation:
                 "does then",
                 error.kind,
             ) from error
-        counters = self._ear.decoder.counters.as_dict()
+        # Bytes and frames are counted as well, but are no damage.
+        counters = self._listener.decoder.counters.as_dict()
         for name in ("bytes", "frames"):
             counters.pop(name)
         self._transcript.damage = {name: count for name, count in counters.items() if count}
-        self._transcript.other_version = self._ear.decoder.other_version
+        self._transcript.other_version = self._listener.decoder.other_version
         return self._transcript
 
     def _requests(self) -> None:
@@ -128,10 +193,10 @@ class Conversation:
         )
         self._ask_time("stopped")
         self._ask("unknown request", Request(UNKNOWN, ANY_ARGUMENT))
-        self._say("damaged", _damaged_requests(), AFTER_DAMAGE)
-        self._say("wrong way", b"".join(map(encode, _frames_of_hubs())), AFTER_WRONG_WAY)
-        self._say("XOFF", b"\x13\0", Command.STOP)
-        self._say("XON", b"\x11\0", Command.STOP)
+        self._send_bytes("damaged", _damaged_requests(), AFTER_DAMAGE)
+        self._send_bytes("wrong way", b"".join(map(encode, _frames_of_hubs())), AFTER_WRONG_WAY)
+        self._send_bytes("XOFF", XOFF, Command.STOP)
+        self._send_bytes("XON", XON, Command.STOP)
 
     def _samples(self) -> None:
         self._ask("impossible period", Request(Command.SET_PERIOD, 0))
@@ -143,20 +208,20 @@ class Conversation:
         for number in range(3):
             self._ask(f"start again {number}", Request(Command.START), seconds=BETWEEN_START_S)
         self._ask("slower", Request(Command.SET_PERIOD, SLOWER_US), seconds=NEW_PERIOD_S)
-        self._ask("stop samples", Request(Command.STOP), seconds=0.3)
+        self._ask("stop samples", Request(Command.STOP), seconds=STOPPED_S)
         self._ask("stop again", Request(Command.STOP))
-        self._ask("start after stop", Request(Command.START), seconds=1.2)
+        self._ask("start after stop", Request(Command.START), seconds=SAMPLES_S)
 
     def _host_that_does_not_read(self) -> None:
-        self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=1.2)
+        self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=SAMPLES_S)
         self._begin("unread")
         self._wire.ignore(UNREAD_S)
         self._listen(GRACE_S)
         self._ask("period again", Request(Command.SET_PERIOD, PERIOD_US), seconds=SETTLE_S)
         self._begin("gone")
         self._wire.reopen(AWAY_S)
-        self._ear.reopen()
-        self._ask("back", Request(Command.HELLO), seconds=1.2)
+        self._listener.reopen()
+        self._ask("back", Request(Command.HELLO), seconds=SAMPLES_S)
 
     def _leave_as_found(self) -> None:
         self._ask("end", Request(Command.STOP))
@@ -165,7 +230,7 @@ class Conversation:
             self._ask("first period", Request(Command.SET_PERIOD, hello.period_us))
 
     def _ask(self, name: str, *requests: Request, seconds: float = GRACE_S) -> None:
-        """Send requests at once, wait for their ACKs (and HELLO), and listen on."""
+        """Send requests at once, wait for their ACKs and HELLOs, and listen for `seconds`."""
         step = self._begin(name, *requests)
         self._wire.send(b"".join(map(encode, requests)))
         hellos = sum(request.request == Command.HELLO for request in requests)
@@ -177,38 +242,38 @@ class Conversation:
         self._listen(seconds)
 
     def _ask_time(self, state: str) -> None:
-        """Ask for TIME three times, far enough apart to tell a clock that stands still."""
+        """Ask for TIME three times, far enough apart to notice a clock that stands still."""
         for number in range(3):
             question = Request(Command.TIME, ANY_ARGUMENT + number)
             self._ask(f"time {state} {number}", question)
 
-    def _say(self, name: str, data: bytes, last: int) -> None:
-        """Send bytes that a hub must ignore, and a sound request behind them."""
+    def _send_bytes(self, name: str, data: bytes, last: int) -> None:
+        """Send bytes that a hub must ignore, and the valid request `last` behind them."""
         step = self._begin(name)
         self._wire.send(data + encode(Request(last)))
         self._listen(ANSWER_S, lambda: step.ack(last) is not None)
         self._listen(GRACE_S)
 
-    def _begin(self, name: str, *requests: Request) -> Step:
+    def _begin(self, name: str, *requests: Request) -> CheckStep:
         now = self._wire.now()
         done = min(now - self._begin_s, DURATION_S)
         self._report(done, DURATION_S, name.rstrip(" 0123456789"))
-        self._step = Step(name, requests, now, now)
+        self._step = CheckStep(name, requests, now, now)
         self._transcript.steps[name] = self._step
         return self._step
 
     def _listen(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
-        """Hear what comes within so long, or until it is enough."""
+        """Add what comes to the step, for a time, or until `enough()`."""
         step = self._step
         until = self._wire.now() + seconds
         while (left := until - self._wire.now()) > 0 and not enough():
             data = self._wire.listen(left)
-            if len(self._transcript.first_bytes) < 16:
-                self._transcript.first_bytes += data[:16]
-            damaged = self._ear.damaged
-            heard = self._ear.hear(data, self._wire.now())
+            if len(self._transcript.first_bytes) < N_FIRST_BYTES:
+                self._transcript.first_bytes += data[:N_FIRST_BYTES]
+            damaged = self._listener.damaged
+            heard = self._listener.hear(data, self._wire.now())
             step.heard += heard
-            step.damaged += self._ear.damaged - damaged
+            step.damaged += self._listener.damaged - damaged
             self._n_frames += len(heard)
             if self._n_frames > MAX_FRAMES:
                 raise CubeError(
@@ -220,7 +285,7 @@ class Conversation:
 
 
 def _damaged_requests() -> bytes:
-    """The requests of DAMAGED behind noise that is longer than any request."""
+    """Return the requests of `DAMAGED`, behind noise that is longer than any request."""
     cut, wrong_crc, version = DAMAGED
     flipped = bytearray(encode(Request(wrong_crc)))
     flipped[-3] ^= 0x40
@@ -237,7 +302,7 @@ def _damaged_requests() -> bytes:
 
 
 def _frames_of_hubs() -> list[Frame]:
-    """One of each, with numbers of a hub that is not there."""
+    """Return one frame of each kind that only hubs send, with the uid of no hub."""
     no_fault, unknown = np.zeros(1, "<u4"), np.full(1, -32768, "<i2")
     return [
         Ack(Command.START),

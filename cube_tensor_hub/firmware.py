@@ -1,4 +1,4 @@
-"""The firmware: what builds it, and the hub that QEMU runs."""
+"""Build of the firmware, and a hub that QEMU emulates."""
 
 from __future__ import annotations
 
@@ -17,34 +17,56 @@ PACKAGES = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "qemu-system-arm": "qemu-system-arm",
 }
-"""Program -> Debian packages that have it."""
+"""Program -> Debian packages that contain it."""
+
 MACHINE = "mps2-an386"
+"""The board that QEMU emulates."""
+
 ANY_ADDRESS = ("127.0.0.1", 0)
-END_S = 2.0
+"""An address of this machine, with any free TCP port."""
+
+MAX_END_S = 2.0
+"""Time, in seconds, that QEMU may take to end; then it is killed."""
 
 
 class FirmwareError(CubeError):
-    """The firmware cannot be built or run here; the text names what is missing."""
+    """The firmware cannot be built or run on this machine; the text names what is missing."""
 
 
 def missing(*programs: str) -> str:
-    """How to install those of the programs that are not there, "" if all are."""
+    """Return the command that installs the programs that are missing, empty if none is."""
     packages = " ".join(PACKAGES[name] for name in programs if shutil.which(name) is None)
     return f"apt-get install --no-install-recommends {packages}" if packages else ""
 
 
 def need(what: str, *programs: str) -> None:
-    """FirmwareError: a program is not there."""
+    """Check that programs are installed.
+
+    Args:
+        what: What needs them, for the error message.
+        programs: Their names.
+
+    Raises:
+        FirmwareError: One is missing.
+    """
     absent = [name for name in programs if shutil.which(name) is None]
     if absent:
         raise FirmwareError(f"{what} needs {', '.join(absent)}: {missing(*absent)}")
 
 
 def build(source: Path, out: Path, target: str) -> str:
-    """Make a target of the firmware's Makefile in the folder `out`; returns what make said.
+    """Make a target of the Makefile of the firmware.
 
-    source: the folder firmware/ of a checkout. FirmwareError: a program is missing, or the
-    compiler failed.
+    Args:
+        source: Folder firmware/ of a checkout.
+        out: Folder for the results.
+        target: Name of the target.
+
+    Returns:
+        What make printed.
+
+    Raises:
+        FirmwareError: A program is missing, or the compiler failed.
     """
     if not (source / "Makefile").is_file():
         raise FirmwareError(f"{source}: no Makefile; the firmware is built in a checkout")
@@ -58,29 +80,32 @@ def build(source: Path, out: Path, target: str) -> str:
 
 
 class Emulator:
-    """An image in QEMU; a context manager that ends it.
+    """A hub that QEMU emulates; a context manager.
 
-    port: of the hub, as the driver takes it
-    pads: connected to the line over which the hub asks for captures
+    Attributes:
+        port: Port of the hub, as in a skin file.
+        pads: Socket of the line over which the hub asks for captures of its pads.
     """
 
     def __init__(self, image: Path, address: tuple[str, int] = ANY_ADDRESS) -> None:
-        """address: where the hub's line is to be. FirmwareError: QEMU is not there."""
+        """Prepare the hub.
+
+        Args:
+            image: The firmware.
+            address: Address at which the line of the hub appears.
+
+        Raises:
+            FirmwareError: QEMU is not installed.
+        """
         need("the emulated hub", "qemu-system-arm")
         self._image, self._address = image, address
 
     def __enter__(self) -> Emulator:
-        # QEMU gets sockets that listen already: so no port is taken by somebody else in between.
+        # QEMU gets sockets that listen already, so that nobody else takes the ports in between.
         with _listening(self._address) as host, _listening(ANY_ADDRESS) as pads:
             self.port = "socket://{}:{}".format(*host.getsockname())
-            command = [
-                *end_with_parent(),
-                "qemu-system-arm",
-                "-M",
-                MACHINE,
-                "-kernel",
-                str(self._image),
-            ]
+            command = [*end_with_parent(), "qemu-system-arm"]
+            command += ["-M", MACHINE, "-kernel", str(self._image)]
             command += ["-display", "none", "-monitor", "none"]
             for name, listener in (("host", host), ("pads", pads)):
                 line = f"socket,id={name},fd={listener.fileno()},server=on,wait=off,nodelay=on"
@@ -98,19 +123,19 @@ class Emulator:
         return self
 
     def check(self) -> None:
-        """FirmwareError: QEMU has ended by itself."""
+        """Raise FirmwareError if QEMU has ended by itself."""
         if self._process.poll() is not None and self._process.stderr is not None:
             said = self._process.stderr.read().strip()
             raise FirmwareError(f"QEMU ended with code {self._process.returncode}: {said}")
 
     def __exit__(self, *_: object) -> None:
-        # Ends a `recv` of another thread, which closing does not.
+        # A shutdown ends a `recv` of another thread, closing does not.
         with contextlib.suppress(OSError):
             self.pads.shutdown(socket.SHUT_RDWR)
         self.pads.close()
         self._process.terminate()
         try:
-            self._process.wait(END_S)
+            self._process.wait(MAX_END_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -119,7 +144,7 @@ class Emulator:
 
 
 def _listening(address: tuple[str, int]) -> socket.socket:
-    """FirmwareError: the address cannot be used."""
+    """Return a socket that listens; FirmwareError: the address cannot be had."""
     try:
         return socket.create_server(address, backlog=1)
     except OSError as error:

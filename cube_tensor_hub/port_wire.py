@@ -9,15 +9,18 @@ from cube_tensor_driver.config.port import TCP
 from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device.links.link import Link, LinkConfig
 
-TRY_AGAIN_S = 0.01
-BACK_S = 5.0
-"""A board on USB that restarts when its port is opened is away for some seconds."""
+RETRY_PERIOD_S = 0.01
+"""Period, in seconds, of the attempts to open a port."""
+
+MAX_REOPEN_S = 5.0
+"""Time, in seconds, for which opening the port again is tried. A board on USB that restarts when
+its port is opened is away for some seconds."""
 
 
 class PortWire:
-    """The `Wire` of a `Link`. A context manager: the port is open inside.
+    """The `Wire` of a port of this machine; a context manager, inside which the port is open.
 
-    LinkError, also on entering: the port cannot be opened, or was lost.
+    Entering and all methods raise LinkError if the port cannot be opened, or was lost.
     """
 
     def __init__(self, port: str, baud: int) -> None:
@@ -41,6 +44,7 @@ class PortWire:
     def listen(self, seconds: float) -> bytes:
         until = self.now() + seconds
         while (left := until - self.now()) > 0:
+            # Bytes for which the kernel had no room are sent as soon as it has.
             waiting = [self._link.fileno()] if self._link.unsent else []
             readable, writable, _ = select.select([self._link.fileno()], waiting, [], left)
             if writable:
@@ -55,15 +59,15 @@ class PortWire:
     def reopen(self, seconds: float) -> None:
         self._link.close()
         time.sleep(seconds)
-        until = self.now() + BACK_S
+        until = self.now() + MAX_REOPEN_S
         while not self._link.is_open:
             try:
                 self._open()
             except LinkError:
                 if self.now() > until:
                     raise
-                time.sleep(TRY_AGAIN_S)
+                time.sleep(RETRY_PERIOD_S)
 
     def _open(self) -> None:
         while not self._link.open():
-            time.sleep(TRY_AGAIN_S)
+            time.sleep(RETRY_PERIOD_S)

@@ -12,14 +12,19 @@ from cube_tensor_driver.device.wire.protocol import Ack, Frame, Hello, Request, 
 
 FrameType = TypeVar("FrameType", Hello, Sample, Stats, Ack, Time)
 
+REOPENING_STEP = "gone"
+"""Name of the step in which the port is closed and opened again."""
+
 
 @dataclass(frozen=True, slots=True)
 class Heard:
     """One frame from the hub.
 
-    at_s: the host's clock when its last byte had come
-    opened: whether a zero of its own opened it, behind the zero that closed the frame before;
-        None if there was no frame just before
+    Attributes:
+        at_s: Time on the host's clock at which its last byte had come, in seconds.
+        frame: The frame.
+        opened: Whether it has a zero of its own before it, besides the zero that closed the frame
+            before; None: there was no frame just before it.
     """
 
     at_s: float
@@ -28,14 +33,16 @@ class Heard:
 
 
 @dataclass
-class Step:
-    """Something that was sent, and what came until the next step.
+class CheckStep:
+    """Something that was sent to the hub, and what came until the next step.
 
-    name: what the step is for
-    requests: the sound requests that were sent, in order
-    sent_s, end_s: when it began and ended, host's clock
-    heard: the frames that came, in order
-    damaged: runs of bytes that were no frame
+    Attributes:
+        name: What the step is for; rules find it by this name.
+        requests: The valid requests that were sent, in order.
+        sent_s: Time at which it began, on the host's clock.
+        end_s: Time at which it ended, on the host's clock.
+        heard: The frames that came, in order.
+        damaged: Number of runs of bytes that were no frame.
     """
 
     name: str
@@ -46,52 +53,58 @@ class Step:
     damaged: int = 0
 
     def frames(self, kind: type[FrameType]) -> list[FrameType]:
+        """Return the frames of a kind."""
         return [heard.frame for heard in self.heard if isinstance(heard.frame, kind)]
 
     @property
     def acks(self) -> list[Ack]:
+        """The ACKs that came."""
         return self.frames(Ack)
 
     @property
     def n_answers(self) -> int:
+        """Number of answers. Only the request for TIME is answered by a TIME instead of an ACK."""
         return len(self.acks) + len(self.frames(Time))
 
     def ack(self, request: int) -> Ack | None:
-        """The first ACK of a request."""
+        """Return the first ACK of a request."""
         return next((ack for ack in self.acks if ack.request == request), None)
 
 
 @dataclass
 class Transcript:
-    """A conversation.
+    """A conversation with a hub.
 
-    port: what was checked; is_tcp: whether it is a TCP address
-    steps: by name, in the order in which they were made
-    first_bytes: the first that came, at most 16
-    damage: what was wrong with damaged runs: counter of `Decoder` -> runs
-    other_version: of frames whose version is not ours
+    Attributes:
+        port: Port of the hub.
+        is_tcp: Whether the port is a TCP address.
+        steps: The steps by name, in the order in which they were made.
+        first_bytes: The first bytes that came, at most 16.
+        damage: Counter of `Decoder` -> number of damaged runs that it counted.
+        other_version: Version of frames that are not of ours; None: there were none.
     """
 
     port: str
     is_tcp: bool
-    steps: dict[str, Step] = field(default_factory=dict)
+    steps: dict[str, CheckStep] = field(default_factory=dict)
     first_bytes: bytes = b""
     damage: dict[str, int] = field(default_factory=dict)
     other_version: int | None = None
 
     def heard(self, *names: str) -> Iterator[Heard]:
-        """All frames of these steps, or of all."""
+        """Yield all frames of the named steps, or of all steps."""
         for name, step in self.steps.items():
             if not names or name in names:
                 yield from step.heard
 
     def frames(self, kind: type[FrameType], *names: str) -> list[FrameType]:
+        """Return the frames of a kind in the named steps, or in all steps."""
         return [heard.frame for heard in self.heard(*names) if isinstance(heard.frame, kind)]
 
     @property
     def first_visit(self) -> list[str]:
-        """The names of the steps before the port was closed."""
-        return list(itertools.takewhile(lambda name: name != "gone", self.steps))
+        """Names of the steps before the port was closed. What the kernel holds then is lost."""
+        return list(itertools.takewhile(lambda name: name != REOPENING_STEP, self.steps))
 
     @property
     def hello(self) -> Hello | None:
@@ -100,10 +113,12 @@ class Transcript:
         return hellos[-1] if hellos else None
 
 
-class Ear:
-    """Bytes in, frames out, and what a decoder does not tell: the zeros around each frame.
+class FrameListener:
+    """Turns bytes into frames, and notes what a decoder does not tell: the zeros around frames.
 
-    damaged: runs that were no frame
+    Attributes:
+        decoder: The decoder, with its counters.
+        damaged: Number of runs that were no frame.
     """
 
     def __init__(self) -> None:
@@ -112,14 +127,14 @@ class Ear:
         self.reopen()
 
     def reopen(self) -> None:
-        """The port was opened: the first run's beginning may have been sent before."""
+        """Start again after the port was opened: the first run may lack its beginning."""
         self._tail = b""
         self._is_first = True
         self._follows_frame = False
         self._opening_zeros = 0
 
     def hear(self, data: bytes, at_s: float) -> list[Heard]:
-        """The frames that `data` completes."""
+        """Return the frames that are completed by bytes which came at a time, in seconds."""
         runs = (self._tail + data).split(b"\0")
         self._tail = runs.pop()
         heard = []
@@ -129,7 +144,7 @@ class Ear:
             else:
                 self._opening_zeros += 1
         if len(self._tail) > MAX_RUN:
-            # No frame is so long. One run more than it is may be counted, but memory is bounded.
+            # No frame is so long. The run may be counted twice, but the memory is bounded.
             self._hear_run(self._tail, at_s)
             self._tail = b""
         return heard

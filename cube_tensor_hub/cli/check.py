@@ -37,36 +37,36 @@ def run(options: argparse.Namespace) -> int:
     from ..port_wire import PortWire
 
     with PortWire(options.port, options.baud) as wire, progress_bar() as report:
-        result = check(wire, report)
-    show_check(result)
+        checked = check(wire, report)
+    show_check(checked)
     if options.json is not None:
-        write_json(options.json, result.to_dict())
-    return 1 if result.failed() else 0
+        write_json(options.json, checked.to_dict())
+    return 1 if checked.failed() else 0
 
 
-def show_check(result: Checked) -> None:
+def show_check(checked: Checked) -> None:
     """Print the hub, a line for each rule, and how many rules have each outcome."""
     from rich.console import Console
     from rich.text import Text
 
-    from ..verdict import RULES, Outcome
+    from ..rule import RULES, Outcome
 
     styles = {Outcome.PASSED: "green", Outcome.FAILED: "bold red", Outcome.NOT_TRIED: "dim"}
     console = Console(highlight=False, soft_wrap=True)
-    hello = result.hello
+    hello = checked.hello
     if hello is not None:
         console.print(
-            f"{result.port}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} "
+            f"{checked.port}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} "
             f"pads, firmware 0x{hello.firmware:x}",
             markup=False,
         )
-    for number, verdict in result.verdicts.items():
+    for number, result in checked.results.items():
         line = Text(f"{number}  ")
-        line.append(f"{verdict.outcome.value:<9}", styles[verdict.outcome])
-        line.append(f"  {verdict.text}")
-        if verdict.outcome is Outcome.FAILED:
+        line.append(f"{result.outcome.value:<9}", styles[result.outcome])
+        line.append(f"  {result.text}")
+        if result.outcome is Outcome.FAILED:
             rule = RULES[number]
             line.append(f". The page says: {rule.says} (docs/protocol.md, {rule.section})")
         console.print(line)
-    counts = [f"{result.count(outcome)} {outcome.value}" for outcome in Outcome]
-    console.print(f"{len(result.verdicts)} rules: {', '.join(counts)}")
+    counts = [f"{checked.count(outcome)} {outcome.value}" for outcome in Outcome]
+    console.print(f"{len(checked.results)} rules: {', '.join(counts)}")

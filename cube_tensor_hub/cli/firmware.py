@@ -1,4 +1,4 @@
-"""./cube firmware build, run, test: hubs in C."""
+"""./cube firmware build, run, test: build, run and test the hubs in C."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ if TYPE_CHECKING:
     from cube_tensor_driver.simulation.cubes import HubCubes
 
 OUT = ROOT / ".cube" / "firmware"
+"""Folder for what is built."""
+
 SOURCE = ROOT / "firmware"
+"""Folder of the sources."""
+
+EMULATED_HUB = (4, 8)
+"""Number of cubes of the emulated hub, and of pads of each cube."""
 
 
 def arguments(parser: Parser) -> None:
@@ -41,7 +47,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def build_all(options: argparse.Namespace) -> int:
-    """FirmwareError: a compiler is not there; what is before it is built."""
+    """Build the hub as a process and the hub for a microcontroller.
+
+    Raises:
+        FirmwareError: A compiler is missing; what was built before stays.
+    """
     from ..firmware import build
 
     build(SOURCE, OUT, "posix")
@@ -53,7 +63,7 @@ def build_all(options: argparse.Namespace) -> int:
 
 
 def run_emulated(options: argparse.Namespace) -> int:
-    """Until Ctrl-C."""
+    """Emulate a hub under a load until Ctrl-C."""
     from cube_tensor_driver.config.load_script import read_script
     from cube_tensor_driver.device.links.tcp import parse_url
     from cube_tensor_driver.simulation.load import Load, default_script
@@ -76,7 +86,11 @@ def run_emulated(options: argparse.Namespace) -> int:
 
 
 def skin_of_hub(path: Path | None) -> tuple[Skin, HubCubes]:
-    """The skin whose pads the emulated hub reads, and its cubes. CubeError: they do not fit."""
+    """Return the skin whose pads the emulated hub measures, and the cubes of the hub.
+
+    Raises:
+        CubeError: The skin file cannot be used, or has other cubes than the emulated hub.
+    """
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.errors import ConfigError
@@ -85,7 +99,7 @@ def skin_of_hub(path: Path | None) -> tuple[Skin, HubCubes]:
     skin = read_skin(path or package_data() / "config" / "skin_firmware.yaml")
     hubs = hub_cubes(skin)
     sizes = [(len(hub.members), hub.cubes.n_pads) for hub in hubs]
-    if sizes != [(4, 8)]:
+    if sizes != [EMULATED_HUB]:
         raise ConfigError(
             f"{path}: hubs with (cubes, pads) {sizes}; the emulated hub has 4 cubes of 8 pads"
         )
@@ -93,6 +107,6 @@ def skin_of_hub(path: Path | None) -> tuple[Skin, HubCubes]:
 
 
 def run_tests(options: argparse.Namespace) -> int:
-    """Run the tests of the firmware; the exit code is that of pytest."""
+    """Run the tests of the firmware and return the exit code of pytest."""
     command = [sys.executable, "-m", "pytest", "test/hub/test_firmware.py", "-rs"]
     return subprocess.run(command, cwd=ROOT, check=False).returncode

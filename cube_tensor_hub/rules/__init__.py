@@ -1,7 +1,8 @@
-"""The numbered rules of docs/protocol.md, one function each. A module has those of one section.
+"""The numbered rules of docs/protocol.md, one function each; a module has those of one section.
 
-The function of a rule looks at the steps of a conversation (`conversation.py`) and says what came.
-A rule leaves to another what that one is about, so that a hub which breaks one rule fails one.
+The function of a rule looks at the steps of a conversation (`conversation.py`) and returns what
+came. A function does not check what another rule is about, so that a hub which breaks one rule
+fails one.
 """
 
 from . import frames, hello, line, request, sample, time

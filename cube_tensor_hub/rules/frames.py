@@ -5,16 +5,17 @@ from __future__ import annotations
 from cube_tensor_driver.device.wire.protocol import Hello, Request, Sample
 
 from ..conversation import AFTER_DAMAGE, AFTER_WRONG_WAY, DAMAGED
+from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
-from ..verdict import ANY_FRAME, Verdict, failed, not_tried, passed, rule
 
 OVERFULL = ("unread", "gone")
-"""Steps in which S9 judges what is damaged."""
+"""Steps in which damaged frames are checked by S9: buffers overflow there."""
 
 
 @rule("F1", "A sender puts a zero before and behind each frame.", needs=(ANY_FRAME,))
-def zeros_around(talk: Transcript) -> Verdict:
-    opened = [heard.opened for heard in talk.heard() if heard.opened is not None]
+def zeros_around(transcript: Transcript) -> RuleResult:
+    """Between two frames there must be two zeros: one behind the first, one before the second."""
+    opened = [heard.opened for heard in transcript.heard() if heard.opened is not None]
     if not opened:
         return not_tried("no two frames came one behind the other")
     missing = opened.count(False)
@@ -29,8 +30,9 @@ def zeros_around(talk: Transcript) -> Verdict:
     "answers it",
     needs=(ANY_FRAME,),
 )
-def goes_on_behind_damage(talk: Transcript) -> Verdict:
-    step = talk.steps["damaged"]
+def goes_on_behind_damage(transcript: Transcript) -> RuleResult:
+    """Damaged requests must not be answered, and a valid request behind them must be."""
+    step = transcript.steps["damaged"]
     answered = [DAMAGED[ack.request] for ack in step.acks if ack.request in DAMAGED]
     if answered:
         return failed(f"the hub answered a request {answered[0]}")
@@ -40,8 +42,8 @@ def goes_on_behind_damage(talk: Transcript) -> Verdict:
 
 
 @rule("F3", "A frame that goes the wrong way, or that nobody waits for, is ignored.", (ANY_FRAME,))
-def ignores_the_wrong_way(talk: Transcript) -> Verdict:
-    step = talk.steps["wrong way"]
+def ignores_the_wrong_way(transcript: Transcript) -> RuleResult:
+    step = transcript.steps["wrong way"]
     if step.ack(AFTER_WRONG_WAY) is None:
         return failed("no answer to a request behind frames that only hubs send")
     if len(step.acks) > 1:
@@ -51,11 +53,11 @@ def ignores_the_wrong_way(talk: Transcript) -> Verdict:
 
 
 @rule("F4", "Flags and spare bytes are sent as 0", needs=(ANY_FRAME,))
-def flags_are_0(talk: Transcript) -> Verdict:
-    flags = [hello.flags for hello in talk.frames(Hello) if hello.flags]
+def flags_are_0(transcript: Transcript) -> RuleResult:
+    flags = [hello.flags for hello in transcript.frames(Hello) if hello.flags]
     if flags:
         return failed(f"flags of HELLO are 0x{flags[0]:02x}")
-    spare = [sample.spare for sample in talk.frames(Sample) if any(sample.spare)]
+    spare = [sample.spare for sample in transcript.frames(Sample) if any(sample.spare)]
     if spare:
         return failed(f"spare bytes of SAMPLE are {spare[0].hex(' ')}")
     return passed("flags of HELLO and spare bytes of SAMPLE are 0")
@@ -65,12 +67,13 @@ def flags_are_0(talk: Transcript) -> Verdict:
     "F5",
     "Each run of bytes between two zeros of a sender is a frame of this page that goes its way.",
 )
-def nothing_but_frames(talk: Transcript) -> Verdict:
-    steps = [step for step in talk.steps.values() if step.name not in OVERFULL]
+def nothing_but_frames(transcript: Transcript) -> RuleResult:
+    """Every run of bytes must be a frame, and none a REQUEST, which only hosts send."""
+    steps = [step for step in transcript.steps.values() if step.name not in OVERFULL]
     damaged = sum(step.damaged for step in steps)
     if damaged:
-        kinds = ", ".join(f"{name} {count}" for name, count in talk.damage.items())
-        other = "" if talk.other_version is None else f"; version {talk.other_version}"
+        kinds = ", ".join(f"{name} {count}" for name, count in transcript.damage.items())
+        other = "" if transcript.other_version is None else f"; version {transcript.other_version}"
         return failed(f"{damaged} runs of bytes are no frame ({kinds}{other})")
     wrong_way = [heard for step in steps for heard in step.heard if type(heard.frame) is Request]
     if wrong_way:

@@ -8,15 +8,25 @@ from statistics import mode
 
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample
 
-from ..transcript import Heard, Step, Transcript
-from ..verdict import Verdict, failed, not_tried, passed, rule
+from ..rule import RuleResult, failed, not_tried, passed, rule
+from ..transcript import CheckStep, Heard, Transcript
 
-BEHIND_S = 0.3
-"""A HELLO that comes later is that of the second."""
+MAX_BEHIND_ACK_S = 0.3
+"""Time, in seconds, after an ACK within which a HELLO counts as its answer. A later one may be the
+HELLO that comes once a second."""
+
+MAX_PADS = 32
+"""Number of bits in the mask of pad faults."""
 
 
 def once_a_second(heard: list[Heard], name: str, what: str) -> str:
-    """What is wrong with frames that should come once a second, "" if nothing is."""
+    """Return what is wrong with frames that must come once a second, empty if nothing is.
+
+    Args:
+        heard: The frames.
+        name: Their name.
+        what: State of the hub, in words.
+    """
     if len(heard) < 3:
         return f"{len(heard)} {name} {what} in a time in which 3 were due"
     gaps = [after.at_s - before.at_s for before, after in pairwise(heard)]
@@ -26,48 +36,52 @@ def once_a_second(heard: list[Heard], name: str, what: str) -> str:
     return ""
 
 
-def frames_per_sample(talk: Transcript) -> int:
-    """Of how many frames most samples are."""
-    frames = Counter(sample.sequence for sample in talk.frames(Sample))
+def frames_per_sample(transcript: Transcript) -> int:
+    """Return the number of frames that most samples consist of."""
+    frames = Counter(sample.sequence for sample in transcript.frames(Sample))
     return mode(frames.values())
 
 
-def of_kind(talk: Transcript, kind: type, *names: str) -> list[Heard]:
-    return [heard for heard in talk.heard(*names) if isinstance(heard.frame, kind)]
+def of_kind(transcript: Transcript, kind: type, *names: str) -> list[Heard]:
+    """Return the frames of a kind with their times, in the named steps."""
+    return [heard for heard in transcript.heard(*names) if isinstance(heard.frame, kind)]
 
 
-def hello_is_behind_ack(step: Step) -> bool:
-    """Also if there was no ACK of request 1, which R1 judges."""
+def hello_is_behind_ack(step: CheckStep) -> bool:
+    """Return whether a HELLO came behind the ACK of request 1.
+
+    A missing ACK is for R1 to report.
+    """
     acks_s = [
         heard.at_s
         for heard in step.heard
         if isinstance(heard.frame, Ack) and heard.frame.request == Command.HELLO
     ]
     hellos_s = [heard.at_s for heard in step.heard if isinstance(heard.frame, Hello)]
-    return not acks_s or any(0 <= hello_s - acks_s[0] < BEHIND_S for hello_s in hellos_s)
+    return not acks_s or any(0 <= hello_s - acks_s[0] < MAX_BEHIND_ACK_S for hello_s in hellos_s)
 
 
 @rule(
     "H1",
     "A hub sends HELLO after power-up, behind the ACK of request 1, and once a second.",
 )
-def hello_comes(talk: Transcript) -> Verdict:
-    if not talk.first_bytes and not talk.is_tcp:
+def hello_comes(transcript: Transcript) -> RuleResult:
+    if not transcript.first_bytes and not transcript.is_tcp:
         return not_tried("nothing came: see L2")
-    if not any(talk.heard()):
+    if not any(transcript.heard()):
         return failed("no HELLO came, and no other frame")
-    if not all(map(hello_is_behind_ack, talk.steps.values())):
-        return failed(f"no HELLO within {BEHIND_S:g} s behind the ACK of request 1")
+    if not all(map(hello_is_behind_ack, transcript.steps.values())):
+        return failed(f"no HELLO within {MAX_BEHIND_ACK_S:g} s behind the ACK of request 1")
     for name, what in (("quiet", "while stopped"), ("start", "while started")):
-        wrong = once_a_second(of_kind(talk, Hello, name), "HELLO", what)
+        wrong = once_a_second(of_kind(transcript, Hello, name), "HELLO", what)
         if wrong:
             return failed(wrong)
     return passed("behind the ACK of request 1, and once a second, stopped and started")
 
 
 @rule("H2", "All other uids of a hub differ", needs=(Hello,))
-def uids_differ(talk: Transcript) -> Verdict:
-    hellos = talk.frames(Hello)
+def uids_differ(transcript: Transcript) -> RuleResult:
+    hellos = transcript.frames(Hello)
     hubs = list(dict.fromkeys(hello.hub_uid for hello in hellos))
     if len(hubs) > 1:
         return failed(f"the hub's uid changed from 0x{hubs[0]:x} to 0x{hubs[1]:x}")
@@ -82,9 +96,9 @@ def uids_differ(talk: Transcript) -> Verdict:
 
 
 @rule("H3", "A hub has 1 to 32 pads per cube", needs=(Hello,))
-def pads_fit_the_mask(talk: Transcript) -> Verdict:
-    for hello in talk.frames(Hello):
-        if hello.n_cubes and not 1 <= hello.n_pads <= 32:
+def pads_fit_the_mask(transcript: Transcript) -> RuleResult:
+    for hello in transcript.frames(Hello):
+        if hello.n_cubes and not 1 <= hello.n_pads <= MAX_PADS:
             return failed(f"HELLO says {hello.n_pads} pads per cube")
     return passed(f"{hello.n_cubes} cubes of {hello.n_pads} pads")
 
@@ -95,11 +109,14 @@ def pads_fit_the_mask(talk: Transcript) -> Verdict:
     "behind it.",
     needs=(Hello, Sample),
 )
-def cubes_stay(talk: Transcript) -> Verdict:
-    """Cubes beyond those of HELLO, and pads, are S5's."""
-    frames = frames_per_sample(talk)
+def cubes_stay(transcript: Transcript) -> RuleResult:
+    """The number of cubes in SAMPLE may change only behind a HELLO with another number.
+
+    Whether it is the number of HELLO is for S5 to check.
+    """
+    frames = frames_per_sample(transcript)
     hello, last = 0, None
-    for heard in talk.heard(*talk.first_visit):
+    for heard in transcript.heard(*transcript.first_visit):
         if isinstance(heard.frame, Hello):
             if heard.frame.n_cubes != hello:
                 hello, last = heard.frame.n_cubes, None
@@ -112,5 +129,5 @@ def cubes_stay(talk: Transcript) -> Verdict:
 
 
 @rule("H5", "The pads of a cube are in the order of its layout")
-def order_of_pads(talk: Transcript) -> Verdict:
+def order_of_pads(transcript: Transcript) -> RuleResult:
     return not_tried("bytes do not show it: press on one pad after the other, docs/build.md")

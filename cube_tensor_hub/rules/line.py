@@ -7,37 +7,44 @@ import numpy as np
 from cube_tensor_driver.device.wire.protocol import Command, Hello, Sample, Stats
 
 from ..conversation import AWAY_S
+from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
-from ..verdict import ANY_FRAME, Verdict, failed, not_tried, passed, rule
 from .request import behind_ack
 from .sample import periods_us
 
-TELNET_COMMANDS = range(0xFB, 0xFF)  # WILL, WON'T, DO, DON'T
-TLS_RECORD = b"\x15\x03"  # an alert: this is no TLS that we speak
+TELNET_COMMANDS = range(0xFB, 0xFF)
+"""Second byte of a Telnet negotiation: WILL, WON'T, DO, DON'T (RFC 854)."""
+
+TLS_RECORD = b"\x15\x03"
+"""Beginning of the alert that a TLS server sends to a client that does not speak TLS."""
+
+MIN_TAKEN_SHARE = 0.7
+"""Share of the samples that are due while the port is closed, below which the hub has stopped."""
 
 
 @rule("L1", "no flow control, neither RTS/CTS nor XON/XOFF", needs=(ANY_FRAME,))
-def no_flow_control(talk: Transcript) -> Verdict:
-    if talk.steps["XOFF"].ack(Command.STOP) is None:
+def no_flow_control(transcript: Transcript) -> RuleResult:
+    """A hub with XON/XOFF would stop sending behind an XOFF byte."""
+    if transcript.steps["XOFF"].ack(Command.STOP) is None:
         return failed("the hub did not answer behind an XOFF byte (0x13)")
     return passed("an XOFF byte (0x13) does not stop the hub")
 
 
 @rule("L2", "must send while DTR is set")
-def sends_while_dtr_is_set(talk: Transcript) -> Verdict:
-    if talk.is_tcp:
+def sends_while_dtr_is_set(transcript: Transcript) -> RuleResult:
+    if transcript.is_tcp:
         return not_tried("TCP has no DTR")
-    if not talk.first_bytes:
-        seconds = sum(step.end_s - step.sent_s for step in talk.steps.values())
+    if not transcript.first_bytes:
+        seconds = sum(step.end_s - step.sent_s for step in transcript.steps.values())
         return failed(f"not one byte in {seconds:.1f} s, with DTR and RTS set")
     return passed("the hub sends with DTR and RTS set")
 
 
 @rule("L3", "The bytes are those of a serial port and nothing else: no Telnet, no TLS.")
-def nothing_but_the_bytes(talk: Transcript) -> Verdict:
-    if not talk.is_tcp:
+def nothing_but_the_bytes(transcript: Transcript) -> RuleResult:
+    if not transcript.is_tcp:
         return not_tried("this is no TCP link")
-    first = talk.first_bytes
+    first = transcript.first_bytes
     if len(first) > 1 and first[0] == 0xFF and first[1] in TELNET_COMMANDS:
         return failed(f"the bridge begins with a command of Telnet: {first[:3].hex(' ')}")
     if first[:2] == TLS_RECORD:
@@ -48,7 +55,7 @@ def nothing_but_the_bytes(talk: Transcript) -> Verdict:
 
 
 @rule("L4", "A connection that ends or fails is lost.")
-def lost_connections(talk: Transcript) -> Verdict:
+def lost_connections(transcript: Transcript) -> RuleResult:
     return not_tried("a rule of the host")
 
 
@@ -58,22 +65,26 @@ def lost_connections(talk: Transcript) -> Verdict:
     "it would have answered the last one.",
     needs=(Hello, Sample, Stats),
 )
-def host_goes_away(talk: Transcript) -> Verdict:
-    before, after = talk.frames(Stats, *talk.first_visit), talk.frames(Stats, "back")
-    if not talk.frames(Hello, "back"):
+def host_goes_away(transcript: Transcript) -> RuleResult:
+    """The counters of STATS around the time in which the port was closed must have gone on."""
+    before, after = (
+        transcript.frames(Stats, *transcript.first_visit),
+        transcript.frames(Stats, "back"),
+    )
+    if not transcript.frames(Hello, "back"):
         return failed(f"no HELLO after the port was closed for {AWAY_S:g} s and opened again")
     if not after:
         return failed("no STATS after the port was closed and opened again")
     if after[-1].uptime_ms < before[-1].uptime_ms:
-        if talk.is_tcp:
+        if transcript.is_tcp:
             return failed("the hub restarted when the connection was closed and made again")
         return not_tried("this hub restarts when its port is opened, as L2 allows")
     taken = after[-1].taken - before[-1].taken & 0xFFFFFFFF
     seconds = 1e-3 * (after[-1].uptime_ms - before[-1].uptime_ms)
-    # What a busy host reads before the ACK was taken at the faster period.
-    gaps = periods_us(behind_ack(talk.steps["period again"], Command.SET_PERIOD))[1:]
+    # Samples that a busy host reads before the ACK were taken at the faster period.
+    gaps = periods_us(behind_ack(transcript.steps["period again"], Command.SET_PERIOD))[1:]
     due = 1e6 * seconds / float(np.median(gaps)) if len(gaps) else 0
-    if taken < 0.7 * due:
+    if taken < MIN_TAKEN_SHARE * due:
         return failed(
             f"{taken} samples taken in the {seconds:.2f} s in which the port was closed and opened "
             f"again, {due:.0f} were due"

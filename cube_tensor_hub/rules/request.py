@@ -8,24 +8,28 @@ from numpy.typing import NDArray
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Result, Sample, Stats
 
 from ..conversation import PERIOD_US, UNKNOWN
-from ..transcript import Step, Transcript
-from ..verdict import ANY_FRAME, Verdict, failed, not_tried, passed, rule
+from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
+from ..transcript import CheckStep, Transcript
 from .sample import first_frames, periods_us
 
-MOVED = 0.1
-"""Of a period: by less than that a busy machine may move some samples."""
-TOLERANCE = 0.01
-"""R3 lets a hub round; a period that is off by more than it says is wrong."""
+MAX_SHIFT = 0.1
+"""Largest shift of samples that a busy machine can cause, as a share of the period."""
+
+PERIOD_TOLERANCE = 0.01
+"""Largest relative difference between the period in force and the measured one."""
+
+MIN_PERIODS = 3
+"""Number of periods that a rule about them needs."""
 
 
-def in_force(step: Step) -> int:
-    """The period that the hub answered, µs; 0: it did not."""
+def in_force(step: CheckStep) -> int:
+    """Return the period that the hub answered, in µs; 0: it did not answer."""
     ack = step.ack(Command.SET_PERIOD)
     return 0 if ack is None else ack.argument
 
 
-def behind_ack(step: Step, request: int) -> list[Sample]:
-    """Samples behind the ACK of a request."""
+def behind_ack(step: CheckStep, request: int) -> list[Sample]:
+    """Return the samples behind the first ACK of a request."""
     frames = [heard.frame for heard in step.heard]
     for at, frame in enumerate(frames):
         if isinstance(frame, Ack) and frame.request == request:
@@ -38,9 +42,13 @@ def behind_ack(step: Step, request: int) -> list[Sample]:
     "Each sound request gets one ACK, in order, after it was carried out",
     needs=(ANY_FRAME,),
 )
-def one_ack_each(talk: Transcript) -> Verdict:
+def one_ack_each(transcript: Transcript) -> RuleResult:
+    """In each step the ACKs must be those of the requests, in order.
+
+    That a request was carried out before its ACK shows in the samples around START and STOP.
+    """
     n_requests = 0
-    for step in talk.steps.values():
+    for step in transcript.steps.values():
         asked = [ask.request for ask in step.requests if ask.request != Command.TIME]
         if not asked:
             continue
@@ -51,15 +59,16 @@ def one_ack_each(talk: Transcript) -> Verdict:
                 f"requests {words(asked)} got ACKs {words(answered)}, in the step '{step.name}'"
             )
     for name in ("stop", "stop samples"):
-        late = behind_ack(talk.steps[name], Command.STOP)
+        late = behind_ack(transcript.steps[name], Command.STOP)
         if late:
             return failed(f"{len(late)} samples came behind the ACK of STOP")
-    if not talk.frames(Sample, "start"):
+    if not transcript.frames(Sample, "start"):
         return failed("no SAMPLE came behind the ACK of START")
     return passed(f"{n_requests} requests, one ACK each, in order")
 
 
 def words(numbers: list[int]) -> str:
+    """Return numbers as a list in a sentence."""
     return ", ".join(map(str, numbers)) or "none"
 
 
@@ -69,15 +78,15 @@ def words(numbers: list[int]) -> str:
     "0, as is that of request 5 and of unknown requests.",
     needs=(Ack,),
 )
-def arguments_that_are_0(talk: Transcript) -> Verdict:
-    acks = [ack for ack in talk.frames(Ack) if ack.request != Command.SET_PERIOD]
+def arguments_that_are_0(transcript: Transcript) -> RuleResult:
+    acks = [ack for ack in transcript.frames(Ack) if ack.request != Command.SET_PERIOD]
     for ack in acks:
         if ack.argument:
             return failed(f"the ACK of request {ack.request} has argument {ack.argument}")
-        # A second START or STOP is R6's.
+        # The result of a second START or STOP is for R6 to check.
         if ack.request in (Command.HELLO, Command.IDENTIFY) and ack.result != Result.DONE:
             return failed(f"request {ack.request} was answered with result {ack.result}")
-    unknown = talk.steps["unknown request"].ack(UNKNOWN)
+    unknown = transcript.steps["unknown request"].ack(UNKNOWN)
     if unknown is not None and unknown.result != Result.UNKNOWN:
         return failed(f"unknown request {UNKNOWN} was answered with result {unknown.result}")
     return passed(f"in {len(acks)} ACKs; the arguments of requests are ignored")
@@ -88,21 +97,21 @@ def arguments_that_are_0(talk: Transcript) -> Verdict:
     "It answers 0 (done) with the period now in force, which HELLO then says too.",
     needs=(Ack, Hello),
 )
-def period_is_kept(talk: Transcript) -> Verdict:
-    ack = talk.steps["period"].ack(Command.SET_PERIOD)
+def period_is_kept(transcript: Transcript) -> RuleResult:
+    ack = transcript.steps["period"].ack(Command.SET_PERIOD)
     if ack is None or ack.result == Result.REFUSED:
         return not_tried(f"the hub did not take a period of {PERIOD_US} µs")
     if ack.result != Result.DONE:
         return failed(f"request 4 was answered with result {ack.result}")
-    hello = talk.frames(Hello, "after period")
+    hello = transcript.frames(Hello, "after period")
     if hello and hello[0].period_us != ack.argument:
         return failed(f"ACK says {ack.argument} µs, HELLO behind it {hello[0].period_us} µs")
-    gaps = periods_us(talk.frames(Sample, "start"))
-    if len(gaps) < 3:
+    gaps = periods_us(transcript.frames(Sample, "start"))
+    if len(gaps) < MIN_PERIODS:
         return not_tried(f"{len(gaps)} periods came in the step 'start', 3 are needed")
     middle = float(np.median(gaps))
     text = f"asked {PERIOD_US} µs, in force {ack.argument} µs, median {middle:.1f} µs"
-    if abs(middle - ack.argument) > TOLERANCE * ack.argument + 2:
+    if abs(middle - ack.argument) > PERIOD_TOLERANCE * ack.argument + 2:
         return failed(text)
     return passed(f"{text}, mean {gaps.mean():.1f} µs, jitter {gaps.std():.1f} µs")
 
@@ -112,12 +121,12 @@ def period_is_kept(talk: Transcript) -> Verdict:
     "A hub that cannot do a period answers 2 (refused) with the one in force, and keeps that.",
     needs=(Ack, Hello),
 )
-def impossible_period(talk: Transcript) -> Verdict:
-    ack = talk.steps["impossible period"].ack(Command.SET_PERIOD)
+def impossible_period(transcript: Transcript) -> RuleResult:
+    ack = transcript.steps["impossible period"].ack(Command.SET_PERIOD)
     if ack is None:
         return not_tried("request 4 was not answered: see R1")
-    before = talk.frames(Hello, "three at once")
-    after = talk.frames(Hello, "after impossible period")
+    before = transcript.frames(Hello, "three at once")
+    after = transcript.frames(Hello, "after impossible period")
     if ack.result == Result.DONE and ack.argument:
         return not_tried(f"the hub rounded a period of 0 µs to {ack.argument} µs, as R3 allows")
     if ack.result != Result.REFUSED:
@@ -132,7 +141,7 @@ def impossible_period(talk: Transcript) -> Verdict:
 
 
 @rule("R5", "A HELLO with a period that is neither the one asked for")
-def hosts_see_restarts(talk: Transcript) -> Verdict:
+def hosts_see_restarts(transcript: Transcript) -> RuleResult:
     return not_tried("a rule of the host")
 
 
@@ -142,59 +151,61 @@ def hosts_see_restarts(talk: Transcript) -> Verdict:
     "has stopped.",
     needs=(Ack,),
 )
-def start_and_stop_again(talk: Transcript) -> Verdict:
-    again = [name for name in talk.steps if name.startswith("start again")]
+def start_and_stop_again(transcript: Transcript) -> RuleResult:
+    again = [name for name in transcript.steps if name.startswith("start again")]
     asked = [(Command.START, name) for name in again]
     asked += [(Command.STOP, name) for name in ("three at once", "stop again")]
     for command, name in asked:
-        ack = talk.steps[name].ack(command)
+        ack = transcript.steps[name].ack(command)
         if ack is not None and ack.result != Result.DONE:
             return failed(f"a second {command.name} was answered with result {ack.result}")
-    period_us = in_force(talk.steps["period"])
-    before = phases(talk.frames(Sample, "start"), period_us)[-5:]
+    period_us = in_force(transcript.steps["period"])
+    before = phases(transcript.frames(Sample, "start"), period_us)[-5:]
     if len(before) < 3:
         return not_tried("too few samples came to see it")
     for name in again:
-        behind = phases(talk.frames(Sample, name), period_us)
+        behind = phases(transcript.frames(Sample, name), period_us)
         if len(behind) < 3:
             return failed(f"{len(behind)} samples came after a second START")
-        # A hub that is held up is late for some samples, so those nearest to each other count.
+        # A busy emulator is late for some samples, so those nearest to each other are compared.
         apart = (behind[:, None] - before + 0.5) % 1.0 - 0.5
         shift = float(np.abs(apart).min())
-        if shift > MOVED:
+        if shift > MAX_SHIFT:
             return failed(f"a second START moved the samples by {shift:.2f} periods")
         before = behind
     return passed("a second START moves no sample; both are answered 0")
 
 
 def phases(samples: list[Sample], period_us: int) -> NDArray[np.float64]:
-    """Where in a period each sample is, 0 to 1."""
+    """Return the position of each sample within the period, 0 to 1."""
     times = [sample.device_us for sample in first_frames(samples)]
     return np.array(times) % max(1, period_us) / max(1, period_us)
 
 
 @rule("R7", "A new period counts at once, also while samples flow.", needs=(Sample, Ack))
-def new_period_at_once(talk: Transcript) -> Verdict:
-    period_us = in_force(talk.steps["slower"])
-    if not period_us or period_us == in_force(talk.steps["period"]):
+def new_period_at_once(transcript: Transcript) -> RuleResult:
+    period_us = in_force(transcript.steps["slower"])
+    if not period_us or period_us == in_force(transcript.steps["period"]):
         return not_tried("the hub did not take another period")
-    gaps = periods_us(behind_ack(talk.steps["slower"], Command.SET_PERIOD))[1:]
-    if len(gaps) < 3:
+    gaps = periods_us(behind_ack(transcript.steps["slower"], Command.SET_PERIOD))[1:]
+    if len(gaps) < MIN_PERIODS:
         return failed(f"{len(gaps) + 1} periods came after a new period of {period_us} µs")
-    middle = float(np.median(gaps))  # of few; R3 looks closer
-    if abs(middle - period_us) > MOVED * period_us:
+    # There are few gaps, so the limit is wide; R3 checks the period closely.
+    middle = float(np.median(gaps))
+    if abs(middle - period_us) > MAX_SHIFT * period_us:
         return failed(f"{period_us} µs in force, but samples come every {middle:.0f} µs")
     return passed(f"{middle:.0f} µs from the next sample on")
 
 
 @rule("R8", "After power-up a hub has stopped, until START.", needs=(ANY_FRAME,))
-def stopped_until_start(talk: Transcript) -> Verdict:
-    early = talk.frames(Sample, "opened", "hello")
-    stats = talk.frames(Stats, "opened", "hello", "quiet")
+def stopped_until_start(transcript: Transcript) -> RuleResult:
+    """Samples before START are wrong if the power came on after the port was opened."""
+    early = transcript.frames(Sample, "opened", "hello")
+    stats = transcript.frames(Stats, "opened", "hello", "quiet")
     if not stats:
         return not_tried("no STATS came, so when the power came on is not known")
-    opened = talk.steps["opened"].sent_s
-    first = next(heard for heard in talk.heard() if isinstance(heard.frame, Stats))
+    opened = transcript.steps["opened"].sent_s
+    first = next(heard for heard in transcript.heard() if isinstance(heard.frame, Stats))
     uptime_s = 1e-3 * stats[0].uptime_ms
     if early and uptime_s < first.at_s - opened + 0.5:
         return failed(f"{len(early)} samples came before START, {uptime_s:.1f} s after power-up")

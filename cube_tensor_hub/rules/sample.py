@@ -1,6 +1,6 @@
 """Rules of SAMPLE and STATS: S1 to S9.
 
-Samples are counted until the port is closed: what the host's kernel holds then is lost.
+Samples are counted until the port is closed, because what the kernel holds then is lost.
 """
 
 from __future__ import annotations
@@ -15,30 +15,40 @@ from cube_tensor_driver.device.clock.line import MAX_DRIFT
 from cube_tensor_driver.device.wire.protocol import Hello, Sample, Stats
 
 from ..conversation import UNREAD_S
+from ..rule import RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
-from ..verdict import Verdict, failed, not_tried, passed, rule
 from .hello import frames_per_sample, of_kind, once_a_second
 
 HALF = 1 << 31
-STANDSTILL_S, WAITS = 2.5, 0.1
-"""Between two STATS, and of the samples that are due: a hub on a busy machine is not so slow."""
-UPTIME_S = 5.0
-"""By so much device time and uptime may differ: both count from power-up."""
+"""Half of the range of sequence numbers."""
+
+MAX_STATS_GAP_S = 2.5
+"""Time between two STATS, in seconds, above which the hub has waited. A hub on a busy machine is
+not so slow."""
+
+MIN_TAKEN_SHARE = 0.1
+"""Share of the samples that are due below which the hub has waited."""
+
+MAX_UPTIME_DIFFERENCE_S = 5.0
+"""Largest difference between device time and uptime, in seconds: both count from power-up."""
+
+MIN_DRIFT_SAMPLES = 20
+"""Number of samples that a comparison of the clocks needs."""
 
 
 def forward(later: int, earlier: int) -> int:
-    """By how much a number that wraps at 2^32 grew; negative if it went back."""
+    """Return by how much a number that wraps at 2^32 grew; negative if it went back."""
     return (later - earlier + HALF) % (1 << 32) - HALF
 
 
 def first_frames(samples: list[Sample]) -> list[Sample]:
-    """One frame of each sample."""
+    """Return the first frame of each sample."""
     later = [b for a, b in pairwise(samples) if b.sequence != a.sequence]
     return [*samples[:1], *later]
 
 
 def periods_us(samples: list[Sample]) -> NDArray[np.float64]:
-    """Device time per number from sample to sample, µs."""
+    """Return the device time from sample to sample, per sequence number, in µs."""
     gaps = [
         (after.device_us - before.device_us) / forward(after.sequence, before.sequence)
         for before, after in pairwise(first_frames(samples))
@@ -53,13 +63,13 @@ def periods_us(samples: list[Sample]) -> NDArray[np.float64]:
     "listens. START, STOP and a new period do not change the numbers.",
     needs=(Sample,),
 )
-def numbers_go_on(talk: Transcript) -> Verdict:
-    """Of the first frame of each sample; S3 judges the others."""
-    begin = min(sample.first_cube for sample in talk.frames(Sample))
+def numbers_go_on(transcript: Transcript) -> RuleResult:
+    """The first frames of the samples must have growing numbers; S3 checks the other frames."""
+    begin = min(sample.first_cube for sample in transcript.frames(Sample))
     samples = [
         (name, sample)
-        for name in talk.first_visit
-        for sample in talk.frames(Sample, name)
+        for name in transcript.first_visit
+        for sample in transcript.frames(Sample, name)
         if sample.first_cube == begin
     ]
     for (before, last), (name, sample) in pairwise(samples):
@@ -67,7 +77,7 @@ def numbers_go_on(talk: Transcript) -> Verdict:
         if forward(sample.sequence, last.sequence) <= 0:
             return failed(f"number {sample.sequence} came after {last.sequence}, {where}")
     first, last = samples[0][1], samples[-1][1]
-    stats = talk.frames(Stats, "opened", "hello", "stop", "quiet")
+    stats = transcript.frames(Stats, "opened", "hello", "stop", "quiet")
     if stats and stats[-1].taken == 0 and first.sequence != 0:
         return failed(f"the first sample since power-up has number {first.sequence}")
     return passed(f"numbers {first.sequence} to {last.sequence} over START, STOP, new periods")
@@ -79,24 +89,27 @@ def numbers_go_on(talk: Transcript) -> Verdict:
     "back while the hub runs",
     needs=(Sample,),
 )
-def device_time_runs(talk: Transcript) -> Verdict:
-    samples = first_frames(talk.frames(Sample, *talk.first_visit))
+def device_time_runs(transcript: Transcript) -> RuleResult:
+    """Device time must grow, agree with the uptime, and run at the rate of the host's clock."""
+    samples = first_frames(transcript.frames(Sample, *transcript.first_visit))
     for before, after in pairwise(samples):
         if forward(after.sequence, before.sequence) > 0 and after.device_us <= before.device_us:
             return failed(
                 f"device time goes from {before.device_us} µs of sample {before.sequence} to "
                 f"{after.device_us} µs of sample {after.sequence}"
             )
-    stats = talk.frames(Stats, *talk.first_visit)
+    stats = transcript.frames(Stats, *transcript.first_visit)
     device_s = 1e-6 * samples[-1].device_us
-    if stats and abs(device_s - 1e-3 * stats[-1].uptime_ms) > UPTIME_S:
+    if stats and abs(device_s - 1e-3 * stats[-1].uptime_ms) > MAX_UPTIME_DIFFERENCE_S:
         uptime_s = 1e-3 * stats[-1].uptime_ms
         return failed(f"device time is {device_s:.3f} s, the uptime in STATS {uptime_s:.3f} s")
-    flow = of_kind(talk, Sample, "start")
-    if len(flow) < 20:
-        return not_tried(f"{len(flow)} samples came in the step 'start', 20 are needed")
+    flow = of_kind(transcript, Sample, "start")
+    if len(flow) < MIN_DRIFT_SAMPLES:
+        return not_tried(
+            f"{len(flow)} samples came in the step 'start', {MIN_DRIFT_SAMPLES} are needed"
+        )
     host_us = np.array([1e6 * heard.at_s for heard in flow])
-    device_us = np.array([float(sample.device_us) for sample in talk.frames(Sample, "start")])
+    device_us = np.array([float(sample.device_us) for sample in transcript.frames(Sample, "start")])
     drift, unsure, jitter = drift_of(host_us - host_us[0], device_us - device_us[0])
     text = f"{1e6 * drift:+.0f} ± {1e6 * unsure:.0f} ppm against the host, jitter {jitter:.0f} µs"
     if abs(drift) - unsure > MAX_DRIFT:
@@ -105,10 +118,17 @@ def device_time_runs(talk: Transcript) -> Verdict:
 
 
 def drift_of(host: NDArray[np.float64], device: NDArray[np.float64]) -> tuple[float, float, float]:
-    """(relative drift, how unsure it is, median delay above the smallest in the unit of time).
+    """Compare the rates of two clocks.
 
-    Delay is never negative, so the earliest arrivals of both halves tell the clock. That they are
-    late too makes it unsure.
+    The delay of an arrival is never negative, so that the arrivals with the smallest delay in both
+    halves give the rate. Their own unknown delays make it uncertain.
+
+    Args:
+        host: (N,) times of arrival, in µs.
+        device: (N,) times of the samples, in µs.
+
+    Returns:
+        Relative drift, its uncertainty, and the median delay above the smallest one, in µs.
     """
     delay = host - device
     half = len(delay) // 2
@@ -126,8 +146,8 @@ def drift_of(host: NDArray[np.float64], device: NDArray[np.float64]) -> tuple[fl
     "at the same cubes. All have the same number and device time.",
     needs=(Sample,),
 )
-def frames_of_a_sample(talk: Transcript) -> Verdict:
-    samples = talk.frames(Sample, *talk.first_visit)
+def frames_of_a_sample(transcript: Transcript) -> RuleResult:
+    samples = transcript.frames(Sample, *transcript.first_visit)
     if len({sample.first_cube for sample in samples}) == 1:
         return not_tried("each sample of this hub fits one frame")
     groups = [list(group) for _, group in groupby(samples, key=lambda sample: sample.sequence)]
@@ -157,16 +177,19 @@ def frames_of_a_sample(talk: Transcript) -> Verdict:
     "A hub that must drop drops all frames of a sample and counts 1.",
     needs=(Sample, Stats),
 )
-def drops_are_counted(talk: Transcript) -> Verdict:
-    """All numbers that are missing before a STATS are in its count. It may count more, behind the
-    last number that came, until it has dropped nothing for a second."""
-    names = talk.first_visit
-    base = talk.frames(Stats, *names)[0].dropped
-    frames = Counter(sample.sequence for sample in talk.frames(Sample, *names))
-    n_frames = frames_per_sample(talk)
+def drops_are_counted(transcript: Transcript) -> RuleResult:
+    """All numbers that are missing before a STATS must be in its count.
+
+    It may count more, which were dropped behind the last number that came, until it has dropped
+    nothing for a second.
+    """
+    names = transcript.first_visit
+    base = transcript.frames(Stats, *names)[0].dropped
+    frames = Counter(sample.sequence for sample in transcript.frames(Sample, *names))
+    n_frames = frames_per_sample(transcript)
     missing, counted = 0, 0
     previous: int | None = None
-    for heard in talk.heard(*names):
+    for heard in transcript.heard(*names):
         if isinstance(heard.frame, Sample) and heard.frame.sequence != previous:
             number = heard.frame.sequence
             step = 1 if previous is None else forward(number, previous)
@@ -184,9 +207,9 @@ def drops_are_counted(talk: Transcript) -> Verdict:
 
 
 @rule("S5", "n_pads is that of HELLO.", needs=(Hello, Sample))
-def samples_fit_hello(talk: Transcript) -> Verdict:
+def samples_fit_hello(transcript: Transcript) -> RuleResult:
     hello: Hello | None = None
-    for heard in talk.heard():
+    for heard in transcript.heard():
         if isinstance(heard.frame, Hello):
             hello = heard.frame
         elif isinstance(heard.frame, Sample) and hello is not None:
@@ -200,7 +223,7 @@ def samples_fit_hello(talk: Transcript) -> Verdict:
 
 
 @rule("S6", "A frequency of 0 means not measured.", needs=(Sample,))
-def pads_that_are_not_measured(talk: Transcript) -> Verdict:
+def pads_that_are_not_measured(transcript: Transcript) -> RuleResult:
     return not_tried("bytes do not show it: stop one oscillator, docs/build.md")
 
 
@@ -210,20 +233,25 @@ def pads_that_are_not_measured(talk: Transcript) -> Verdict:
     "wraps with it. STATS goes out behind the frames of the samples that it counts.",
     needs=(Sample, Stats),
 )
-def taken_is_the_next_number(talk: Transcript) -> Verdict:
-    """Between the numbers of the samples before and behind it, which mostly leaves one."""
+def taken_is_the_next_number(transcript: Transcript) -> RuleResult:
+    """The count must lie between the numbers of the samples before and behind the STATS.
+
+    Mostly that leaves one number.
+    """
     waiting: list[Stats] = []
-    expected: int | None = None  # the number behind that of the last sample
+    # The number behind that of the last sample.
+    expected: int | None = None
     n_compared = 0
-    for heard in talk.heard(*talk.first_visit):
+    for heard in transcript.heard(*transcript.first_visit):
         if isinstance(heard.frame, Stats):
             waiting.append(heard.frame)
         elif isinstance(heard.frame, Sample):
             number = heard.frame.sequence
-            least = number if expected is None else expected
+            lowest = number if expected is None else expected
             for stats in waiting:
-                is_early = expected is not None and forward(stats.taken, least) < 0
-                if forward(number, least) >= 0 and (is_early or forward(number, stats.taken) < 0):
+                too_low = expected is not None and forward(stats.taken, lowest) < 0
+                too_high = forward(number, stats.taken) < 0
+                if forward(number, lowest) >= 0 and (too_low or too_high):
                     last = "none" if expected is None else str((expected - 1) & 0xFFFFFFFF)
                     return failed(
                         f"STATS says {stats.taken} taken, the sample before it is {last}, the "
@@ -236,9 +264,9 @@ def taken_is_the_next_number(talk: Transcript) -> Verdict:
 
 
 @rule("S8", "A hub sends STATS once a second, started or not.", needs=(Hello,))
-def stats_come(talk: Transcript) -> Verdict:
+def stats_come(transcript: Transcript) -> RuleResult:
     for name, what in (("quiet", "while stopped"), ("start", "while started")):
-        wrong = once_a_second(of_kind(talk, Stats, name), "STATS", what)
+        wrong = once_a_second(of_kind(transcript, Stats, name), "STATS", what)
         if wrong:
             return failed(wrong)
     return passed("stopped and started")
@@ -249,29 +277,29 @@ def stats_come(talk: Transcript) -> Verdict:
     "A full transmit buffer never makes a hub wait: it drops whole frames.",
     needs=(Sample, Stats),
 )
-def full_buffer(talk: Transcript) -> Verdict:
-    step = talk.steps["unread"]
-    if sum(other.damaged for other in talk.steps.values()) > step.damaged:
+def full_buffer(transcript: Transcript) -> RuleResult:
+    step = transcript.steps["unread"]
+    if sum(other.damaged for other in transcript.steps.values()) > step.damaged:
         return not_tried("frames are damaged in any case: see F5")
     if step.damaged:
         return failed(f"{step.damaged} damaged frames after {UNREAD_S:g} s without reading")
-    read = talk.first_visit[: talk.first_visit.index("unread")]
-    before = talk.frames(Stats, *read)[-1]
-    stats = [before, *talk.frames(Stats, "unread", "period again")]
+    read = transcript.first_visit[: transcript.first_visit.index("unread")]
+    before = transcript.frames(Stats, *read)[-1]
+    stats = [before, *transcript.frames(Stats, "unread", "period again")]
     dropped = forward(stats[-1].dropped, before.dropped)
     if dropped:
         return passed(f"{dropped} whole samples dropped in {UNREAD_S:g} s without reading")
     due_ms = before.uptime_ms + 1e3 * UNREAD_S
     if stats[-1].uptime_ms < due_ms:
         return failed(f"no STATS any more after {UNREAD_S:g} s without reading")
-    gaps = periods_us(talk.frames(Sample, "fast"))
+    gaps = periods_us(transcript.frames(Sample, "fast"))
     rate = 1e6 / float(np.median(gaps)) if len(gaps) else 0.0
     for one, other in pairwise(stats):
         seconds = 1e-3 * (other.uptime_ms - one.uptime_ms)
-        if seconds > STANDSTILL_S:
+        if seconds > MAX_STATS_GAP_S:
             return failed(f"no STATS for {seconds:.1f} s while nobody read: the hub waited")
         taken = forward(other.taken, one.taken)
-        if other.uptime_ms <= due_ms and taken < WAITS * seconds * rate:
+        if other.uptime_ms <= due_ms and taken < MIN_TAKEN_SHARE * seconds * rate:
             return failed(
                 f"while nobody read, {taken} samples were taken in {seconds:.1f} s at {rate:.0f} "
                 "Hz, and none counts as dropped: the hub waited"

@@ -7,43 +7,55 @@ from itertools import pairwise
 
 from cube_tensor_driver.device.wire.protocol import Command, Result, Sample, Time
 
+from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
-from ..verdict import ANY_FRAME, Verdict, failed, not_tried, passed, rule
 from .hello import of_kind
 
-MAX_RATE = 0.02
-"""By how much two clocks may differ here; S2 judges the rate of the hub's."""
-OTHER_CLOCK_S = 1.0
-"""A sample that comes so long after or before it was measured has another clock than TIME."""
+MAX_RATE_DIFFERENCE = 0.02
+"""Largest relative difference between the clocks of hub and host. It is wide, because S2 checks the
+rate of the hub's clock."""
+
+MAX_AGE_S = 1.0
+"""Age of a sample at its arrival, in seconds, above which it has another clock than TIME."""
+
+RESOLUTION_S = 2e-6
+"""Sum of the rounding errors of two TIMEs, in seconds."""
+
+NOT_KNOWN = "this hub does not know request 6: see T4"
+"""Why rules about TIME are not tried."""
 
 
 @dataclass(frozen=True)
-class RoundTrip:
-    """A question and its answer: between sent_s and came_s, host's clock, the hub's clock showed
-    device_s."""
+class TimeExchange:
+    """A request for TIME and its answer.
+
+    Attributes:
+        sent_s: Time on the host's clock at which the request was sent, in seconds.
+        came_s: Time on the host's clock at which the answer came, in seconds.
+        device_s: Time on the hub's clock somewhere between these two, in seconds.
+    """
 
     sent_s: float
     came_s: float
     device_s: float
 
 
-def round_trips(talk: Transcript) -> list[RoundTrip]:
+def time_exchanges(transcript: Transcript) -> list[TimeExchange]:
+    """Return the requests for TIME that were answered."""
     trips = []
-    for step in talk.steps.values():
+    for step in transcript.steps.values():
         if step.name.startswith("time"):
             for heard in step.heard:
                 if isinstance(heard.frame, Time):
                     device_s = 1e-6 * heard.frame.device_us
-                    trips.append(RoundTrip(step.sent_s, heard.at_s, device_s))
+                    trips.append(TimeExchange(step.sent_s, heard.at_s, device_s))
                     break
     return trips
 
 
-def knows_time(talk: Transcript) -> bool:
-    return bool(talk.frames(Time))
-
-
-NOT_KNOWN = "this hub does not know request 6: see T4"
+def knows_time(transcript: Transcript) -> bool:
+    """Return whether the hub has ever sent a TIME."""
+    return bool(transcript.frames(Time))
 
 
 @rule(
@@ -52,21 +64,24 @@ NOT_KNOWN = "this hub does not know request 6: see T4"
     "first byte of the answer goes out.",
     needs=(ANY_FRAME,),
 )
-def clock_is_read_between(talk: Transcript) -> Verdict:
-    """Between two readings the hub's clock goes on by what the host's does, give or take the round
-    trips."""
-    trips = round_trips(talk)
-    if not knows_time(talk) or len(trips) < 2:
+def clock_is_read_between(transcript: Transcript) -> RuleResult:
+    """Between two answers the hub's clock must go on by what the host's clock does.
+
+    Each reading is uncertain by the time between request and answer.
+    """
+    trips = time_exchanges(transcript)
+    if not knows_time(transcript) or len(trips) < 2:
         return not_tried(NOT_KNOWN)
     shortest = min(trip.came_s - trip.sent_s for trip in trips)
     for first, trip in pairwise(trips):
-        slack = MAX_RATE * (trip.came_s - first.sent_s) + 2e-6
-        least, most = trip.sent_s - first.came_s - slack, trip.came_s - first.sent_s + slack
+        slack = MAX_RATE_DIFFERENCE * (trip.came_s - first.sent_s) + RESOLUTION_S
+        shortest_s = trip.sent_s - first.came_s - slack
+        longest_s = trip.came_s - first.sent_s + slack
         went = trip.device_s - first.device_s
-        if not least <= went <= most:
+        if not shortest_s <= went <= longest_s:
             return failed(
                 f"between two TIMEs the hub's clock went on by {went:.6f} s, the host's by "
-                f"{least:.6f} to {most:.6f} s"
+                f"{shortest_s:.6f} to {longest_s:.6f} s"
             )
     return passed(f"{len(trips)} answers, shortest round trip {1e3 * shortest:.2f} ms")
 
@@ -76,10 +91,10 @@ def clock_is_read_between(talk: Transcript) -> Verdict:
     "Each sound request 6 gets one TIME with the request's argument, started or not.",
     needs=(ANY_FRAME,),
 )
-def one_time_each(talk: Transcript) -> Verdict:
-    if not knows_time(talk):
+def one_time_each(transcript: Transcript) -> RuleResult:
+    if not knows_time(transcript):
         return not_tried(NOT_KNOWN)
-    for step in talk.steps.values():
+    for step in transcript.steps.values():
         numbers = [time.number for time in step.frames(Time)]
         asked = [ask.argument for ask in step.requests if ask.request == Command.TIME]
         if numbers != asked:
@@ -89,17 +104,17 @@ def one_time_each(talk: Transcript) -> Verdict:
 
 
 @rule("T3", "The clock is that of the device time in SAMPLE.", needs=(ANY_FRAME,))
-def clock_of_samples(talk: Transcript) -> Verdict:
-    trips = round_trips(talk)
-    samples = of_kind(talk, Sample, "start")
+def clock_of_samples(transcript: Transcript) -> RuleResult:
+    trips = time_exchanges(transcript)
+    samples = of_kind(transcript, Sample, "start")
     if not trips:
         return not_tried(NOT_KNOWN)
     if not samples:
         return not_tried("no SAMPLE came")
     best = min(trips, key=lambda trip: trip.came_s - trip.sent_s)
-    for heard, sample in zip(samples, talk.frames(Sample, "start"), strict=True):
+    for heard, sample in zip(samples, transcript.frames(Sample, "start"), strict=True):
         age_s = heard.at_s - best.sent_s - (1e-6 * sample.device_us - best.device_s)
-        if abs(age_s) > OTHER_CLOCK_S:
+        if abs(age_s) > MAX_AGE_S:
             return failed(
                 f"by the clock of TIME, sample {sample.sequence} came {age_s:.3f} s after it "
                 "was measured"
@@ -112,10 +127,10 @@ def clock_of_samples(talk: Transcript) -> Verdict:
     "A hub that does not know request 6 answers it with ACK and result 1, as any unknown request.",
     needs=(ANY_FRAME,),
 )
-def unknown_time(talk: Transcript) -> Verdict:
-    if knows_time(talk):
+def unknown_time(transcript: Transcript) -> RuleResult:
+    if knows_time(transcript):
         return not_tried("this hub knows request 6")
-    ack = talk.steps["time stopped 0"].ack(Command.TIME)
+    ack = transcript.steps["time stopped 0"].ack(Command.TIME)
     if ack is None:
         return failed("request 6 got neither TIME nor ACK")
     if ack.result != Result.UNKNOWN:
@@ -124,5 +139,5 @@ def unknown_time(talk: Transcript) -> Verdict:
 
 
 @rule("T5", "The host asks each hub about once a second")
-def asking_for_time(talk: Transcript) -> Verdict:
+def asking_for_time(transcript: Transcript) -> RuleResult:
     return not_tried("a rule of the host")

@@ -15,7 +15,7 @@ from cube_tensor_driver.core.errors import CubeError, LinkError
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Request, Sample, Time, encode
 from cube_tensor_hub.check import Checked, check, in_order
-from cube_tensor_hub.verdict import Outcome
+from cube_tensor_hub.rule import Outcome
 
 UIDS = (0xA1, 0xA2, 0xA3)
 
@@ -416,7 +416,7 @@ class BusyHost(MemoryWire):
 
 def test_samples_of_the_faster_period_are_not_due_while_the_port_is_closed():
     result = check(BusyHost(made(HubInMemory, {})))
-    assert result.verdicts["L5"].outcome is Outcome.PASSED, result.to_dict()
+    assert result.results["L5"].outcome is Outcome.PASSED, result.to_dict()
 
 
 def test_every_rule_that_can_fail_has_its_broken_hub():
@@ -426,11 +426,11 @@ def test_every_rule_that_can_fail_has_its_broken_hub():
     tried = {
         number
         for result in sound
-        for number, verdict in result.verdicts.items()
+        for number, verdict in result.results.items()
         if verdict.outcome is Outcome.PASSED
     }
     assert tried == {number for number, _, _ in BROKEN} | {"L3"}
-    for verdict in sound[0].verdicts.values():
+    for verdict in sound[0].results.values():
         assert verdict.text
 
 

@@ -38,8 +38,8 @@ from cube_tensor_hub.captures import COUNTER_HZ, WINDOW_US, Oscillators, edges
 from cube_tensor_hub.check import Checked, check
 from cube_tensor_hub.firmware import Emulator, FirmwareError, build, missing, need
 from cube_tensor_hub.port_wire import PortWire
-from cube_tensor_hub.transcript import Ear
-from cube_tensor_hub.verdict import Outcome
+from cube_tensor_hub.rule import Outcome
+from cube_tensor_hub.transcript import FrameListener
 
 SOURCE = ROOT / "firmware"
 SKIN = package_data() / "config" / "skin_firmware.yaml"
@@ -205,7 +205,7 @@ def test_a_sample_goes_out_when_it_is_taken(out, tmp_path):
         cube_hub(out / "cube_hub", "--ports", str(tmp_path)) as port,
         PortWire(port, 921_600) as wire,
     ):
-        ear = Ear()
+        ear = FrameListener()
         wire.send(encode(Request(Command.SET_PERIOD, round(1e6 * period_s))))
         wire.send(encode(Request(Command.START)) + encode(Request(Command.TIME)))
         heard = [one for _ in range(30) for one in ear.hear(wire.listen(0.05), wire.now())]
@@ -269,9 +269,9 @@ def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
     assert {name: result.failed() for name, result in results.items()} == {
         name: [] for name in ports
     }
-    assert results["terminal"].verdicts["S3"].outcome is Outcome.PASSED
-    assert results["terminal"].verdicts["S9"].outcome is Outcome.PASSED
-    assert results["simulator"].verdicts["S9"].outcome is Outcome.PASSED
+    assert results["terminal"].results["S3"].outcome is Outcome.PASSED
+    assert results["terminal"].results["S9"].outcome is Outcome.PASSED
+    assert results["simulator"].results["S9"].outcome is Outcome.PASSED
 
 
 @emulated
