@@ -205,10 +205,11 @@ class LiveLinks:
         with self._lock:
             now_ns, step_ns = self._check_host_clock()
             for link, arrival_ns, frames, asked_ns in received:
-                # Bytes that were read just before the clock was set have an arrival in its old
-                # time.
-                if step_ns and abs(arrival_ns + step_ns - now_ns) < abs(arrival_ns - now_ns):
-                    arrival_ns += step_ns
+                if step_ns:
+                    # Bytes that were read just before the clock was set arrived in its old time.
+                    shifted_ns = arrival_ns + step_ns
+                    is_old = abs(shifted_ns - now_ns) < abs(arrival_ns - now_ns)
+                    arrival_ns = shifted_ns if is_old else arrival_ns
                 # All rows are counted first, so that an error in one frame hides no other.
                 for frame in frames:
                     if isinstance(frame, Sample):
@@ -274,7 +275,8 @@ class LiveLinks:
         device_us = [sample.device_us for sample in samples]
         numbers = [sample.sequence for sample in samples]
         stamps_ns = clock.update(device_us, arrival_ns, numbers)
-        self._scans.add(link, samples, stamps_ns, STAMP if clock.in_doubt else 0)
+        status = STAMP if clock.in_doubt else 0
+        self._scans.add(link, samples, stamps_ns, status)
 
     def _deliver(self) -> None:
         """Call back with the rows of all complete scans; a scan without rows is discarded."""

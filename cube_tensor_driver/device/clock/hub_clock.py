@@ -17,22 +17,24 @@ MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay, in ns, between sampling and arrival. If the estimated sampling time is
 older, the estimate is discarded and the arrival is the stamp."""
 RESTART_US = 1_000_000
-"""Step back of the device time, in µs, that shows that the hub restarted. After a smaller one the
-sample is out of order."""
+"""Step back of the device time, in µs, that shows that the hub restarted. If the step is smaller,
+the sample is out of order."""
 MIN_STILL_NS = 200_000_000
-"""Time without a change of the device time, in ns, after which the clock stands still."""
+"""Time, in ns, after which a device time that does not change shows that the hub's clock stands
+still."""
 MIN_STILL_READS = 3
-"""Number of reads without a change of the device time after which the clock stands still."""
-MAX_ANOMALIES = 3
-"""Number of steps within `ANOMALY_NS` after which the clock is not used."""
-ANOMALY_NS = 10_000_000_000
-"""Time, in ns, for which a step counts as an anomaly."""
+"""Number of reads without a change of the device time after which the hub's clock stands still. Two
+reads may give frames of the same sample."""
+MAX_STEPS = 3
+"""Number of steps of a hub's clock within `STEPS_NS` after which the clock is not used."""
+STEPS_NS = 10_000_000_000
+"""Time, in ns, in which the steps of a hub's clock are counted."""
 MAX_BAD_ANSWERS = 3
 """Number of successive answers to TIME that contradict the samples, after which it is reported."""
 CLOCK_SET = "the hub's clock was set: stamps follow its new time"
 CLOCK_STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
 CLOCK_KEEPS_JUMPING = (
-    f"the hub's clock jumped {MAX_ANOMALIES} times within {ANOMALY_NS / 1e9:g} s: "
+    f"the hub's clock jumped {MAX_STEPS} times within {STEPS_NS / 1e9:g} s: "
     "rows are stamped by their arrival"
 )
 BAD_ANSWERS = "the hub's answers to TIME contradict its samples: they are not used"
@@ -61,7 +63,7 @@ class HubClock:
         self._last_us = -1
         self._moved_ns = 0
         self._n_still = 0
-        self._anomalies_ns: deque[int] = deque(maxlen=MAX_ANOMALIES)
+        self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)
         self._n_bad_answers = 0
         self._last_arrival = _NEVER
         self._last_stamp = _NEVER
@@ -108,7 +110,7 @@ class HubClock:
         """Continue in the new time after the host's clock was set by `step_ns`."""
         self._first_ns += step_ns
         self._moved_ns += step_ns
-        self._anomalies_ns = deque((at + step_ns for at in self._anomalies_ns), MAX_ANOMALIES)
+        self._steps_ns = deque((at + step_ns for at in self._steps_ns), MAX_STEPS)
         if self._last_arrival != _NEVER:
             self._last_arrival += step_ns
         if self._last_stamp != _NEVER:
@@ -173,6 +175,7 @@ class HubClock:
         return self._newest == _NEVER
 
     def _restart(self) -> None:
+        """Forget all samples but the drift and the last stamp."""
         self._first_us = self._first_ns = 0
         self._newest = _NEVER  # device time of the newest sample
         self._line.restart()
@@ -180,8 +183,9 @@ class HubClock:
         self._decision: StepDecision | None = None
 
     def _count_reset(self) -> None:
+        """Count a restart of the line or a step of the hub's clock."""
         self.resets += 1
-        self._anomalies_ns.append(self._last_arrival)
+        self._steps_ns.append(self._last_arrival)
 
     def _convert(self, times: Sequence[int], arrival_ns: int) -> list[int]:
         """Learn from the newest of some samples and convert the device times of all."""
@@ -214,20 +218,27 @@ class HubClock:
         goes_back = arrival_ns < self._last_arrival
         self._last_arrival = arrival_ns
         if goes_back:
+            # Only a clock of the host that was set unnoticed, or a simulated time, does that.
             self._last_stamp = _NEVER
             self.reset()
+
         problem = self._find_problem(newest_us, arrival_ns)
         if problem:
             self.problems.add(problem)
             self._decision = None
         elif self._decision is not None and not self._n_still:
             self._decide(self._decision, newest_us, arrival_ns)
+
         device_ns = 1000 * (newest_us - self._first_us)
         if device_ns + 1000 * RESTART_US < self._newest:
             self.reset()
         if self._newest == _NEVER:
-            self._first_us, self._first_ns, device_ns = newest_us, arrival_ns, 0
-        if self._decision is None and self._line.add(device_ns, arrival_ns - self._first_ns):
+            self._first_us, self._first_ns = newest_us, arrival_ns
+            device_ns = 0
+
+        # While it is open whether the clock was set, the delays of samples are unknown.
+        arrival = arrival_ns - self._first_ns
+        if self._decision is None and self._line.add(device_ns, arrival):
             self.problems.add(CLOCK_SET)
             self._count_reset()
         if problem or self._decision is not None:
@@ -244,26 +255,36 @@ class HubClock:
             if self._n_still and self._stands_still(arrival_ns):
                 self.reset()  # It is unknown how long the clock stood still.
             self._last_us, self._moved_ns, self._n_still = device_us, arrival_ns, 0
-        anomalies = self._anomalies_ns
-        if anomalies and arrival_ns - anomalies[0] > ANOMALY_NS:
-            anomalies.popleft()
-        return CLOCK_KEEPS_JUMPING if len(anomalies) == MAX_ANOMALIES else ""
+        steps_ns = self._steps_ns
+        if steps_ns and arrival_ns - steps_ns[0] > STEPS_NS:
+            steps_ns.popleft()
+        return CLOCK_KEEPS_JUMPING if len(steps_ns) == MAX_STEPS else ""
 
     def _stands_still(self, arrival_ns: int) -> bool:
-        return self._n_still >= MIN_STILL_READS and arrival_ns - self._moved_ns > MIN_STILL_NS
+        """Return whether the device time has not changed for too long."""
+        still_ns = arrival_ns - self._moved_ns
+        return self._n_still >= MIN_STILL_READS and still_ns > MIN_STILL_NS
 
     def _begin_decision(self, step_us: int, arrival_ns: int) -> None:
         """Begin to decide whether the hub's clock was set, or add a step to the decision."""
-        before = self._decision
+        newest_ns = self._newest
+        before_ns = self._last_arrival - self._first_ns
+        since_ns = arrival_ns - self._first_ns
+        if self._decision is not None:
+            step_us += self._decision.step_us
+            newest_ns = self._decision.newest_ns
+            before_ns = self._decision.before_ns
+            since_ns = self._decision.since_ns
+        if not step_us:
+            self._decision = None  # The second step has undone the first.
+            return
         self._decision = StepDecision(
-            step_us=step_us + (before.step_us if before else 0),
-            newest_ns=before.newest_ns if before else self._newest,
-            before_ns=before.before_ns if before else self._last_arrival - self._first_ns,
-            since_ns=before.since_ns if before else arrival_ns - self._first_ns,
+            step_us=step_us,
+            newest_ns=newest_ns,
+            before_ns=before_ns,
+            since_ns=since_ns,
             usual_delay_ns=self._line.recent_min_height,
         )
-        if not self._decision.step_us:
-            self._decision = None
 
     def _decide(self, decision: StepDecision, newest_us: int, arrival_ns: int) -> None:
         """Decide whether the hub's clock was set, if that can be done now."""

@@ -24,30 +24,34 @@ from itertools import pairwise
 from typing import NamedTuple
 
 BUCKET_NS = 1_000_000_000
-"""Length of the intervals, in ns, of each of which the earliest point is kept."""
+"""Length, in ns, of the intervals (buckets) of each of which the earliest point is kept."""
 MAX_BUCKETS = 120
-"""Number of intervals kept, together two minutes."""
+"""Number of buckets whose earliest point is kept; together they are two minutes."""
 MIN_BUCKETS_FOR_DRIFT = 5
-"""Number of intervals before drift is estimated. Over a shorter time, delay looks like drift."""
+"""Number of buckets before the drift is estimated. Over a shorter time, a change of the delay
+cannot be distinguished from drift."""
 UNKNOWN_DRIFT = 1e-4
-"""Bound of the drift before it is estimated. Crystals are better than that."""
+"""Bound of the relative drift of a hub's clock before it is estimated. Crystals are better than
+that."""
 MAX_DRIFT = 1e-3
-"""Largest credible drift between two clocks. A steeper line comes from a pause of the host."""
+"""Largest credible relative drift between two clocks. A steeper line comes from a pause of the
+host."""
 MAX_RISE_NS = 20e6
-"""Height above the line, in ns, beyond which all points of an interval show that a clock was set.
-Bursts over USB delay samples by 16 ms."""
+"""Height above the line, in ns. If all points of a bucket are higher, a clock was set. USB adapters
+delay samples by up to 16 ms without that."""
 MAX_FALL_NS = 4e6
-"""Depth below the line, in ns, that shows that a clock was set, because no delay is negative. Steps
-of 5 ms are found, with 1 ms for the error of the line itself."""
+"""Depth below the line, in ns. A point that is deeper shows that a clock was set, because no delay
+is negative. Steps of 5 ms are found, with 1 ms for the error of the line itself."""
 MIN_BUCKETS_HIGH = 2
-"""Number of successive intervals above `MAX_RISE_NS` that show that a clock was set. One interval
-may be a pause of the host."""
+"""Number of successive buckets above `MAX_RISE_NS` that show that a clock was set. A single one may
+come from a pause of the host."""
 JITTER_POINTS = 64
-"""Number of points over which the jitter is averaged."""
+"""Number of points over which the jitter, the mean height above the line, is averaged."""
 MAX_ROUND_TRIPS = 64
-"""Number of round trips that are kept, about one minute."""
+"""Number of round trips that are kept. With one per second they cover about one minute."""
 MAX_COMMON_DELAY_NS = 1e9
-"""Longest credible delay, in ns, that all samples have beyond that of the answers."""
+"""Longest credible delay, in ns, that all samples have and the answers to TIME do not have. An
+answer that requires a longer one contradicts the samples."""
 
 
 class ClockRoundTrip(NamedTuple):
@@ -96,12 +100,12 @@ class ClockLine:
         self._n_high = 0
 
     def __len__(self) -> int:
-        """Return the number of points kept, one for each full interval."""
+        """Return the number of points kept, one for each full bucket."""
         return len(self._points)
 
     @property
     def recent_min_height(self) -> float:
-        """Smallest height of a point since the previous interval began; 0 before the first."""
+        """Smallest height of a point in this and the previous bucket; 0 if there is no point."""
         height = min(self._bucket_height, self._previous_height)
         return height if math.isfinite(height) else 0.0
 
@@ -110,7 +114,7 @@ class ClockLine:
         return arrival_ns - device_ns - self.offset - self.drift * device_ns
 
     def add(self, device_ns: float, arrival_ns: int) -> bool:
-        """Add a point: lower the line if the point is below it, and fit it after each interval.
+        """Add a point: lower the line if the point is below it, and fit it after each bucket.
 
         Returns:
             Whether the point shows that one of the clocks was set.
@@ -150,7 +154,7 @@ class ClockLine:
 
     def _lower(self, height: float) -> bool:
         """Lower the line to a point at a negative height; return whether a clock was set."""
-        # In the first interval the line falls because the smallest delay is not known yet.
+        # In the first bucket the line falls because the smallest delay is not known yet.
         self._fall -= height if self._points else 0.0
         was_set = self._fall > MAX_FALL_NS or -height > MAX_RISE_NS
         if was_set:
@@ -162,10 +166,10 @@ class ClockLine:
         return was_set
 
     def _fit(self, arrival_ns: int) -> bool:
-        """Fit the line to the earliest points of all intervals and begin the next interval.
+        """Fit the line to the earliest points of all buckets, and begin the next bucket.
 
         Returns:
-            Whether one of the clocks was set some intervals ago.
+            Whether a clock was set some buckets ago.
         """
         device_ns, delay = self._earliest
         height = delay - self.offset - self.drift * device_ns
@@ -175,9 +179,12 @@ class ClockLine:
             self._n_high = 0
             self._points.clear()
         self._points.append(self._earliest)
+
         points = sorted(self._points)
         if len(points) >= MIN_BUCKETS_FOR_DRIFT:
-            self.drift = min(max(_slope_at_centre(points), -MAX_DRIFT), MAX_DRIFT)
+            slope = _slope_at_centre(points)
+            self.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
+        # The line must not lie above any point, not even where the slope was limited.
         self.offset = min(delay - self.drift * device_ns for device_ns, delay in points)
         self._bucket_end = arrival_ns + BUCKET_NS
         self._fall = 0.0
@@ -189,27 +196,33 @@ class ClockLine:
         """Return the largest error that the estimated drift may have."""
         if len(self._points) < MIN_BUCKETS_FOR_DRIFT:
             return UNKNOWN_DRIFT
-        span = self._points[-1][0] - self._points[0][0]
-        return min(UNKNOWN_DRIFT, self.jitter_ns / span) if span > 0 else UNKNOWN_DRIFT
+        first, _ = self._points[0]
+        last, _ = self._points[-1]
+        if last <= first:
+            return UNKNOWN_DRIFT
+        return min(UNKNOWN_DRIFT, self.jitter_ns / (last - first))
 
     def _intersect_bounds(self) -> None:
         """Find the offset that the newest consistent round trips allow."""
+        self._trip_offset, self.error_bound = math.inf, None
         low, high = -math.inf, math.inf
         drift_error = self._drift_error()
         for trip in reversed(self._round_trips):
             drifted = self.drift * trip.device_ns
+            # The error of the drift widens the bounds of round trips that are long ago.
             age = abs(self._round_trips[-1].device_ns - trip.device_ns)
-            next_low = max(low, trip.low_ns - drifted - drift_error * age)
-            next_high = min(high, trip.high_ns - drifted + drift_error * age)
+            tolerance = drift_error * age
+            next_low = max(low, trip.low_ns - drifted - tolerance)
+            next_high = min(high, trip.high_ns - drifted + tolerance)
             if next_low > next_high:
-                break  # A clock was set between the round trips: the earlier ones are void.
+                break  # A clock was set between the round trips: the earlier ones are invalid.
             low, high = next_low, next_high
-        self._trip_offset = (low + high) / 2 if self._round_trips else math.inf
-        self.error_bound = (high - low) / 2 if self._round_trips else None
+            self._trip_offset = (low + high) / 2
+            self.error_bound = (high - low) / 2
         self._set_bounded_offset()
 
     def _set_bounded_offset(self) -> None:
-        """Move the offset towards that of the round trips, as delays are never negative."""
+        """Use the offset of the round trips, unless a delay would then be negative."""
         self.bounded_offset = min(self.offset, self._trip_offset)
 
 
@@ -219,7 +232,8 @@ def _slope_at_centre(points: list[tuple[float, float]]) -> float:
     for x, y in points:
         while len(hull) > 1:
             (x0, y0), (x1, y1) = hull[-2:]
-            if (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0):
+            turns_left = (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0)
+            if turns_left:
                 break  # The last point lies below the line to the new one.
             hull.pop()
         hull.append((x, y))

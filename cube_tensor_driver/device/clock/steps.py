@@ -15,28 +15,33 @@ from collections.abc import Callable
 from ..scans.sequence import MAX_DISORDER, MAX_GAP
 
 MIN_STEP_US = 4000.0
-"""Smallest deviation from the period, in µs, that counts as a step. Steps of 5 ms are found, with
-1 ms for the jitter of the hub."""
+"""Smallest deviation of a device time from the sample period, in µs, that counts as a step of the
+hub's clock. Steps of 5 ms are found, with 1 ms for the jitter of the hub."""
 PERIOD_TOLERANCE = 1e-3
-"""Relative error of the known period, by which a longer gap widens `MIN_STEP_US`."""
+"""Relative error of the estimated sample period. Over a gap of lost samples, `MIN_STEP_US` is
+increased by this part of the gap."""
 PERIOD_SAMPLES = 64
-"""Number of samples over which the period is averaged."""
+"""Number of samples over which the sample period of a hub is averaged."""
 DECISION_NS = 200_000_000
-"""Time, in ns, to wait for a sample that decides at once. Then the smallest delay decides."""
+"""Time after a step, in ns, in which only samples decide whose delay leaves no doubt. After it, the
+smallest delay decides whether the clock was set."""
 MAX_DECISION_NS = 1_000_000_000
-"""Longest time, in ns, to wait while the smallest delay lies in the middle of both explanations."""
+"""Longest time after a step, in ns, without a decision, while the smallest delay fits both
+explanations equally well."""
 MIN_DECISION_READS = 8
-"""Number of reads that a decision by the smallest delay needs, as single samples may wait long."""
+"""Number of reads after a step before the smallest delay decides, because one sample may wait
+long."""
 UNLIKELY_DELAY = 8.0
-"""Ratio to the mean delay above which hardly any sample waits."""
+"""Ratio of a delay to the mean delay above which hardly any sample waits."""
 MIN_HOST_STEP_NS = 1_000_000
-"""Smallest step of the host's clock, in ns, that is detected. Two clocks are not read at once."""
+"""Smallest step of the host's clock, in ns, that is detected. Reading it and the monotonic clock
+one after the other takes time."""
 MAX_READ_NS = 100_000
-"""Longest time, in ns, that reading two clocks may take for a comparison."""
+"""Longest time, in ns, that reading both clocks of the host may take for a valid comparison."""
 MAX_READS = 3
-"""Number of attempts to read two clocks within `MAX_READ_NS`."""
+"""Number of attempts to read both clocks of the host within `MAX_READ_NS`."""
 _WRAP = 1 << 32
-_NO_NUMBER = -2
+_NO_NUMBER = -2  # not -1, which 0 would follow
 
 
 class HostClockWatch:
@@ -85,7 +90,7 @@ class SampleTiming:
         self._period_us = 0.0
 
     def forget_period(self) -> None:
-        """Take the sample period from the next two samples."""
+        """Discard the estimated sample period; the next two samples give a new one."""
         self._period_us = 0.0
 
     def find_step(self, number: int, device_us: int) -> int:
@@ -113,8 +118,11 @@ class SampleTiming:
         return round(error) if is_step else 0
 
     def _is_ahead(self, number: int, device_us: int) -> bool:
-        """Return whether a number lies ahead of the newest by a credible gap; restart if it is
-        neither that nor a sample that comes late."""
+        """Return whether a number follows the newest one, with a credible gap.
+
+        A number that neither does nor belongs to a late sample comes from a hub that restarted:
+        then all samples before are forgotten.
+        """
         advance = (number - self._number + _WRAP // 2) % _WRAP - _WRAP // 2
         is_known = self._number != _NO_NUMBER
         if is_known and 0 < advance <= MAX_GAP:
@@ -154,8 +162,7 @@ class StepDecision:
         self.newest_ns = newest_ns
         self.before_ns = before_ns
         self.since_ns = since_ns
-        # Before a step forward only a delay below zero is proof, as the next sample may wait less.
-        self._usual_ns = usual_delay_ns if step_us < 0 else 0.0
+        self._usual_delay_ns = usual_delay_ns
         self._min_delay_ns = math.inf
         self._n_reads = 0
 
@@ -182,19 +189,24 @@ class StepDecision:
             return True  # A clock does not go back by itself.
         self._n_reads += 1
         self._min_delay_ns = min(self._min_delay_ns, delay_ns)
-        # 0 if the sample waited as usual, so the clock was not set; 1 if it was.
-        shift = (self._usual_ns - delay_ns) / step_ns
-        min_shift = (self._usual_ns - self._min_delay_ns) / step_ns
-        if (step_ns > 0) == (min_shift > 0.5):
+        # A shift is 0 if the sample waited as before, and 1 if the clock was set. Before a step
+        # forward, the shortest possible delay counts, because the next sample may wait less.
+        reference_ns = self._usual_delay_ns if step_ns < 0 else 0.0
+        shift = (reference_ns - delay_ns) / step_ns
+        max_shift = (reference_ns - self._min_delay_ns) / step_ns
+        if (step_ns > 0) == (max_shift > 0.5):
             return step_ns > 0  # With the other explanation, the delay would be negative.
+
         if abs(step_ns) > UNLIKELY_DELAY * mean_delay_ns:
-            # With the other explanation, the sample had waited for just the step.
+            # With the other explanation, the delay would equal the step by chance.
             if abs(shift) < 0.25:
                 return False
             if abs(shift - 1) < 0.25:
                 return True
+
         age_ns = arrival_ns - self.since_ns
-        is_unclear = abs(min_shift - 0.5) < 0.25 and age_ns < MAX_DECISION_NS
+        shift = (self._usual_delay_ns - self._min_delay_ns) / step_ns
+        is_unclear = abs(shift - 0.5) < 0.25 and age_ns < MAX_DECISION_NS
         if age_ns < DECISION_NS or self._n_reads < MIN_DECISION_READS or is_unclear:
             return None
-        return min_shift > 0.5
+        return shift > 0.5

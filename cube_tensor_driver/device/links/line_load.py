@@ -25,7 +25,9 @@ def line_doubts(skin: Skin) -> Iterator[str]:
         cubes = [cube for cube in skin.cubes if cube.link == link.name]
         if not cubes or link.port.startswith(PORTS_WITHOUT_BAUD):
             continue
-        wanted = sample_bytes(len(cubes), cubes[0].calibration.layout.n_pads) * skin.rate
+        # All cubes of a hub have the same number of pads.
+        n_pads = cubes[0].calibration.layout.n_pads
+        wanted = sample_bytes(len(cubes), n_pads) * skin.rate
         carried = link.baud / BITS_PER_BYTE
         if wanted > carried:
             yield (

@@ -133,7 +133,11 @@ class Link:
         self.error: LinkError | None = None
         self.decoder = Decoder()
         self.hello: Hello | None = None
-        self.opened = self.lost = self.silences = self.before_hello = self.bytes_out = 0
+        self.opened = 0
+        self.lost = 0
+        self.silences = 0
+        self.before_hello = 0
+        self.bytes_out = 0
         self.period_problem = ""
         self.path = config.port
         self.is_pattern = "://" not in config.port and glob.has_magic(config.port)
@@ -155,8 +159,14 @@ class Link:
         opened, lost, silences: number of times the link was opened, lost, and became silent.
         before_hello: samples that were not delivered because the hub had not identified itself.
         """
-        names = ("opened", "lost", "silences", "before_hello", "bytes_out")
-        return {**self.decoder.counters.as_dict(), **{name: getattr(self, name) for name in names}}
+        return {
+            **self.decoder.counters.as_dict(),
+            "opened": self.opened,
+            "lost": self.lost,
+            "silences": self.silences,
+            "before_hello": self.before_hello,
+            "bytes_out": self.bytes_out,
+        }
 
     @property
     def is_open(self) -> bool:
@@ -252,7 +262,8 @@ class Link:
         if self._tcp or self._stream is None:
             return False
         try:
-            (waiting,) = struct.unpack("i", fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0" * 4))
+            answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, bytes(4))
+            (waiting,) = struct.unpack("i", answer)
         except OSError:
             return False
         return bool(self._out) or waiting > 0
@@ -267,7 +278,7 @@ class Link:
             self._connecting = None
         if self._stream is not None:
             if self.is_draining():
-                # Otherwise the kernel waits for up to 30 s for a hub that does not read.
+                # Without the flush, closing waits for up to 30 s until the hub has read the bytes.
                 with contextlib.suppress(termios.error):
                     termios.tcflush(self._fd, termios.TCOFLUSH)
             with contextlib.suppress(OSError):
@@ -381,4 +392,6 @@ def _identify_file(path: str) -> tuple[object, ...] | None:
         status = Path(path).stat()
     except OSError:
         return None
-    return path, status.st_ino, status.st_rdev, status.st_mode, status.st_uid, status.st_gid
+    # The permissions belong to it, because a change of them may allow to open the port.
+    permissions = status.st_mode, status.st_uid, status.st_gid
+    return path, status.st_ino, status.st_rdev, permissions

@@ -299,17 +299,19 @@ class Reader:
 
     def _waiting_time(self, reads: list[LinkRead]) -> float:
         """Return how long to wait, in s, for links that should deliver but have not yet."""
-        came = {i for i, _, result in reads if isinstance(result, list) and result}
-        if len(came) in (0, len(self.links)):
+        delivered = {read.link for read in reads if isinstance(read.result, list) and read.result}
+        if not delivered or len(delivered) == len(self.links):
             return 0.0
         periods_us = [
             session.actual_us
             for i, session in enumerate(self._sessions)
-            if i not in came and session.is_delivering
+            if i not in delivered and session.is_delivering
         ]
         if not periods_us:
             return 0.0
-        return min(MAX_WAIT_PERIODS * 1e-6 * min(periods_us), MAX_WAIT_S)
+        # The fastest of the other hubs would deliver its next sample first.
+        period_s = 1e-6 * min(periods_us)
+        return min(MAX_WAIT_PERIODS * period_s, MAX_WAIT_S)
 
     def _send_requests(self) -> None:
         """Send the requests of other threads."""
@@ -368,7 +370,9 @@ class Reader:
                 with contextlib.suppress(LinkError):
                     link.write(encode(Request(Command.STOP)))
         until = time.monotonic() + DRAIN_S
-        while any(link.is_draining() for link in self.links) and time.monotonic() < until:
+        while time.monotonic() < until:
+            if not any(link.is_draining() for link in self.links):
+                break
             time.sleep(0.002)
         for session in self._sessions:
             session.link.close()

@@ -39,12 +39,15 @@ class Port:
 
 def find_ports() -> list[Port]:
     """Return the serial ports of the machine and of running demos, without opening any."""
-    ports = [
-        Port(found.device, "" if found.description in (None, "n/a") else found.description)
-        for found in list_ports.comports()
-    ]
-    of_demo = sorted(Path(tempfile.gettempdir()).glob(DEMO_PORTS))
-    ports += [Port(str(path), "demo") for path in of_demo if path.is_symlink()]
+    ports: list[Port] = []
+    for found in list_ports.comports():
+        has_description = found.description not in (None, "n/a")
+        ports.append(Port(found.device, found.description if has_description else ""))
+    folder = Path(tempfile.gettempdir())
+    for path in sorted(folder.glob(DEMO_PORTS)):
+        # Simulated hubs put symbolic links to their pseudo-terminals there.
+        if path.is_symlink():
+            ports.append(Port(str(path), "demo"))
     return ports
 
 

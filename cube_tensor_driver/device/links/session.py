@@ -129,8 +129,13 @@ class Session:
         self.set_state(LinkState.WAITING, error)
 
     def send(self, request: Request) -> None:
-        """Send a request; what a hub should do is remembered, and sent again after each opening.
-        LinkError: the link must be closed."""
+        """Send a request.
+
+        The period, START and STOP are remembered and sent again after each opening.
+
+        Raises:
+            LinkError: The link must be closed.
+        """
         if request.request == Command.SET_PERIOD:
             self._period_us = request.argument
             self._answered_us = None
@@ -235,7 +240,8 @@ class Session:
         self._knows_time = True
         if self._period_us is not None:
             self.link.write(encode(Request(Command.SET_PERIOD, self._period_us)))
-        self.link.write(encode(Request(Command.START if self._is_started else Command.STOP)))
+        command = Command.START if self._is_started else Command.STOP
+        self.link.write(encode(Request(command)))
         if not self._is_started:
             self.set_state(LinkState.OPEN)
 

@@ -159,6 +159,7 @@ class ScanBuilder:
             return True
         if len(self._pending) < n_scans:
             return False
+        # The last scan lacks the samples of these links.
         missing = self._live - self._pending[-1].keys()
         if not missing:
             return True
@@ -198,10 +199,10 @@ class ScanBuilder:
 
     def rows_waiting(self) -> int:
         """Return the number of rows that were added and neither built nor left out yet."""
-        gathered = sum(
-            stamped.sample.n_cubes for scan in self._pending for stamped in scan.values()
-        )
-        return gathered + sum(len(part.cubes) for part in self._deferred)
+        waiting = sum(len(part.cubes) for part in self._deferred)
+        for scan in self._pending:
+            waiting += sum(stamped.sample.n_cubes for stamped in scan.values())
+        return waiting
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
         """Remove the oldest scans, and find the cubes of the skin in them."""
@@ -273,10 +274,10 @@ class ScanBuilder:
                 queues.setdefault(link, []).append(stamped)
 
         n_scans = max(map(len, queues.values()))
-        self._pending = [
-            {link: queue[at] for link, queue in queues.items() if at < len(queue)}
-            for at in range(n_scans)
-        ]
+        self._pending = [{} for _ in range(n_scans)]
+        for link, queue in queues.items():
+            for scan, stamped in zip(self._pending, queue, strict=False):
+                scan[link] = stamped
         self._pending_ns = [
             min(stamped.stamp_ns for stamped in scan.values()) for scan in self._pending
         ]

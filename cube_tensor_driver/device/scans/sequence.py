@@ -148,7 +148,8 @@ class SequenceTracker:
     def _ahead(self, sequence: int) -> int:
         """Return the distance of a number (u32) from the next one; negative if it is behind."""
         half = _WRAP // 2
-        return (sequence - self._next + half) % _WRAP - half
+        distance = (sequence - self._next) % _WRAP
+        return distance if distance < half else distance - _WRAP
 
     def _fits_run(self, number: int, device_us: int) -> bool:
         """Return whether a late sample belongs to the current run of the hub.
@@ -160,13 +161,18 @@ class SequenceTracker:
             return False
         if number < self._first:
             return abs(self._newest_us - device_us) < RESTART_US
+
         before = [entry for entry in self._seen if entry[0] < self._set_back]
         after = [entry for entry in self._seen if entry[0] >= self._set_back]
+        fits_after = _is_in_order(number, device_us, after)
         if number >= self._set_back:
-            return _is_in_order(number, device_us, after)
-        if number < max(before)[0]:
-            return _is_in_order(number, device_us, before)
-        return any(_is_in_order(number, device_us, entries) for entries in (before, after))
+            return fits_after
+        fits_before = _is_in_order(number, device_us, before)
+        last_before, _ = max(before)
+        if number < last_before:
+            return fits_before
+        # The sample lies between the last one before the step and the first one after it.
+        return fits_before or fits_after
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
         """Begin again with a sample of a hub that restarted."""
@@ -237,7 +243,7 @@ class SampleAccount:
             # account.
             self._dropped_before = frame.dropped
         elif last is not None and frame.uptime_ms < last.uptime_ms:
-            # The hub restarted, perhaps before any sample of the new run came.
+            # The hub restarted, perhaps before a sample after the restart has come.
             self._dropped_before = 0
             return
         dropped = (frame.dropped - self._dropped_before) % _WRAP
@@ -258,8 +264,10 @@ class SampleAccount:
         """
         # The copy is necessary because another thread may add a tracker.
         parts = [tracker.counters for tracker in list(self._trackers.values())]
-        names = SequenceCounters().as_dict()
-        total = {name: sum(getattr(part, name) for part in parts) for name in names}
+        total = SequenceCounters().as_dict()
+        for part in parts:
+            for name, value in part.as_dict().items():
+                total[name] += value
         missing = total.pop("missing")
         # A sample dropped in the hub counts as lost on the way until the next STATS, but no sample
         # lost on the way ever counts as dropped.
@@ -279,5 +287,5 @@ class SampleAccount:
             return []
         return [
             f"{self.received} samples received, {delivered} delivered and {duplicate} duplicate: "
-            "the driver lost count, please report it"
+            "the driver lost count, please report it",
         ]
