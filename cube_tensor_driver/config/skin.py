@@ -12,8 +12,12 @@ from glob import has_magic
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError, CubeError
+from ..core.poses import CubePoses
+from ..core.tensor import rotation_from_rpy
 from .calibration import find_calibration, read_calibration
 from .port import port_problem
 from .schema import NAME, TEXT, TRIPLE, JsonSchema, Schema, integer, list_of, mapping, real
@@ -137,6 +141,16 @@ class Skin:
     def calibrations(self) -> tuple[Calibration, ...]:
         """Calibration of each cube. Cubes with the same file share one object."""
         return tuple(cube.calibration for cube in self.cubes)
+
+    @property
+    def poses(self) -> CubePoses:
+        """Poses of the cubes in the parent frame."""
+        half_sides = [calibration.half_side for calibration in self.calibrations]
+        return CubePoses(
+            position=np.array([cube.xyz for cube in self.cubes]),
+            rotation=np.array([rotation_from_rpy(*cube.rpy) for cube in self.cubes]),
+            half_side=np.array(half_sides),
+        )
 
     @property
     def n_pads(self) -> int:

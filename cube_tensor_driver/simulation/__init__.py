@@ -1,6 +1,6 @@
-"""Hubs that exist only in software: loads, pads, hubs, lines and faults.
+"""Simulation of hubs: loads, pads, hubs, lines and faults.
 
-Also here is the log of what these hubs sampled, and what compares it with what arrived. A simulated
-skin is a source of frequencies in this process (`source`), or a process with ports (`main`). ROS is
-not imported.
+A simulated skin is a source of frequencies in this process (`source`), or a process of its own with
+ports (`main`). A log tells what the hubs sampled, to compare it with what arrived. ROS is not
+imported.
 """

@@ -1,5 +1,7 @@
-"""Simulated hubs in the background of a program that computes the load itself, such as a robot in
-simulation under a controller. The real driver reads them as it reads hardware.
+"""Simulated hubs in the background of a program that computes the load itself.
+
+Such a program is a robot in simulation under a controller. The real driver reads the hubs as it
+reads hardware::
 
     touch = MujocoSkin(model, data, skin)
     with BackgroundHubs(skin, "ports") as hubs:
@@ -24,38 +26,65 @@ from .simulator import Simulator
 
 
 class BackgroundHubs:
-    """All hubs of a skin on pseudo-terminals, played by a thread in real time until `close`.
+    """All hubs of a skin on pseudo-terminals, played in real time by a thread until `close`.
 
-    ports: folder in which they appear, each under the name of its link; `open_links` and the node
-        `driver` take it as `port_directory`
-    noise, drift: of the pads, as in `simulate`
-
-    A sample shows the load that was set last before the sample ahead of it was taken. Without a
-    load the skin is at rest.
-
-    ConfigError: cubes of one hub have different numbers of pads, or the folder cannot be used.
+    Each sample is computed from the last load that was set before the previous sample was taken.
+    Without a load, the skin is at rest.
     """
 
     def __init__(
-        self, skin: Skin, ports: Path | str, *, noise: float | None = 0.0, drift: float = 0.0
+        self,
+        skin: Skin,
+        ports: Path | str,
+        *,
+        noise: float | None = 0.0,
+        drift: float = 0.0,
     ) -> None:
-        self._load = _Newest(len(skin.cubes))
-        self._simulator = Simulator(skin, self._load, Path(ports), noise=noise, drift=drift)
-        self._stop = _Stop()
-        self._thread = threading.Thread(target=self._simulator.run, args=(self._stop,), daemon=True)
+        """Start the hubs.
+
+        Args:
+            skin: Skin whose hubs are simulated.
+            ports: Folder in which the ports appear, each under the name of its link. `open_links`
+                and the driver node take it as `port_directory`.
+            noise: Noise of the pads as in `simulate`.
+            drift: Drift of the pads as in `simulate`.
+
+        Raises:
+            ConfigError: Cubes of one hub have different numbers of pads, or the folder cannot be
+                used.
+        """
+        self._load = _SetLoad(len(skin.cubes))
+        self._simulator = Simulator(
+            skin,
+            self._load,
+            Path(ports),
+            noise=noise,
+            drift=drift,
+        )
+        self._stop = _StopRequest()
+        self._thread = threading.Thread(
+            target=self._simulator.run,
+            args=(self._stop,),
+            daemon=True,
+        )
         self._thread.start()
 
     def set_load(self, stress: ArrayLike, gradient: ArrayLike) -> None:
-        """What acts on the cubes from now on, as `MujocoSkin.field` gives it: stress (cubes, 6) in
-        Pa and gradient (cubes, 6, 3) in Pa/m, in the cubes' frames.
+        """Set what acts on the cubes from now on, in their frames, as `MujocoSkin.field` returns
+        it.
 
-        ConfigError: the shapes are not these.
+        Args:
+            stress: Stress (cubes, 6) in Pa, order xx yy zz yz zx xy.
+            gradient: Gradient (cubes, 6, 3) in Pa/m.
+
+        Raises:
+            ConfigError: The shapes are different.
         """
         self._load.set(np.array(stress, float), np.array(gradient, float))
 
     def close(self) -> None:
-        """The hubs stop, and their ports vanish."""
-        self._stop.now()
+        """Stop the hubs and remove their ports."""
+        self._stop.request()
         self._thread.join()
         self._simulator.close()
         self._stop.close()
@@ -67,8 +96,11 @@ class BackgroundHubs:
         self.close()
 
 
-class _Newest:
-    """A `load.Fields` that somebody sets. It is swapped whole: another thread reads it."""
+class _SetLoad:
+    """A `load.Fields` that another thread sets.
+
+    Stress and gradient are replaced together, so that the reading thread never mixes two loads.
+    """
 
     repeats: float | None = None
     period = 0.0
@@ -89,14 +121,14 @@ class _Newest:
         return self._field
 
 
-class _Stop:
-    """A `simulator.Stop` for another thread."""
+class _StopRequest:
+    """A `simulator.Stop` that another thread requests."""
 
     def __init__(self) -> None:
         self.requested = False
         self.fd, self._write = os.pipe()
 
-    def now(self) -> None:
+    def request(self) -> None:
         self.requested = True
         os.write(self._write, b"\0")
 

@@ -1,5 +1,7 @@
-"""Simulated cubes: what the oscillators of their pads do under a stress field, and which cubes each
-simulated hub carries. Response and pad law are those of the core."""
+"""Simulated cubes: frequencies of their pads under a stress field, and the cubes of each hub.
+
+Response and pad law are those of the core.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config.skin import Skin, SkinLink
+from ..core.arrays import Array, Index
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
-from ..core.modes import COMPONENTS, to_matrix
+from ..core.modes import COMPONENTS, STRESS, to_matrix
 from ..core.oscillator import pad_frequency, stress_slope
 from ..device.wire.protocol import NOT_MEASURED
 from .imperfections import Imperfections, PadBehaviour
 from .sample_log import ABSENT
 
+Millihertz = NDArray[np.uint32]
+"""Frequencies in mHz as on the wire; `NOT_MEASURED` stands for a pad without a frequency."""
+
 
 class SimulatedCubes:
     """Cubes with the same number of pads.
 
-    noise: standard deviation of a frequency relative to itself, 0 for none; None: what the
-    calibration of each cube states. drift: relative change of every rest frequency per second;
-    seed: of the noise and, with theirs, of the imperfections.
+    Attributes:
+        n_pads: Number of pads of each cube.
     """
 
     def __init__(
@@ -36,37 +41,62 @@ class SimulatedCubes:
         imperfections: Imperfections | None = None,
         seed: int = 0,
     ) -> None:
+        """Create the cubes.
+
+        Args:
+            calibrations: Calibration of each cube.
+            noise: Standard deviation of a frequency divided by the frequency, 0 for none; None: as
+                the calibration of each cube states.
+            drift: Relative change of every rest frequency per second.
+            imperfections: Deviations of the pads from their calibrations.
+            seed: Seed of the noise and, with their own seed, of the imperfections.
+        """
         self.n_pads = calibrations[0].layout.n_pads
-        self._drift, self._random = drift, np.random.default_rng(seed)
+        self._drift = drift
+        self._random = np.random.default_rng(seed)
         self._groups = calibration_groups(calibrations)
-        self._noise = np.full((len(calibrations), self.n_pads), noise or 0.0)
+
+        shape = (len(calibrations), self.n_pads)
+        self._noise = np.full(shape, noise or 0.0)
         if noise is None:
             for calibration, rows in self._groups:
                 self._noise[rows] = frequency_noise(calibration)
         self._is_noisy = bool(self._noise.any())
+
         self._behaviour = None
         if imperfections is not None:
-            shape = (len(calibrations), self.n_pads)
             self._behaviour = PadBehaviour(imperfections, shape, seed)
 
     def frequency(
-        self, stress: NDArray[np.float64], gradient: NDArray[np.float64], seconds: float
-    ) -> NDArray[np.uint32]:
-        """Frequencies (cubes, pads) in mHz under true fields: stress (cubes, 6) Pa, gradient
-        (cubes, 6, 3) Pa/m.
+        self,
+        stress: Array,
+        gradient: Array,
+        seconds: float,
+    ) -> Millihertz:
+        """Compute the frequencies under true stress fields.
 
-        A pad beyond what its law allows reads NOT_MEASURED, as an oscillator that stopped would.
+        Args:
+            stress: Stress (cubes, 6) in Pa.
+            gradient: Gradient (cubes, 6, 3) in Pa/m.
+            seconds: Simulated time in s.
+
+        Returns:
+            Frequencies (cubes, pads) in mHz. A pad beyond the range of its law reads
+            `NOT_MEASURED`, as an oscillator does that stopped.
         """
-        on_pads = np.empty((len(stress), self.n_pads))
+        pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
             state = true_state(calibration, stress[rows], gradient[rows])
-            on_pads[rows] = state @ calibration.response.T
+            pad_stress[rows] = state @ calibration.response.T
         if self._behaviour is not None:
-            on_pads = self._behaviour.reported(on_pads, seconds)
-        hertz = np.empty_like(on_pads)
+            pad_stress = self._behaviour.reported(pad_stress, seconds)
+
+        hertz = np.empty_like(pad_stress)
         for calibration, rows in self._groups:
             rest = calibration.rest_frequency * (1 + self._drift * seconds)
-            hertz[rows] = pad_frequency(on_pads[rows], rest, calibration.beta, calibration.modulus)
+            hertz[rows] = pad_frequency(
+                pad_stress[rows], rest, calibration.beta, calibration.modulus
+            )
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
         return np.nan_to_num(np.rint(hertz * 1e3), nan=NOT_MEASURED).astype("<u4")
@@ -76,40 +106,50 @@ class SimulatedCubes:
 class HubCubes:
     """The cubes of one simulated hub.
 
-    link: that the hub is on
-    members: (hub cubes,) index in the skin of each of its cubes, ABSENT where the skin has none
-    cubes: those that the skin has
+    Attributes:
+        link: Link that the hub is on.
+        members: Index (hub cubes,) in the skin of each of its cubes, `ABSENT` where the skin has
+            none.
+        cubes: The cubes that the skin has.
     """
 
     link: SkinLink
-    members: NDArray[np.int64]
+    members: Index
     cubes: SimulatedCubes
 
     @property
-    def skin_cubes(self) -> NDArray[np.int64]:
-        """Index in the skin of each of its cubes that the skin has, in the hub's order."""
-        return self.members[self.members != ABSENT]
+    def skin_cubes(self) -> Index:
+        """Index in the skin of each of its cubes that the skin has, in the order of the hub."""
+        return np.asarray(self.members[self.members != ABSENT])
 
     def frequency(
-        self, stress: NDArray[np.float64], gradient: NDArray[np.float64], seconds: float
-    ) -> NDArray[np.uint32]:
-        """Frequencies (hub cubes, pads) in mHz under the fields of the whole skin, as
-        `SimulatedCubes.frequency`; NOT_MEASURED where the skin has no cube."""
+        self,
+        stress: Array,
+        gradient: Array,
+        seconds: float,
+    ) -> Millihertz:
+        """Compute the frequencies (hub cubes, pads) under the fields of the whole skin.
+
+        Arguments as in `SimulatedCubes.frequency`. Cubes that the skin does not have read
+        `NOT_MEASURED`.
+        """
+        shape = (len(self.members), self.cubes.n_pads)
+        frequency = np.full(shape, NOT_MEASURED, "<u4")
         cubes = self.skin_cubes
-        frequency = np.full((len(self.members), self.cubes.n_pads), NOT_MEASURED, "<u4")
-        frequency[self.members != ABSENT] = self.cubes.frequency(
-            stress[cubes], gradient[cubes], seconds
-        )
+        in_skin = self.members != ABSENT
+        frequency[in_skin] = self.cubes.frequency(stress[cubes], gradient[cubes], seconds)
         return frequency
 
 
-def frequency_noise(calibration: Calibration) -> NDArray[np.float64]:
-    """(pads,) standard deviation of a frequency relative to itself that makes, at rest, the noise
-    in Pa that the calibration states."""
+def frequency_noise(calibration: Calibration) -> Array:
+    """Return the relative standard deviation (pads,) of a frequency from the noise of a
+    calibration.
+
+    At rest, it causes the noise in Pa that the calibration states.
+    """
     rest = calibration.rest_frequency
     slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
-    relative: NDArray[np.float64] = calibration.noise / (slope * rest)
-    return relative
+    return np.asarray(calibration.noise / (slope * rest))
 
 
 def hub_cubes(
@@ -119,21 +159,23 @@ def hub_cubes(
     drift: float = 0.0,
     imperfections: Imperfections | None = None,
 ) -> list[HubCubes]:
-    """The cubes of each simulated hub of a skin, in the order of its links; without those that
-    carry none. noise, drift and imperfections as in `SimulatedCubes`.
+    """Create the cubes of all simulated hubs of a skin, in the order of its links.
 
-    ConfigError: cubes of one hub have different numbers of pads.
+    Links without cubes are left out. The other arguments are those of `SimulatedCubes`.
+
+    Raises:
+        ConfigError: Cubes of one hub have different numbers of pads.
     """
     hubs = []
     for number, link in enumerate(skin.links):
         members = hub_members(skin, link.name)
-        calibrations = [skin.cubes[i].calibration for i in members if i != ABSENT]
+        calibrations = [skin.cubes[cube].calibration for cube in members if cube != ABSENT]
         if not calibrations:
             continue
-        widths = {calibration.layout.n_pads for calibration in calibrations}
-        if len(widths) > 1:
+        n_pads = {calibration.layout.n_pads for calibration in calibrations}
+        if len(n_pads) > 1:
             raise ConfigError(
-                f"link {link.name}: its cubes have {sorted(widths)} pads; all cubes of a hub must "
+                f"link {link.name}: its cubes have {sorted(n_pads)} pads; all cubes of a hub must "
                 "have the same number"
             )
         cubes = SimulatedCubes(
@@ -143,71 +185,86 @@ def hub_cubes(
     return hubs
 
 
-def hub_members(skin: Skin, link: str) -> NDArray[np.int64]:
-    """(hub cubes,) index in the skin of each cube that a simulated hub on this link carries, ABSENT
-    for none.
+def hub_members(skin: Skin, link: str) -> Index:
+    """Return the index in the skin of each cube (hub cubes,) of the hub on a link, or `ABSENT`.
 
-    Cubes that are known by uid alone take the free places; without a link they are on the first
-    one.
+    Cubes that have a uid but no index take the free places; those without a link are on the first
+    link.
     """
     by_index = {
         cube.index: number
         for number, cube in enumerate(skin.cubes)
         if cube.link == link and cube.index is not None
     }
-    first = skin.links[0].name
+    first_link = skin.links[0].name
     by_uid = [
         number
         for number, cube in enumerate(skin.cubes)
-        if cube.index is None and (cube.link or first) == link
+        if cube.index is None and (cube.link or first_link) == link
     ]
-    size = max([len(by_index) + len(by_uid), *(index + 1 for index in by_index)], default=0)
+
+    highest = max(by_index, default=-1)
+    size = max(len(by_index) + len(by_uid), highest + 1)
     members = np.full(size, ABSENT)
     members[list(by_index)] = list(by_index.values())
-    free = np.flatnonzero(members == ABSENT)[: len(by_uid)]
-    members[free] = by_uid
+    free = np.flatnonzero(members == ABSENT)
+    members[free[: len(by_uid)]] = by_uid
     return members
 
 
-def calibration_groups(
-    calibrations: Sequence[Calibration],
-) -> list[tuple[Calibration, NDArray[np.int64]]]:
-    """Each calibration once, with the numbers of the cubes that have it."""
-    numbers: dict[str, list[int]] = {}
+def calibration_groups(calibrations: Sequence[Calibration]) -> list[tuple[Calibration, Index]]:
+    """Return each different calibration with the indices of the cubes that have it."""
+    cubes_by_id: dict[str, list[int]] = {}
     for number, calibration in enumerate(calibrations):
-        numbers.setdefault(calibration.id, []).append(number)
-    return [(calibrations[cubes[0]], np.array(cubes)) for cubes in numbers.values()]
+        cubes_by_id.setdefault(calibration.id, []).append(number)
+    return [(calibrations[cubes[0]], np.array(cubes)) for cubes in cubes_by_id.values()]
 
 
 def true_state(
-    calibration: Calibration, stress: NDArray[np.float64], gradient: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Amplitudes (N, modes) in Pa of true fields: stress (N, 6) Pa, gradient (N, 6, 3) Pa/m.
+    calibration: Calibration,
+    stress: Array,
+    gradient: Array,
+) -> Array:
+    """Project true stress fields onto the modes of a calibration.
 
-    What the calibration's modes do not have, such as yy for a planar cube, is left out: its
-    response does not say how the pads would answer.
+    What the modes do not contain, such as yy for a planar cube, is left out: the response does not
+    tell how the pads would react to it.
+
+    Args:
+        calibration: Calibration of the cubes.
+        stress: Stress (N, 6) in Pa.
+        gradient: Gradient (N, 6, 3) in Pa/m.
+
+    Returns:
+        Amplitudes (N, modes) in Pa.
     """
-    tensor = to_matrix(np.moveaxis(gradient, -1, -2))  # (N, k, i, j)
-    return calibration.modes.state(stress, np.moveaxis(tensor, -3, -1) * calibration.half_side)
+    by_axis = to_matrix(np.moveaxis(gradient, -1, -2))  # (N, axis, i, j)
+    scaled = np.moveaxis(by_axis, -3, -1) * calibration.half_side
+    return calibration.modes.state(stress, scaled)
 
 
 def true_components(
-    calibration: Calibration, stress: NDArray[np.float64], gradient: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The 15 components (N, 15), Pa and Pa/m, that a cube with this calibration should report of
-    true fields."""
-    scale = np.where(np.arange(len(COMPONENTS)) < 6, 1.0, 1 / calibration.half_side)
-    components: NDArray[np.float64] = (
-        true_state(calibration, stress, gradient) @ calibration.modes.components.T * scale
-    )
-    return components
+    calibration: Calibration,
+    stress: Array,
+    gradient: Array,
+) -> Array:
+    """Return the components (N, 15) in Pa and Pa/m that a cube should report of true fields.
+
+    Arguments as in `true_state`.
+    """
+    is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
+    scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
+    state = true_state(calibration, stress, gradient)
+    return np.asarray(state @ calibration.modes.components.T * scale)
 
 
 def skin_components(
-    skin: Skin, stress: NDArray[np.float64], gradient: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """`true_components` (cubes, 15) of all cubes of a skin."""
+    skin: Skin,
+    stress: Array,
+    gradient: Array,
+) -> Array:
+    """Return the `true_components` (cubes, 15) of all cubes of a skin."""
     components = np.empty((len(skin.cubes), len(COMPONENTS)))
-    for calibration, rows in calibration_groups([cube.calibration for cube in skin.cubes]):
+    for calibration, rows in calibration_groups(skin.calibrations):
         components[rows] = true_components(calibration, stress[rows], gradient[rows])
     return components

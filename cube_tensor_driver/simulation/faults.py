@@ -1,8 +1,7 @@
-"""Faults of simulated hubs: which there are, and how a fault is written.
+"""Faults of simulated hubs: which there are, and how they are written.
 
-A fault is a table with `kind` and, where it needs them: `at` (s of simulated time, now if left
-out), `link` (all if left out), `seconds` (how long), `count` (samples harmed), `cube` and `pad` (on
-the hub), `value`. `injector.py` carries faults out.
+A fault is a table with the key `kind` and further keys where the kind needs them; `Fault` lists
+them. `injector.py` carries faults out.
 """
 
 from __future__ import annotations
@@ -41,9 +40,14 @@ KINDS = {
     "pads": "send one pad too many for `seconds`",
     "version": "speak protocol version 2 for `seconds`",
 }
+"""What each kind of fault does, with the keys that it uses."""
+
 FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
-"""What happens to the frames of single samples."""
+"""Faults of the frames of single samples."""
+
 PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
+"""Faults of one pad."""
+
 CUT_FAULTS = (
     "stall",
     "burst",
@@ -57,14 +61,26 @@ CUT_FAULTS = (
     "pads",
     "version",
 )
-"""What cuts a link or its clock."""
+"""Faults that interrupt a link or its clock."""
+
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
-"""What is over as soon as it has begun; all others last `seconds`."""
+"""Faults that end as soon as they have begun. All others last `seconds`."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault; the head of this file describes the fields."""
+    """One fault.
+
+    Attributes:
+        kind: One of `KINDS`.
+        at: Simulated time at which it begins, in s; 0 by default.
+        link: Name of the link; empty for all links.
+        seconds: Duration in s.
+        count: Number of samples that are affected.
+        cube: Index of the cube on the hub.
+        pad: Index of the pad.
+        value: Size of the fault, in the unit that `KINDS` names.
+    """
 
     kind: str
     at: float = 0.0
@@ -77,7 +93,16 @@ class Fault:
 
     @classmethod
     def parse(cls, data: Any, place: str) -> Fault:
-        """From plain values. ConfigError names key, what was found and what is allowed."""
+        """Check the plain values of a fault.
+
+        Args:
+            data: Values as from YAML.
+            place: Where they come from, for messages.
+
+        Raises:
+            ConfigError: A key or a value is wrong. The message names the key, the value and what is
+                allowed.
+        """
         if not isinstance(data, dict) or "kind" not in data:
             raise ConfigError(
                 f"{place}: found {str(data)[:60]!r}, allowed: a table with the key kind, "
@@ -88,7 +113,7 @@ class Fault:
         for key, value in data.items():
             if key not in types:
                 raise ConfigError(f"{place}: unknown key {key!r}, allowed: {', '.join(types)}")
-            if not _fits(key, value, types[key]):
+            if not _is_valid(key, value, types[key]):
                 raise ConfigError(
                     f"{place}: {key}: found {value!r}, allowed: a {types[key].__name__} from 0 up"
                 )
@@ -97,34 +122,12 @@ class Fault:
         return cls(**{key: types[key](value) for key, value in data.items()})
 
 
-@dataclass(frozen=True)
-class HubSize:
-    """How many cubes a simulated hub has, and how many pads each of them."""
-
-    cubes: int
-    pads: int
-
-
-def check_target(fault: Fault, hubs: Mapping[str, HubSize]) -> list[str]:
-    """The links that a fault is for. ConfigError: a link, cube or pad that there is not.
-
-    hubs: by the name of the link
-    """
-    names = [fault.link] if fault.link else list(hubs)
-    for name in names:
-        hub = hubs.get(name)
-        if hub is None:
-            raise ConfigError(f"fault {fault.kind}: link {name!r}, allowed: {', '.join(hubs)}")
-        if fault.kind in PAD_FAULTS and not (fault.cube < hub.cubes and fault.pad < hub.pads):
-            raise ConfigError(
-                f"fault {fault.kind}: found cube {fault.cube}, pad {fault.pad} of link {name!r}; "
-                f"allowed: below {hub.cubes}, {hub.pads}"
-            )
-    return names
-
-
-def _fits(key: str, value: Any, wanted: type) -> bool:
-    """Whether a key of a fault may have this value; only `value` may be negative."""
+def _is_valid(
+    key: str,
+    value: Any,
+    wanted: type,
+) -> bool:
+    """Return whether a key of a fault may have this value; only `value` may be negative."""
     if wanted is str:
         return isinstance(value, str)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -135,7 +138,42 @@ def _fits(key: str, value: Any, wanted: type) -> bool:
 
 
 def parse_faults(data: Any, place: str) -> list[Fault]:
-    """A list of faults from plain values. ConfigError: as `Fault.parse`."""
+    """Check a list of faults; arguments and errors as in `Fault.parse`."""
     if not isinstance(data, list):
         raise ConfigError(f"{place}: found {str(data)[:60]!r}, allowed: a list of faults")
     return [Fault.parse(item, f"{place}: [{number}]") for number, item in enumerate(data)]
+
+
+@dataclass(frozen=True)
+class HubSize:
+    """Number of cubes of a simulated hub, and of pads of each of them."""
+
+    cubes: int
+    pads: int
+
+
+def check_target(fault: Fault, hubs: Mapping[str, HubSize]) -> list[str]:
+    """Check the link, cube and pad of a fault.
+
+    Args:
+        fault: Fault to check.
+        hubs: Size of each hub by the name of its link.
+
+    Returns:
+        Names of the links that the fault affects.
+
+    Raises:
+        ConfigError: The link, cube or pad does not exist.
+    """
+    names = [fault.link] if fault.link else list(hubs)
+    for name in names:
+        hub = hubs.get(name)
+        if hub is None:
+            raise ConfigError(f"fault {fault.kind}: link {name!r}, allowed: {', '.join(hubs)}")
+        exists = fault.cube < hub.cubes and fault.pad < hub.pads
+        if fault.kind in PAD_FAULTS and not exists:
+            raise ConfigError(
+                f"fault {fault.kind}: found cube {fault.cube}, pad {fault.pad} of link {name!r}; "
+                f"allowed: below {hub.cubes}, {hub.pads}"
+            )
+    return names

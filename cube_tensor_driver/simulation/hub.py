@@ -1,5 +1,7 @@
-"""A simulated hub: answers requests, takes samples and logs them. Like the protocol code it has no
-I/O and no clock: its caller says what time it is."""
+"""A simulated hub: answers requests, takes samples and logs them.
+
+Like the protocol code, it has no input, output or clock; its caller passes bytes and the time.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.arrays import PadMasks
 from ..device.wire.decoder import PythonDecoder
 from ..device.wire.protocol import (
     TEMPERATURE_UNKNOWN,
@@ -23,35 +25,45 @@ from ..device.wire.protocol import (
     Time,
     encode,
 )
+from .cubes import Millihertz
 from .prepared_frames import PreparedFrame
 from .sample_log import SampleRun
 
 FIRMWARE = 0x00010000
+"""Firmware version that a simulated hub reports."""
+
 PERIOD_LIMITS_US = (100, 10_000_000)
+"""Shortest and longest sample period in µs that a simulated hub accepts."""
+
+_BUFFER_SIZE = 5000
+"""Free buffer that a simulated hub reports in STATS, in bytes."""
+
+_UINT32_MASK = 0xFFFFFFFF
+"""Counters on the wire have 32 bits; those in the log do not wrap."""
 
 
 @dataclass
 class SimulatedHub:
-    """The device side of the protocol.
+    """The device side of the protocol. Simulated times are in µs.
 
-    uid, cube_uids, n_pads: what it says in HELLO
-    boot_us: what its clock shows at simulated time 0
-    period_us: sample period
-    started: whether it takes samples
-    next_us: simulated time of the next sample
-    sequence: number of the next sample since the last restart, counted on beyond 2^32
-    dropped: samples that found no room on the line since the last restart
-    decoder: of the requests that come in
-    boots: restarts so far
-
-    Set by faults:
-
-    drift_ppm: how much too fast its clock runs
-    version: protocol version of its frames
-    false_uid: what it says instead of its uid
-    extra_pads: pads that it says it has beyond n_pads
-    celsius: temperature in 0.01 °C
-    pad_fault: (cubes,) bit p: it reports that pad p has failed; None: it reports none
+    Attributes:
+        uid: Uid that it reports in HELLO.
+        cube_uids: Uids of its cubes that it reports in HELLO.
+        n_pads: Number of pads of each cube.
+        boot_us: Value of its clock at simulated time 0.
+        period_us: Sample period.
+        started: Whether it takes samples.
+        next_us: Simulated time of the next sample.
+        sequence: Number of the next sample since the last restart; it does not wrap.
+        dropped: Number of samples since the last restart for which the line had no room.
+        decoder: Decoder of the incoming requests.
+        boots: Number of restarts.
+        drift_ppm: Excess rate of its clock in ppm; this and all below are set by faults.
+        version: Protocol version of its frames.
+        false_uid: Uid that it reports instead of its own.
+        extra_pads: Number of pads that it reports in addition to `n_pads`.
+        celsius: Temperature in 0.01 °C.
+        pad_fault: Bits (cubes,) of the pads that it reports as failed; None for no pads.
     """
 
     uid: int
@@ -70,85 +82,108 @@ class SimulatedHub:
     false_uid: int | None = None
     extra_pads: int = 0
     celsius: int = TEMPERATURE_UNKNOWN
-    pad_fault: NDArray[np.uint32] | None = None
+    pad_fault: PadMasks | None = None
     _drift_since_us: int = 0
     _ended_runs: list[SampleRun] = field(default_factory=list)
-    _run: SampleRun | None = None  # the newest, as it began; _last: its last sample
+    _run: SampleRun | None = None  # the newest run, as it began; `_last` is its last sample
     _last: int = 0
     _expected: tuple[int, int, int] | None = None  # time, period and boot of its next sample
-    _prepared: dict[int, tuple[NDArray[np.uint32], PreparedFrame]] = field(default_factory=dict)
+    _prepared: dict[int, tuple[Millihertz, PreparedFrame]] = field(default_factory=dict)
 
     def hello(self) -> bytes:
-        """Bytes of the HELLO frame."""
+        """Return the HELLO frame."""
         uid = self.uid if self.false_uid is None else self.false_uid
-        pads, uids = self.n_pads + self.extra_pads, np.array(self.cube_uids, "<u8")
-        return encode(Hello(uid, FIRMWARE, pads, self.period_us, uids), self.version)
+        n_pads = self.n_pads + self.extra_pads
+        uids = np.array(self.cube_uids, "<u8")
+        return encode(Hello(uid, FIRMWARE, n_pads, self.period_us, uids), self.version)
 
     def stats(self, now_us: int) -> bytes:
-        """Bytes of the STATS frame at simulated time now_us."""
-        uptime_ms = max(0, self.device_us(now_us)) // 1000
-        frame = Stats(uptime_ms, self.sequence & 0xFFFFFFFF, self.dropped & 0xFFFFFFFF, 5000)
-        return encode(frame, self.version)
+        """Return the STATS frame."""
+        uptime_ms = self._positive_device_us(now_us) // 1000
+        sequence = self.sequence & _UINT32_MASK
+        dropped = self.dropped & _UINT32_MASK
+        return encode(Stats(uptime_ms, sequence, dropped, _BUFFER_SIZE), self.version)
 
     def device_us(self, now_us: int) -> int:
-        """What the hub's clock shows at simulated time now_us."""
-        return (
-            self.boot_us + now_us + round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
-        )
+        """Return the value of the hub's clock."""
+        gained = round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
+        return self.boot_us + now_us + gained
 
-    def set_clock(self, now_us: int, step_us: int = 0, drift_ppm: float | None = None) -> None:
-        """Set the clock forward, or give it another rate from now on."""
+    def _positive_device_us(self, now_us: int) -> int:
+        """Return the value of the hub's clock as it is sent: without a sign."""
+        return max(0, self.device_us(now_us))
+
+    def set_clock(
+        self,
+        now_us: int,
+        step_us: int = 0,
+        drift_ppm: float | None = None,
+    ) -> None:
+        """Set the clock forward, or change its rate from now on."""
         self.boot_us = self.device_us(now_us) - now_us + step_us
         self.drift_ppm = self.drift_ppm if drift_ppm is None else drift_ppm
         self._drift_since_us = now_us
 
     def off(self) -> None:
-        """The power is gone."""
+        """Switch the power off."""
         self.started = False
 
     def reset(self, now_us: int, sequence: int) -> None:
-        """Restart: stopped, clock at 0, counting from `sequence`."""
+        """Restart: sampling stopped, clock at 0, numbers from `sequence` on."""
         self.off()
         self.boots += 1
-        self.boot_us, self._drift_since_us = -now_us, now_us
-        self.sequence, self.dropped = sequence, 0
+        self.boot_us = -now_us
+        self._drift_since_us = now_us
+        self.sequence = sequence
+        self.dropped = 0
         self.decoder = PythonDecoder()
 
     def receive(self, data: bytes, now_us: int) -> bytes:
-        """What the hub answers to bytes that the host sends at simulated time now_us."""
-        answers = [
-            self._answer(frame, now_us)
-            for frame in self.decoder.feed(data)
-            if isinstance(frame, Request)
-        ]
-        return b"".join(answers)
+        """Return the answers to bytes from the host."""
+        frames = self.decoder.feed(data)
+        requests = [frame for frame in frames if isinstance(frame, Request)]
+        return b"".join(self._answer(request, now_us) for request in requests)
 
-    def prepare(self, frequency: NDArray[np.uint32]) -> None:
-        """Encode now what will be the same in every SAMPLE of this very array of frequencies."""
-        sample = self._sample(0, 0, frequency)
+    def prepare(self, frequency: Millihertz) -> None:
+        """Encode in advance what is the same in every SAMPLE of this very array of frequencies."""
+        sample = self._build_sample(0, 0, frequency)
         self._prepared[id(frequency)] = frequency, PreparedFrame(sample)
 
-    def sample(self, frequency: NDArray[np.uint32]) -> bytes:
-        """Take the sample of next_us: bytes of its SAMPLE frame. frequency: (cubes, pads) in
-        mHz."""
-        self._log()
-        sequence, device_us = self.sequence & 0xFFFFFFFF, max(0, self.device_us(self.next_us))
+    def sample(self, frequency: Millihertz) -> bytes:
+        """Take the sample of `next_us`.
+
+        Args:
+            frequency: Frequencies (cubes, pads) in mHz.
+
+        Returns:
+            The SAMPLE frame.
+        """
+        self._log_sample()
+        sequence = self.sequence & _UINT32_MASK
+        device_us = self._positive_device_us(self.next_us)
         self.sequence += 1
         self.next_us += self.period_us
+
         _, prepared = self._prepared.get(id(frequency), (None, None))
         is_plain = self.celsius == TEMPERATURE_UNKNOWN and self.pad_fault is None
         if prepared is not None and is_plain and self.version == VERSION:
             return prepared.encode(sequence, device_us)
-        sample = self._sample(sequence, device_us, frequency, self.celsius, self.pad_fault)
+        sample = self._build_sample(
+            sequence,
+            device_us,
+            frequency,
+            self.celsius,
+            self.pad_fault,
+        )
         return encode(sample, self.version)
 
     @staticmethod
-    def _sample(
+    def _build_sample(
         sequence: int,
         device_us: int,
-        frequency: NDArray[np.uint32],
+        frequency: Millihertz,
         celsius: int = TEMPERATURE_UNKNOWN,
-        pad_fault: NDArray[np.uint32] | None = None,
+        pad_fault: PadMasks | None = None,
     ) -> Sample:
         n = len(frequency)
         if pad_fault is None:
@@ -163,44 +198,53 @@ class SimulatedHub:
             return []
         return [*self._ended_runs, replace(self._run, last=self._last)]
 
-    def _log(self) -> None:
-        """The sample of next_us goes on with the run or begins a new one."""
+    def _log_sample(self) -> None:
+        """Continue the run with the sample of `next_us`, or begin a new run."""
         if (self.next_us, self.period_us, self.boots) != self._expected:
             self._ended_runs = self.runs
             self._run = SampleRun(
-                self.sequence, self.sequence, self.next_us, self.period_us, self.boots
+                first=self.sequence,
+                last=self.sequence,
+                start_us=self.next_us,
+                period_us=self.period_us,
+                boot=self.boots,
             )
         self._last = self.sequence
         self._expected = self.next_us + self.period_us, self.period_us, self.boots
 
     def skip(self, now_us: int) -> None:
-        """Take the next sample after now_us; those before are never taken."""
-        self._schedule(now_us)
+        """Schedule the next sample after now; samples that are due are never taken.
 
-    def _schedule(self, now_us: int) -> None:
-        """Samples fall on whole multiples of the period, so that hubs sample together."""
+        Samples fall on whole multiples of the period, so that hubs sample together.
+        """
         self.next_us = (now_us // self.period_us + 1) * self.period_us
 
     def _answer(self, request: Request, now_us: int) -> bytes:
-        result, argument = Result.DONE, 0
-        if request.request == Command.HELLO:
-            return encode(Ack(request.request), self.version) + self.hello()
-        if request.request == Command.START:
-            if not self.started:
-                self._schedule(now_us)
-            self.started = True
-        elif request.request == Command.STOP:
-            self.started = False
-        elif request.request == Command.SET_PERIOD:
-            low, high = PERIOD_LIMITS_US
-            if low <= request.argument <= high:
-                self.period_us = request.argument
-                self._schedule(now_us)
-            else:
-                result = Result.REFUSED
-            argument = self.period_us
-        elif request.request == Command.TIME:
-            return encode(Time(request.argument, max(0, self.device_us(now_us))), self.version)
-        elif request.request != Command.IDENTIFY:
-            result = Result.UNKNOWN
+        """Carry out a request and return the answer."""
+        result = Result.DONE
+        argument = 0
+        match request.request:
+            case Command.HELLO:
+                return encode(Ack(request.request), self.version) + self.hello()
+            case Command.TIME:
+                device_us = self._positive_device_us(now_us)
+                return encode(Time(request.argument, device_us), self.version)
+            case Command.START:
+                if not self.started:
+                    self.skip(now_us)
+                self.started = True
+            case Command.STOP:
+                self.started = False
+            case Command.SET_PERIOD:
+                low, high = PERIOD_LIMITS_US
+                if low <= request.argument <= high:
+                    self.period_us = request.argument
+                    self.skip(now_us)
+                else:
+                    result = Result.REFUSED
+                argument = self.period_us
+            case Command.IDENTIFY:
+                pass
+            case _:
+                result = Result.UNKNOWN
         return encode(Ack(request.request, result, argument), self.version)

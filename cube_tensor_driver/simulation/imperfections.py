@@ -1,15 +1,16 @@
-"""What real pads do that their calibrations do not say: spread, creep with hysteresis, failure.
+"""Deviations of real pads from their calibrations: spread of gains, creep with hysteresis, failure.
 
-Foam creeps: under a constant stress its strain goes on growing, and so does what a pad reports of
-it. In linear viscoelasticity the compliance is a Prony series (chain of Kelvin and Voigt elements),
-J(t) = J(0) (1 + sum_i c_i (1 - exp(-t / tau_i))), so that a pad under the stress v(t) reports::
+Foam creeps: under a constant stress its strain keeps growing, and so does the stress that a pad
+reports. In linear viscoelasticity the compliance is a Prony series (chain of Kelvin-Voigt
+elements), J(t) = J(0) (1 + sum_i c_i (1 - exp(-t / tau_i))), so that a pad under the stress v(t)
+reports::
 
     v + sum_i c_i q_i,     tau_i dq_i/dt = v - q_i
 
-Loading and unloading then differ: that is the hysteresis of this model. The silicone around the
-cubes needs no such term: as long as its Poisson's ratio does not change, the stress in a
-viscoelastic body under given tractions is that of the elastic body (correspondence principle). That
-contacts widen as silicone creeps is left out.
+Loading and unloading then differ, which is the hysteresis of this model. The silicone around the
+cubes needs no such term: if its Poisson's ratio does not change, the stress in a viscoelastic body
+under given tractions is that of the elastic body (correspondence principle). The growth of contacts
+as silicone creeps is not modelled.
 
 Source: J. D. Ferry, Viscoelastic Properties of Polymers (1980), 1.E and 3.F; R. M. Christensen,
 Theory of Viscoelasticity (1982), 2.2.
@@ -18,7 +19,7 @@ Theory of Viscoelasticity (1982), 2.2.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,14 @@ from ..core.errors import ConfigError
 class Imperfections:
     """How the pads of simulated cubes differ from their calibrations.
 
-    gain_spread: standard deviation of a pad's sensitivity over the calibrated one, relative
-    dead: part of the pads whose oscillators do not run, 0 to 1
-    creep: terms (c, tau) of the series in the module head: relative size, and time in s
-    seed: of which pads are how
+    Attributes:
+        gain_spread: Standard deviation of a pad's sensitivity divided by the calibrated one.
+        dead: Fraction of the pads whose oscillators do not run, 0 to 1.
+        creep: Terms (c, tau) of the series in the module head: relative size, and time in s.
+        seed: Seed that determines which pad is how.
 
-    ConfigError: a value is out of range.
+    Raises:
+        ConfigError: A value is out of range.
     """
 
     gain_spread: float = 0.0
@@ -62,31 +65,39 @@ class Imperfections:
 
 
 def read_imperfections(path: Path) -> Imperfections:
-    """A file with some of the fields of `Imperfections`, as YAML. ConfigError: it has another key
-    or a value that is none."""
+    """Read a YAML file with some of the fields of `Imperfections`.
+
+    Raises:
+        ConfigError: A key is unknown, or a value is wrong.
+    """
     data = read_yaml(path)
-    keys = tuple(Imperfections.__dataclass_fields__)
+    keys = [field.name for field in fields(Imperfections)]
     if not isinstance(data, dict) or not set(data) <= set(keys):
         found = [key for key in data if key not in keys] if isinstance(data, dict) else data
         raise ConfigError(
             f"{path}: found {str(found)[:60]!r}, allowed: a table of {', '.join(keys)}"
         )
+
     for key, value in data.items():
-        if key == "creep":
-            fits = isinstance(value, list) and all(_is_pair(term) for term in value)
-        else:
-            fits = _is_number(value) and (key != "seed" or isinstance(value, int))
-        if not fits:
-            allowed = {"creep": "[[size, seconds], ...]", "seed": "a whole number"}
-            raise ConfigError(
-                f"{path}: {key}: found {str(value)[:60]!r}, allowed: {allowed.get(key, 'a number')}"
-            )
+        allowed = _describe_mismatch(key, value)
+        if allowed:
+            raise ConfigError(f"{path}: {key}: found {str(value)[:60]!r}, allowed: {allowed}")
     if "creep" in data:
         data["creep"] = tuple((size, time) for size, time in data["creep"])
     try:
         return Imperfections(**data)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def _describe_mismatch(key: str, value: Any) -> str:
+    """Return what is allowed for a key if the type of its value is wrong, else an empty text."""
+    if key == "creep":
+        is_valid = isinstance(value, list) and all(_is_pair(term) for term in value)
+        return "" if is_valid else "[[size, seconds], ...]"
+    if key == "seed":
+        return "" if isinstance(value, int) and _is_number(value) else "a whole number"
+    return "" if _is_number(value) else "a number"
 
 
 def _is_pair(value: Any) -> bool:
@@ -98,25 +109,47 @@ def _is_number(value: Any) -> bool:
 
 
 class PadBehaviour:
-    """The pads of some cubes, with the creep that they have by now. shape: (cubes, pads)."""
+    """Imperfect pads of some cubes, with the creep that they have accumulated."""
 
-    def __init__(self, imperfections: Imperfections, shape: tuple[int, int], seed: int) -> None:
+    def __init__(
+        self,
+        imperfections: Imperfections,
+        shape: tuple[int, int],
+        seed: int,
+    ) -> None:
+        """Draw the gains and the dead pads.
+
+        Args:
+            imperfections: Size of the deviations.
+            shape: Number of cubes and of pads per cube.
+            seed: Seed that differs between the hubs of a skin.
+        """
         random = np.random.default_rng([imperfections.seed, seed])
         self._gain = 1 + imperfections.gain_spread * random.standard_normal(shape)
         self._dead = random.random(shape) < imperfections.dead
+
         terms = np.array(imperfections.creep, float).reshape(-1, 2)
-        self._size, self._time = terms[:, 0], terms[:, 1]
-        self._crept = np.zeros((len(terms), *shape))
+        self._creep_size = terms[:, 0]
+        self._creep_time = terms[:, 1]
+        self._crept = np.zeros((len(terms), *shape))  # q_i of the module head
         self._seconds = 0.0
 
     def reported(self, stress: Array, seconds: float) -> Array:
-        """Stress (cubes, pads) in Pa that pads report under that stress, which has lasted since the
-        last call; NaN: the pad is dead."""
-        pressed = np.where(self._dead, np.nan, stress * self._gain)
-        if len(self._time):
-            passed = max(seconds - self._seconds, 0.0)
-            part = -np.expm1(-passed / self._time)[:, None, None]
-            self._crept += part * (np.nan_to_num(pressed) - self._crept)
-            pressed += np.tensordot(self._size, self._crept, axes=1)
+        """Compute the stress that pads report.
+
+        Args:
+            stress: True stress (cubes, pads) in Pa since the previous call.
+            seconds: Simulated time in s.
+
+        Returns:
+            Reported stress (cubes, pads) in Pa; NaN for a dead pad.
+        """
+        reported = np.where(self._dead, np.nan, stress * self._gain)
+        if len(self._creep_time):
+            elapsed = max(seconds - self._seconds, 0.0)
+            # Solution of tau dq/dt = v - q for a constant v: 1 - exp(-t / tau)
+            approach = -np.expm1(-elapsed / self._creep_time)[:, np.newaxis, np.newaxis]
+            self._crept += approach * (np.nan_to_num(reported) - self._crept)
+            reported += np.tensordot(self._creep_size, self._crept, axes=1)
             self._seconds = seconds
-        return pressed
+        return reported

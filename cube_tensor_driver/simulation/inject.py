@@ -15,11 +15,18 @@ from .simulator import FAULT_PIPE, HUBS_FILE
 
 
 def inject(ports: Path | None, words: Sequence[str]) -> str:
-    """Send the fault that words such as kind=unplug describe to a simulator.
+    """Send a fault to a simulator.
 
-    ports: its folder of ports; None: that of the demo that was started last.
-    Returns what happens now, in words. ConfigError: no such fault, no simulator there, or a link,
-    cube or pad that it does not have.
+    Args:
+        ports: Folder of the simulator's ports; None: that of the demo that was started last.
+        words: The fault as key=value, such as ``kind=unplug``.
+
+    Returns:
+        What happens now, in words.
+
+    Raises:
+        ConfigError: The fault is wrong, no simulator runs there, or it does not have the link, cube
+            or pad.
     """
     unclear = [word for word in words if "=" not in word]
     if unclear:
@@ -34,25 +41,34 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
     }
     parsed = Fault.parse(fault, "fault")
     folder = ports or _newest_demo()
-    pipe = folder / FAULT_PIPE
+
+    with os.fdopen(_open_pipe(folder / FAULT_PIPE), "w") as stream:
+        sizes = read_yaml(folder / HUBS_FILE)
+        hubs = {name: HubSize(**size) for name, size in sizes.items()}
+        links = check_target(parsed, hubs)
+        stream.write(fault_line(fault))
+    return f"{', '.join(links)}: {_describe(parsed)}"
+
+
+def fault_line(fault: dict[str, object]) -> str:
+    """Return a fault as one line for the pipe of a simulator."""
+    return to_yaml(fault).replace("\n", " ").strip() + "\n"
+
+
+def _open_pipe(pipe: Path) -> int:
+    """Open the pipe of a simulator for writing."""
     try:
-        # Without O_NONBLOCK, opening a pipe that nobody reads would wait for ever.
-        writer = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        # Without O_NONBLOCK, opening a pipe without a reader would wait for ever.
+        return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
     except OSError as error:
         reason = "no simulator reads it" if error.errno == errno.ENXIO else error.strerror
         raise ConfigError(
             f"{pipe}: {reason}; name the ports' folder of a running simulator"
         ) from None
-    with os.fdopen(writer, "w") as stream:
-        sizes = read_yaml(folder / HUBS_FILE)
-        hubs = {name: HubSize(**size) for name, size in sizes.items()}
-        links = check_target(parsed, hubs)
-        stream.write(fault_line(fault))
-    return f"{', '.join(links)}: {_in_words(parsed)}"
 
 
-def _in_words(fault: Fault) -> str:
-    """What a fault does, with its values."""
+def _describe(fault: Fault) -> str:
+    """Return what a fault does, with its values."""
     text = KINDS[fault.kind]
     for name, unit in (("seconds", " s"), ("count", ""), ("value", "")):
         text = text.replace(f"`{name}`", f"{getattr(fault, name):g}{unit}")
@@ -61,13 +77,12 @@ def _in_words(fault: Fault) -> str:
     return text
 
 
-def fault_line(fault: dict[str, object]) -> str:
-    """A fault as one line for the pipe of a simulator."""
-    return to_yaml(fault).replace("\n", " ").strip() + "\n"
-
-
 def _newest_demo() -> Path:
-    """The folder of ports of the demo that was started last. ConfigError: none runs."""
+    """Return the folder of ports of the demo that was started last.
+
+    Raises:
+        ConfigError: No demo runs.
+    """
     pipes = Path(tempfile.gettempdir()).glob(f"cube_demo_*/ports/{FAULT_PIPE}")
     newest = max(pipes, key=os.path.getmtime, default=None)
     if newest is None:

@@ -1,5 +1,7 @@
-"""The line between a simulated hub and the host: a pseudo-terminal or TCP. It can be unplugged,
-stalled, and made to send in bursts."""
+"""Line between a simulated hub and the host: a pseudo-terminal or a TCP connection.
+
+It can be unplugged, stalled, and made to send in bursts.
+"""
 
 from __future__ import annotations
 
@@ -12,104 +14,126 @@ from pathlib import Path
 from ..core.errors import ConfigError
 from ..device.links.tcp import parse_url
 
-OUT_LIMIT = 1 << 16
-"""Bytes that wait for the line at most: the hub drops and counts what it samples beyond."""
-BURST_US = 16_000
-"""The latency timer of common USB serial chips."""
+MAX_QUEUED_BYTES = 1 << 16
+"""Largest number of bytes that wait for the line. The hub drops and counts samples beyond it."""
+
+BURST_PERIOD_US = 16_000
+"""Period in µs at which a line in bursts sends: the latency timer of common USB serial chips."""
+
+_READ_BYTES = 65536
 
 
-class Line:
-    """A pseudo-terminal. One end is the hub's; the other appears as the symbolic link `port`.
+class SimulatedLine:
+    """A pseudo-terminal. One end is the hub's, the other one appears as the symbolic link `port`.
 
-    fd: of the hub's end, -1 while it is unplugged
-    held_until_us: until this simulated time nothing goes out
-    burst_until_us: until this simulated time all that waits goes out every BURST_US
+    Attributes:
+        port: Path of the port.
+        fd: File descriptor of the hub's end, -1 while it is unplugged.
+        held_until_us: Simulated time until which nothing is sent.
+        burst_until_us: Simulated time until which all waiting bytes are sent once per
+            `BURST_PERIOD_US`.
     """
 
     def __init__(self, port: Path) -> None:
         self.port = port
-        self.fd = self._far = -1
-        self.held_until_us = self.burst_until_us = 0
-        self._out = bytearray()
-        self._burst = 0
+        self.fd = -1
+        self.held_until_us = 0
+        self.burst_until_us = 0
+        self._far_end = -1
+        self._queue = bytearray()
+        self._newest_burst = 0
         self.plug()
 
     @property
     def plugged(self) -> bool:
+        """Whether the port exists."""
         return self.fd >= 0
 
     def plug(self, port: Path | None = None) -> None:
-        """Appear, under another name if `port` is given."""
+        """Create the port, under another name if `port` is given."""
         self.port = port or self.port
-        # The far end stays open, else the near one reports an error whenever the driver closes it.
-        self.fd, self._far = os.openpty()
-        tty.setraw(self._far)
+        # The far end stays open here. Otherwise, the near end reports an error whenever the driver
+        # closes the port.
+        self.fd, self._far_end = os.openpty()
+        tty.setraw(self._far_end)
         os.set_blocking(self.fd, False)
         self.port.unlink(missing_ok=True)
-        self.port.symlink_to(os.ttyname(self._far))
+        self.port.symlink_to(os.ttyname(self._far_end))
 
     def unplug(self) -> None:
-        """Vanish, together with all that was on its way."""
+        """Remove the port; bytes that wait are lost."""
         if self.plugged:
             self.port.unlink(missing_ok=True)
             os.close(self.fd)
-            os.close(self._far)
-            self.fd = self._far = -1
-        self._out.clear()
+            os.close(self._far_end)
+            self.fd = self._far_end = -1
+        self._queue.clear()
 
     def send(self, data: bytes, now_us: int) -> bool:
-        """Queue bytes for the line and write what it takes; False when there was no room for
-        them."""
-        room = self.plugged and len(self._out) + len(data) <= OUT_LIMIT
-        if room:
-            self._out += data
+        """Queue bytes and write what the line takes.
+
+        Returns:
+            Whether there was room for the bytes.
+        """
+        has_room = self.plugged and len(self._queue) + len(data) <= MAX_QUEUED_BYTES
+        if has_room:
+            self._queue += data
         self.flush(now_us)
-        return room
+        return has_room
 
     def flush(self, now_us: int) -> None:
-        """Write what the line takes now."""
+        """Write the waiting bytes that the line takes now."""
         if not self.plugged or now_us < self.held_until_us:
             return
         if now_us < self.burst_until_us:
-            burst = now_us // BURST_US
-            if burst == self._burst:
+            burst = now_us // BURST_PERIOD_US
+            if burst == self._newest_burst:
                 return
-            self._burst = burst
+            self._newest_burst = burst
         with contextlib.suppress(BlockingIOError):
-            while self._out:
-                del self._out[: os.write(self.fd, self._out)]
+            while self._queue:
+                del self._queue[: os.write(self.fd, self._queue)]
 
     def due_us(self, now_us: int) -> int | None:
-        """When `flush` is worth calling again, None if nothing waits for its time."""
-        if not self._out:
+        """Return when `flush` should be called again; None if nothing waits for its time."""
+        if not self._queue:
             return None
         if now_us < self.held_until_us:
             return self.held_until_us
-        return (now_us // BURST_US + 1) * BURST_US if now_us < self.burst_until_us else None
+        if now_us < self.burst_until_us:
+            return (now_us // BURST_PERIOD_US + 1) * BURST_PERIOD_US
+        return None
 
     def read(self) -> bytes:
-        """What the host sent."""
+        """Return what the host sent."""
         if not self.plugged:
             return b""
         try:
-            return os.read(self.fd, 65536)
+            return os.read(self.fd, _READ_BYTES)
         except BlockingIOError:
             return b""
 
 
-class TcpLine(Line):
-    """A line behind a bridge that listens at a url socket://host:port. Unplugging takes the bridge
-    away; it always comes back under the same name."""
+class TcpLine(SimulatedLine):
+    """A line behind a bridge that listens at a URL socket://host:port.
+
+    Unplugging removes the bridge. It always comes back at the same address.
+    """
 
     def __init__(self, url: str) -> None:
-        """LinkError: the url is no such address. ConfigError: the address cannot be used."""
+        """Listen at the address.
+
+        Raises:
+            LinkError: The URL is no such address.
+            ConfigError: The address cannot be used.
+        """
         self._address = parse_url(url)
         self._listener: socket.socket | None = None
         self._connection: socket.socket | None = None
         super().__init__(Path(url))
 
     def plug(self, port: Path | None = None) -> None:
-        """Listen."""
+        """Listen; the address is the same whatever `port` is."""
         try:
             self._listener = socket.create_server(self._address, backlog=1)
         except OSError as error:
@@ -121,15 +145,16 @@ class TcpLine(Line):
         self.fd = self._listener.fileno()
 
     def unplug(self) -> None:
-        """Vanish, together with all that was on its way."""
+        """Close connection and listener; bytes that wait are lost."""
         self._hang_up()
         if self._listener is not None:
             self._listener.close()
-            self._listener, self.fd = None, -1
-        self._out.clear()
+            self._listener = None
+            self.fd = -1
+        self._queue.clear()
 
     def flush(self, now_us: int) -> None:
-        """Write what the line takes now; without a connection it waits."""
+        """Write the waiting bytes that the line takes; without a connection they wait."""
         if self._connection is None:
             return
         try:
@@ -138,13 +163,9 @@ class TcpLine(Line):
             self._hang_up()
 
     def read(self) -> bytes:
-        """What the host sent. The first call accepts its connection."""
-        if self._connection is None and self._listener is not None:
-            with contextlib.suppress(OSError):  # the host went away again
-                self._connection, _ = self._listener.accept()
-                self._connection.setblocking(False)
-                self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self.fd = self._connection.fileno()
+        """Return what the host sent. The first call accepts its connection."""
+        if self._connection is None:
+            self._accept()
             return b""
         try:
             data = super().read()
@@ -154,7 +175,18 @@ class TcpLine(Line):
             self._hang_up()
         return data
 
+    def _accept(self) -> None:
+        """Accept the connection that made the listener readable."""
+        if self._listener is None:
+            return
+        with contextlib.suppress(OSError):  # the host has closed it again
+            self._connection, _ = self._listener.accept()
+            self._connection.setblocking(False)
+            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self.fd = self._connection.fileno()
+
     def _hang_up(self) -> None:
+        """Close the connection and wait for the next one."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None

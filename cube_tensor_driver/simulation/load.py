@@ -1,4 +1,4 @@
-"""What the indenters of a load script do to a skin, and the stress it makes at each cube."""
+"""Loads on a simulated skin: the contacts of a load script and the stress at each cube."""
 
 from __future__ import annotations
 
@@ -8,43 +8,49 @@ from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.load_script import Action, Indenter, Script, interpolate_knots, read_script
 from ..config.package_data import package_data
 from ..config.skin import Skin
-from ..core.arrays import Array
+from ..core.arrays import Array, Index
 from ..core.errors import ConfigError
 from ..core.poses import CubePoses
-from ..core.tensor import rotation_from_rpy
 from ..mechanics import contact
 from .spline import CubicSpline
 
-SLOW = 1e-3
-"""Speed at which friction has reached 0.7 of its full size, m/s: so it changes direction smoothly
-where a slide does."""
-WIDEST = 12
-"""Radius of a contact over the depth of the cubes, at most: wider ones need so many points that
-nobody can wait for them."""
-KEPT_BYTES = 64 << 20
-"""What the fields that are kept may take."""
+FRICTION_SPEED = 1e-3
+"""Speed in m/s at which friction has reached 0.7 of its full size. It makes friction change
+smoothly where a slide reverses its direction."""
+
+MAX_RADIUS_DEPTHS = 12
+"""Largest radius of a contact divided by the depth of the cubes. The quadrature of larger contacts
+needs so many points that it takes minutes."""
+
+MAX_CACHED_BYTES = 64 << 20
+"""Largest memory of the fields that `LoadMemory` keeps."""
+
 _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
-"""Orders of quadrature in use: few, so that many cubes are computed together."""
+"""Quadrature orders in use. They are few, so that many cubes have the same order and are computed
+together."""
+
+_FAR_RATIO = 0.15
+"""Radius of a contact divided by its distance below which one ring of points is enough."""
 
 
 def default_script() -> Script:
-    """The shipped script, for any skin: an indenter wanders over all of it."""
+    """Read the shipped script for any skin: an indenter wanders over all of it."""
     return read_script(package_data() / "config" / "load_demo.yaml")
 
 
-class Press(NamedTuple):
-    """What one indenter does at one time, in the skin's parent frame.
+class ContactLoad(NamedTuple):
+    """One contact at one time, in the skin's parent frame.
 
-    shape: disc or sphere
-    position: (3,) m, centre of the contact
-    normal: (3,) out of the skin there
-    force: (3,) N on the skin
-    radius: of the contact, m
+    Attributes:
+        shape: `disc` for uniform traction, `sphere` for Hertz's.
+        position: Centre (3,) of the contact in m.
+        normal: Unit normal (3,) out of the skin.
+        force: Force (3,) in N on the skin.
+        radius: Radius of the contact in m.
     """
 
     shape: str
@@ -55,70 +61,82 @@ class Press(NamedTuple):
 
 
 class Fields(Protocol):
-    """Stress and gradient at the cubes of a skin as time goes on.
-
-    repeats: time after which all comes again, s; None: never
-    period: the same, or the time that counts as the whole of it, s
-    """
+    """Stress and gradient at the cubes of a skin over time."""
 
     @property
-    def repeats(self) -> float | None: ...
+    def repeats(self) -> float | None:
+        """Time in s after which everything repeats; None: never."""
 
     @property
-    def period(self) -> float: ...
+    def period(self) -> float:
+        """The same time, or a duration in s that counts as the whole load."""
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
-        the cubes' frames."""
+        """Compute the fields at a time.
+
+        Returns:
+            Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
+            the frames of the cubes.
+        """
 
 
 class AnyLoad(Fields, Protocol):
-    """What acts on the cubes of a skin: a script, or a robot in simulation.
-
-    poses: of the cubes; depth: from their centres to the surface, m
-    """
+    """Load on the cubes of a skin: a script, or a robot in simulation."""
 
     @property
-    def poses(self) -> CubePoses: ...
+    def poses(self) -> CubePoses:
+        """Poses of the cubes."""
 
     @property
-    def depth(self) -> float: ...
+    def depth(self) -> float:
+        """Distance from the centres of the cubes to the surface, in m."""
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """As the function `total`, of what touches the skin at this time."""
+        """Return the function `total` of all contacts at a time."""
 
 
 class Load:
-    """A script on a skin: the same at the same time in every process.
+    """A script on a skin. It is the same at the same time in every process.
 
-    Each cube sees a half space whose surface lies `script.depth` above it, across its own z axis,
-    with the load at the foot of its perpendicular. A cube that is tilted away from the load by an
-    angle sees the load times the angle's cosine, and nothing beyond a right angle. A sphere's
-    contact is Hertz's: a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a slide is friction ×
-    normal force along its velocity v, times v / √(v² + SLOW²).
+    Each cube sees a half space whose surface lies `depth` above it, perpendicular to its own z
+    axis. The load acts at its position in the cube's x-y plane. A cube that is tilted away from the
+    load by an angle sees the load times the cosine of the angle, and no load beyond a right angle.
+    The contact of a sphere is Hertz's: a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a slide
+    is friction × normal force along its velocity v, times v / √(v² + FRICTION_SPEED²).
 
     Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz), 7.1 (sliding), 8.1 (rolling with
     traction).
 
-    poses, depth, repeats, period: as in `AnyLoad`; period: the script's length if it plays once
+    Attributes:
+        script: The script.
+        poses: Poses of the cubes.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        repeats: Time in s after which the script repeats; None: it plays once.
+        period: The same time, or the length of a script that plays once, in s.
     """
 
     def __init__(self, skin: Skin, script: Script) -> None:
-        """ConfigError: a sphere sinks in deeper than Hertz's contact holds, or a disc is too wide
-        for its depth."""
+        """Prepare the paths of all indenters.
+
+        Raises:
+            ConfigError: A sphere sinks in deeper than Hertz's contact holds, or a contact is too
+                wide for the depth.
+        """
         self.script = script
-        self.depth, self.repeats = script.depth, script.period
+        self.depth = script.depth
+        self.repeats = script.period
         self.period = script.period or script.end
-        self._position = np.array([cube.xyz for cube in skin.cubes])
-        self._rotation = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
-        half = np.array([cube.calibration.half_side for cube in skin.cubes])
-        low = (self._position - half[:, None]).min(axis=0)
-        high = (self._position + half[:, None]).max(axis=0)
-        self._centre, self._half_extent = (low + high) / 2, (high - low) / 2
-        self.poses = CubePoses(self._position, self._rotation, half)
+        self.poses = skin.poses
         self._pitch = self.poses.pitch
+
+        # Relative positions of a script range over the box around all cubes.
+        half = self.poses.half_side[:, np.newaxis]
+        low = (self.poses.position - half).min(axis=0)
+        high = (self.poses.position + half).max(axis=0)
+        self._centre = (low + high) / 2
+        self._half_extent = (high - low) / 2
         self._paths = {
-            id(action): self._path(action)
+            id(action): self._plan_path(action)
             for indenter in script.indenters
             for action in indenter.actions
         }
@@ -126,132 +144,161 @@ class Load:
             self._check(indenter)
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
-        the cubes' frames."""
-        n = len(self._position)
-        stress, gradient = np.zeros((n, 6)), np.zeros((n, 6, 3))
-        below = np.array([[0.0, 0.0, -self.script.depth]])
-        for press in self.presses(seconds):
-            local = np.einsum("nij,ni->nj", self._rotation, press.position - self._position)
+        """Compute the fields at a time, as `Fields.at`."""
+        position, rotation, _ = self.poses
+        n = len(position)
+        stress = np.zeros((n, 6))
+        gradient = np.zeros((n, 6, 3))
+        below = np.array([[0.0, 0.0, -self.depth]])
+        for load in self.contact_loads(seconds):
+            local = np.einsum("nij,ni->nj", rotation, load.position - position)
             distance = np.hypot(local[:, 0], local[:, 1])
-            facing = np.maximum(self._rotation[:, :, 2] @ press.normal, 0.0)
-            force = np.einsum("nij,i->nj", self._rotation, press.force) * facing[:, None]
-            orders = _orders(press.shape, press.radius, self.script.depth, distance)
-            # Cubes with the same order of quadrature are computed together.
+            facing = np.maximum(rotation[:, :, 2] @ load.normal, 0.0)
+            force = np.einsum("nij,i->nj", rotation, load.force) * facing[:, np.newaxis]
+            orders = _choose_orders(load.shape, load.radius, self.depth, distance)
+
+            # Cubes with the same quadrature order are computed together.
             for order in np.unique(orders[facing > 0]).tolist():
                 rows = np.flatnonzero((orders == order) & (facing > 0))
-                points, weights = _points(press.shape, order)
-                sources = local[rows, None, :] * (1.0, 1.0, 0.0) + press.radius * points
-                forces = force[rows, None, :] * weights
-                field = contact.field(below, sources, forces, self.script.poisson)
-                stress[rows] += field[0][:, 0]
-                gradient[rows] += field[1][:, 0]
+                points, weights = _unit_points(load.shape, order)
+                in_plane = local[rows, np.newaxis, :] * (1.0, 1.0, 0.0)
+                sources = in_plane + load.radius * points
+                forces = force[rows, np.newaxis, :] * weights
+                part, slope = contact.field(below, sources, forces, self.script.poisson)
+                stress[rows] += part[:, 0]
+                gradient[rows] += slope[:, 0]
         return stress, gradient
 
-    def presses(self, seconds: float) -> list[Press]:
-        """What each indenter does that touches the skin at this time."""
+    def contact_loads(self, seconds: float) -> list[ContactLoad]:
+        """Return the contacts of all indenters that touch the skin at a time."""
         if self.script.period is not None:
             seconds %= self.script.period
-        presses = [
-            self._press(indenter, action, seconds)
+        loads = [
+            self._contact_load(indenter, action, seconds)
             for indenter in self.script.indenters
             for action in indenter.actions
             if action.start <= seconds < action.end
         ]
-        return [press for press in presses if press.force.any()]
+        return [load for load in loads if load.force.any()]
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """As `total`, of what presses at this time."""
-        return total(self.presses(seconds))
+        """Return the function `total` of the contacts at a time."""
+        return total(self.contact_loads(seconds))
 
     def _check(self, indenter: Indenter) -> None:
-        """ConfigError: the contact is too wide for what is computed."""
+        """Raise ConfigError if the contact of an indenter is too wide."""
         force = max(action.force.max() for action in indenter.actions)
-        radius = self._radius(indenter, force)
+        radius = self._contact_radius(indenter, force)
         if radius > indenter.radius:
             raise ConfigError(
                 f"{indenter.name}: under {force:g} N the contact's radius is "
                 f"{1e3 * radius:.3g} mm, the sphere's only {1e3 * indenter.radius:g} mm; "
                 "take less force or a larger radius"
             )
-        if radius > WIDEST * self.script.depth:
+        if radius > MAX_RADIUS_DEPTHS * self.depth:
             raise ConfigError(
                 f"{indenter.name}: the contact's radius is {1e3 * radius:g} mm, the cubes' depth "
-                f"{1e3 * self.script.depth:g} mm; take several contacts of at most {WIDEST} times "
-                "the depth"
+                f"{1e3 * self.depth:g} mm; take several contacts of at most {MAX_RADIUS_DEPTHS} "
+                "times the depth"
             )
 
-    def _press(self, indenter: Indenter, action: Action, seconds: float) -> Press:
-        """when: from 0 at the action's start to 1 at its end."""
-        when = (seconds - action.start) / (action.end - action.start)
+    def _contact_load(
+        self,
+        indenter: Indenter,
+        action: Action,
+        seconds: float,
+    ) -> ContactLoad:
+        """Return the contact of an indenter during an action."""
+        duration = action.end - action.start
+        progress = (seconds - action.start) / duration  # 0 to 1
         path = self._paths[id(action)]
-        position = path.position(when) if path else self._in_metres(action.path[0])
+        position = path.position(progress) if path else self._to_metres(action.path[0])
         normal = surface_normal(self.poses, self._pitch, position)
-        size = float(interpolate_knots(action.force, when))
+        size = float(interpolate_knots(action.force, progress))
         if path and action.kind == "slide":
-            velocity = path.velocity(when) / (action.end - action.start)
+            velocity = path.velocity(progress) / duration
             velocity -= normal * (velocity @ normal)
             speed = float(np.linalg.norm(velocity))
-            shear = indenter.friction * size * velocity / math.hypot(speed, SLOW)
+            shear = indenter.friction * size * velocity / math.hypot(speed, FRICTION_SPEED)
         else:
             if len(action.shear) == 1:
+                # One value belongs to the largest force, and shear follows the force.
                 shear = action.shear[0] * size / action.force.max()
             else:
-                shear = interpolate_knots(action.shear, when)
+                shear = interpolate_knots(action.shear, progress)
             shear = shear - normal * (shear @ normal)
-        force = shear - size * normal
-        return Press(indenter.shape, position, normal, force, self._radius(indenter, size))
+        radius = self._contact_radius(indenter, size)
+        return ContactLoad(indenter.shape, position, normal, shear - size * normal, radius)
 
-    def _radius(self, indenter: Indenter, force: float) -> float:
+    def _contact_radius(self, indenter: Indenter, force: float) -> float:
+        """Return the radius in m of a contact under a normal force in N."""
         if indenter.shape == "disc":
             return indenter.radius
         stiffness = self.script.young / (1 - self.script.poisson**2)
         return float(np.cbrt(3 * force * indenter.radius / (4 * stiffness)))
 
-    def _in_metres(self, position: Array) -> Array:
-        """A position of the script in m in the skin's parent frame."""
+    def _to_metres(self, position: Array) -> Array:
+        """Convert positions of the script to m in the skin's parent frame."""
         if not self.script.relative:
             return position
-        return self._centre + position * self._half_extent
+        return np.asarray(self._centre + position * self._half_extent)
 
-    def _path(self, action: Action) -> CubicSpline | None:
-        """Through all positions at equal intervals; at rest at both ends, unless it is closed."""
+    def _plan_path(self, action: Action) -> CubicSpline | None:
+        """Return the path through all positions at equal intervals; None for a single position.
+
+        It starts and ends at rest, unless the last position is the first one.
+        """
         if len(action.path) == 1:
             return None
         closed = len(action.path) > 2 and np.array_equal(action.path[0], action.path[-1])
-        return CubicSpline(self._in_metres(action.path), closed=closed)
+        return CubicSpline(self._to_metres(action.path), closed=closed)
 
 
-def surface_normal(poses: CubePoses, pitch: float, position: Array) -> Array:
-    """(3,) out of the skin: the mean of the cubes' z axes, weighted by how near they are.
+def surface_normal(
+    poses: CubePoses,
+    pitch: float,
+    position: Array,
+) -> Array:
+    """Return the unit normal (3,) out of the skin at a position.
 
-    pitch: that of the poses, m, which takes long to find
+    It is the mean of the cubes' z axes, weighted with a Gaussian of the distance.
+
+    Args:
+        poses: Poses of the cubes.
+        pitch: Pitch of the poses in m; computing it takes long.
+        position: Position (3,) in m.
     """
     square = ((poses.position - position) ** 2).sum(axis=1)
-    weight = np.exp((square.min() - square) / (2 * pitch**2))
+    nearest = np.argmin(square)
+    weight = np.exp((square[nearest] - square) / (2 * pitch**2))
     normal = weight @ poses.rotation[:, :, 2]
     length = np.linalg.norm(normal)
-    return normal / length if length > 0 else poses.rotation[np.argmin(square), :, 2]
+    # Opposite axes may cancel: then the nearest cube decides.
+    return np.asarray(normal / length if length > 0 else poses.rotation[nearest, :, 2])
 
 
-def total(presses: Sequence[Press]) -> tuple[Array, Array, Array]:
-    """Sum (3,) of all forces on the skin in N, their centre of pressure (3,) in m and the mean
-    normal (3,) there.
+def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
+    """Return the sum of all contacts.
 
-    Without load centre and normal are NaN.
+    Returns:
+        Force (3,) on the skin in N, centre of pressure (3,) in m and mean normal (3,). Without a
+        load, centre and normal are NaN.
     """
-    if not presses:
+    if not loads:
         return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
-    weight = np.array([-press.force @ press.normal for press in presses])
-    force = np.sum([press.force for press in presses], axis=0)
-    centre = weight @ np.array([press.position for press in presses]) / weight.sum()
-    normal = weight @ np.array([press.normal for press in presses])
+    weight = np.array([-load.force @ load.normal for load in loads])
+    force = np.sum([load.force for load in loads], axis=0)
+    centre = weight @ np.array([load.position for load in loads]) / weight.sum()
+    normal = weight @ np.array([load.normal for load in loads])
     return force, centre, normal / np.linalg.norm(normal)
 
 
 class LoadMemory:
-    """The fields of a load at whole microseconds. Those of a periodic script are kept for the next
-    time that it comes by there: each costs a contact problem for every cube."""
+    """Fields of a load at whole microseconds.
+
+    Those of a periodic script are kept for the next period, because each of them is a contact
+    problem for every cube.
+    """
 
     def __init__(self, load: Fields) -> None:
         self._load = load
@@ -260,38 +307,53 @@ class LoadMemory:
         self._fields: dict[int, tuple[Array, Array]] = {}
 
     def at(self, time_us: int) -> tuple[Array, Array]:
-        """As `Load.at`."""
+        """Return the fields at a time in µs, as `Fields.at`."""
         if self._period_us is not None:
             time_us %= self._period_us
         field = self._fields.get(time_us)
         if field is None:
             field = self._load.at(time_us * 1e-6)
-            if (len(self._fields) + 1) * sum(part.nbytes for part in field) > KEPT_BYTES:
+            field_bytes = sum(part.nbytes for part in field)
+            if (len(self._fields) + 1) * field_bytes > MAX_CACHED_BYTES:
                 self._fields.clear()
             self._fields[time_us] = field
         return field
 
 
-def _orders(shape: str, radius: float, depth: float, distance: Array) -> NDArray[np.int64]:
-    """Order of quadrature for each cube, `distance` m from the contact's axis: few points for cubes
-    that see the contact from afar.
+def _choose_orders(
+    shape: str,
+    radius: float,
+    depth: float,
+    distance: Array,
+) -> Index:
+    """Return the quadrature order (cubes,), lower for cubes far from the contact.
 
-    Stress and gradient are within 1e-3 of their greatest value; any sum of point forces satisfies
-    equilibrium.
+    Stress and gradient are within 1e-3 of their largest value. Equilibrium holds exactly, because
+    any sum of point forces satisfies it.
+
+    Args:
+        shape: Shape of the contact.
+        radius: Radius of the contact in m.
+        depth: Depth of the cubes in m.
+        distance: Distance (cubes,) of the cubes from the axis of the contact, in m.
     """
-    near = radius / np.hypot(depth, np.maximum(distance - radius, 0.0))
-    wanted = 5 * near + 1 if shape == "sphere" else 3.3 * near + 0.5
-    return np.where(near < 0.15, 1, _ORDERS[np.searchsorted(_ORDERS, wanted)])
+    to_rim = np.maximum(distance - radius, 0.0)
+    ratio = radius / np.hypot(depth, to_rim)
+    wanted = 5 * ratio + 1 if shape == "sphere" else 3.3 * ratio + 0.5
+    orders = _ORDERS[np.searchsorted(_ORDERS, wanted)]
+    return np.where(ratio < _FAR_RATIO, 1, orders)
 
 
 @lru_cache(maxsize=64)
-def _points(shape: str, order: int) -> tuple[Array, Array]:
-    """Points (L, 3) of a contact of radius 1 and the part (L, 1) of the force on each of them."""
+def _unit_points(shape: str, order: int) -> tuple[Array, Array]:
+    """Return points (L, 3) of a contact of radius 1, and the fraction (L, 1) of the force on
+    each."""
+    unit_force = (0.0, 0.0, 1.0)
     if shape == "sphere" and order > 1:
-        points, forces = contact.hertz(1.0, (0.0, 0.0, 1.0), order=order)
+        points, forces = contact.hertz(1.0, unit_force, order=order)
     else:
-        # Seen from afar a sphere's contact is a disc with the same second moment: 2/5 a² against
-        # 1/2 a².
+        # From far away, the contact of a sphere looks like a disc with the same second moment: 2/5
+        # a² for the sphere, 1/2 a² for a disc.
         radius = math.sqrt(0.8) if shape == "sphere" else 1.0
-        points, forces = contact.disc(radius, (0.0, 0.0, 1.0), order=order)
+        points, forces = contact.disc(radius, unit_force, order=order)
     return points, forces[:, 2:]

@@ -1,5 +1,7 @@
-"""SAMPLE frames that are sent again and again with other numbers and times, encoded once: simulated
-hubs must cost little where the driver is measured."""
+"""SAMPLE frames that are encoded once and sent again with other sequence numbers and times.
+
+Simulated hubs must use little time where the speed of the driver is measured.
+"""
 
 from __future__ import annotations
 
@@ -9,41 +11,51 @@ import zlib
 from ..device.wire import cobs
 from ..device.wire.protocol import Sample, encode
 
-_HEAD = 24
-"""Bytes of a SAMPLE before its frequencies; the last one is spare and 0."""
-_SEQUENCE = struct.Struct("<I"), 4
-_DEVICE_US = struct.Struct("<Q"), 12
-"""How a field of the header is packed, and where."""
+_HEAD_BYTES = 24
+"""Number of bytes of a SAMPLE before its frequencies; the last one is spare and 0."""
+
+_CRC_BYTES = 4
+"""Number of bytes of the checksum at the end of a frame."""
+
+_SEQUENCE = struct.Struct("<I")
+_SEQUENCE_OFFSET = 4
+_DEVICE_US = struct.Struct("<Q")
+_DEVICE_US_OFFSET = 12
 
 
 class PreparedFrame:
-    """A SAMPLE that is encoded but for sequence, time and checksum.
+    """A SAMPLE frame that is encoded except for sequence number, time and checksum.
 
-    COBS codes what lies between two zeros in the same way wherever it stands. So the frame is coded
-    in three parts: up to the last byte of the header, up to the last zero before the checksum, and
-    the rest.
+    COBS encodes the bytes between two zeros in the same way wherever they stand. So the frame is
+    encoded in three parts: up to the last byte of the head, up to the last zero before the
+    checksum, and the rest.
     """
 
     def __init__(self, sample: Sample) -> None:
         frame = encode(sample)
-        body = (cobs.decode(frame[1:-1]) or b"")[:-4]
-        self._head, self._tail = bytearray(body[:_HEAD]), body[_HEAD:]
-        last_zero = body.rfind(b"\0", _HEAD)
-        self._middle = cobs.encode(body[_HEAD:last_zero])
+        body = (cobs.decode(frame[1:-1]) or b"")[:-_CRC_BYTES]
+        last_zero = body.rfind(b"\0", _HEAD_BYTES)
+        self._head = bytearray(body[:_HEAD_BYTES])
+        self._tail = body[_HEAD_BYTES:]
+        self._encoded_middle = cobs.encode(body[_HEAD_BYTES:last_zero])
         self._rest = body[last_zero + 1 :]
-        # Where there is no zero, or 254 bytes without one before one of these two zeros, COBS codes
-        # otherwise: such a sample is encoded again each time.
+
+        # Without such a zero, or with 254 bytes without a zero before one of these two zeros, COBS
+        # encodes differently. Such a sample is encoded as a whole each time.
         self._sample: Sample | None = None
         if last_zero < 0 or self.encode(sample.sequence, sample.device_us) != frame:
             self._sample = sample
 
     def encode(self, sequence: int, device_us: int) -> bytes:
-        """The same bytes as `protocol.encode` of the sample with these numbers."""
+        """Return the bytes that `protocol.encode` returns for the sample with these numbers."""
         if self._sample is not None:
-            self._sample.sequence, self._sample.device_us = sequence, device_us
+            self._sample.sequence = sequence
+            self._sample.device_us = device_us
             return encode(self._sample)
-        for (packing, offset), value in ((_SEQUENCE, sequence), (_DEVICE_US, device_us)):
-            packing.pack_into(self._head, offset, value)
-        crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(4, "little")
-        start, end = cobs.encode(bytes(self._head[:-1])), cobs.encode(self._rest + crc)
-        return b"".join((b"\0", start, self._middle, end, b"\0"))
+
+        _SEQUENCE.pack_into(self._head, _SEQUENCE_OFFSET, sequence)
+        _DEVICE_US.pack_into(self._head, _DEVICE_US_OFFSET, device_us)
+        crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(_CRC_BYTES, "little")
+        start = cobs.encode(bytes(self._head[:-1]))
+        end = cobs.encode(self._rest + crc)
+        return b"".join((b"\0", start, self._encoded_middle, end, b"\0"))

@@ -1,4 +1,4 @@
-"""The log of a simulator: which samples its hubs took, when, and which faults were carried out.
+"""Log of a simulator: the samples that its hubs took, and the faults that were carried out.
 
 The simulator writes it when it ends. Checks of what arrived read it.
 """
@@ -20,23 +20,28 @@ from ..core.matching import SampleKeys, SampleRows, match_rows
 from .faults import Fault
 
 ABSENT = -1
-"""Index in the skin of a cube that the hub has and the skin has not."""
+"""Index in the skin of a cube of a hub that the skin does not have."""
+
 NO_LINK = -1
-"""Link of a cube that is on none."""
+"""Index of the link of a cube that is on no link."""
+
 CUBE_RANGE = 1 << 16
 """Number of possible indices of a cube, which are 16 bits wide in messages."""
+
 SEQUENCE_RANGE = 1 << 32
-"""Sequence numbers on the wire begin again at 0 here; those in the log do not."""
+"""Number of different sequence numbers on the wire, where they wrap. Those in the log do not."""
 
 
 @dataclass(frozen=True)
 class SampleRun:
     """Samples of one hub at equal intervals.
 
-    first, last: numbers of the first and the last one, counted on beyond 2^32
-    start_us: simulated time of the first one
-    period_us: time between two of them
-    boot: how often the hub had restarted before
+    Attributes:
+        first: Number of the first sample; numbers do not wrap at 2^32.
+        last: Number of the last sample.
+        start_us: Simulated time of the first sample in µs.
+        period_us: Time between two samples in µs.
+        boot: Number of restarts of the hub before.
     """
 
     first: int
@@ -50,19 +55,20 @@ class SampleRun:
 
     @property
     def end_us(self) -> int:
-        """Simulated time of the sample that would follow the last one."""
+        """Simulated time in µs of the sample that would follow the last one."""
         return self.start_us + len(self) * self.period_us
 
 
 @dataclass(frozen=True)
 class LinkLog:
-    """What the hub of one link did.
+    """Samples of the hub of one link.
 
-    name: of the link
-    cubes: index in the skin of each of the hub's cubes, ABSENT where the skin has none
-    dropped: samples that the hub took and had no room to send, since its last restart
-    runs: all samples that it took, in the order of time
-    damaged: boot and number of each sample that was harmed, or found no room on the line
+    Attributes:
+        name: Name of the link.
+        cubes: Index in the skin of each of the hub's cubes, `ABSENT` where the skin has none.
+        dropped: Number of samples since the last restart for which the line had no room.
+        runs: All samples that it took, in the order of time.
+        damaged: Boot and number of each sample that was altered, or for which the line had no room.
     """
 
     name: str
@@ -79,7 +85,13 @@ class LinkLog:
 
 @dataclass(frozen=True)
 class FaultRecord:
-    """A fault that was carried out from start_us to end_us of simulated time, on `fault.link`."""
+    """A fault that was carried out on one link.
+
+    Attributes:
+        start_us: Simulated time in µs at which it began.
+        end_us: Simulated time in µs at which it ended.
+        fault: The fault; its `link` is set.
+    """
 
     start_us: int
     end_us: int
@@ -88,11 +100,12 @@ class FaultRecord:
 
 @dataclass(frozen=True)
 class SampleLog:
-    """What all hubs of a skin did.
+    """Samples of all hubs of a skin, and their faults.
 
-    start_time_ns: wall clock at simulated time 0
-    links: in the order of the skin file; links without cubes are left out
-    faults: in the order in which they began
+    Attributes:
+        start_time_ns: Wall clock at simulated time 0, in ns.
+        links: Logs of all links with cubes, in the order of the skin file.
+        faults: Faults in the order in which they began.
     """
 
     start_time_ns: int
@@ -100,13 +113,21 @@ class SampleLog:
     faults: tuple[FaultRecord, ...] = ()
 
     def write(self, path: Path) -> None:
-        """As JSON. ConfigError: the file cannot be written."""
+        """Write the log as JSON.
+
+        Raises:
+            ConfigError: The file cannot be written.
+        """
         with atomic_write(path) as partial:
             partial.write_text(json.dumps(asdict(self)))
 
     @classmethod
     def read(cls, path: Path) -> SampleLog:
-        """ConfigError: there is no such file, or it is no sample log."""
+        """Read a log.
+
+        Raises:
+            ConfigError: There is no such file, or it is no sample log.
+        """
         try:
             return cls._parse(json.loads(path.read_text()))
         except OSError as error:
@@ -129,14 +150,18 @@ class SampleLog:
             for link in data["links"]
         )
         faults = tuple(
-            FaultRecord(record["start_us"], record["end_us"], Fault(**record["fault"]))
+            FaultRecord(
+                record["start_us"],
+                record["end_us"],
+                Fault(**record["fault"]),
+            )
             for record in data["faults"]
         )
         return cls(data["start_time_ns"], links, faults)
 
     @property
     def dropped(self) -> int:
-        """Samples that the hubs took and had no room to send."""
+        """Number of samples for which the lines had no room."""
         return sum(link.dropped for link in self.links)
 
     @cached_property

@@ -1,4 +1,5 @@
-"""A simulated skin as a source of frequencies in this process: no ports, no threads, no waiting."""
+"""A simulated skin as a source of frequencies in this process, without ports, threads and
+waiting."""
 
 from __future__ import annotations
 
@@ -32,18 +33,24 @@ def simulate(
     drift: float = 0.0,
     imperfections: Imperfections | None = None,
 ) -> SimulatedSource:
-    """The frequencies that hubs of this skin would send under a load, scan by scan.
+    """Simulate the frequencies that the hubs of a skin would send under a load, scan by scan.
 
-    load: what presses on the skin (a `Load`, a `MujocoLoad`), or the file of a load script; None:
-        the shipped script, an indenter that wanders over the skin
-    rate: samples per second; None: the skin's, 100 where it has none
-    duration: s of simulated time; None: without end
-    noise: standard deviation of a frequency relative to itself (8e-6 is usual)
-    drift: relative change of every rest frequency per second
-    imperfections: of the pads: spread, creep, failure; None: they are as calibrated
+    Args:
+        skin: Skin to simulate.
+        load: Load on the skin (a `Load`, a `MujocoLoad`), or the file of a load script; None: the
+            shipped script, an indenter that wanders over the skin.
+        rate: Samples per second; None: those of the skin, or 100.
+        duration: Simulated time in s; None: without end.
+        noise: Standard deviation of a frequency divided by the frequency (8e-6 is usual).
+        drift: Relative change of every rest frequency per second.
+        imperfections: Spread, creep and failure of the pads; None: they are as calibrated.
 
-    ConfigError: a rate that hubs refuse, a duration that is not greater than 0, an unusable load
-    script, or cubes of one hub with different numbers of pads.
+    Returns:
+        Source of frequency rows.
+
+    Raises:
+        ConfigError: Hubs refuse the rate, the duration is not positive, the load script cannot be
+            used, or cubes of one hub have different numbers of pads.
     """
     if load is None or isinstance(load, (Path, str)):
         script = default_script() if load is None else read_script(Path(load))
@@ -55,19 +62,38 @@ def simulate(
         raise ConfigError(f"rate is {rate!r}, allowed: {low:g} to {high:g} samples per second")
     if duration is not None and not duration > 0:
         raise ConfigError(f"duration is {duration!r}, allowed: a time greater than 0 s, or None")
-    source = SimulatedSource(skin, load, round(1e6 / rate), duration, noise, drift, imperfections)
-    hub_cubes(skin)
-    return source
+
+    hub_cubes(skin)  # raises here, and not at the first iteration
+    return SimulatedSource(
+        skin,
+        load,
+        period_us=round(1e6 / rate),
+        duration=duration,
+        noise=noise,
+        drift=drift,
+        imperfections=imperfections,
+    )
 
 
 @dataclass
 class SimulatedSource:
-    """A `core.rows.Source`: each time it is iterated the same skin starts again at time 0.
+    """A `core.rows.Source`. Every iteration starts the same skin again at time 0.
 
     One scan has a row of every cube, in the order in which the driver delivers them: link by link.
-    All rows of scan k have sequence k and stamp_ns = k × period: simulated time 0 is the start of
-    the load script. Values are what the driver makes of a hub's: a whole number of mHz in float32
-    Hz; NaN for pads that a cube does not have or whose oscillator stopped; temperature unknown.
+    All rows of scan k have the sequence number k and stamp_ns = k × period; simulated time 0 is the
+    start of the load script. Values are those that the driver makes of a hub's: a whole number of
+    mHz in float32 Hz; NaN for pads that a cube does not have or whose oscillator stopped;
+    temperature unknown.
+
+    Attributes:
+        skin: Skin to simulate.
+        load: Load on the skin.
+        period_us: Time between two scans in µs.
+        duration: Simulated time in s; None: without end.
+        noise: As in `simulate`.
+        drift: As in `simulate`.
+        imperfections: As in `simulate`.
+        scans: Number of scans since the last iteration began.
     """
 
     skin: Skin
@@ -81,10 +107,11 @@ class SimulatedSource:
 
     @property
     def is_live(self) -> bool:
+        """Whether the source has to be read in real time: it has not."""
         return False
 
     def statistics(self) -> dict[str, object]:
-        """What was given since the last iteration began, and s of simulated time."""
+        """Return the number of rows and scans and the simulated time since the iteration began."""
         return {
             "rows given": self.scans * len(self.skin.cubes),
             "scans given": self.scans,
@@ -92,7 +119,12 @@ class SimulatedSource:
         }
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        pads = SkinPads(self.skin, self.noise, self.drift, self.imperfections)
+        pads = SkinPads(
+            self.skin,
+            self.noise,
+            self.drift,
+            self.imperfections,
+        )
         fields = LoadMemory(self.load)
         self.scans = 0
         for number in itertools.count():
@@ -106,14 +138,11 @@ class SimulatedSource:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Nothing is held open."""
+        """Do nothing: no resource is held."""
 
 
 class SkinPads:
-    """What the pads of a whole skin measure. noise and so on: as in `SimulatedCubes`.
-
-    ConfigError: cubes of one hub have different numbers of pads.
-    """
+    """Pads of a whole skin."""
 
     def __init__(
         self,
@@ -122,14 +151,34 @@ class SkinPads:
         drift: float = 0.0,
         imperfections: Imperfections | None = None,
     ) -> None:
-        self._hubs = hub_cubes(skin, noise=noise, drift=drift, imperfections=imperfections)
+        """Create the pads; arguments as in `SimulatedCubes`.
+
+        Raises:
+            ConfigError: Cubes of one hub have different numbers of pads.
+        """
+        self._hubs = hub_cubes(
+            skin,
+            noise=noise,
+            drift=drift,
+            imperfections=imperfections,
+        )
         self._cube = np.concatenate([hub.skin_cubes for hub in self._hubs]).astype(np.uint16)
         self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
 
-    def rows(self, stress: Array, gradient: Array, number: int, time_us: int) -> FrequencyRows:
-        """Scan `number`, a row of every cube, under the fields of the cubes in the skin's order.
+    def rows(
+        self,
+        stress: Array,
+        gradient: Array,
+        number: int,
+        time_us: int,
+    ) -> FrequencyRows:
+        """Compute one scan with a row of every cube.
 
-        stress: (cubes, 6) Pa; gradient: (cubes, 6, 3) Pa/m; time_us: simulated time
+        Args:
+            stress: Stress (cubes, 6) in Pa, cubes in the order of the skin.
+            gradient: Gradient (cubes, 6, 3) in Pa/m.
+            number: Sequence number of the scan.
+            time_us: Simulated time in µs.
         """
         count = len(self._cube)
         millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
@@ -137,10 +186,10 @@ class SkinPads:
         for hub in self._hubs:
             cubes = hub.skin_cubes
             end = start + len(cubes)
-            millihertz[start:end, : hub.cubes.n_pads] = hub.cubes.frequency(
-                stress[cubes], gradient[cubes], 1e-6 * time_us
-            )
+            own = hub.cubes.frequency(stress[cubes], gradient[cubes], 1e-6 * time_us)
+            millihertz[start:end, : hub.cubes.n_pads] = own
             start = end
+
         frequency = (millihertz * 1e-3).astype(np.float32)
         frequency[millihertz == NOT_MEASURED] = np.nan
         return FrequencyRows(

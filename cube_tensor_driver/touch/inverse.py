@@ -15,7 +15,6 @@ from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from ..core.errors import ElasticError
 from ..core.modes import STRESS
 from ..core.poses import CubePoses
-from ..core.tensor import rotation_from_rpy
 from ..mechanics.influence import Influence
 from ..mechanics.kernels import Kernels, MeasurementModel
 from ..mechanics.layer import Layer
@@ -101,11 +100,6 @@ class SurfaceInverse:
             ElasticError: There is no such layer, no cube observes anything, or the influence
                 functions belong to other cubes.
         """
-        poses = CubePoses(
-            position=np.array([cube.xyz for cube in skin.cubes]),
-            rotation=np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes]),
-            half_side=np.array([calibration.half_side for calibration in skin.calibrations]),
-        )
         by_pad = noise_of_all_pads(skin.calibrations)
         layer = Layer(thickness, poisson)
         model = None
@@ -113,7 +107,7 @@ class SurfaceInverse:
             layer = influence.layer
             depth = influence.depth
             model = model_pads(influence, skin.calibrations)
-        self._set_up(poses, by_pad, layer, depth, side, model)
+        self._set_up(skin.poses, by_pad, layer, depth, side, model)
 
     @classmethod
     def from_poses(

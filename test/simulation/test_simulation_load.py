@@ -111,7 +111,7 @@ def test_few_points_from_afar_are_as_good(tmp_path):
             skin_of(places), script_of(tmp_path, PRESS, shape=shape, radius=radius, poisson=0.5)
         )
         found = load.at(1.5)
-        press = load.presses(1.5)[0]
+        press = load.contact_loads(1.5)[0]
         sources, forces = getattr(contact, "hertz" if shape == "sphere" else shape)(
             press.radius, press.force, order=24
         )
@@ -145,14 +145,14 @@ def test_a_slide_is_a_press_moved(tmp_path):
         "shear": [0.9, 1.2, 0],
     }
     press = Load(skin, script_of(tmp_path, {"press": in_place}))
-    # 1.5 × 50 mm in 2 s in the middle: (SLOW / v)² / 2 is missing of the friction
+    # 1.5 × 50 mm in 2 s in the middle: (FRICTION_SPEED / v)² / 2 is missing of the friction
     for sliding, still in zip(slide.at(1.0), press.at(1.0), strict=True):
         np.testing.assert_allclose(sliding, still, atol=1e-3 * np.abs(still).max())
     roll = Load(skin, script_of(tmp_path, {"roll": moved}))
     np.testing.assert_allclose(roll.total(1.0)[0], [0, 0, -3], atol=1e-12)
     np.testing.assert_allclose(roll.total(1.0)[1], [0.005, 0.02, 0])
     # at rest at both ends
-    np.testing.assert_allclose(slide.presses(1e-6)[0].position, [-0.01, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(slide.contact_loads(1e-6)[0].position, [-0.01, 0, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("closed", [False, True])

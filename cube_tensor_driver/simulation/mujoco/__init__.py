@@ -1,1 +1,1 @@
-"""Skins on bodies of a MuJoCo model."""
+"""Skins on the bodies of a MuJoCo model."""

@@ -2,10 +2,10 @@
 
 The scene is one XML file that plays by itself:
 
-- the text `skin` in `<custom>` names its skin file, relative to the scene's folder;
-- it starts in the first keyframe, if that is at time 0;
-- the controls `ctrl` of the keyframes are reached at their times, and change linearly in between;
-- after the last keyframe it starts again. Without keyframes it goes on without an end.
+- The text `skin` in `<custom>` names its skin file, relative to the scene's folder.
+- It starts in the first keyframe, if that is at time 0.
+- The controls `ctrl` of the keyframes are reached at their times, and change linearly in between.
+- After the last keyframe it starts again. Without keyframes it goes on without an end.
 """
 
 from __future__ import annotations
@@ -26,42 +26,61 @@ if TYPE_CHECKING:
     from mujoco import MjModel
 
 KEPT_S = 2.0
-"""What is kept of a scene that does not repeat: hubs ask for slightly different times."""
-WHOLE_S = 10.0
-"""What counts as the whole of a scene that does not repeat."""
+"""Time in s for which the contacts of a scene that does not repeat are kept. The hubs of a skin ask
+for slightly different times."""
+
+UNBOUNDED_PERIOD_S = 10.0
+"""Time in s that counts as the whole of a scene that does not repeat."""
+
+CAMERA_ELEVATION = -12.0
+"""Elevation of the camera in degrees; negative values look down."""
 
 
 def read_scene(path: Path) -> MjModel:
-    """The model of an MJCF or URDF file. ConfigError: MuJoCo is missing, or cannot read it."""
+    """Read the model of an MJCF or URDF file.
+
+    Raises:
+        ConfigError: MuJoCo is not installed or cannot read the file.
+    """
     mujoco = load_mujoco()
     if not path.is_file():
         raise ConfigError(f"{path}: no such file; name a scene (MJCF, .xml)")
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, RuntimeError, MemoryError) as error:
-        said = " ".join(str(error).split())
-        raise ConfigError(f"{path}: MuJoCo cannot read it: {said}") from None
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path}: MuJoCo cannot read it: {reason}") from None
 
 
 def scene_skin(path: Path) -> Path:
-    """The skin file that a scene names. ConfigError: it names none."""
-    mujoco, model = load_mujoco(), read_scene(path)
+    """Return the skin file that a scene names.
+
+    Raises:
+        ConfigError: The scene cannot be read or names no skin file.
+    """
+    mujoco = load_mujoco()
+    model = read_scene(path)
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, "skin")
     if number < 0:
         raise ConfigError(
             f'{path}: names no skin; add <custom><text name="skin" data="skin.yaml"/></custom>, '
             "or name the skin file (--config)"
         )
-    start, size = model.text_adr[number], model.text_size[number]
-    text = bytes(model.text_data[start : start + size])
+    start = model.text_adr[number]
+    end = start + model.text_size[number]
+    text = bytes(model.text_data[start:end])
     return path.parent / text.rstrip(b"\0").decode(errors="replace")
 
 
 class MujocoLoad:
-    """A scene that plays by itself, as a `load.AnyLoad`: the same at the same time.
+    """A scene that plays by itself, as a `load.AnyLoad`. It is the same at the same time.
 
-    touch: the skin as a sensor, of the state that was computed last
-    Other parameters and what is raised: as in `MujocoSkin`, and ConfigError for the scene.
+    Attributes:
+        touch: The skin as a sensor, in the state that was computed last.
+        poses: Poses of the cubes.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        repeats: Time in s after which the scene repeats; None: never.
+        period: The same time, or `UNBOUNDED_PERIOD_S`.
     """
 
     def __init__(
@@ -72,45 +91,82 @@ class MujocoLoad:
         thickness: float = np.inf,
         noise: float | None = 0.0,
     ) -> None:
+        """Read the scene.
+
+        Args:
+            path: File of the scene.
+            skin: Skin on its bodies.
+            thickness: As in `MujocoSkin`.
+            noise: As in `MujocoSkin`.
+
+        Raises:
+            ConfigError: The scene cannot be read, or the skin does not fit it.
+            ElasticError: Thickness and depth make no layer.
+        """
         self._mujoco = load_mujoco()
         model = read_scene(path)
         data = self._mujoco.MjData(model)
-        self.touch = MujocoSkin(model, data, skin, thickness=thickness, noise=noise)
-        self.poses, self.depth = self.touch.poses, self.touch.depth
-        self._times, self._controls = _timeline(path, model)
+        self.touch = MujocoSkin(
+            model,
+            data,
+            skin,
+            thickness=thickness,
+            noise=noise,
+        )
+        self.poses = self.touch.poses
+        self.depth = self.touch.depth
+
+        self._times, self._controls = _keyframe_controls(path, model)
         self.repeats = float(self._times[-1]) if len(self._times) else None
-        self.period = self.repeats or WHOLE_S
+        self.period = self.repeats or UNBOUNDED_PERIOD_S
         self._touches: dict[int, list[Touch]] = {}
         self._step = 0
         self._restart()
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """As `AnyLoad.at`: of the last step of the scene that is not later."""
-        return self.touch.field(self._at(seconds))
+        """Compute the fields as `AnyLoad.at`, for the last step of the scene before this time."""
+        return self.touch.field(self._touches_at(seconds))
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """As `AnyLoad.total`."""
-        return total([touch.press for touch in self._at(seconds)])
+        """Return the sum of all contacts, as `AnyLoad.total`."""
+        return total([touch.press for touch in self._touches_at(seconds)])
 
     def play(self, seconds: float) -> None:
-        """Bring `touch.data` to this time."""
+        """Bring `touch.data` to a time."""
         self._restart()
-        while self._step < self._number(seconds):
-            self._go_on()
+        while self._step < self._step_number(seconds):
+            self._advance()
 
     def picture(
-        self, width: int, height: int, *, lookat: Array, distance: float, azimuth: float
+        self,
+        width: int,
+        height: int,
+        *,
+        lookat: Array,
+        distance: float,
+        azimuth: float,
     ) -> NDArray[np.uint8]:
-        """The scene as it is now, pixels (height, width, 3), without a display.
+        """Render the scene as it is now, without a display.
 
-        lookat: (3,) m, in the middle; distance: of the camera, m; azimuth: degrees
+        Args:
+            width: Width in pixels.
+            height: Height in pixels.
+            lookat: Position (3,) in m at the centre of the picture.
+            distance: Distance of the camera from it, in m.
+            azimuth: Direction of the camera in degrees.
 
-        ConfigError: OpenGL cannot draw here.
+        Returns:
+            Pixels (height, width, 3).
+
+        Raises:
+            ConfigError: OpenGL cannot draw here.
         """
         mujoco = self._mujoco
         camera = mujoco.MjvCamera()
-        camera.lookat[:], camera.distance = lookat, distance
-        camera.azimuth, camera.elevation = azimuth, -12.0
+        camera.lookat[:] = lookat
+        camera.distance = distance
+        camera.azimuth = azimuth
+        camera.elevation = CAMERA_ELEVATION
         try:
             with mujoco.Renderer(self.touch.model, height, width) as renderer:
                 renderer.update_scene(self.touch.data, camera)
@@ -122,23 +178,27 @@ class MujocoLoad:
             ) from None
         return pixels
 
-    def _at(self, seconds: float) -> list[Touch]:
-        number = self._number(seconds)
+    def _touches_at(self, seconds: float) -> list[Touch]:
+        """Return the contacts at a time, playing the scene up to it if necessary."""
+        number = self._step_number(seconds)
         if number not in self._touches:
             if number < self._step:
                 self._restart()
             while self._step < number:
-                self._go_on()
+                self._advance()
         return self._touches[number]
 
-    def _number(self, seconds: float) -> int:
-        """Of the step that lasts at this time."""
+    def _step_number(self, seconds: float) -> int:
+        """Return the number of the step during which a time lies."""
         if self.repeats is not None:
             seconds %= self.repeats
+        # The small addition keeps exact multiples of the time step from being rounded down.
         return int(np.floor(seconds / self.touch.model.opt.timestep + 1e-6))
 
     def _restart(self) -> None:
-        model, data = self.touch.model, self.touch.data
+        """Bring the scene to its start."""
+        model = self.touch.model
+        data = self.touch.data
         if model.nkey and model.key_time[0] == 0:
             self._mujoco.mj_resetDataKeyframe(model, data, 0)
         else:
@@ -147,23 +207,28 @@ class MujocoLoad:
         self._step = 0
         self._touches[0] = self.touch.touches()
 
-    def _go_on(self) -> None:
-        model, data = self.touch.model, self.touch.data
+    def _advance(self) -> None:
+        """Play one step and keep its contacts."""
+        model = self.touch.model
+        data = self.touch.data
         if len(self._times):
-            for actuator in range(model.nu):
-                course = self._controls[:, actuator]
-                data.ctrl[actuator] = np.interp(data.time, self._times, course)
+            for actuator, controls in enumerate(self._controls.T):
+                data.ctrl[actuator] = np.interp(data.time, self._times, controls)
         self._mujoco.mj_step(model, data)
         self._step += 1
         self._touches[self._step] = self.touch.touches()
         if self.repeats is None:
-            self._touches.pop(self._step - round(KEPT_S / model.opt.timestep), None)
+            oldest = self._step - round(KEPT_S / model.opt.timestep)
+            self._touches.pop(oldest, None)
 
 
-def _timeline(path: Path, model: MjModel) -> tuple[Array, Array]:
-    """Times (K,) s and controls (K, actuators) of the keyframes; none where all are at time 0.
+def _keyframe_controls(path: Path, model: MjModel) -> tuple[Array, Array]:
+    """Return times (K,) in s and controls (K, actuators) of the keyframes.
 
-    ConfigError: they go back in time.
+    Both are empty if all keyframes are at time 0.
+
+    Raises:
+        ConfigError: The keyframes go back in time.
     """
     times = np.array(model.key_time)
     if np.any(np.diff(times) < 0):

@@ -1,5 +1,7 @@
 """A skin on the bodies of a MuJoCo model: contact forces become tractions, and stress at the cubes.
 
+Example::
+
     import mujoco
     from cube_tensor_driver.simulation.mujoco.source import MujocoSkin
 
@@ -11,17 +13,16 @@
         rows = touch.read()
 
 The skin sits on the body that has the name of its parent frame. Cubes whose link has the name of
-another body sit on that one: so the two fingers of a hand can be one skin. Poses of the skin file
-hold in the model's reference configuration (qpos0). The surface is that of the bodies' geoms above
-the cubes.
+another body sit on that one, so that the two fingers of a hand can be one skin. The poses of the
+skin file hold in the reference configuration of the model (qpos0). The surface is that of the
+bodies' geoms above the cubes.
 
-Each cube sees a layer whose surface lies `depth` above it, across its own z axis, as in `load.py`;
-patches.py says how contact points become tractions, mechanics/contact_tables.py
-what these do to a cube.
-Contacts with the back of a body, where no cube looks, are not felt. The contact's own damping is
-MuJoCo's.
+Each cube sees a layer whose surface lies `depth` above it, perpendicular to its own z axis, as in
+`load.py`. patches.py turns contact points into tractions, mechanics/contact_tables.py tractions
+into stress at the cubes. Contacts with the back of a body, where no cube looks, are not felt. The
+damping of contacts is MuJoCo's.
 
-MuJoCo is the extra `mujoco` of this package; it is loaded when a skin is made.
+MuJoCo is the extra `mujoco` of this package. It is imported when a skin is created.
 """
 
 from __future__ import annotations
@@ -30,20 +31,18 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...config.skin import Skin, SkinCube
-from ...core.arrays import Array
+from ...core.arrays import Array, Index
 from ...core.defaults import POISSONS_RATIO, YOUNGS_MODULUS
 from ...core.errors import ConfigError
 from ...core.poses import CubePoses
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
-from ...core.tensor import rotation_from_rpy
 from ...mechanics.contact_tables import DiscTables, PolygonTables
 from ...mechanics.layer import Layer
 from ..imperfections import Imperfections
-from ..load import Press, surface_normal
+from ..load import ContactLoad, surface_normal
 from ..source import SkinPads
 from .patches import Polygon, flat_contact, hertz_radius
 
@@ -51,14 +50,20 @@ if TYPE_CHECKING:
     from mujoco import MjData, MjModel
 
 
-SAME_DEPTH = 0.1
-"""How far a cube's depth may be from the others', over the depth: there is one table for all."""
-LEAST = 0.3
-"""Width over the depth of what is flat and touches along a line."""
+MAX_DEPTH_DEVIATION = 0.1
+"""Largest deviation of the depth of a cube from the median of all cubes, divided by the median. All
+cubes share one table."""
+
+MIN_WIDTH_DEPTHS = 0.3
+"""Width divided by the depth that a flat body gets if it touches along a line."""
 
 
 def load_mujoco() -> Any:
-    """The module mujoco. ConfigError: it is not installed."""
+    """Import the module mujoco.
+
+    Raises:
+        ConfigError: It is not installed.
+    """
     try:
         import mujoco
     except ModuleNotFoundError:
@@ -69,15 +74,20 @@ def load_mujoco() -> Any:
     return mujoco
 
 
-class _Part(NamedTuple):
+class _BodyCubes(NamedTuple):
     """The cubes on one body.
 
-    body: its number; cubes: their numbers in the skin; poses: of the cubes in the parent frame;
-    pitch: theirs, m; rotation, position: from the body's frame to the parent frame
+    Attributes:
+        body: Number of the body.
+        cubes: Indices (n,) of the cubes in the skin.
+        poses: Poses of these cubes in the parent frame.
+        pitch: Their pitch in m.
+        rotation: Rotation (3, 3) from the body's frame to the parent frame.
+        position: Origin (3,) of the body's frame in the parent frame, in m.
     """
 
     body: int
-    cubes: NDArray[np.intp]
+    cubes: Index
     poses: CubePoses
     pitch: float
     rotation: Array
@@ -85,29 +95,28 @@ class _Part(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """What touches a skin, in the skin's parent frame.
+    """One contact of a skin, in the skin's parent frame.
 
-    body: that is touched, its number; press: all of it as one round contact, of the same area;
-    polygon: what it is where it is flat, None where it is round
+    Attributes:
+        body: Number of the body that is touched.
+        press: The contact as a round one of the same area.
+        polygon: The contact if it is flat, None if it is round.
     """
 
     body: int
-    press: Press
+    press: ContactLoad
     polygon: Polygon | None = None
 
 
 class MujocoSkin:
     """The cubes of a skin as a sensor of a MuJoCo model.
 
-    depth: from the cubes' centres to the surface, m, as it is in the model
-    poses: of the cubes in the skin's parent frame
-
-    Parameters: model, data: of MuJoCo; data is read after each step. thickness: of the elastomer
-    over rigid ground, m; inf: a half space. young: Pa, sets how wide round contacts are; poisson.
-    noise, drift, imperfections: as in `simulate`. Setting up takes seconds the first time.
-
-    ConfigError: MuJoCo is not installed, the model has no body of that name, or a cube does not
-    lie below the surface of its body. ElasticError: thickness, poisson and depth make no layer.
+    Attributes:
+        model: MuJoCo's model.
+        data: MuJoCo's state, which is read after each step.
+        skin: The skin.
+        poses: Poses of the cubes in the skin's parent frame.
+        depth: Distance in m from the centres of the cubes to the surface of the model.
     """
 
     def __init__(
@@ -123,14 +132,32 @@ class MujocoSkin:
         drift: float = 0.0,
         imperfections: Imperfections | None = None,
     ) -> None:
+        """Attach the cubes to the bodies, which takes seconds the first time.
+
+        Args:
+            model: MuJoCo's model.
+            data: MuJoCo's state.
+            skin: Skin on its bodies.
+            thickness: Thickness of the elastomer on rigid ground, in m; infinite for a half space.
+            young: Young's modulus of the elastomer in Pa, which determines how wide round contacts
+                are.
+            poisson: Poisson's ratio of the elastomer.
+            noise: Noise of the pads as in `simulate`.
+            drift: Drift of the pads as in `simulate`.
+            imperfections: Imperfections of the pads as in `simulate`.
+
+        Raises:
+            ConfigError: MuJoCo is not installed, the model has no body of that name, or a cube does
+                not lie below the surface of its body.
+            ElasticError: Thickness, Poisson's ratio and depth make no layer.
+        """
         self._mujoco = load_mujoco()
-        self.model, self.data, self.skin = model, data, skin
-        self.poses = CubePoses(
-            position=np.array([cube.xyz for cube in skin.cubes]),
-            rotation=np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes]),
-            half_side=np.array([cube.calibration.half_side for cube in skin.cubes]),
-        )
+        self.model = model
+        self.data = data
+        self.skin = skin
+        self.poses = skin.poses
         self._parts, self.depth = self._attach()
+        # Rounded, so that skins whose depths differ by rounding errors share their tables.
         self._discs, self._polygons = _tables(Layer(thickness, poisson), round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
         self._curvature = _curvatures(model, self._mujoco)
@@ -139,198 +166,307 @@ class MujocoSkin:
         self._scans = 0
 
     def read(self) -> StressRows:
-        """What the cubes report of the state of `data`: call it after mj_step."""
+        """Return the tensors of all cubes in the state of `data`; call it after mj_step."""
         return self._reconstructor.process(self.frequencies())
 
     def frequencies(self) -> FrequencyRows:
-        """What the pads measure in the state of `data`; stamps are its time."""
+        """Return the frequencies of all pads in the state of `data`, with its time as stamp."""
         stress, gradient = self.field(self.touches())
         self._scans += 1
-        return self._pads.rows(stress, gradient, self._scans - 1, round(1e6 * self.data.time))
+        return self._pads.rows(
+            stress,
+            gradient,
+            self._scans - 1,
+            round(1e6 * self.data.time),
+        )
 
     def touches(self) -> list[Touch]:
-        """What touches the skin in the state of `data`."""
-        data, found = self.data, []
+        """Return all contacts of the skin in the state of `data`."""
+        data = self.data
         geoms = data.contact.geom[: data.ncon]
         # A flexible body has no geom: its number is negative.
         bodies = np.where(geoms >= 0, self.model.geom_bodyid[geoms], -1)
+
+        found: list[Touch] = []
         for part in self._parts:
             for side in (0, 1):
                 rows = np.flatnonzero(bodies[:, side] == part.body)
-                for other in np.unique(geoms[rows, 1 - side]):
-                    same = rows[geoms[rows, 1 - side] == other]
-                    found += self._touch(part, same, side)
+                others = geoms[rows, 1 - side]
+                for other in np.unique(others):
+                    touch = self._find_touch(part, rows[others == other], side)
+                    if touch is not None:
+                        found.append(touch)
         return found
 
     def field(self, touches: list[Touch]) -> tuple[Array, Array]:
-        """Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m at the cubes, in their frames,
-        order xx yy zz yz zx xy."""
+        """Compute the fields at the cubes under contacts.
+
+        Returns:
+            Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
+            the frames of the cubes.
+        """
         n = len(self.poses.position)
-        stress, gradient = np.zeros((n, 6)), np.zeros((n, 6, 3))
+        stress = np.zeros((n, 6))
+        gradient = np.zeros((n, 6, 3))
         for part in self._parts:
-            mine = [touch for touch in touches if touch.body == part.body]
-            presses = [touch.press for touch in mine if touch.polygon is None]
-            flat = [(t.polygon, t.press.normal) for t in mine if t.polygon is not None]
-            found = []
-            if presses:
-                found.append(_under_discs(part, presses, self._discs))
-            if flat:
-                found.append(_under_polygons(part, flat, self._polygons))
-            for one, its_gradient in found:
-                stress[part.cubes] += one
-                gradient[part.cubes] += its_gradient
+            own = [touch for touch in touches if touch.body == part.body]
+            loads = [touch.press for touch in own if touch.polygon is None]
+            polygons = [(one.polygon, one.press.normal) for one in own if one.polygon is not None]
+            fields = []
+            if loads:
+                fields.append(_field_of_discs(part, loads, self._discs))
+            if polygons:
+                fields.append(_field_of_polygons(part, polygons, self._polygons))
+            for part_stress, part_gradient in fields:
+                stress[part.cubes] += part_stress
+                gradient[part.cubes] += part_gradient
         return stress, gradient
 
-    def _touch(self, part: _Part, rows: NDArray[np.intp], side: int) -> list[Touch]:
-        """The contacts `rows` of one pair of bodies; none where they do not press on the front.
+    def _find_touch(
+        self,
+        part: _BodyCubes,
+        rows: Index,
+        side: int,
+    ) -> Touch | None:
+        """Return the contact of one pair of bodies; None if it does not press on the front.
 
-        side: 1 where the skin is the second of the two, on which MuJoCo's forces act.
+        Args:
+            part: Body of the skin and its cubes.
+            rows: Contact points of the pair in MuJoCo's list.
+            side: 1 where the skin is the second of the two bodies, on which MuJoCo's forces act.
         """
-        data, contact, sign = self.data, self.data.contact, 2 * side - 1
-        frames, places = contact.frame[rows].reshape(-1, 3, 3), contact.pos[rows]
-        back = data.xmat[part.body].reshape(3, 3)
-        turn = part.rotation @ back.T
-        inside, six = np.empty((len(rows), 3)), np.empty(6)
-        for number, row in enumerate(rows.tolist()):
-            self._mujoco.mj_contactForce(self.model, data, row, six)
-            inside[number] = six[:3]
-        place = (places - data.xpos[part.body]) @ turn.T + part.position
-        force = sign * np.einsum("nj,njk->nk", inside, frames) @ turn.T
-        outward = -sign * frames[:, 0] @ turn.T
+        data = self.data
+        contact = data.contact
+        sign = 2 * side - 1
+        place, force, outward = self._contact_points(part, rows, sign)
         normal = surface_normal(part.poses, part.pitch, place.mean(axis=0))
-        felt = (outward @ normal > 0) & (force @ normal < 0)
-        if not felt.any():
-            return []
-        place, force = place[felt], force[felt]
+        is_felt = (outward @ normal > 0) & (force @ normal < 0)
+        if not is_felt.any():
+            return None
+
+        place = place[is_felt]
+        force = force[is_felt]
         total = force.sum(axis=0)
         if len(place) > 1:
-            polygon = flat_contact(place, force, normal, LEAST * self.depth)
-            radius = np.sqrt(total @ normal / (polygon.traction @ normal) / np.pi)
-            press = Press("disc", polygon.centre, normal, total, float(radius))
-            return [Touch(part.body, press, polygon)]
+            polygon = flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
+            area = total @ normal / (polygon.traction @ normal)
+            radius = float(np.sqrt(area / np.pi))
+            load = ContactLoad("disc", polygon.centre, normal, total, radius)
+            return Touch(part.body, load, polygon)
         curvature = self._curvature[contact.geom[rows[0]]].sum()
         radius = hertz_radius(-float(total @ normal), curvature, self._stiffness)
-        return [Touch(part.body, Press("sphere", place[0], normal, total, radius))]
+        return Touch(part.body, ContactLoad("sphere", place[0], normal, total, radius))
 
-    def _attach(self) -> tuple[list[_Part], float]:
-        """The cubes on each body, and the depth of all. ConfigError: they do not fit."""
-        model, mujoco, skin = self.model, self._mujoco, self.skin
-        still = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, still)
-        base = self._body(skin.parent_frame)
+    def _contact_points(
+        self,
+        part: _BodyCubes,
+        rows: Index,
+        sign: int,
+    ) -> tuple[Array, Array, Array]:
+        """Return positions in m, forces in N on the skin and outward normals (n, 3), parent
+        frame."""
+        data = self.data
+        frames = data.contact.frame[rows].reshape(-1, 3, 3)
+        in_frames = np.empty((len(rows), 3))
+        wrench = np.empty(6)
+        for number, row in enumerate(rows.tolist()):
+            self._mujoco.mj_contactForce(self.model, data, row, wrench)
+            in_frames[number] = wrench[:3]
+
+        body_rotation = data.xmat[part.body].reshape(3, 3)
+        to_parent = part.rotation @ body_rotation.T
+        offset = data.contact.pos[rows] - data.xpos[part.body]
+        place = offset @ to_parent.T + part.position
+        force = sign * np.einsum("nj,njk->nk", in_frames, frames) @ to_parent.T
+        outward = -sign * frames[:, 0] @ to_parent.T
+        return place, force, outward
+
+    def _attach(self) -> tuple[list[_BodyCubes], float]:
+        """Find the body and the depth of each cube.
+
+        Returns:
+            The cubes on each body, and the depth of all in m.
+
+        Raises:
+            ConfigError: The skin does not fit the model.
+        """
+        model = self.model
+        skin = self.skin
+        reference = self._mujoco.MjData(model)
+        self._mujoco.mj_kinematics(model, reference)
+        base = self._body_number(skin.parent_frame)
         if base < 0:
             names = [model.body(number).name for number in range(model.nbody)]
             raise ConfigError(
                 f"the MuJoCo model has no body {skin.parent_frame}, which is the parent_frame of "
                 f"skin {skin.name}; its bodies are {', '.join(filter(None, names))}"
             )
-        on = np.array([max(self._body(cube.link), -1) for cube in skin.cubes])
-        on[on < 0] = base
-        origin, axes = still.xpos[base], still.xmat[base].reshape(3, 3)
-        depth = np.empty(len(on))
+        bodies = np.array([self._body_number(cube.link) for cube in skin.cubes])
+        bodies[bodies < 0] = base
+
+        origin = reference.xpos[base]
+        axes = reference.xmat[base].reshape(3, 3)
+        depth = np.empty(len(bodies))
         for number, cube in enumerate(skin.cubes):
             place = origin + axes @ self.poses.position[number]
             outward = axes @ self.poses.rotation[number, :, 2]
-            depth[number] = self._surface(still, int(on[number]), place, outward, cube)
-        middle = float(np.median(depth))
-        far = int(np.argmax(np.abs(depth - middle)))
-        if abs(depth[far] - middle) > SAME_DEPTH * middle:
-            raise ConfigError(
-                f"skin {skin.name} does not fit the MuJoCo model: cube {skin.cubes[far].name} lies "
-                f"{1e3 * depth[far]:.3g} mm below the surface, the others {1e3 * middle:.3g} mm; "
-                f"all must have one depth to {SAME_DEPTH:.0%}: move cubes or geoms"
+            depth[number] = self._distance_to_surface(
+                reference, int(bodies[number]), place, outward, cube
             )
-        parts = []
-        for body in np.unique(on).tolist():
-            cubes = np.flatnonzero(on == body)
-            poses = CubePoses(*(column[cubes] for column in self.poses))
-            rotation = axes.T @ still.xmat[body].reshape(3, 3)
-            position = axes.T @ (still.xpos[body] - origin)
-            parts.append(_Part(body, cubes, poses, poses.pitch, rotation, position))
-        return parts, middle
+        median = float(np.median(depth))
+        deviation = np.abs(depth - median)
+        farthest = int(np.argmax(deviation))
+        if deviation[farthest] > MAX_DEPTH_DEVIATION * median:
+            raise ConfigError(
+                f"skin {skin.name} does not fit the MuJoCo model: cube {skin.cubes[farthest].name} "
+                f"lies {1e3 * depth[farthest]:.3g} mm below the surface, the others "
+                f"{1e3 * median:.3g} mm; all must have one depth to {MAX_DEPTH_DEVIATION:.0%}: move "
+                "cubes or geoms"
+            )
 
-    def _body(self, name: str | None) -> int:
-        """Its number, -1 where there is none."""
+        parts = []
+        for body in np.unique(bodies).tolist():
+            cubes = np.flatnonzero(bodies == body)
+            poses = CubePoses(*(column[cubes] for column in self.poses))
+            rotation = axes.T @ reference.xmat[body].reshape(3, 3)
+            position = axes.T @ (reference.xpos[body] - origin)
+            parts.append(
+                _BodyCubes(
+                    body,
+                    cubes,
+                    poses,
+                    poses.pitch,
+                    rotation,
+                    position,
+                )
+            )
+        return parts, median
+
+    def _body_number(self, name: str | None) -> int:
+        """Return the number of a body, -1 if there is none of this name."""
         kind = self._mujoco.mjtObj.mjOBJ_BODY
         return -1 if name is None else self._mujoco.mj_name2id(self.model, kind, name)
 
-    def _surface(
-        self, still: MjData, body: int, place: Array, outward: Array, cube: SkinCube
+    def _distance_to_surface(
+        self,
+        reference: MjData,
+        body: int,
+        place: Array,
+        outward: Array,
+        cube: SkinCube,
     ) -> float:
-        """Distance in m from a cube to the surface of its body's geoms that collide, in the world
-        frame of `still`. ConfigError: there is none."""
-        model, mujoco = self.model, self._mujoco
+        """Return the distance in m from a cube to the nearest colliding geom of its body.
+
+        Args:
+            reference: State in the reference configuration.
+            body: Number of the body.
+            place: Position (3,) of the cube in the world, in m.
+            outward: z axis (3,) of the cube in the world.
+            cube: The cube, for messages.
+
+        Raises:
+            ConfigError: There is no geom above the cube.
+        """
+        model = self.model
+        mujoco = self._mujoco
         first = model.body_geomadr[body]
-        found = []
+        distances = []
         for geom in range(first, first + model.body_geomnum[body]):
             if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
-                continue
+                continue  # it does not collide
             kind = model.geom_type[geom]
             if kind == mujoco.mjtGeom.mjGEOM_MESH:
-                found.append(mujoco.mj_rayMesh(model, still, geom, place, outward))
+                distance = mujoco.mj_rayMesh(model, reference, geom, place, outward)
             else:
-                frame = still.geom_xpos[geom], still.geom_xmat[geom], model.geom_size[geom]
-                found.append(mujoco.mju_rayGeom(*frame, place, outward, kind))
-        found = [distance for distance in found if distance > 0]
-        if not found:
+                position = reference.geom_xpos[geom]
+                rotation = reference.geom_xmat[geom]
+                size = model.geom_size[geom]
+                distance = mujoco.mju_rayGeom(position, rotation, size, place, outward, kind)
+            if distance > 0:
+                distances.append(float(distance))
+        if not distances:
             raise ConfigError(
                 f"skin {self.skin.name} does not fit the MuJoCo model: no geom of body "
                 f"{model.body(body).name} that collides is above cube {cube.name} along its z "
                 "axis; move the cube in the skin file, or the geom in the model"
             )
-        return min(found)
+        return min(distances)
 
 
 @lru_cache(maxsize=8)
 def _tables(layer: Layer, depth: float) -> tuple[DiscTables, PolygonTables]:
-    """Kept: the skins of a robot are often alike."""
+    """Return the tables of a layer; the skins of a robot often share them."""
     return DiscTables(layer, depth), PolygonTables(layer, depth)
 
 
-def _under_discs(part: _Part, presses: list[Press], tables: DiscTables) -> tuple[Array, Array]:
-    """Stress and gradient at the cubes of a part under round contacts."""
-    position, rotation, _ = part.poses
-    facing = np.maximum(rotation[:, :, 2] @ np.stack([press.normal for press in presses], 1), 0.0)
-    place = (position[:, None] - [press.position for press in presses]) @ rotation
-    force = np.stack([press.force for press in presses]) @ rotation * facing[..., None]
-    return tables.field(place[..., :2], force, [press.radius for press in presses])
-
-
-def _under_polygons(
-    part: _Part, flat: list[tuple[Polygon, Array]], tables: PolygonTables
+def _field_of_discs(
+    part: _BodyCubes,
+    loads: list[ContactLoad],
+    tables: DiscTables,
 ) -> tuple[Array, Array]:
-    """Stress and gradient at the cubes of a part under polygons and their normals.
+    """Compute stress and gradient at the cubes of a body under round contacts."""
+    position, rotation, _ = part.poses
+    normals = np.stack([load.normal for load in loads], axis=1)
+    centres = np.array([load.position for load in loads])
+    forces = np.stack([load.force for load in loads])
+    radii = [load.radius for load in loads]
 
-    A polygon is laid flat on a cube's plane, which leaves the part of its area by which it faces
-    the cube.
+    facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
+    place = (position[:, np.newaxis] - centres) @ rotation
+    force = forces @ rotation * facing[..., np.newaxis]
+    return tables.field(place[..., :2], force, radii)
+
+
+def _field_of_polygons(
+    part: _BodyCubes,
+    loads: list[tuple[Polygon, Array]],
+    tables: PolygonTables,
+) -> tuple[Array, Array]:
+    """Compute stress and gradient at the cubes of a body under polygons with their normals.
+
+    A polygon is projected onto the plane of a cube, which reduces its area by the cosine with which
+    it faces the cube.
     """
     position, rotation, _ = part.poses
-    polygons = [polygon for polygon, _ in flat]
-    following: list[int] = []  # the number of the corner where each edge ends
-    number: list[int] = []  # the edge's polygon
-    for one, polygon in enumerate(polygons):
-        first, size = len(number), len(polygon.corners)
-        following += [*range(first + 1, first + size), first]
-        number += [one] * size
+    in_plane = rotation[..., :2]
+    polygons = [polygon for polygon, _ in loads]
+    normals = np.stack([normal for _, normal in loads], axis=1)
+    next_corner: list[int] = []  # the corner where each edge ends
+    number: list[int] = []  # the polygon of each edge
+    for index, polygon in enumerate(polygons):
+        first = len(number)
+        size = len(polygon.corners)
+        next_corner += [*range(first + 1, first + size), first]
+        number += [index] * size
+
+    origin = position[:, np.newaxis]
     places = np.concatenate([polygon.corners for polygon in polygons])
-    corners = (places - position[:, None]) @ rotation[..., :2]
-    centre = (np.stack([one.centre for one in polygons]) - position[:, None]) @ rotation[..., :2]
-    facing = np.maximum(rotation[:, :, 2] @ np.stack([normal for _, normal in flat], axis=1), 0.0)
+    corners = (places - origin) @ in_plane
+    centre = (np.stack([polygon.centre for polygon in polygons]) - origin) @ in_plane
+
+    # The twist turns about the centroid; the tables want it about the point above the cube.
+    facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
     twist = facing * [polygon.twist for polygon in polygons]
     traction = np.stack([polygon.traction for polygon in polygons]) @ rotation
-    traction *= (facing > 0)[..., None]
+    traction *= (facing > 0)[..., np.newaxis]
     traction[..., 0] += twist * centre[..., 1]
     traction[..., 1] -= twist * centre[..., 0]
-    return tables.field(corners, corners[:, following], traction[:, number], twist[:, number])
+    return tables.field(
+        corners,
+        corners[:, next_corner],
+        traction[:, number],
+        twist[:, number],
+    )
 
 
 def _curvatures(model: MjModel, mujoco: Any) -> Array:
-    """(geoms + 1,) 1/m, of spheres and of what is round with one radius; 0 for all that is flat.
+    """Return the curvature (geoms + 1,) of each geom in 1/m.
 
-    The last is that of what is no geom.
+    Spheres, capsules and cylinders have that of their radius, all others 0. The last entry belongs
+    to flexible bodies, which have no geom.
     """
     kinds = mujoco.mjtGeom
-    round_ones = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
-    is_round = np.isin(model.geom_type, [int(kind) for kind in round_ones])
-    size = np.where(is_round, model.geom_size[:, 0], 1.0)
-    return np.append(np.where(is_round, 1 / size, 0.0), 0.0)
+    round_kinds = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
+    is_round = np.isin(model.geom_type, [int(kind) for kind in round_kinds])
+    radius = np.where(is_round, model.geom_size[:, 0], 1.0)
+    return np.append(np.where(is_round, 1 / radius, 0.0), 0.0)
