@@ -320,8 +320,8 @@ class MujocoSkin:
             raise ConfigError(
                 f"skin {skin.name} does not fit the MuJoCo model: cube {skin.cubes[farthest].name} "
                 f"lies {1e3 * depth[farthest]:.3g} mm below the surface, the others "
-                f"{1e3 * median:.3g} mm; all must have one depth to {MAX_DEPTH_DEVIATION:.0%}: move "
-                "cubes or geoms"
+                f"{1e3 * median:.3g} mm; all must have one depth to {MAX_DEPTH_DEVIATION:.0%}: "
+                "move cubes or geoms"
             )
 
         parts = []
