@@ -6,10 +6,11 @@ the posterior of t, prediction.py replaces values that are missing.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from ..config.skin import Skin
 from ..core.arrays import Array, Index, Single
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from ..core.errors import ElasticError
@@ -77,7 +78,7 @@ class SurfaceInverse:
 
     def __init__(
         self,
-        skin: Any,
+        skin: Skin,
         *,
         depth: float = SURFACE_DEPTH,
         thickness: float = np.inf,

@@ -174,10 +174,9 @@ def test_a_curved_skin_laid_flat_is_off_by_half_its_depth_over_its_radius():
 def test_it_is_made_of_a_skin_as_read_from_its_file():
     from types import SimpleNamespace as Skin
 
-    places = grid().position[:6]
-    cubes = [Skin(xyz=tuple(place), rpy=(0.0, 0.0, 0.0)) for place in places]
+    poses = CubePoses(*(column[:6] for column in grid()))
     calibrations = [illustrative("planar")] * 6
-    inverse = SurfaceInverse(Skin(cubes=cubes, calibrations=calibrations), depth=DEPTH)
+    inverse = SurfaceInverse(Skin(poses=poses, calibrations=calibrations), depth=DEPTH)
     values = np.full((6, 15), np.nan)
     assert np.isfinite(inverse.field(values).traction).all()
     assert len(inverse.columns) == 7
