@@ -19,104 +19,115 @@ from cube_tensor_driver.ros.launching import (
     FromSkin,
     GivenParameters,
     check_arguments,
+    declare_switch,
+    declare_text,
     record_skin,
     rviz_file,
-    switch,
-    text,
 )
 
 PACKAGE = "cube_tensor_driver"
-RESPAWN_DELAY_S = 2.0
 
-given = LaunchConfiguration
+RESPAWN_DELAY_S = 2.0
+"""Time, in seconds, after which a node that has ended by itself starts again."""
+
+ARGUMENTS = (
+    declare_text("config", "Skin file (YAML); empty with simulate:=true: the demo skin."),
+    declare_text("namespace", "Namespace of the nodes and their topics, below any that is pushed."),
+    declare_text("port", "Port of the hub instead of the file's, for a skin with one link."),
+    declare_text("rate", "Samples per second; empty: as the parameter says."),
+    declare_text(
+        "publish_period", "Time that one message covers, s; empty: as the parameter says."
+    ),
+    declare_switch("simulate", "Simulate the skin's hubs instead of opening its ports."),
+    declare_text("load", "Load script (YAML) for a simulated skin.", str(DEMO_LOAD)),
+    declare_switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
+    declare_switch("autostart", "Nodes configure and activate themselves (lifecycle).", ""),
+    declare_switch("respawn", "Start a node again that has ended by itself.", "true"),
+    declare_switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
+    declare_switch("markers", "Publish the skin as a MarkerArray on `markers`."),
+    declare_switch("state_publisher", "Publish the cubes' frames (robot_state_publisher)."),
+    declare_switch("record", "Record the skin with ros2 bag into a new folder here (mcap)."),
+    declare_switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
+)
 
 
 def generate_launch_description() -> LaunchDescription:
-    arguments = [
-        text("config", "Skin file (YAML); empty with simulate:=true: the demo skin."),
-        text("namespace", "Namespace of the nodes and their topics, below any that is pushed."),
-        text("port", "Port of the hub instead of the file's, for a skin with one link."),
-        text("rate", "Samples per second; empty: as the parameter says."),
-        text("publish_period", "Time that one message covers, s; empty: as the parameter says."),
-        switch("simulate", "Simulate the skin's hubs instead of opening its ports."),
-        text("load", "Load script (YAML) for a simulated skin.", str(DEMO_LOAD)),
-        switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
-        switch("autostart", "Nodes configure and activate themselves (lifecycle).", ""),
-        switch("respawn", "Start a node again that has ended by itself.", "true"),
-        switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
-        switch("markers", "Publish the skin as a MarkerArray on `markers`."),
-        switch("state_publisher", "Publish the cubes' frames (robot_state_publisher)."),
-        switch("record", "Record the skin with ros2 bag into a new folder here (mcap)."),
-        switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
-    ]
     autostart = ParameterFile(GivenParameters("autostart"))
     reconstruction = ParameterFile(GivenParameters("autostart", "config", "publish_period"))
     driver = ParameterFile(
         GivenParameters("autostart", "config", "publish_period", "port", "rate", "port_directory")
     )
-    separate, composed = UnlessCondition(given("composed")), IfCondition(given("composed"))
-    urdf = {"robot_description": ParameterValue(FromSkin(skin_urdf), value_type=str)}
+    is_composed = LaunchConfiguration("composed")
     return LaunchDescription(
         [
-            *arguments,
+            *ARGUMENTS,
             OpaqueFunction(function=check_arguments),
-            simulator(),
-            node("reconstruction", reconstruction, separate),
-            node("driver", driver, separate),
-            node("composed", driver, composed),
-            node("contacts", autostart, IfCondition(given("contacts"))),
-            node("markers", autostart, wanted("markers", "rviz")),
-            OpaqueFunction(function=record_skin, condition=wanted("record")),
-            Node(
-                package="robot_state_publisher",
-                executable="robot_state_publisher",
-                namespace=given("namespace"),
-                parameters=[urdf],
-                output="screen",
-                condition=wanted("state_publisher", "rviz"),
-            ),
+            make_simulator(),
+            make_node("reconstruction", reconstruction, UnlessCondition(is_composed)),
+            make_node("driver", driver, UnlessCondition(is_composed)),
+            make_node("composed", driver, IfCondition(is_composed)),
+            make_node("contacts", autostart, if_any("contacts")),
+            make_node("markers", autostart, if_any("markers", "rviz")),
+            OpaqueFunction(function=record_skin, condition=if_any("record")),
+            make_state_publisher(),
             Node(
                 package="rviz2",
                 executable="rviz2",
-                namespace=given("namespace"),
+                namespace=LaunchConfiguration("namespace"),
                 arguments=["-d", FromSkin(rviz_file)],
-                condition=wanted("rviz"),
+                condition=if_any("rviz"),
             ),
         ]
     )
 
 
-def wanted(argument: str, other: str | None = None) -> IfCondition:
-    """If one of the arguments is true."""
-    return IfCondition(OrSubstitution(given(argument), given(other or argument)))
+def if_any(argument: str, other: str | None = None) -> IfCondition:
+    """Return the condition that one of these launch arguments is true."""
+    first, second = LaunchConfiguration(argument), LaunchConfiguration(other or argument)
+    return IfCondition(OrSubstitution(first, second))
 
 
-def node(executable: str, parameters: Any, condition: Any) -> Node:
-    """A node of this package. `composed` holds several, which keep their own names."""
+def make_node(executable: str, parameters: Any, condition: Any) -> Node:
+    """Return a node of this package."""
+    # The process `composed` holds several nodes, which keep their own names.
+    name = None if executable == "composed" else executable
     return Node(
         package=PACKAGE,
         executable=executable,
-        name=None if executable == "composed" else executable,
-        namespace=given("namespace"),
+        name=name,
+        namespace=LaunchConfiguration("namespace"),
         parameters=[parameters],
         condition=condition,
         output="screen",
         emulate_tty=True,
-        respawn=given("respawn"),
+        respawn=LaunchConfiguration("respawn"),
         respawn_delay=RESPAWN_DELAY_S,
     )
 
 
-def simulator() -> ExecuteProcess:
-    """The hubs of the skin; not a ROS node."""
+def make_state_publisher() -> Node:
+    """Return the node that publishes the frames of the cubes."""
+    urdf = ParameterValue(FromSkin(skin_urdf), value_type=str)
+    return Node(
+        package="robot_state_publisher",
+        executable="robot_state_publisher",
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[{"robot_description": urdf}],
+        output="screen",
+        condition=if_any("state_publisher", "rviz"),
+    )
+
+
+def make_simulator() -> ExecuteProcess:
+    """Return the process of the skin's simulated hubs, which is no ROS node."""
     return ExecuteProcess(
         cmd=[
             ExecutableInPackage("simulator", PACKAGE),
-            *("--config", given("config")),
-            *("--ports", given("port_directory")),
-            *("--load", given("load")),
+            *("--config", LaunchConfiguration("config")),
+            *("--ports", LaunchConfiguration("port_directory")),
+            *("--load", LaunchConfiguration("load")),
         ],
         name="simulator",
-        condition=IfCondition(given("simulate")),
+        condition=IfCondition(LaunchConfiguration("simulate")),
         output="screen",
     )

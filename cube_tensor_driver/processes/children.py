@@ -17,12 +17,19 @@ from .domain import check_domain
 from .skin_processes import Process, Value
 
 END_S = 1.2
-"""How long a process has to end when asked; then it is killed. A hung rclpy ignores SIGTERM."""
-POLL_S = 0.05
-LOG_LINES = 10
-"""Of a process that ended are part of the error message."""
+"""Time, in seconds, that a process has to end when asked.
+
+Then it is killed, because a rclpy that hangs ignores SIGTERM.
+"""
+
+POLL_PERIOD_S = 0.05
+"""Time, in seconds, between two looks into a log file."""
+
+SHOWN_LINES = 10
+"""Number of lines at the end of a log that an error message shows."""
+
 HAS_SETPRIV = shutil.which("setpriv") is not None
-"""Part of util-linux."""
+"""Whether the program setpriv is there. It is part of util-linux."""
 
 
 class ChildError(CubeError):
@@ -30,12 +37,14 @@ class ChildError(CubeError):
 
 
 class Children:
-    """Child processes by the name of their executable; a context manager that ends them all.
-
-    Each writes its output to a log file in the folder `logs`. ConfigError: ROS_DOMAIN_ID is none.
-    """
+    """Child processes by the name of their executable; a context manager that ends them all."""
 
     def __init__(self, logs: Path) -> None:
+        """Write the output of each process to a file in the folder `logs`.
+
+        Raises:
+            ConfigError: ROS_DOMAIN_ID is no domain.
+        """
         check_domain()
         self._logs = logs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -67,33 +76,34 @@ class Children:
     def kill(self, executable: str) -> None:
         """End a process by force, as a crash would."""
         process = self._processes.pop(executable)
-        _signal(process, signal.SIGKILL)
+        _signal_session(process, signal.SIGKILL)
         process.wait()
 
     def pause(self, executable: str) -> None:
         """Stop a process where it is, until `resume`."""
-        _signal(self._processes[executable], signal.SIGSTOP)
+        _signal_session(self._processes[executable], signal.SIGSTOP)
 
     def resume(self, executable: str) -> None:
-        """Let a process go on that was stopped."""
-        _signal(self._processes[executable], signal.SIGCONT)
+        """Let a stopped process go on."""
+        _signal_session(self._processes[executable], signal.SIGCONT)
 
     def names(self) -> list[str]:
-        """Of those that were started and not ended."""
+        """Return the names of the processes that were started and not ended."""
         return list(self._processes)
 
     def pid(self, executable: str) -> int:
-        """The process id."""
+        """Return the id of a process."""
         return self._processes[executable].pid
 
     def log(self, executable: str) -> str:
-        """What the process has written so far."""
+        """Return what a process has written so far."""
         return self._log_file(executable).read_text(errors="replace")
 
     def wait_for_line(self, executable: str, text: str, seconds: float) -> str:
-        """The first line of the log that contains `text`, once it is there.
+        """Return the first line of a log that contains `text`, once it is there.
 
-        Raises ChildError if any process ends before, or if it takes longer than `seconds`.
+        Raises:
+            ChildError: A process has ended before, or it takes longer than `seconds`.
         """
         until = time.monotonic() + seconds
         while True:
@@ -107,29 +117,29 @@ class Children:
                     f"{self.log(executable)}"
                 )
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._processes[executable].wait(POLL_S)
+                self._processes[executable].wait(POLL_PERIOD_S)
 
     def check(self) -> None:
         """Raise ChildError, with the end of its log, if a process has ended."""
         for executable, process in self._processes.items():
             if process.poll() is not None:
-                end_of_log = "\n".join(self.log(executable).splitlines()[-LOG_LINES:])
+                end_of_log = "\n".join(self.log(executable).splitlines()[-SHOWN_LINES:])
                 raise ChildError(
                     f"the {executable} ended with code {process.returncode}:\n{end_of_log}"
                 )
 
     def end(self, executables: Iterable[str]) -> None:
-        """End these processes: ask all of them first, kill after END_S what is still there."""
+        """End processes: ask all of them first, kill after `END_S` what is still there."""
         ending = [self._processes.pop(name) for name in executables]
         for process in ending:
-            _signal(process, signal.SIGTERM)
+            _signal_session(process, signal.SIGTERM)
         until = time.monotonic() + END_S
         for process in ending:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(timeout=max(0.0, until - time.monotonic()))
         for process in ending:
             if process.poll() is None:
-                _signal(process, signal.SIGKILL)
+                _signal_session(process, signal.SIGKILL)
                 process.wait()
 
     def _log_file(self, executable: str) -> Path:
@@ -137,24 +147,28 @@ class Children:
 
 
 def ros_arguments(parameters: dict[str, Value]) -> list[str]:
-    """`-p name:=value` for each parameter. Values are written as YAML, so that a text stays one."""
+    """Return `-p name:=value` for each parameter."""
     words = []
     for name, value in parameters.items():
+        # ROS reads a value as YAML, in which a text in quotes stays a text.
         written = f"'{value}'" if isinstance(value, str) else str(value).lower()
         words += ["-p", f"{name}:={written}"]
     return words
 
 
 def end_with_parent() -> list[str]:
-    """In front of a command: the kernel ends it when the thread that started it is gone, even by
-    SIGKILL; and it does not start if this process was gone before the kernel was asked."""
+    """Return words in front of a command that end it when this process ends, even by SIGKILL.
+
+    The kernel does that. The command does not start at all if this process has ended before the
+    kernel was asked.
+    """
     if not HAS_SETPRIV:
         return []
-    is_there = '[ "$PPID" = "$0" ] && exec "$@"'
-    return ["setpriv", "--pdeathsig", "TERM", "sh", "-c", is_there, str(os.getpid())]
+    is_parent_there = '[ "$PPID" = "$0" ] && exec "$@"'
+    return ["setpriv", "--pdeathsig", "TERM", "sh", "-c", is_parent_there, str(os.getpid())]
 
 
-def _signal(process: subprocess.Popen[bytes], number: int) -> None:
-    """To all processes of its session."""
+def _signal_session(process: subprocess.Popen[bytes], number: int) -> None:
+    """Send a signal to all processes of a child's session."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)

@@ -1,5 +1,7 @@
-"""What to start for a skin: the list of `./cube demo`. launch/skin.launch.py has the same processes
-as actions."""
+"""The processes that a skin needs, as `./cube demo` starts them.
+
+launch/skin.launch.py has the same processes as actions.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +9,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 Value = str | float | bool
+"""Value of a parameter."""
+
 RECORDED = ("frequencies", "stress", "info", "driver/info", "/diagnostics")
-"""The topics of a recording. `frequencies` and `info` are enough to reconstruct everything again,
-`driver/info` where no reconstruction runs; `stress` is what was published at the time,
-`/diagnostics` what the nodes said about links and cubes."""
+"""The topics of a recording.
+
+`frequencies` and `info` are enough to reconstruct everything again, `driver/info` where no
+reconstruction runs; `stress` is what was published at the time, `/diagnostics` what the nodes
+reported about links and cubes.
+"""
 
 
 @dataclass(frozen=True)
 class Process:
     """One process of a running skin.
 
-    executable: its name in the package. module: what `python -m` runs. node: whether it is a ROS
-    node, which takes parameters; other processes take arguments. program: path of what runs in the
-    place of a module.
+    Attributes:
+        executable: Its name in the package.
+        module: The module that `python -m` runs.
+        node: Whether it is a ROS node, which takes parameters. Other processes take arguments.
+        parameters: Name of a parameter -> its value.
+        arguments: Arguments of the command line.
+        program: Path of a program that runs in the place of the module; empty: the module.
     """
 
     executable: str
@@ -34,12 +45,15 @@ class Process:
 class SimulatedHubs:
     """The simulator that takes the place of the real hubs.
 
-    ports: folder for its pseudo-terminals. load: its load script; None: the one in the package.
-    mujoco: a MuJoCo scene instead of a load script.
-    sample_log: file for a record of every sample it sends; None: none. instants: how many instants
-    of the load it computes in advance, see `simulation.simulator.Simulator`; None: its default.
-    noise: of the pads, relative to their frequencies; None: as the calibrations state.
-    imperfections: file of what else is wrong with the pads; None: nothing.
+    Attributes:
+        ports: Folder for its pseudo-terminals.
+        load: Its load script; None: the one in the package.
+        mujoco: A MuJoCo scene instead of a load script; None: none.
+        sample_log: File for a record of every sample that it sends; None: none.
+        instants: Number of instants of the load that it computes in advance, see
+            `simulation.simulator.Simulator`; None: its default.
+        noise: Noise of the pads, relative to their frequencies; None: as the calibrations state.
+        imperfections: File of what else is wrong with the pads; None: nothing.
     """
 
     ports: Path
@@ -51,22 +65,21 @@ class SimulatedHubs:
     imperfections: Path | None = None
 
     def process(self, config: Path) -> Process:
-        """The simulator of the skin file `config`."""
-        arguments = ["--config", str(config), "--ports", str(self.ports)]
-        if self.load is not None:
-            arguments += ["--load", str(self.load)]
-        if self.mujoco is not None:
-            arguments += ["--mujoco", str(self.mujoco)]
-        if self.sample_log is not None:
-            arguments += ["--log", str(self.sample_log)]
-        if self.instants is not None:
-            arguments += ["--instants", str(self.instants)]
-        if self.noise is not None:
-            arguments += ["--noise", str(self.noise)]
-        if self.imperfections is not None:
-            arguments += ["--imperfections", str(self.imperfections)]
+        """Return the simulator of the skin file `config`."""
+        options = {
+            "--config": config,
+            "--ports": self.ports,
+            "--load": self.load,
+            "--mujoco": self.mujoco,
+            "--log": self.sample_log,
+            "--instants": self.instants,
+            "--noise": self.noise,
+            "--imperfections": self.imperfections,
+        }
+        given = {name: str(value) for name, value in options.items() if value is not None}
+        arguments = tuple(word for option in given.items() for word in option)
         module = "cube_tensor_driver.simulation.main"
-        return Process("simulator", module, node=False, arguments=tuple(arguments))
+        return Process("simulator", module, node=False, arguments=arguments)
 
 
 def skin_processes(
@@ -80,13 +93,17 @@ def skin_processes(
     contacts: bool = False,
     simulated: SimulatedHubs | None = None,
 ) -> list[Process]:
-    """The processes of a skin file, in the order in which they start.
+    """Return the processes of a skin file, in the order in which they start.
 
-    These are the driver and the reconstruction, or one process with both if `composed`; before them
-    the simulator, if hubs are `simulated`; after them the nodes `markers` and `contacts` if wanted.
-
-    port: replaces the port in the file, for a skin with one link. rate: samples per second, 0: as
-    the file says. publish_period: time that one message covers, s, 0: one message per scan.
+    Args:
+        config: The skin file.
+        port: Port instead of the one in the file, for a skin with one link.
+        rate: Samples per second; 0: as the file says.
+        publish_period: Time that one message covers, in s; 0: one message per scan.
+        composed: Whether one process holds driver and reconstruction.
+        markers: Whether the node `markers` runs, too.
+        contacts: Whether the node `contacts` runs, too.
+        simulated: Simulated hubs instead of real ones.
     """
     common: dict[str, Value] = {"config": str(config), "publish_period": publish_period}
     port_directory = str(simulated.ports) if simulated else ""

@@ -1,7 +1,7 @@
-"""What the launch files need beside the actions of launch: arguments that are checked, and texts
-that are made from the skin file.
+"""What the launch files need beside the actions of launch.
 
-Imports launch, which every ROS 2 installation has. The ROS 2 wheels lack it.
+These are arguments that are checked, and texts and commands that are made from the skin file. This
+module imports launch, which every ROS 2 installation has. The ROS 2 wheels lack it.
 """
 
 from __future__ import annotations
@@ -29,26 +29,37 @@ from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 
 _CONFIG = package_data() / "config"
-SINGLE, DEMO, DEMO_LOAD = (
-    _CONFIG / name for name in ("cube.yaml", "skin_demo.yaml", "load_demo.yaml")
-)
+
+SINGLE_CUBE = _CONFIG / "cube.yaml"
+"""Skin file of a single cube."""
+
+DEMO_SKIN = _CONFIG / "skin_demo.yaml"
+"""Skin file of the demo."""
+
+DEMO_LOAD = _CONFIG / "load_demo.yaml"
+"""Load script of the demo."""
+
 SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
+"""Launch file of a skin."""
+
 RECORD_QOS = _CONFIG / "record_qos.yaml"
-NEEDS = {
+"""Quality of service with which topics are recorded."""
+
+NEEDED_PACKAGES = {
     "rviz": ("rviz2", "robot_state_publisher"),
     "state_publisher": ("robot_state_publisher",),
     "record": ("ros2bag", "rosbag2_storage_mcap"),
 }
-"""The ROS packages beyond our own that an argument needs."""
+"""Launch argument -> the ROS packages that it needs beyond our own."""
 
 
-def text(name: str, description: str, default: str = "") -> DeclareLaunchArgument:
-    """A launch argument."""
+def declare_text(name: str, description: str, default: str = "") -> DeclareLaunchArgument:
+    """Declare a launch argument that is a text."""
     return DeclareLaunchArgument(name, default_value=default, description=description)
 
 
-def switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
-    """A launch argument that is true or false, or empty if that is the default."""
+def declare_switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
+    """Declare a launch argument that is true or false, or empty if that is the default."""
     choices = ["true", "false"] if default else ["", "true", "false"]
     return DeclareLaunchArgument(
         name, default_value=default, choices=choices, description=description
@@ -66,15 +77,15 @@ class FromSkin(Substitution):  # type: ignore[misc]
         return f"{self._make.__name__} of config"
 
     def perform(self, context: LaunchContext) -> str:
-        """ConfigError: the skin file is wrong."""
-        return self._make(read_skin(Path(_given(context, "config"))))
+        """Return the text. ConfigError: the skin file is wrong."""
+        return self._make(_read_skin(context))
 
 
 class GivenParameters(Substitution):  # type: ignore[misc]
     """The path of a parameter file with the launch arguments of these names that are not empty.
 
-    The others are left to the including launch file: what a node is passed beats its SetParameter.
-    ConfigError: one is not of the parameter's type.
+    The others are left to the including launch file: what a node is passed overrides the
+    SetParameter of that file.
     """
 
     def __init__(self, *names: str) -> None:
@@ -85,58 +96,40 @@ class GivenParameters(Substitution):  # type: ignore[misc]
         return f"parameters {', '.join(parameter.name for parameter in self._parameters)}"
 
     def perform(self, context: LaunchContext) -> str:
+        """Write the file and return its path. ConfigError: a text is not of its type."""
         given = {
-            parameter.name: _typed(parameter.name, text, type(parameter.default))
+            parameter.name: _convert(parameter.name, text, type(parameter.default))
             for parameter in self._parameters
-            if (text := _given(context, parameter.name))
+            if (text := _argument(context, parameter.name))
         }
         path = temporary_folder("cube_parameters_") / "given.yaml"
         write_yaml(path, {"/**": {"ros__parameters": given}})
         return str(path)
 
 
-def parent_frame(skin: Skin) -> str:
-    return skin.parent_frame
-
-
 def rviz_file(skin: Skin) -> str:
-    """The path of a configuration of RViz for this skin."""
+    """Write a configuration of RViz for this skin, and return its path."""
     path = temporary_folder("cube_rviz_") / "skin.rviz"
     write_yaml(path, rviz_view(skin))
     return str(path)
 
 
 def record_skin(context: LaunchContext) -> list[Action]:
-    """Start `ros2 bag record` for the skin's topics, as its nodes name them.
+    """Return the action that starts `ros2 bag record` for the skin's topics.
 
     A namespace, remaps and the parameter `qos_reliability` that the including launch file sets
     around the skin are applied here, because `ros2 bag` is no action of launch_ros.
     """
     surroundings: dict[str, Any] = context.launch_configurations
-    namespace = make_namespace_absolute(
-        prefix_namespace(surroundings.get("ros_namespace", ""), _given(context, "namespace"))
-    )
-    remaps: dict[str, str] = dict(surroundings.get("ros_remaps") or [])
-    given = [pair for pair in surroundings.get("global_params", []) if isinstance(pair, tuple)]
-    parameters: dict[str, str] = dict(given)
-    reliability = parameters.get("qos_reliability", "reliable")
-
-    qualities = {}
-    for topic, quality in read_yaml(RECORD_QOS).items():
-        name = topic if topic == "/diagnostics" else topic.removeprefix("/")
-        name = remaps.get(name, name)
-        full_name = name if name.startswith("/") else f"{(namespace or '').rstrip('/')}/{name}"
-        is_batch = topic in ("/frequencies", "/stress")
-        qualities[full_name] = quality | ({"reliability": reliability} if is_batch else {})
+    outer_namespace = surroundings.get("ros_namespace", "")
+    relative = prefix_namespace(outer_namespace, _argument(context, "namespace"))
+    namespace = (make_namespace_absolute(relative) or "").strip("/")
+    qualities = _recorded_topics(surroundings, namespace)
     overrides = temporary_folder("cube_record_") / "qos.yaml"
     write_yaml(overrides, qualities)
 
-    skin = read_skin(Path(_given(context, "config")))
-    parts = [
-        *(namespace or "").strip("/").split("/"),
-        skin.name,
-        f"{datetime.now():%Y_%m_%d-%H_%M_%S}",
-    ]
+    time = f"{datetime.now():%Y_%m_%d-%H_%M_%S}"
+    parts = [*namespace.split("/"), _read_skin(context).name, time]
     folder = Path("_".join(part for part in parts if part)).absolute()
     command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(folder)]
     command += ["--qos-profile-overrides-path", str(overrides)]
@@ -145,43 +138,72 @@ def record_skin(context: LaunchContext) -> list[Action]:
     return [ExecuteProcess(cmd=command, name="recorder", output="screen")]
 
 
-def check_arguments(context: LaunchContext) -> list[Action]:
-    """The first action of a launch file: an argument that cannot work ends the launch before
-    anything starts.
+def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, dict[str, str]]:
+    """Return the full names of the recorded topics and the quality of service of each."""
+    remaps: dict[str, str] = dict(surroundings.get("ros_remaps") or [])
+    # Beside pairs of name and value there may be paths of parameter files.
+    given = [pair for pair in surroundings.get("global_params", []) if isinstance(pair, tuple)]
+    parameters: dict[str, str] = dict(given)
+    reliability = parameters.get("qos_reliability", "reliable")
 
-    It sets `config` to the path of the skin file, and `port_directory` to a new folder if hubs are
-    simulated. ConfigError: an argument, the skin file or the load script is wrong, or a ROS package
-    that is asked for is not installed.
+    qualities = {}
+    for topic, quality in read_yaml(RECORD_QOS).items():
+        name = topic if topic == "/diagnostics" else topic.removeprefix("/")
+        name = remaps.get(name, name)
+        prefix = f"/{namespace}" if namespace else ""
+        full_name = name if name.startswith("/") else f"{prefix}/{name}"
+        is_batch = topic in ("/frequencies", "/stress")
+        qualities[full_name] = quality | ({"reliability": reliability} if is_batch else {})
+    return qualities
+
+
+def check_arguments(context: LaunchContext) -> list[Action]:
+    """Check all arguments, as the first action of a launch file, before anything starts.
+
+    Returns:
+        Actions that set `config` to the path of the skin file, and `port_directory` to a new folder
+        if hubs are simulated.
+
+    Raises:
+        ConfigError: An argument, the skin file or the load script is wrong, or a ROS package that
+            is asked for is not installed. This ends the launch.
     """
-    simulate = _given(context, "simulate") == "true"
-    config = _given(context, "config") or (str(DEMO) if simulate else "")
+    is_simulated = _argument(context, "simulate") == "true"
+    config = _argument(context, "config") or (str(DEMO_SKIN) if is_simulated else "")
     if not config:
         raise ConfigError(
             "config is missing: name a skin file, config:=skin.yaml, or try simulate:=true"
         )
     path = Path(config).expanduser().resolve()
     read_skin(path)
-    read_script(Path(_given(context, "load")).expanduser())
-    problem = _given(context, "port") and port_problem(_given(context, "port"))
+    read_script(Path(_argument(context, "load")).expanduser())
+
+    problem = _argument(context, "port") and port_problem(_argument(context, "port"))
     if problem:
         raise ConfigError(f"port: {problem}")
     for name in ("rate", "publish_period"):
-        _typed(name, _given(context, name) or "0", float)
-    for name, packages in NEEDS.items():
-        if _given(context, name) == "true":
+        _convert(name, _argument(context, name) or "0", float)
+    for name, packages in NEEDED_PACKAGES.items():
+        if _argument(context, name) == "true":
             _check_installed(name, packages)
-    ports = str(temporary_folder("cube_ports_")) if simulate else ""
+
+    ports = str(temporary_folder("cube_ports_")) if is_simulated else ""
     return [
         SetLaunchConfiguration("config", str(path)),
         SetLaunchConfiguration("port_directory", ports),
     ]
 
 
-def _given(context: LaunchContext, name: str) -> str:
+def _argument(context: LaunchContext, name: str) -> str:
     return str(LaunchConfiguration(name).perform(context))
 
 
-def _typed(name: str, text: str, kind: type) -> Any:
+def _read_skin(context: LaunchContext) -> Skin:
+    return read_skin(Path(_argument(context, "config")))
+
+
+def _convert(name: str, text: str, kind: type) -> Any:
+    """Return the value of a launch argument. ConfigError: it is not of this type."""
     if kind is bool:
         return text == "true"
     try:
@@ -191,6 +213,7 @@ def _typed(name: str, text: str, kind: type) -> Any:
 
 
 def _check_installed(name: str, packages: tuple[str, ...]) -> None:
+    """Raise ConfigError if a ROS package that a launch argument needs is not installed."""
     for package in packages:
         try:
             get_package_prefix(package)

@@ -1,20 +1,30 @@
-"""Messages that are gone for good are counted, also those that DDS drops without a word."""
+"""What the reconstruction reports: lost messages, also those that DDS drops without a word, and its
+own state."""
 
 from __future__ import annotations
 
 import itertools
 import time
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
+import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import UInt32
 
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.core.reconstructor import Reconstructor
+from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.ros.compat import make_executor, with_number
-from cube_tensor_driver.ros.diagnostics.reconstruction import LostMessages
+from cube_tensor_driver.ros.diagnostics.reconstruction import (
+    LostMessages,
+    ReconstructionDiagnostics,
+)
 
 DEPTH = 10
 
@@ -79,3 +89,27 @@ def test_a_publisher_that_begins_again_is_no_loss():
     for number in (40, 41, 44, 45):
         lost.note_arrival(number)
     assert lost.count == 6
+
+
+def test_an_inactive_node_says_so_and_blames_no_cube():
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    reconstructor = Reconstructor(skin)
+    tare = SimpleNamespace(uids={}, age=dict)
+    diagnostics = ReconstructionDiagnostics(skin, reconstructor, tare, LostMessages())
+    rest = np.array([cube.calibration.rest_frequency for cube in skin.cubes])
+
+    def texts(active: bool, second: int | None = None) -> list[str]:
+        if second is not None:
+            cubes = np.arange(len(skin.cubes))
+            stamps = np.full(len(cubes), second * 1_000_000_000)
+            reconstructor(FrequencyRows.of(cubes, rest.astype(np.float32), stamp_ns=stamps))
+        statuses, changes = diagnostics.statuses(active)
+        assert not changes
+        return [status.message for status in statuses]
+
+    assert texts(True, 1) == [""]
+    inactive = ["inactive: the node processes no rows until it is activated"]
+    assert texts(False) == inactive and texts(False) == inactive
+    # No rows in the second of the activation are no fault either.
+    assert texts(True) == [""]
+    assert texts(True, 5) == [""]
