@@ -34,7 +34,9 @@ def pad_table(
     Cubes of one skin may have different numbers of pads. The places of pads that a cube does not
     have are set to `fill`.
     """
-    table = np.full((len(values), n_pads), fill, dtype=float)
+    shape = (len(values), n_pads)
+    # The type is stated, because an integer as fill value would make integers of all values.
+    table = np.full(shape, fill, dtype=float)
     for row, value in zip(table, values, strict=True):
         row[: len(value)] = value
     return table

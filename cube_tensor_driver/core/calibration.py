@@ -110,6 +110,7 @@ class Calibration:
                 f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n_pads} pads: "
                 f"give one number or {n_pads}"
             )
+        # Only the parasitic capacitance may be absent; all other quantities divide or are divided.
         lowest = array.min()
         may_be_zero = name == "beta"
         if lowest < 0 or (lowest == 0 and not may_be_zero):
@@ -182,6 +183,7 @@ class Calibration:
     @cached_property
     def id(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 hash of the content in canonical JSON."""
+        # Sorted keys and fixed separators: equal content must give equal text on every machine.
         text = json.dumps(
             self._content(),
             sort_keys=True,
@@ -220,6 +222,7 @@ class Calibration:
         """Return everything but the id in plain types; values that are not given are left out."""
         built_in = LAYOUTS.get(self.layout.name)
         is_built_in = built_in is not None and built_in.same_as(self.layout)
+        # A built-in layout is stated by its name, so that files stay short and comparable.
         content: dict[str, Any] = {
             "schema": SCHEMA,
             "layout": self.layout.name if is_built_in else self.layout.to_dict(),
@@ -246,7 +249,7 @@ class Calibration:
             raise CalibrationError(f"a calibration is a table; found {data!r}")
         attributes = {item.name for item in fields(cls)}
         _check_keys(data, attributes)
-        values = {key: value for key, value in data.items() if key in attributes}
+        values = {key: data[key] for key in attributes & set(data)}
         layout, neglect = values["layout"], values.get("neglect", ())
         try:
             if isinstance(layout, Mapping):
@@ -267,6 +270,7 @@ class Calibration:
                 raise CalibrationError(f"calibration: {key} is {values[key]!r}; it must be text")
 
         calibration = cls(**values)
+        # The id is computed from the checked values, so 1 and 1.0 in a file are the same.
         if data.get("id", calibration.id) != calibration.id:
             raise CalibrationError(
                 f"calibration: the id says {data['id']!r} but the content gives "

@@ -105,11 +105,13 @@ class Estimator:
         # A pad without redundancy could show anything and leave no residual.
         is_checked = size > LEAK_TOLERANCE**2
         safe_size = np.where(is_checked, size, 1)
-        drop = np.where(is_checked, (z @ columns) ** 2 / safe_size, -np.inf)
+        reduction = (z @ columns) ** 2 / safe_size
+        drop = np.where(is_checked, reduction, -np.inf)
 
         chi2 = np.sum(z**2, axis=1)
         best = drop.max(axis=1)
         is_similar = drop > best[:, None] - SUSPECT_MARGIN
+        # One broken pad leaves noise in the others, which have one degree of freedom less.
         limit_without = chi2_limit(self.dof - 1, FALSE_ALARM)
         is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
         is_specific = is_similar.sum(axis=1) < is_checked.sum()
@@ -137,12 +139,18 @@ def make_estimator(
     """
     response = np.asarray(response, dtype=float)
     noise = np.asarray(noise, dtype=float)
-    targets = modes.components if targets is None else np.asarray(targets, dtype=float)
+    if targets is None:
+        targets = modes.components
+    targets = np.asarray(targets, dtype=float)
     n_pads, n_targets = len(response), len(targets)
-    present = np.setdiff1d(np.arange(n_pads), np.asarray(missing, dtype=int))
-    kept = np.setdiff1d(np.arange(modes.n_modes), modes.index(neglect))
+    all_pads, all_modes = np.arange(n_pads), np.arange(modes.n_modes)
+    present = np.setdiff1d(all_pads, np.asarray(missing, dtype=int))
+    kept = np.setdiff1d(all_modes, modes.index(neglect))
 
+    # Dividing by the noise gives all pads the standard deviation 1, so that the sum of squared
+    # residuals is chi-square.
     whitened = response[np.ix_(present, kept)] / noise[present, None]
+    # The full matrix u is needed: its last columns give the residual.
     u, s, vt = np.linalg.svd(whitened, full_matrices=True)
     rank = 0
     if s.size and s[0] > 0:
@@ -152,16 +160,21 @@ def make_estimator(
     kept_targets = targets[:, kept]
     projected = (kept_targets @ v1) @ v1.T
     unseen = np.linalg.norm(kept_targets - projected, axis=1)
-    neglected = np.linalg.norm(np.delete(targets, kept, axis=1), axis=1)
+    # Neglected modes are stated to be zero, not measured: a target with a part along them is
+    # unobserved.
+    neglected_targets = np.delete(targets, kept, axis=1)
+    neglected = np.linalg.norm(neglected_targets, axis=1)
     size = np.linalg.norm(targets, axis=1)
     observed = (size > 0) & (unseen + neglected <= LEAK_TOLERANCE * size)
 
+    # half @ half.T is the covariance, as the whitened pads have unit variance.
     half = kept_targets @ v1 / s[:rank]
     matrix = np.zeros((n_targets, n_pads))
     matrix[:, present] = half @ u[:, :rank].T / noise[present]
     matrix[~observed] = np.nan
     covariance = half @ half.T
-    covariance[~observed] = covariance[:, ~observed] = np.nan
+    covariance[~observed] = np.nan
+    covariance[:, ~observed] = np.nan
     null = np.zeros((len(present) - rank, n_pads))
     null[:, present] = u[:, rank:].T / noise[present]
     return Estimator(
@@ -221,7 +234,8 @@ def summarize_response(
         if s.size:
             s = s[s > RANK_TOLERANCE * s[0]]
         result[f"rank_{part}"] = len(s)
-        result[f"condition_{part}"] = float(s[0] / s[-1]) if s.size else None
+        condition = float(s[0] / s[-1]) if s.size else None
+        result[f"condition_{part}"] = condition
 
     deviations = np.sqrt(np.diag(estimator.covariance)).tolist()
     noise = {

@@ -47,19 +47,23 @@ class Forces:
                 the forces is the force on the whole skin. None stands for the side of each cube.
         """
         cubes = skin.cubes
+        positions = [cube.xyz for cube in cubes]
         sides = [side or 2 * cube.calibration.half_side for cube in cubes]
         rotations = [rotation_from_rpy(*cube.rpy) for cube in cubes]
-        self.position = np.array([cube.xyz for cube in cubes], float)
+        self.position = np.array(positions, float)
         self.side = np.array(sides)
         self._rotation = np.array(rotations)
 
     def __call__(self, rows: StressRows) -> Array:
         """Compute the force of each row (N, 3)."""
-        in_cube_frame = face_force(rows.stress, self.side[rows.cube, None])
+        side = self.side[rows.cube, None]
         rotation = self._rotation[rows.cube]
+        in_cube_frame = face_force(rows.stress, side)
         force: Array = np.einsum("nij,nj->ni", rotation, in_cube_frame)
         traction = rows.stress[:, TRACTION_COMPONENTS]
-        force[np.isnan(traction).all(axis=1)] = np.nan
+        # Zero would claim that nothing presses.
+        is_unobserved = np.isnan(traction).all(axis=1)
+        force[is_unobserved] = np.nan
         return force
 
     def of_skin(self, rows: StressRows) -> Array:

@@ -45,7 +45,8 @@ class LatestStress:
     """
 
     def __init__(self, n_cubes: int) -> None:
-        self.values = np.full((n_cubes, len(COMPONENTS)), np.nan)
+        shape = (n_cubes, len(COMPONENTS))
+        self.values = np.full(shape, np.nan)
         self.residual = np.full(n_cubes, np.nan)
         self.status = np.zeros(n_cubes, np.uint16)
         self.left_out = np.zeros(n_cubes, np.uint32)
@@ -81,7 +82,8 @@ class LatestStress:
         np.add.at(self.count, cube, 1)
         is_over_limit = rows.status & RESIDUAL != 0
         if is_over_limit.any():
-            np.add.at(self._over_limit, cube[is_over_limit], 1)
+            exceeding = cube[is_over_limit]
+            np.add.at(self._over_limit, exceeding, 1)
 
     def health(self, now: float, stale_after: float) -> Index:
         """Judge each cube.
@@ -95,7 +97,8 @@ class LatestStress:
         """
         # A single high residual is normal noise; many of them are counted in `high_residual`.
         other_bits = self.status & ~np.uint16(RESIDUAL)
-        health = np.where(self.high_residual | (other_bits != 0), DOUBTFUL, FINE)
+        is_doubtful = self.high_residual | (other_bits != 0)
+        health = np.where(is_doubtful, DOUBTFUL, FINE)
         health[self.status & INVALID != 0] = FAULTY
         health[now - self.arrived > stale_after] = STALE
         return health

@@ -86,7 +86,8 @@ class Layout:
                 f"{pad} at {position.tolist()} is not on the face {normal.tolist()}; "
                 "its coordinate along the normal must be 1"
             )
-        edge = np.max(np.abs(position - normal * height)) + self.pad_size / 2
+        on_face = position - normal * height
+        edge = np.max(np.abs(on_face)) + self.pad_size / 2
         if edge > 1 + TOLERANCE:
             self._refuse(f"{pad} reaches {edge:.3g} from the face's centre; the face ends at 1")
         for other in range(number):
@@ -121,8 +122,10 @@ class Layout:
     @property
     def planar(self) -> bool:
         """Whether all pads and normals lie in the plane y = 0."""
-        is_off_plane = np.any(np.abs(self.positions[:, 1]) > TOLERANCE)
-        return not (is_off_plane or np.any(self.normals[:, 1]))
+        y = self.positions[:, 1]
+        is_off_plane = np.any(np.abs(y) > TOLERANCE)
+        is_tilted = np.any(self.normals[:, 1])
+        return not (is_off_plane or is_tilted)
 
     def index(self, pad: str) -> int:
         """Return the number of a pad by its name. LayoutError: there is no such pad."""
@@ -172,11 +175,17 @@ class Layout:
                 "allowed are name, positions, normals, pad_size"
             )
         size = data.get("pad_size", PAD_SIZE)
+        # True and False are integers in Python, but never a size.
         if isinstance(size, bool) or not isinstance(size, (int, float)):
             raise LayoutError(
                 f"layout: pad_size is {size!r}; it must be a number in units of the half side"
             )
-        return cls(str(data["name"]), data["positions"], data["normals"], size)
+        return cls(
+            name=str(data["name"]),
+            positions=data["positions"],
+            normals=data["normals"],
+            pad_size=size,
+        )
 
 
 def find_layout(name: str) -> Layout:
@@ -195,7 +204,8 @@ def _read_vectors(value: Any, name: str) -> Array:
         raise LayoutError(
             f"layout: {name} must be a list of [x, y, z] numbers; found {value!r}"
         ) from None
-    if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.all(np.isfinite(vectors)):
+    is_list_of_three = vectors.ndim == 2 and vectors.shape[1] == 3
+    if not is_list_of_three or not np.all(np.isfinite(vectors)):
         raise LayoutError(
             f"layout: {name} must be a list of [x, y, z] finite numbers; "
             f"found shape {vectors.shape}"
@@ -221,9 +231,12 @@ def _parse_axis(text: str) -> Array:
 
 def _make_layout(name: str, pads: str) -> Layout:
     """Construct a layout from the face and side of each pad, such as "+z-x +z+x"."""
-    normals = np.array([_parse_axis(pad[:2]) for pad in pads.split()])
-    sides = np.array([_parse_axis(pad[2:]) for pad in pads.split()])
-    return Layout(name, normals + PAD_OFFSET * sides, normals)
+    names = pads.split()
+    normals = np.array([_parse_axis(pad[:2]) for pad in names])
+    sides = np.array([_parse_axis(pad[2:]) for pad in names])
+    # The face lies at the distance 1 from the centre, in units of d0.
+    positions = normals + PAD_OFFSET * sides
+    return Layout(name, positions, normals)
 
 
 _QUAD_PADS = "+z-x +z+x -z-x -z+x"

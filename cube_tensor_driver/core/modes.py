@@ -36,7 +36,13 @@ COMPONENTS = STRESS + GRADIENT
 FIELD_SIZE = 9 + 27
 """Number of entries of a linear stress field: the tensor S (3, 3) and the gradient G (3, 3, 3)."""
 
-_VOIGT_INDICES = tuple((AXES.index(name[0]), AXES.index(name[1])) for name in STRESS)
+_ROWS = [AXES.index(name[0]) for name in STRESS]
+_COLUMNS = [AXES.index(name[1]) for name in STRESS]
+_COMPONENT_NUMBERS = [
+    [0, 5, 4],
+    [5, 1, 3],
+    [4, 3, 2],
+]
 
 Float = TypeVar("Float", bound=np.floating[Any])
 
@@ -44,14 +50,15 @@ Float = TypeVar("Float", bound=np.floating[Any])
 def to_matrix(stress: NDArray[Float]) -> NDArray[Float]:
     """Return symmetric matrices (..., 3, 3) of components (..., 6) in Voigt order."""
     s = np.asarray(stress)
-    matrix: NDArray[Float] = s[..., [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
+    matrix: NDArray[Float] = s[..., _COMPONENT_NUMBERS]
     return matrix
 
 
 def to_voigt(matrix: NDArray[Float]) -> NDArray[Float]:
     """Return components (..., 6), in Voigt order, of symmetric matrices (..., 3, 3)."""
     m = np.asarray(matrix)
-    return np.stack([m[..., i, j] for i, j in _VOIGT_INDICES], axis=-1)
+    components: NDArray[Float] = m[..., _ROWS, _COLUMNS]
+    return components
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +133,8 @@ class Modes:
             g = np.zeros((len(s), 27))
         else:
             g = np.asarray(gradient, dtype=float).reshape(-1, 27)
-        state: Array = np.concatenate([s, g], axis=1) @ self.reading.T
+        fields = np.concatenate([s, g], axis=1)
+        state: Array = fields @ self.reading.T
         return state
 
     def field(self, state: Array) -> tuple[Array, Array]:
@@ -135,10 +143,9 @@ class Modes:
         Returns:
             Stress (N, 3, 3) and gradient times d0 (N, 3, 3, 3), both in Pa.
         """
-        amplitudes = np.asarray(state, dtype=float).reshape(-1, self.n_modes)
-        flat = amplitudes @ self.fields.T
-        stress, gradient = flat[:, :9], flat[:, 9:]
-        return stress.reshape(-1, 3, 3), gradient.reshape(-1, 3, 3, 3)
+        amplitudes = np.asarray(state, dtype=float)
+        flat = amplitudes.reshape(-1, self.n_modes) @ self.fields.T
+        return _split_fields(flat)
 
     def action(self, rotation: Array) -> Array:
         """Compute the matrix that transforms states when the field is rotated or mirrored.
@@ -179,14 +186,23 @@ class Modes:
         return [self.names.index(name) for name in names]
 
 
+def _split_fields(flat: Array) -> tuple[Array, Array]:
+    """Return stress (N, 3, 3) and gradient (N, 3, 3, 3) of flat fields (N, 36)."""
+    stress, gradient = flat[:, :9], flat[:, 9:]
+    return stress.reshape(-1, 3, 3), gradient.reshape(-1, 3, 3, 3)
+
+
 def _parse_terms(name: str) -> list[tuple[float, int]]:
     """Return sign and place (among the 36 entries of a field) of each term of a mode's name."""
     terms = []
     for number, part in enumerate(name.split("-")):
-        place = 3 * AXES.index(part[0]) + AXES.index(part[1])
+        i, j = AXES.index(part[0]), AXES.index(part[1])
+        place = 3 * i + j
         if "_" in part:
-            place = 9 + 3 * place + AXES.index(part[3])
-        terms.append((-1.0 if number else 1.0, place))
+            k = AXES.index(part[3])
+            place = 9 + 3 * place + k
+        sign = -1.0 if number else 1.0
+        terms.append((sign, place))
     return terms
 
 
@@ -207,23 +223,25 @@ def _make_modes(
     for row, name in zip(flat, names, strict=True):
         for sign, place in _parse_terms(name):
             row[place] = sign
-    stress = flat[:, :9].reshape(-1, 3, 3)
-    gradient = flat[:, 9:].reshape(-1, 3, 3, 3)
+    stress, gradient = _split_fields(flat)
 
     if symmetric:
-        # Only the named half is set so far; the other half is its mirror image.
-        stress = stress + np.where(stress == 0, stress.transpose(0, 2, 1), 0)
-        gradient = gradient + np.where(gradient == 0, gradient.transpose(0, 2, 1, 3), 0)
+        # Only the entries that the names state are set so far; sigma_ji equals sigma_ij.
+        transposed_stress = stress.transpose(0, 2, 1)
+        transposed_gradient = gradient.transpose(0, 2, 1, 3)
+        stress = np.where(stress == 0, transposed_stress, stress)
+        gradient = np.where(gradient == 0, transposed_gradient, gradient)
 
     for g, name in zip(gradient, names, strict=True):
         if name not in GRADIENT or name[0] != name[3]:
             continue
         # Equilibrium: the divergences of the shears cancel that of the normal stress.
         i = AXES.index(name[0])
-        for axis in axes:
+        for axis in axes.replace(name[0], ""):
             j = AXES.index(axis)
-            if j != i:
-                g[i, j, j] = g[j, i, j] = -1 / (len(axes) - 1)
+            balance = -1 / (len(axes) - 1)
+            g[i, j, j] = balance
+            g[j, i, j] = balance
 
     stress.flags.writeable = gradient.flags.writeable = False
     return Modes(tuple(names), stress, gradient)

@@ -38,6 +38,7 @@ def pad_stress(
     """Compute normal stresses in Pa, tension positive, from frequencies in Hz."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
+        # The small difference is formed first: 1 - r would lose digits in float32.
         u = (f - f0) / f0
         # The foam is infinitely thick where this reaches zero.
         denominator = 1 - beta * u
@@ -74,7 +75,8 @@ def stress_slope(
     with np.errstate(all="ignore"):
         denominator = 1 - beta * (f - f0) / f0
         slope = modulus * (1 + beta) / (f0 * denominator**2)
-        return np.where((f > 0) & (denominator > 0), slope, np.nan)
+        is_possible = (f > 0) & (denominator > 0)
+        return np.where(is_possible, slope, np.nan)
 
 
 def highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
@@ -127,10 +129,12 @@ class TemperatureModel:
 
     def factor(self, temperature: ArrayLike) -> Array:
         """Compute f0(T) / f0, (N, P), for temperatures (N,) in °C."""
-        difference = np.asarray(temperature, dtype=float)[..., None] - self.reference
-        exponents = np.arange(1, self.coefficients.shape[1] + 1)
-        powers = difference[..., None] ** exponents
-        factor: Array = 1 + np.sum(self.coefficients * powers, axis=-1)
+        degree = self.coefficients.shape[1]
+        t = np.asarray(temperature, dtype=float)
+        difference = t[..., None] - self.reference
+        powers = difference[..., None] ** np.arange(1, degree + 1)
+        change = np.sum(self.coefficients * powers, axis=-1)
+        factor: Array = 1 + change
         return factor
 
     def to_dict(self) -> dict[str, Any]:

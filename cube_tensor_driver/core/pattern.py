@@ -37,7 +37,9 @@ class PatternCache(Generic[Computed]):
     def get(self, cube: AnyArray) -> Computed:
         """Return the result for this column, and compute it if it is not in the cache."""
         # A short key finds the entry; its content decides, because other columns may share the key.
-        key = (len(cube), int(cube[0]), int(cube[-1])) if len(cube) else (0,)
+        key: tuple[int, ...] = (0,)
+        if len(cube):
+            key = (len(cube), int(cube[0]), int(cube[-1]))
         # Bytes are compared in a fifth of the time that numbers are.
         content = cube.tobytes()
         entry = self._entries.pop(key, None)
@@ -68,7 +70,9 @@ def count_repeats(cube: AnyArray) -> int:
     """
     is_new_scan = cube[1:] <= cube[:-1]
     starts = np.flatnonzero(is_new_scan)
-    length = int(starts[0]) + 1 if len(starts) else len(cube)
+    length = len(cube)
+    if len(starts):
+        length = int(starts[0]) + 1
     if not length or len(cube) % length:
         return 0
     scans = cube.reshape(-1, length)

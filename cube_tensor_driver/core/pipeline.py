@@ -158,10 +158,10 @@ class Pipeline:
         numbers = {key: number for number, key in enumerate(by_id)}
         self._groups = tuple(by_id.values())
         self._group = np.array([numbers[c.id] for c in self.calibrations])
-        self._beta = pad_table(
-            [np.maximum(c.beta, MIN_BETA) for c in self._groups], self.n_pads, fill=1
-        )
+        # The fill values make the stiffness of missing pads 0, without a division by 0.
+        beta = pad_table([c.beta for c in self._groups], self.n_pads, fill=1)
         modulus = pad_table([c.modulus for c in self._groups], self.n_pads, fill=0)
+        self._beta = np.maximum(beta, MIN_BETA)
         self._stiffness = modulus * (1 + self._beta) / self._beta
         pad_counts = np.array([c.layout.n_pads for c in self._groups])
         self._exists: Mask = np.arange(self.n_pads) < pad_counts[:, None]
@@ -172,7 +172,8 @@ class Pipeline:
         self._table = lru_cache(maxsize=MAX_CACHED_MASKS)(self._make_table)
         groups = range(len(self._groups))
         # At least one residual row, so that there is a place for its NaN.
-        self._n_residual = max(self._estimator(group, 0).dof for group in groups) or 1
+        most_dof = max(self._estimator(group, 0).dof for group in groups)
+        self._n_residual = most_dof or 1
         tables = [self._make_table(group, 0) for group in groups]
         self._matrices = np.array([table.matrix for table in tables])
         is_recovered = ~np.isnan(self._matrices).all(axis=(0, 2))
@@ -208,7 +209,8 @@ class Pipeline:
                 f"rest_frequency has shape {rest.shape}; this skin needs {exists.shape}"
             )
         existing = rest[exists]
-        if not np.all(existing > 0) or not np.all(np.isfinite(existing)):
+        is_valid = (existing > 0) & np.isfinite(existing)
+        if not is_valid.all():
             raise CubeError(
                 f"rest_frequency holds {existing.min():g} Hz; "
                 "every pad's must be finite and above 0"
@@ -244,6 +246,7 @@ class Pipeline:
             pattern, v, bad = law.pattern, law.v, law.bad
             out = self._multiply(pattern, v)
             limit = pattern.limit
+            # A copy, because rows with bad pads get their own values.
             observed = np.concatenate([pattern.observed] * len(v))
             if bad is not None:
                 limit = np.tile(pattern.limit, (len(v), 1))
@@ -275,11 +278,13 @@ class Pipeline:
 
     def _multiply(self, pattern: _Pattern, v: Real) -> Real:
         """Compute components and residual rows (B, N, 15 + D) of v (B, N, P)."""
-        first = pattern.blocks[0] if len(pattern.blocks) == 1 else None
-        if first is not None and first.matrix.ndim == 2:
+        first = pattern.blocks[0] if pattern.blocks else None
+        if len(pattern.blocks) == 1 and first is not None and first.matrix.ndim == 2:
+            # All cubes share one calibration: the product is the result, without a copy.
             product: Real = v[:, :, : first.pads] @ first.matrix
             return product
-        out = np.full((*v.shape[:2], N_COMPONENTS + self._n_residual), np.nan, dtype=self.dtype)
+        shape = (*v.shape[:2], N_COMPONENTS + self._n_residual)
+        out = np.full(shape, np.nan, dtype=self.dtype)
         for rows, pads, matrix in pattern.blocks:
             if matrix.ndim == 2:
                 out[:, rows] = v[:, rows, :pads] @ matrix
@@ -340,7 +345,8 @@ class Pipeline:
         They are NaN for bad pads, and for pads that the cube does not have.
         """
         group, unknown, stress, bad = self._apply_law_by_row(rows, left_out)
-        is_missing = ~self._exists[group] | unknown[:, None] | _unpack_bits(bad, self.n_pads)
+        is_bad = _unpack_bits(bad, self.n_pads)
+        is_missing = ~self._exists[group] | unknown[:, None] | is_bad
         return np.where(is_missing, np.nan, stress)
 
     def suspects(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Mask:
@@ -372,8 +378,11 @@ class Pipeline:
         scans = len(law.v)
         group = np.tile(law.pattern.group, scans)
         unknown = np.tile(law.pattern.unknown, scans)
-        bad = np.zeros(len(group), np.int64) if law.bad is None else law.bad.ravel()
-        stress = law.v.reshape(-1, self.n_pads) * self._stiffness[group]
+        bad = np.zeros(len(group), np.int64)
+        if law.bad is not None:
+            bad = law.bad.ravel()
+        v = law.v.reshape(-1, self.n_pads)
+        stress = v * self._stiffness[group]
         return group, unknown, stress, bad
 
     def matrix(self, cube: int, left_out: int = 0) -> Array:
@@ -426,8 +435,9 @@ class Pipeline:
         pattern = self._patterns.get(rows.cube)
         n = len(pattern.group)
         count = len(rows) // n if n else 1
-        # numpy is faster with two axes than with three.
-        f = f.reshape((n, self.n_pads) if count == 1 else (count, n, self.n_pads))
+        if count > 1:
+            # Only then, because numpy is faster with two axes than with three.
+            f = f.reshape(count, n, self.n_pads)
         rest, highest = pattern.rest, pattern.highest
         no_temperature = None
         if self._any_thermal:
@@ -452,7 +462,8 @@ class Pipeline:
             return _PadLaw(pattern, v, None, no_temperature)
 
         # NaN, Inf and frequencies outside the range of the law all fail one of the comparisons.
-        is_good = ((f > 0) & (below_highest > 0)).reshape(v.shape)
+        is_good = (f > 0) & (below_highest > 0)
+        is_good = is_good.reshape(v.shape)
         if np.count_nonzero(is_good) == count * pattern.n_pads and not any_reported:
             return _PadLaw(pattern, v, None, no_temperature)
         if any_reported:
@@ -471,11 +482,13 @@ class Pipeline:
         known_cube = np.where(unknown, 0, cube).astype(int)
         group, rest = self._group[known_cube], self._rest[known_cube]
         highest = highest_frequency(rest, self._beta[group])
-        # At f = 0, v is -f0 / f_highest.
-        lowest_v = float(np.fmax.reduce(-rest / highest, axis=None, initial=-1.0))
+        # v is lowest at f = 0. The largest of these values, of all pads, is safe for every pad.
+        at_zero = -rest / highest
+        lowest_v = float(np.fmax.reduce(at_zero, axis=None, initial=-1.0))
         # A scan with an unknown cube has one pad more than there are, so that it never counts as
         # full and is always corrected, which sets the row of the unknown cube to NaN.
-        n_pads = int(np.count_nonzero(self._exists[group])) + int(unknown.any())
+        n_pads = int(np.count_nonzero(self._exists[group]))
+        n_pads += int(unknown.any())
         return _Pattern(
             unknown=unknown,
             group=group,
@@ -502,7 +515,8 @@ class Pipeline:
             index = np.flatnonzero(shared == value)
             first, last = int(index[0]), int(index[-1])
             # A slice makes no copies.
-            rows = slice(first, last + 1) if last - first + 1 == len(index) else index
+            are_neighbours = last - first + 1 == len(index)
+            rows = slice(first, last + 1) if are_neighbours else index
             pads = int(n_pads[first])
             if is_separate:
                 matrix = self._matrices[value, :, :pads].T
@@ -543,15 +557,19 @@ class Pipeline:
         n_pads = self._groups[group].layout.n_pads
         matrix = np.zeros((N_COMPONENTS + self._n_residual, self.n_pads))
         matrix[:N_COMPONENTS, :n_pads] = estimator.matrix * self._scale(group)[:, None]
+        # Without redundancy the residual is unknown.
         matrix[N_COMPONENTS:, :n_pads] = np.nan
         # A mask that lowers the rank by more than the pads it removes could have more null rows.
         null = estimator.null[: self._n_residual]
         dof = len(null)
         limit = np.nan
         if dof:
+            # The residual is sqrt(chi-square / dof), so that noise alone gives about 1.
+            end = N_COMPONENTS + dof
             matrix[N_COMPONENTS:, :n_pads] = 0
-            matrix[N_COMPONENTS : N_COMPONENTS + dof, :n_pads] = null / np.sqrt(dof)
+            matrix[N_COMPONENTS:end, :n_pads] = null / np.sqrt(dof)
             limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof)
+        # v is the pad stress divided by the stiffness, so the stiffness goes into the matrix.
         matrix *= self._stiffness[group]
         observed = int(_pack_bits(estimator.observed))
         return _Table(matrix.astype(self.dtype, order="F"), limit, observed)
@@ -559,7 +577,8 @@ class Pipeline:
 
 def _unpack_bits(mask: AnyArray | int, count: int) -> Mask:
     """Return the lowest bits (..., count) of bit masks."""
-    shifted = np.asarray(mask, dtype=np.int64)[..., None] >> np.arange(count)
+    masks = np.asarray(mask, dtype=np.int64)
+    shifted = masks[..., None] >> np.arange(count)
     bits: Mask = shifted & 1 > 0
     return bits
 
@@ -588,8 +607,11 @@ def _group_by_mask(
     """
     rows = np.arange(len(mask)) if also_good else np.flatnonzero(mask)
     # Masks have 32 bits, so group and mask fit into one integer that can be sorted.
-    pairs, which = np.unique(group[rows] << 32 | mask[rows], return_inverse=True)
+    keys = group[rows] << 32 | mask[rows]
+    pairs, which = np.unique(keys, return_inverse=True)
+    # A stable sort keeps the rows of a pair in their order.
     order = np.argsort(which, kind="stable")
-    ends = np.searchsorted(which[order], np.arange(len(pairs) + 1))
-    for pair, start, end in zip(pairs.tolist(), ends[:-1], ends[1:], strict=True):
+    bounds = np.searchsorted(which[order], np.arange(len(pairs) + 1))
+    for number, pair in enumerate(pairs.tolist()):
+        start, end = bounds[number], bounds[number + 1]
         yield pair >> 32, pair & 0xFFFFFFFF, rows[order[start:end]]

@@ -46,4 +46,5 @@ def quaternions(rotation: Array) -> Array:
 
     The function loops over the cubes, so it should be called once per skin and not per picture.
     """
-    return np.array([np.roll(quaternion_from_rotation(matrix), 1) for matrix in rotation])
+    in_ros_order = [quaternion_from_rotation(matrix) for matrix in rotation]
+    return np.roll(np.array(in_ros_order).reshape(-1, 4), 1, axis=1)

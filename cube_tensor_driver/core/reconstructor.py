@@ -122,6 +122,7 @@ class Reconstructor:
                 problem of a row becomes a bit of its status.
         """
         windows = self.health.closed
+        # Health comes first, so that a pad that breaks is left out of this very row.
         left_out, pad_status = self.health.update(rows)
         if recorded is not None:
             left_out = np.where(recorded.known, recorded.left_out, left_out)

@@ -82,7 +82,8 @@ def generic_response(structure: Structure) -> Array:
     """Return a response (P, M) with random coefficients; it has the ranks of almost all others."""
     generator = np.random.default_rng(0)
     values = generator.uniform(0.5, 1.5, structure.n_coefficients)
-    return response(structure, dict(zip(structure.names, values.tolist(), strict=True)))
+    coefficients = dict(zip(structure.names, values.tolist(), strict=True))
+    return response(structure, coefficients)
 
 
 def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
@@ -106,7 +107,8 @@ def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
             f"{structure.n_coefficients} coefficients; missing {_list_names(missing)}, "
             f"unknown {_list_names(unknown)}"
         )
-    values = np.array([coefficients[name] for name in structure.names], dtype=float)
+    in_order = [coefficients[name] for name in structure.names]
+    values = np.array(in_order, dtype=float)
     is_finite = np.isfinite(values)
     if not is_finite.all():
         invalid = np.array(structure.names)[~is_finite]
@@ -136,10 +138,12 @@ def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], floa
         )
     orbit_sizes = np.einsum("kpm,kpm->k", basis, basis)
     values = np.einsum("kpm,pm->k", basis, matrix) / orbit_sizes
-    remainder = np.linalg.norm(matrix - np.tensordot(values, basis, axes=1))
+    coefficients = dict(zip(structure.names, values.tolist(), strict=True))
+    nearest = np.tensordot(values, basis, axes=1)
+    remainder = np.linalg.norm(matrix - nearest)
     size = np.linalg.norm(matrix)
     relative = float(remainder / size) if size else 0.0
-    return dict(zip(structure.names, values.tolist(), strict=True)), relative
+    return coefficients, relative
 
 
 def prototype(shift: Array) -> Array:
@@ -158,7 +162,12 @@ def prototype(shift: Array) -> Array:
     Returns:
         Normal, shear and gradient readings (N, 3), uncalibrated, in the unit of the shifts.
     """
-    weights = [[-1, -1, 1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1]]
+    weights = [
+        [-1, -1, 1],
+        [-1, 1, -1],
+        [-1, 1, 1],
+        [-1, -1, -1],
+    ]
     readings: Array = np.asarray(shift) @ np.array(weights)
     return readings
 

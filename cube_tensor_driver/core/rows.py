@@ -37,7 +37,8 @@ class _Rows:
 
     def select(self: _Kind, chosen: Any) -> _Kind:
         """Return the rows that an index, a slice or a mask chooses, as numpy indexes arrays."""
-        return type(self)(*(getattr(self, field.name)[chosen] for field in fields(self)))  # type: ignore[arg-type]
+        columns = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
+        return type(self)(*(column[chosen] for column in columns))
 
 
 _Kind = TypeVar("_Kind", bound=_Rows)

@@ -23,8 +23,16 @@ from .modes import PLANE, SPACE, Modes
 POSITION_TOLERANCE = 1e-6
 """Largest distance, in units of d0, of a rotated pad from the pad that it coincides with."""
 
-_QUARTER_TURN_Z = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
-_CYCLE_AXES = ((0, 0, 1), (1, 0, 0), (0, 1, 0))
+_QUARTER_TURN_Z = (
+    (0, -1, 0),
+    (1, 0, 0),
+    (0, 0, 1),
+)
+_CYCLE_AXES = (
+    (0, 0, 1),
+    (1, 0, 0),
+    (0, 1, 0),
+)
 _MIRRORS = (
     ((-1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
@@ -110,7 +118,8 @@ def map_pads(layout: Layout, rotation: Array | Index) -> Index:
     """
     r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
-    positions, normals = layout.positions @ r.T, layout.normals @ r.T
+    positions = layout.positions @ r.T
+    normals = layout.normals @ r.T
     for pad in range(layout.n_pads):
         offset = np.abs(layout.positions - positions[pad])
         rotation_error = np.abs(layout.normals - normals[pad])
@@ -156,9 +165,13 @@ class Structure:
         """Sets of pads that the symmetry maps onto each other."""
         elements = find_layout_group(self.layout, self.symmetry)
         images = np.array([map_pads(self.layout, element) for element in elements])
-        # Pads of one orbit have the same images, so a dictionary leaves each orbit once.
-        orbits = dict.fromkeys(tuple(np.unique(column).tolist()) for column in images.T)
-        return [list(orbit) for orbit in orbits]
+        # Pads of one orbit have the same images, and each orbit is wanted once.
+        orbits: list[list[int]] = []
+        for column in images.T:
+            orbit = np.unique(column).tolist()
+            if orbit not in orbits:
+                orbits.append(orbit)
+        return orbits
 
 
 def default_modes(layout: Layout) -> Modes:
@@ -197,7 +210,8 @@ def _derive_structure(
     )
 
     letters: dict[str, tuple[str, int]] = {}
-    is_one_orbit = len(set(pad_images[:, 0])) == layout.n_pads
+    images_of_first = set(pad_images[:, 0])
+    is_one_orbit = len(images_of_first) == layout.n_pads
     if is_one_orbit and layout.planar and layout.pads[0] == "+z-x":
         # Every pad is an image of V1, so the paper's letters for its row name all entries.
         letters = _PAPER_LETTERS if "xz" in modes.names else _LETTERS
@@ -210,8 +224,10 @@ def _derive_structure(
         rows, columns = pad_images[:, pad], mode_images[:, mode]
         signs = mode_signs[:, mode]
         is_assigned[rows, columns] = True
-        if np.any((rows == pad) & (columns == mode) & (signs < 0)):
-            continue  # An element keeps the pad and flips the mode: the entry must be zero.
+        is_same_entry = (rows == pad) & (columns == mode)
+        if np.any(is_same_entry & (signs < 0)):
+            # An element keeps the pad and reverses the mode, so the entry must be zero.
+            continue
         mode_name = modes.names[mode]
         own_name = (f"{layout.pads[pad]}:{mode_name}", 1)
         name, letter_sign = letters.get(mode_name, own_name)
@@ -235,8 +251,8 @@ def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
         SymmetryError: A matrix is not a signed permutation.
     """
     magnitude = np.abs(matrices)
-    is_permutation = np.allclose(magnitude.sum(axis=1), 1) and np.allclose(magnitude.max(axis=1), 1)
-    if not is_permutation:
+    sums, largest = magnitude.sum(axis=1), magnitude.max(axis=1)
+    if not (np.allclose(sums, 1) and np.allclose(largest, 1)):
         raise SymmetryError("the group does not act on these modes as signed permutations")
     signs = np.sign(matrices.sum(axis=1)).astype(int)
     return magnitude.argmax(axis=1), signs
@@ -258,4 +274,5 @@ def coefficient_counts(layout: Layout) -> dict[str, int | None]:
 
 def largest_symmetry(layout: Layout) -> str:
     """Return the largest symmetry of a layout whose response matrices are not all zero."""
-    return next(name for name, count in coefficient_counts(layout).items() if count)
+    counts = coefficient_counts(layout)
+    return next(name for name, count in counts.items() if count)

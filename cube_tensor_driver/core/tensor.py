@@ -31,15 +31,17 @@ def principal_stresses(stress: Real) -> tuple[Array, Array]:
         sign of a direction is arbitrary. Rows with NaN give NaN.
     """
     matrices = to_matrix(stress).astype(float)
-    is_known = np.isfinite(matrices).all(axis=(-2, -1))
+    is_unknown = ~np.isfinite(matrices).all(axis=(-2, -1))
     # LAPACK raises an error for NaN, so unknown rows are computed as zero and replaced below.
-    values, vectors = np.linalg.eigh(np.where(is_known[..., None, None], matrices, 0))
-    values = values[..., ::-1]
-    directions = np.swapaxes(vectors, -1, -2)[..., ::-1, :]
-    return (
-        np.where(is_known[..., None], values, np.nan),
-        np.where(is_known[..., None, None], directions, np.nan),
-    )
+    matrices[is_unknown] = 0
+    ascending, vectors = np.linalg.eigh(matrices)
+    values = ascending[..., ::-1].copy()
+    # LAPACK returns vectors as columns.
+    rows = np.swapaxes(vectors, -1, -2)
+    directions = rows[..., ::-1, :].copy()
+    values[is_unknown] = np.nan
+    directions[is_unknown] = np.nan
+    return values, directions
 
 
 def invariants(stress: Real) -> Array:
@@ -47,20 +49,25 @@ def invariants(stress: Real) -> Array:
 
     They are I1 = tr s in Pa, I2 = (I1^2 - tr s^2) / 2 in Pa^2 and I3 = det s in Pa^3.
     """
-    xx, yy, zz, yz, zx, xy = np.moveaxis(np.asarray(stress), -1, 0)
-    first = xx + yy + zz
-    second = xx * yy + yy * zz + zz * xx - yz**2 - zx**2 - xy**2
-    third = xx * yy * zz + 2 * yz * zx * xy - xx * yz**2 - yy * zx**2 - zz * xy**2
-    return np.stack([first, second, third], axis=-1)
+    xx, yy, zz, yz, zx, xy = _split(stress)
+    trace = xx + yy + zz
+    minors = xx * yy + yy * zz + zz * xx - yz**2 - zx**2 - xy**2
+    determinant = xx * yy * zz + 2 * yz * zx * xy - xx * yz**2 - yy * zx**2 - zz * xy**2
+    return np.stack([trace, minors, determinant], axis=-1)
 
 
 def von_mises(stress: Real) -> Array:
     """Compute the von Mises stress (...), sqrt(3/2 |deviator|^2), of a stress (..., 6)."""
-    xx, yy, zz, yz, zx, xy = np.moveaxis(np.asarray(stress), -1, 0)
+    xx, yy, zz, yz, zx, xy = _split(stress)
     normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
     shear = yz**2 + zx**2 + xy**2
     result: Array = np.sqrt(normal / 2 + 3 * shear)
     return result
+
+
+def _split(stress: Real) -> AnyArray:
+    """Return the components (6, ...) of a stress (..., 6)."""
+    return np.moveaxis(np.asarray(stress), -1, 0)
 
 
 def traction(stress: Real, normal: ArrayLike) -> Array:
@@ -87,7 +94,8 @@ def traction(stress: Real, normal: ArrayLike) -> Array:
 def rotate_stress(stress: Real, rotation: ArrayLike) -> Array:
     """Compute the stress R s R' (..., 6) in a frame with the coordinates R x. NaN spreads."""
     r = np.asarray(rotation, dtype=float)
-    rotated: Array = r @ to_matrix(stress) @ np.swapaxes(r, -1, -2)
+    inverse = np.swapaxes(r, -1, -2)
+    rotated: Array = r @ to_matrix(stress) @ inverse
     return to_voigt(rotated)
 
 
@@ -130,7 +138,8 @@ def quaternion_from_rpy(
 
 def quaternion_from_rotation(rotation: Array) -> Array:
     """Return the quaternion x, y, z, w (4,) of a rotation matrix (3, 3), with w not negative."""
-    w, x, y, z = quaternions.mat2quat(np.asarray(rotation, dtype=float))
+    matrix = np.asarray(rotation, dtype=float)
+    w, x, y, z = quaternions.mat2quat(matrix)
     return np.array([x, y, z, w])
 
 
@@ -199,5 +208,8 @@ def contact_wrench(
     """
     known: AnyArray = np.nan_to_num(gradient)
     zz_x, zz_y = known[..., 6], known[..., 7]
-    direction = np.stack([zz_y, -zz_x, np.zeros_like(zz_x)], axis=-1)
-    return face_force(stress, side), side**4 / 12 * direction
+    unknown_twist = np.zeros_like(zz_x)
+    direction = np.stack([zz_y, -zz_x, unknown_twist], axis=-1)
+    # A pressure that grows linearly over the square turns about its centre, as in a bent beam.
+    second_moment_of_area = side**4 / 12
+    return face_force(stress, side), second_moment_of_area * direction

@@ -69,9 +69,11 @@ class Conditions:
 
     def __init__(self, n_cubes: int, n_pads: int) -> None:
         # Conditions found in the present window come first, then those of the windows before.
-        self._recent = np.zeros((HOLD_WINDOWS, n_cubes, n_pads), np.uint16)
-        self._pad_bit = np.uint32(1) << np.arange(n_pads, dtype=np.uint32)
-        self._since_collected = np.zeros((n_cubes, n_pads), np.uint16)
+        shape = (n_cubes, n_pads)
+        self._recent = np.zeros((HOLD_WINDOWS, *shape), np.uint16)
+        self._since_collected = np.zeros(shape, np.uint16)
+        pads = np.arange(n_pads, dtype=np.uint32)
+        self._pad_bit = np.uint32(1) << pads
         self._combine()
 
     def add(self, cube: Index, bits: StatusBits) -> None:
@@ -104,7 +106,8 @@ class Conditions:
         self.state: StatusBits = np.bitwise_or.reduce(self._recent, axis=0)
         self._since_collected |= self.state
         is_left_out = self.state & LEFT_OUT > 0
-        self.mask: PadMasks = (is_left_out * self._pad_bit).sum(axis=1, dtype=np.uint32)
+        bits = is_left_out * self._pad_bit
+        self.mask: PadMasks = bits.sum(axis=1, dtype=np.uint32)
         self.status: StatusBits = np.bitwise_or.reduce(self.state, axis=1)
 
 
@@ -189,7 +192,8 @@ class PadDiagnosis:
         is_unmoved = (span < limit) & ~jumped
         is_unused = (state & LEFT_OUT > 0) | ~self._exists
         self.still = has_enough_rows & (is_unmoved | is_unused).all(axis=1)
-        self._mean_before = np.where(np.isnan(window.mean), self._mean_before, window.mean)
+        has_mean = ~np.isnan(window.mean)
+        self._mean_before = np.where(has_mean, window.mean, self._mean_before)
 
     def _find_drifting(self, window: Window) -> Mask:
         moved = ~self.still & (window.rows > 0)
@@ -198,7 +202,9 @@ class PadDiagnosis:
         self._mean_at_rest[has_come_to_rest] = window.mean[has_come_to_rest]
 
         shift = (window.mean - self._mean_at_rest) / self._rest
-        limit = np.maximum(DRIFT_LIMIT, STILL_MAX_SPAN * self.noise / self._rest)
+        # The means of two windows of a still cube may differ by the span that counts as still.
+        still_span = STILL_MAX_SPAN * self.noise / self._rest
+        limit = np.maximum(DRIFT_LIMIT, still_span)
         # A shift that all pads share is temperature or a slow load, not a fault of one pad.
         drifting: Mask = np.abs(shift - _lower_median(shift)) > limit
         return drifting
@@ -231,6 +237,7 @@ def _squared_bound(noise: Array) -> Array:
 def _lower_median(values: Real) -> Real:
     """Return the lower median (cubes, 1) over the pads of each cube that have a value."""
     ordered = np.sort(values, axis=1)  # NaN is sorted to the end
-    n_known = values.shape[1] - np.isnan(ordered).sum(axis=1)
+    n_unknown = np.isnan(ordered).sum(axis=1)
+    n_known = values.shape[1] - n_unknown
     place = np.maximum((n_known - 1) // 2, 0)
     return np.take_along_axis(ordered, place[:, None], axis=1)

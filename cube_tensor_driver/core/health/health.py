@@ -87,8 +87,8 @@ class Health:
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
         n_cubes, n_pads = len(pipeline.calibrations), pipeline.n_pads
-        pad_counts = [calibration.layout.n_pads for calibration in pipeline.calibrations]
-        self._exists: Mask = np.arange(n_pads) < np.array(pad_counts)[:, None]
+        pad_counts = np.array([c.layout.n_pads for c in pipeline.calibrations])
+        self._exists: Mask = np.arange(n_pads) < pad_counts[:, None]
         self._conditions = Conditions(n_cubes, n_pads)
         self._diagnosis = PadDiagnosis(self._exists)
         self._patterns = PatternCache(self._make_pattern, n_cubes)
@@ -145,9 +145,9 @@ class Health:
     def refresh(self) -> None:
         """Take over the rest frequencies of the pipeline, after a tare has changed them."""
         calibrations, n_pads = self._pipeline.calibrations, self._pipeline.n_pads
-        beta = pad_table([calibration.beta for calibration in calibrations], n_pads, 1.0)
-        modulus = pad_table([calibration.modulus for calibration in calibrations], n_pads, 1.0)
-        noise = pad_table([calibration.noise for calibration in calibrations], n_pads, 1.0)
+        beta = pad_table([c.beta for c in calibrations], n_pads, fill=1.0)
+        modulus = pad_table([c.modulus for c in calibrations], n_pads, fill=1.0)
+        noise = pad_table([c.noise for c in calibrations], n_pads, fill=1.0)
         rest = self._pipeline.rest_frequency
 
         def frequency_at(strain: float) -> Single:
@@ -161,7 +161,8 @@ class Health:
             high=frequency_at(MAX_STRAIN),
             open=frequency_at(OPEN_STRAIN),
         )
-        self._diagnosis.set_reference(rest, noise / stress_slope(rest, rest, beta, modulus))
+        slope = stress_slope(rest, rest, beta, modulus)
+        self._diagnosis.set_reference(rest, noise / slope)
         self._patterns.clear()
 
     def update(self, rows: FrequencyRows) -> tuple[PadMasks, StatusBits]:
@@ -184,6 +185,7 @@ class Health:
         pattern = self._patterns.get(rows.cube)
         if pattern.repeats:
             return self._check(pattern, rows)
+        # Cubes in another order are rare, so their parts are not kept in the cache.
         left_out = np.empty(len(rows), np.uint32)
         status = np.empty(len(rows), np.uint16)
         for chosen in _split_into_scans(rows.cube):
@@ -222,6 +224,7 @@ class Health:
         any_doubtful = bool(is_doubtful.any())
         newest_ns = stamp_ns.max(axis=1).tolist()
         is_possible = (frequency > pattern.low) & (frequency < pattern.high)
+        # Scan by scan, because a scan with a fault changes the masks of those after it.
         is_healthy = [
             np.count_nonzero(scan) == pattern.n_pads and not np.count_nonzero(faults)
             for scan, faults in zip(is_possible, pad_fault, strict=True)
@@ -236,6 +239,7 @@ class Health:
             while end < len(frequency) and is_healthy[end] and self._in_window(newest_ns[end]):
                 end += 1
             if not is_healthy[start]:
+                # Before the masks are read below, so that the pad is left out of this very row.
                 self._mark_impossible(pattern.cube, frequency[start], is_possible[start])
                 self._mark_reported(pattern.cube, pad_fault[start])
             self._statistics.add(
@@ -300,18 +304,25 @@ class Health:
         """Add the faults that the device reports, of the pads that the cube has."""
         rows = np.flatnonzero(pad_fault)
         cube = cube[rows]
-        is_reported = pad_fault[rows, None] >> np.arange(self._exists.shape[1]) & 1 > 0
+        pads = np.arange(self._exists.shape[1])
+        is_reported = pad_fault[rows, None] >> pads & 1 > 0
+        # The hub may report a bit of a pad that the cube does not have.
         is_reported &= self._exists[cube]
         self._conditions.add(cube, is_reported * np.uint16(REPORTED))
 
     def _make_pattern(self, cube: AnyArray) -> _Pattern:
-        if len(cube) and not 0 <= int(cube.min()) <= int(cube.max()) < len(self._exists):
-            raise self._misfit(cube, (len(cube), self._exists.shape[1]))
+        n_cubes, n_pads = self._exists.shape
+        if len(cube) and (int(cube.min()) < 0 or int(cube.max()) >= n_cubes):
+            raise self._misfit(cube, (len(cube), n_pads))
         repeats = count_repeats(cube)
-        scan = cube[: len(cube) // repeats].copy() if repeats else cube[:0]
+        scan = cube[:0]
         cubes: Cubes = scan
-        if repeats and int(scan[-1]) - int(scan[0]) + 1 == len(scan):
-            cubes = slice(int(scan[0]), int(scan[-1]) + 1)
+        if repeats:
+            scan = cubes = cube[: len(cube) // repeats].copy()
+            first, last = int(scan[0]), int(scan[-1])
+            # Numbers of a scan rise, so it has no gaps if its length fits.
+            if last - first + 1 == len(scan):
+                cubes = slice(first, last + 1)
         return _Pattern(
             repeats=repeats,
             cube=scan,

@@ -176,9 +176,11 @@ class WindowStatistics:
         """
         frequency = frequency.astype(np.float32, copy=False)
         if len(frequency) > 1 or doubtful is not None or self._is_doubtful.any():
+            # Scans that wait have no doubtful stamps, and come first.
             self._add_waiting()
             self._add(cubes, frequency, stamp_ns, doubtful)
             return
+        # The pattern cache returns the same object for the same cubes, so `is` is enough.
         if cubes is not self._waiting.cubes:
             self._add_waiting()
             self._waiting = _WaitingScans(cubes, frequency.shape[1:])
@@ -220,8 +222,11 @@ class WindowStatistics:
         _add_in_order(bounded_squares, second)
         _add_in_order(first_squares, first * first)
         _add_in_order(total, frequency - base)
-        np.fmin(lowest, np.fmin.reduce(frequency, axis=0), out=lowest)
-        np.fmax(highest, np.fmax.reduce(frequency, axis=0), out=highest)
+        # fmin and fmax ignore NaN, which stands for a row without a frequency.
+        lowest_now = np.fmin.reduce(frequency, axis=0)
+        highest_now = np.fmax.reduce(frequency, axis=0)
+        np.fmin(lowest, lowest_now, out=lowest)
+        np.fmax(highest, highest_now, out=highest)
         difference[:] = first[-1]
         last[:] = frequency[-1]
 
@@ -260,7 +265,8 @@ class WindowStatistics:
             if not before.any():
                 return None
             doubtful = np.zeros((scans, len(before)), bool)
-        intervals: Mask = doubtful | np.concatenate([before[None], doubtful[:-1]])
+        at_start = np.concatenate([before[None], doubtful[:-1]])
+        intervals: Mask = doubtful | at_start
         self._is_doubtful[cubes] = doubtful[-1]
         return intervals
 
@@ -282,22 +288,28 @@ class WindowStatistics:
         """
         between = _differences(self._time_ns[cubes], stamp_ns)
         interval = between if doubtful is None else np.where(doubtful, 0, between)
-        before = np.concatenate([self._interval_ns[cubes][None], interval[:-1]])
+        newest = self._interval_ns[cubes]
+        before = np.concatenate([newest[None], interval[:-1]])
         self._time_ns[cubes] = stamp_ns[-1]
         self._interval_ns[cubes] = interval[-1]
 
-        is_even = (interval < MAX_JITTER_RATIO * before) & (before < MAX_JITTER_RATIO * interval)
+        is_not_longer = interval < MAX_JITTER_RATIO * before
+        is_not_shorter = before < MAX_JITTER_RATIO * interval
+        is_even = is_not_longer & is_not_shorter
         longest = max(interval.max(), before.max())
         # The usual case returns early, which saves a third of the time of `add`.
         if longest < GAP_NS and is_even.all():
             return None
         self._note_gaps(cubes, between)
-        shorter, longer = np.minimum(interval, before), np.maximum(interval, before)
+        shorter = np.minimum(interval, before)
+        longer = np.maximum(interval, before)
         is_known = (shorter > 0) & (longer < GAP_NS)
         safe_before = np.where(is_known, before, 1)
         ratio = np.where(is_known & ~is_even, interval / safe_before, 1.0)
         weight = is_known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
-        return ratio.astype(np.float32)[..., None], weight.astype(np.float32)[..., None]
+        # One value for all pads of a row.
+        ratio, weight = ratio[..., None], weight[..., None]
+        return ratio.astype(np.float32), weight.astype(np.float32)
 
     def _note_gaps(self, cubes: Cubes, interval: Times) -> None:
         """Remember the longest of the intervals (B, N), in ns, forward or back."""
@@ -306,11 +318,14 @@ class WindowStatistics:
         if not gap.any():
             return
         is_first = self._count[cubes] == 0
-        self._gap_before[cubes] = np.where(is_first, gap[0], self._gap_before[cubes])
+        before, within = self._gap_before[cubes], self._gap_within[cubes]
+        # The interval that ends at the first row of a window lies before the window.
+        self._gap_before[cubes] = np.where(is_first, gap[0], before)
         gap[0] = np.where(is_first, 0, gap[0])
-        candidates = np.concatenate([self._gap_within[cubes][None], gap])
+        candidates = np.concatenate([within[None], gap])
         chosen = np.abs(candidates).argmax(axis=0)
-        self._gap_within[cubes] = np.take_along_axis(candidates, chosen[None], axis=0)[0]
+        longest = np.take_along_axis(candidates, chosen[None], axis=0)
+        self._gap_within[cubes] = longest[0]
 
 
 class _WaitingScans:

@@ -113,7 +113,8 @@ def measure_rest(
     result = pipeline.rest_frequency
     works = health.state[chosen] & LEFT_OUT == 0
     used = works & ~np.isnan(result[chosen])
-    for cube in chosen[~used.any(axis=1)].tolist():
+    is_dead = ~used.any(axis=1)
+    for cube in chosen[is_dead].tolist():
         raise TareError(f"cube {names[cube]}: no pad works; see the diagnostics")
 
     with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
@@ -152,7 +153,8 @@ def _select_windows(
     rows = np.array([window.rows[chosen] for window in windows])
     total = rows.sum(axis=0)
     has_empty_window = (rows[:count] == 0).any(axis=0)
-    for cube in chosen[has_empty_window | (total < MIN_COUNT)].tolist():
+    has_too_few = has_empty_window | (total < MIN_COUNT)
+    for cube in chosen[has_too_few].tolist():
         raise TareError(
             f"cube {names[cube]}: no data, or gaps in it, in the last {duration:g} s; see its link"
         )
@@ -176,9 +178,12 @@ def _refuse_gaps(
         rows: Number of rows of each of these cubes in the windows.
         names: Names of all cubes.
     """
+    # A gap before the first window does not matter, because no earlier row is averaged.
     before = [window.gap_before[chosen] for window in windows[1:]]
     within = [window.gap_within[chosen] for window in windows]
-    gaps_s = 1e-9 * np.abs([*before, *within, health.age_ns[chosen]])
+    # The time since the newest row is a gap, too.
+    gaps_ns = [*before, *within, health.age_ns[chosen]]
+    gaps_s = 1e-9 * np.abs(gaps_ns)
     mean_interval_s = len(windows) * WINDOW_S / rows
     limit_s = np.maximum(MAX_GAP_S, MAX_GAP_ROWS * mean_interval_s)
     longest_s = gaps_s.max(axis=0)
@@ -191,13 +196,17 @@ def _refuse_gaps(
 
 def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     """Average the windows, each weighted with its number of rows."""
-    rows = np.array([window.rows[chosen] for window in windows])[:, :, None]
+    rows = np.array([window.rows[chosen] for window in windows])
+    rows = rows[:, :, None]
     mean = np.array([window.mean[chosen] for window in windows])
-    variance = np.array([window.noise[chosen] for window in windows]) ** 2
+    noise = np.array([window.noise[chosen] for window in windows])
+    variance = noise**2
     highest = np.fmax.reduce([window.highest[chosen] for window in windows])
     lowest = np.fmin.reduce([window.lowest[chosen] for window in windows])
 
-    total = (np.where(rows > 0, mean, 0) * rows).sum(axis=0)
+    # The mean of a window without rows is NaN, which its weight 0 would not remove.
+    known_mean = np.where(rows > 0, mean, 0)
+    total = (known_mean * rows).sum(axis=0)
     # The first rows of a cube have no differences yet, so the noise of their window is NaN.
     rows_with_noise = rows * np.isfinite(variance)
     total_variance = (np.nan_to_num(variance) * rows_with_noise).sum(axis=0)
@@ -258,7 +267,8 @@ def _apply_check(
     exceeds = used & ~(check.values <= check.limit)
     if not exceeds.any():
         return
-    excess = np.where(exceeds, np.nan_to_num(check.values, nan=np.inf), -1)
+    values = np.nan_to_num(check.values, nan=np.inf)
+    excess = np.where(exceeds, values, -1)
     row, pad = np.unravel_index(np.argmax(excess), excess.shape)
     cube = int(chosen[row])
     pad_name = pipeline.calibrations[cube].layout.pads[pad]
