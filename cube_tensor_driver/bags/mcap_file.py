@@ -80,7 +80,8 @@ class McapReader:
             ).get_summary()
             if index is None or index.statistics is None:
                 raise McapError("the file has no summary")
-            largest = max((chunk.uncompressed_size for chunk in index.chunk_indexes), default=0)
+            sizes = [chunk.uncompressed_size for chunk in index.chunk_indexes]
+            largest = max(sizes, default=0)
             if largest > MAX_CHUNK_BYTES:
                 raise McapError(f"a chunk of {largest} bytes, the limit is {MAX_CHUNK_BYTES}")
         except BaseException:
@@ -88,6 +89,7 @@ class McapReader:
             raise
         self._index = index
         self._connections = _connections(index)
+        # The cache belongs to this file, and goes with it.
         self._load_chunk = lru_cache(CACHED_CHUNKS)(self._read_chunk)
         self.summary = summarise(path.name, index)
 
@@ -119,7 +121,8 @@ class McapReader:
         if not self._index.chunk_indexes:
             yield from self._unindexed_messages(channels, start_ns, stop_ns)
             return
-        for time_ns, _, channel, data in self._in_order(channels, start_ns, stop_ns):
+        stored = self._in_order(channels, start_ns, stop_ns)
+        for time_ns, _, channel, data in stored:
             if channel in channels and start_ns <= time_ns < stop_ns:
                 yield channels[channel], time_ns, data
 
@@ -149,8 +152,11 @@ class McapReader:
             yield from pending[:ready]
             loaded = self._load_chunk(chunk.chunk_start_offset, chunk.chunk_length)
             waiting = pending[ready:]
-            # Time and place decide, so that the order does not depend on where chunks end.
-            pending = sorted([*waiting, *loaded], key=itemgetter(0, 1)) if waiting else loaded
+            if not waiting:
+                pending = loaded
+                continue
+            # Of messages of the same time, the one that was written first comes first.
+            pending = sorted([*waiting, *loaded], key=itemgetter(0, 1))
         yield from pending
 
     def _read_chunk(self, offset: int, length: int) -> Sequence[StoredMessage]:
@@ -217,9 +223,12 @@ class McapWriter:
         """
         if msgtype not in self._schemas:
             text = definition.encode()
-            self._schemas[msgtype] = self._writer.register_schema(msgtype, "ros2msg", text)
-        about = {"offered_qos_profiles": to_yaml(list(qos)) if qos else ""}
-        return self._writer.register_channel(topic, "cdr", self._schemas[msgtype], about)
+            number = self._writer.register_schema(msgtype, "ros2msg", text)
+            self._schemas[msgtype] = number
+        schema = self._schemas[msgtype]
+        profiles = to_yaml(list(qos)) if qos else ""
+        about = {"offered_qos_profiles": profiles}
+        return self._writer.register_channel(topic, "cdr", schema, about)
 
     def write(
         self,
@@ -240,6 +249,7 @@ class McapWriter:
         Args:
             summary: What the file holds.
         """
+        # The record must not stand within a chunk.
         self.flush()
         self._writer.add_metadata(ROSBAG2, rosbag2_metadata(summary))
         self._writer.finish()  # type: ignore[no-untyped-call]
@@ -284,6 +294,7 @@ def _connections(index: Summary) -> dict[int, Connection]:
     """Return the topics of a file by the numbers of their channels."""
     counts = index.statistics.channel_message_counts if index.statistics else {}
     found = {}
+    # In the order of their numbers, which is that in which topics were added.
     for number, channel in sorted(index.channels.items()):
         schema = index.schemas.get(channel.schema_id)
         has_text = schema is not None and schema.encoding == "ros2msg"
@@ -313,7 +324,8 @@ def _check_summary(stream: BinaryIO) -> None:
     if not footer.summary_crc:  # the program that wrote the file made none
         return
     # The checksum covers the summary and the footer up to the checksum itself.
+    end = size - len(MAGIC) - CHECKSUM_BYTES
     stream.seek(footer.summary_start)
-    checked_bytes = size - len(MAGIC) - CHECKSUM_BYTES - footer.summary_start
-    if crc32(stream.read(max(0, checked_bytes))) != footer.summary_crc:
+    checked = stream.read(max(0, end - footer.summary_start))
+    if crc32(checked) != footer.summary_crc:
         raise McapError("the summary does not have its checksum")

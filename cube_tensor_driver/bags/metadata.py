@@ -7,7 +7,7 @@ from the library rosbags.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,14 +59,15 @@ class Connection:
     @property
     def is_latched(self) -> bool:
         """Whether all publishers kept their last messages for late subscribers."""
-        return bool(self.qos) and all(
-            profile.get("durability") in ("transient_local", 1) for profile in self.qos
-        )
+        names = ("transient_local", 1)
+        return bool(self.qos) and all(profile.get("durability") in names for profile in self.qos)
 
     @property
     def is_best_effort(self) -> bool:
         """Whether a publisher did not repeat messages that were lost."""
-        return any(profile.get("reliability") in ("best_effort", 2) for profile in self.qos)
+        # Up to version 8, rosbag2 wrote the numbers of DDS instead of names.
+        names = ("best_effort", 2)
+        return any(profile.get("reliability") in names for profile in self.qos)
 
 
 @dataclass(frozen=True)
@@ -136,8 +137,11 @@ def typestore() -> Typestore:
     """Return the message types of ROS 2 Jazzy and of this package, as they are today."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
-    for path in sorted((package_data() / "msg").glob("*.msg")):
-        types |= get_types_from_msg(path.read_text(), f"{PACKAGE}/msg/{path.stem}")
+    folder = package_data() / "msg"
+    for path in sorted(folder.glob("*.msg")):
+        name = f"{PACKAGE}/msg/{path.stem}"
+        types |= get_types_from_msg(path.read_text(), name)
+    # All at once, because the types contain each other.
     store.register(types)
     return store
 
@@ -232,9 +236,11 @@ def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connecti
     for connections in of_files:
         for one in connections:
             key = one.topic, one.msgtype
-            count = one.msgcount + (merged[key].msgcount if key in merged else 0)
-            first = merged.get(key, one)
-            merged[key] = Connection(one.topic, one.msgtype, first.definition, first.qos, count)
+            if key in merged:
+                count = merged[key].msgcount + one.msgcount
+                merged[key] = replace(merged[key], msgcount=count)
+            else:
+                merged[key] = one
     return list(merged.values())
 
 

@@ -83,6 +83,7 @@ def report_damage(path: Path) -> Iterator[None]:
     except OSError as error:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
     except READ_ERRORS as error:
+        # Some texts have several lines, and some quote the damaged bytes.
         text = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
             f"{path}: damaged, or no bag ({text[:200]}); "
@@ -106,8 +107,9 @@ def open_storage(path: Path) -> McapReader | SqliteReader:
             f"{path}: no bag; name the folder of a bag, or a file that ends in "
             f"{' or '.join(SUFFIXES.values())}"
         )
+    is_mcap = path.suffix == SUFFIXES["mcap"]
     with report_damage(path):
-        return McapReader(path) if path.suffix == SUFFIXES["mcap"] else SqliteReader(path)
+        return McapReader(path) if is_mcap else SqliteReader(path)
 
 
 def make_message(kind: str, **fields: Any) -> Any:
@@ -155,7 +157,10 @@ class Bag:
         self.path = path
         self.connections: list[Connection] = []
         self.start_ns = self.end_ns = 0
-        self._bag_files = read_metadata(path) if path.is_dir() else BagFiles([path], "")
+        # A single file is a bag, too: then nobody says that it is compressed.
+        self._bag_files = BagFiles([path], "")
+        if path.is_dir():
+            self._bag_files = read_metadata(path)
         self._files: list[McapReader | SqliteReader] = []
         self._opened = ExitStack()
 
@@ -188,8 +193,9 @@ class Bag:
             self.close()
             raise
         used = [summary for summary in summaries if summary.msgcount]
-        self.start_ns = min((summary.start_ns for summary in used), default=0)
-        self.end_ns = max((summary.end_ns for summary in used), default=0)
+        if used:
+            self.start_ns = min(summary.start_ns for summary in used)
+            self.end_ns = max(summary.end_ns for summary in used)
 
     def close(self) -> None:
         """Close the files; a second time does nothing."""
@@ -199,7 +205,8 @@ class Bag:
 
     def topics(self, msgtype: str) -> list[str]:
         """Return the topics of a type, sorted."""
-        return sorted({one.topic for one in self.connections if one.msgtype == msgtype})
+        names = {one.topic for one in self.connections if one.msgtype == msgtype}
+        return sorted(names)
 
     def skin(self) -> str:
         """Return the prefix of the skin's topics, which ends in "/".
@@ -247,7 +254,8 @@ class Bag:
 
     def fields(self, msgtype: str) -> list[tuple[str, Any]]:
         """Return name and kind (in rosbags' form) of a type's fields; none if it is unknown."""
-        return list(typestore().fielddefs.get(msgtype, ((), ()))[1])
+        constants_and_fields = typestore().fielddefs.get(msgtype, ((), ()))
+        return list(constants_and_fields[1])
 
     def infos(self, topic: str) -> list[Any]:
         """Return the SkinInfo messages of a topic.
@@ -255,7 +263,7 @@ class Bag:
         Raises:
             BagError: There is none, or one of another version.
         """
-        infos = [self.decode(entry) for entry in self.entries({topic})]
+        infos = list(map(self.decode, self.entries({topic})))
         if not infos:
             raise BagError(
                 f"{self.path}: no message on {topic}: the bag does not say what its frequencies "
@@ -296,7 +304,9 @@ class Bag:
         stop_ns: int | None = None,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Read messages file by file and count them."""
-        wanted = {one.topic for one in self.connections if topics is None or one.topic in topics}
+        wanted = {one.topic for one in self.connections}
+        if topics is not None:
+            wanted &= topics
         is_packed = self._bag_files.compression == "message"
         begin_ns = 0 if start_ns is None else start_ns
         end_ns = LAST_NS if stop_ns is None else stop_ns
@@ -334,8 +344,10 @@ class Bag:
                         yield decode(*waiting), np.array(times_ns)
                     waiting, times_ns = [], []
                     size, shape = len(data), codec.shape_bytes(data)
+                    # The shape ends with the number of rows.
                     rows = int.from_bytes(shape[-4:], "little")
-                    limit = max(1, min(MAX_BATCH_MESSAGES, MAX_BATCH_ROWS // max(1, rows)))
+                    fitting = MAX_BATCH_ROWS // max(1, rows)
+                    limit = max(1, min(MAX_BATCH_MESSAGES, fitting))
                 waiting.append(data)
                 times_ns.append(time_ns)
             if waiting:
@@ -366,9 +378,11 @@ class Bag:
                 continue
             with report_damage(self.path):
                 definitions = get_types_from_msg(one.definition, one.msgtype)
+            # Constants may differ: the bytes of a message do not depend on them.
             for name, (_, fields) in definitions.items():
-                today = typestore().fielddefs.get(name)
-                if name.startswith(PACKAGE) and (today is None or fields != today[1]):
+                if not name.startswith(PACKAGE):
+                    continue
+                if list(fields) != self.fields(name):
                     self._refuse_version(f"{one.topic} has another definition of {name}")
 
     def _refuse_version(self, difference: str) -> None:
@@ -384,6 +398,7 @@ def _decompress(data: bytes) -> bytes:
     Raises:
         zstandard.ZstdError, ValueError: It is damaged, or larger than `MAX_MESSAGE_BYTES`.
     """
+    # As a stream, because a frame that states its size would be unpacked to any size.
     with zstandard.ZstdDecompressor().stream_reader(data) as reader:
         message = reader.read(MAX_MESSAGE_BYTES + 1)
     if len(message) > MAX_MESSAGE_BYTES:

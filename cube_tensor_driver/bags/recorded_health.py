@@ -41,7 +41,8 @@ class _StressBatch(NamedTuple):
 
     def overlaps(self, begin_ns: int, end_ns: int) -> bool:
         """Return whether a row can lie between two times."""
-        return bool(self.stamp_ns.min() <= end_ns and self.stamp_ns.max() >= begin_ns)
+        first_ns, last_ns = self.stamp_ns.min(), self.stamp_ns.max()
+        return bool(first_ns <= end_ns and last_ns >= begin_ns)
 
 
 class RecordedHealthReader:
@@ -75,9 +76,11 @@ class RecordedHealthReader:
         )
         if not self._has_stress or not len(rows):
             return health
-        for batch in self._batches_between(int(rows.stamp_ns.min()), int(rows.stamp_ns.max())):
-            is_same_batch = np.array_equal(batch.stamp_ns, rows.stamp_ns)
-            if is_same_batch and np.array_equal(batch.cube, rows.cube):
+        begin_ns, end_ns = int(rows.stamp_ns.min()), int(rows.stamp_ns.max())
+        for batch in self._batches_between(begin_ns, end_ns):
+            # Usually frequencies and stress were recorded alike: then nothing must be searched.
+            has_same_stamps = np.array_equal(batch.stamp_ns, rows.stamp_ns)
+            if has_same_stamps and np.array_equal(batch.cube, rows.cube):
                 everything = np.ones(len(rows), bool)
                 return RecordedHealth(everything, batch.left_out, batch.status)
             _copy_matching(batch, rows, health)
@@ -95,15 +98,19 @@ class RecordedHealthReader:
             self._batches.clear()
             self._unread = self._read()
         self._last_wanted_ns = end_ns
-        while self._batches and self._batches[0].stamp_ns.max() < begin_ns - MAX_DISORDER_NS:
+        oldest_ns = begin_ns - MAX_DISORDER_NS
+        while self._batches and self._batches[0].stamp_ns.max() < oldest_ns:
             self._batches.popleft()
 
-        yield from (batch for batch in tuple(self._batches) if batch.overlaps(begin_ns, end_ns))
+        for kept in tuple(self._batches):
+            if kept.overlaps(begin_ns, end_ns):
+                yield kept
         while self._newest_ns < end_ns + MAX_DISORDER_NS:
             batch = next(self._unread, None)
             if batch is None:
                 return
-            self._newest_ns = max(self._newest_ns, int(batch.stamp_ns.max()))
+            newest_ns = int(batch.stamp_ns.max())
+            self._newest_ns = max(self._newest_ns, newest_ns)
             self._batches.append(batch)
             if batch.overlaps(begin_ns, end_ns):
                 yield batch
@@ -124,8 +131,9 @@ def _copy_matching(
     """Copy the health of the rows that a batch contains."""
     match = match_rows(batch, rows)
     # The same number with another stamp is a sample from before a restart of the hub.
-    found = np.flatnonzero(match != NO_MATCH)
-    found = found[batch.stamp_ns[match[found]] == rows.stamp_ns[found]]
-    health.known[found] = True
-    health.left_out[found] = batch.left_out[match[found]]
-    health.status[found] = batch.status[match[found]]
+    has_match = match != NO_MATCH
+    is_same = has_match & (batch.stamp_ns[match] == rows.stamp_ns)
+    source = match[is_same]
+    health.known[is_same] = True
+    health.left_out[is_same] = batch.left_out[source]
+    health.status[is_same] = batch.status[source]

@@ -59,7 +59,8 @@ class Recording:
             self.settings = [settings_of(info) for info in self.infos]
         except MessageError as error:
             raise BagError(f"{bag.path}: {error}") from None
-        self._since_ns = np.array([stamp_ns(info) for info in self.infos])
+        stamps = [stamp_ns(info) for info in self.infos]
+        self._since_ns = np.array(stamps)
         self._health = RecordedHealthReader(bag, topic)
 
     def __repr__(self) -> str:
@@ -79,11 +80,15 @@ class Recording:
         Args:
             newest_ns: Stamp of the newest row of the message, in ns; or an array (M,) of stamps.
         """
-        return np.maximum(np.searchsorted(self._since_ns, newest_ns, side="right") - 1, 0)
+        number = np.searchsorted(self._since_ns, newest_ns, side="right") - 1
+        # Nothing earlier is known about messages that were recorded before the first info.
+        return np.maximum(number, 0)
 
     def settings_at(self, rows: FrequencyRows) -> Settings:
         """Return the settings under which the rows of one message were reconstructed."""
-        return self.settings[int(self.number_at(rows.stamp_ns.max(initial=0)))]
+        newest_ns = rows.stamp_ns.max(initial=0)
+        number = int(self.number_at(newest_ns))
+        return self.settings[number]
 
     def health_at(self, rows: FrequencyRows) -> RecordedHealth:
         """Return the health of the pads that was found when rows were recorded.
@@ -98,8 +103,9 @@ class Recording:
         Raises:
             BagError: One does.
         """
-        ids = [[one.id for one in settings.calibrations] for settings in self.settings]
-        if any(other != ids[0] for other in ids):
+        first = self.settings[0].calibrations
+        expected = [one.id for one in first]
+        if any([one.id for one in other.calibrations] != expected for other in self.settings):
             raise BagError(
                 f"{self._bag.path}: the calibrations change within the recording: "
                 "reprocess it instead"
@@ -117,9 +123,11 @@ def skin_infos(bag: Bag, topic: str) -> list[Any]:
     """
     skin = topic.removesuffix("frequencies")
     own, of_driver = f"{skin}info", f"{skin}driver/info"
-    recorded = {connection.topic for connection in bag.connections if connection.msgcount}
-    infos = bag.infos(of_driver if of_driver in recorded and own not in recorded else own)
-    return [info for info in infos if info.sender == "reconstruction"] or infos
+    recorded = {one.topic for one in bag.connections if one.msgcount}
+    is_only_driver = of_driver in recorded and own not in recorded
+    infos = bag.infos(of_driver if is_only_driver else own)
+    reconstructed = [info for info in infos if info.sender == "reconstruction"]
+    return reconstructed or infos
 
 
 def stamp_ns(message: Any) -> int:
@@ -152,12 +160,14 @@ def settings_of(info: Any) -> Settings:
 
 def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
     """Return the skin of a SkinInfo; a bag does not state where the ports of its links were."""
+    # A dict keeps each name once, in the order of the cubes.
     names = dict.fromkeys(cube.link for cube in info.cubes if cube.link)
     links = tuple(SkinLink(name, "recorded", 0, None) for name in names)
     cubes = []
     for cube, calibration in zip(info.cubes, calibrations, strict=True):
         position, q = cube.pose.position, cube.pose.orientation
-        roll, pitch, yaw = rpy_from_quaternion(np.array([q.x, q.y, q.z, q.w])).tolist()
+        quaternion = np.array([q.x, q.y, q.z, q.w])
+        roll, pitch, yaw = rpy_from_quaternion(quaternion).tolist()
         cubes.append(
             SkinCube(
                 name=cube.name,

@@ -108,7 +108,8 @@ def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
         one_cut, one_damaged = _repair_file(path, keep_rest)
         cut, damaged = cut + one_cut, damaged + one_damaged
     paths = _storage_files(folder)  # without those in which nothing was complete
-    storages = [name for name, suffix in SUFFIXES.items() if any(p.suffix == suffix for p in paths)]
+    existing = {path.suffix for path in paths}
+    storages = [name for name, suffix in SUFFIXES.items() if suffix in existing]
     if not storages:
         raise BagError(
             f"{folder}: no .mcap or .db3 file with a complete message in it; nothing can be read"
@@ -159,8 +160,10 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
         if is_complete and not salvaged.damaged:
             return 0, 0
         if keep_rest and not is_complete and size > salvaged.end:
+            # Before anything is cut: nothing is lost if the disk is full.
             stream.seek(salvaged.end)
-            with path.with_name(path.name + REST).open("wb") as rest:
+            rest_path = path.with_name(path.name + REST)
+            with rest_path.open("wb") as rest:
                 shutil.copyfileobj(stream, rest)
         if salvaged.index.chunk_indexes:
             stream.seek(salvaged.end)
@@ -211,6 +214,7 @@ class _Salvaged:
                 self.end = stream.tell()
             elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 break
+            # A damaged record is left out; the records behind it count again.
             try:
                 self._take(opcode, start, content)
             except READ_ERRORS:
@@ -267,6 +271,7 @@ class _Salvaged:
         if chunk is None or len(index.records) != counts[index.channel_id]:
             raise ValueError("an index has another number of messages than its chunk")
         chunk.message_index_offsets[index.channel_id] = start
+        # Readers need the indexes of all channels, so only the last one makes the chunk complete.
         if chunk.message_index_offsets.keys() == counts.keys():
             self.end = start + _RECORD_HEAD.size + len(content)
             chunk_end = chunk.chunk_start_offset + chunk.chunk_length
@@ -302,8 +307,10 @@ def _write_summary(
         schema_count=len(index.schemas),
     )
     # rosbag2 takes its topics from the summary, but reads nothing without this record.
-    metadata = Metadata(ROSBAG2, rosbag2_metadata(summarise(name, index)))
-    metadata_index = MetadataIndex(stream.tell(), len(_bytes_of([metadata])), ROSBAG2)
+    about = rosbag2_metadata(summarise(name, index))
+    metadata = Metadata(ROSBAG2, about)
+    metadata_length = len(_bytes_of([metadata]))
+    metadata_index = MetadataIndex(stream.tell(), metadata_length, ROSBAG2)
     stream.write(_bytes_of([metadata, DataEnd(0)]))
 
     summary_start = stream.tell()
@@ -318,12 +325,14 @@ def _write_summary(
     offsets: list[McapRecord] = []
     for opcode, records in groups:
         group = _bytes_of(records)
-        offsets.append(SummaryOffset(opcode, summary_start + len(summary), len(group)))
+        group_start = summary_start + len(summary)
+        offsets.append(SummaryOffset(opcode, group_start, len(group)))
         summary += group
     offsets_start = summary_start + len(summary)
     summary += _bytes_of(offsets)
     # The checksum covers the summary and the footer up to the checksum itself.
-    footer = _bytes_of([Footer(summary_start, offsets_start, 0)])[:-CHECKSUM_BYTES]
+    footer = _bytes_of([Footer(summary_start, offsets_start, 0)])
+    footer = footer[:-CHECKSUM_BYTES]
     checksum = struct.pack("<I", crc32(summary + footer))
     stream.write(summary + footer + checksum + MAGIC)
 

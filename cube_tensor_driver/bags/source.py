@@ -94,12 +94,15 @@ class BagSource:
         for messages, recorded_ns in self.bag.frequencies(self.topic):
             cube = messages.by_message(messages.rows.cube)
             times_ns = messages.by_message(messages.rows.stamp_ns)
+            # A message may have no rows.
             newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
             number = self.recording.number_at(newest_ns)
 
             # A segment ends where the cubes change, or the info that holds.
-            ends = (cube[1:] != cube[:-1]).any(axis=1) | (number[1:] != number[:-1])
-            bounds = [0, *(np.flatnonzero(ends) + 1).tolist(), len(messages)]
+            has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
+            has_other_info = number[1:] != number[:-1]
+            ends = np.flatnonzero(has_other_cubes | has_other_info) + 1
+            bounds = [0, *ends.tolist(), len(messages)]
             for begin, end in pairwise(bounds):
                 # Only repeats of one scan give the same results together as one by one.
                 step = end - begin if count_repeats(cube[begin]) else 1

@@ -68,7 +68,14 @@ class SqliteReader:
             self._database.close()
             raise
         connections = list(self._connections.values())
-        self.summary = FileSummary(path.name, connections, span[0] or 0, span[1] or 0)
+        # Both are NULL where there is no message.
+        start_ns, end_ns = span
+        self.summary = FileSummary(
+            path.name,
+            connections,
+            start_ns or 0,
+            end_ns or 0,
+        )
 
     def close(self) -> None:
         """Close the file."""
@@ -81,9 +88,7 @@ class SqliteReader:
         stop_ns: int,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Read messages in the order of their times; arguments as in `McapReader.messages`."""
-        numbers = [
-            number for number, connection in self._connections.items() if connection.topic in topics
-        ]
+        numbers = [number for number, one in self._connections.items() if one.topic in topics]
         places = ",".join("?" * len(numbers))
         rows = self._database.execute(
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places})"

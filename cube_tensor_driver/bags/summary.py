@@ -52,7 +52,12 @@ def cube_summaries(
     cube, sequence, stamp_ns = _columns(bag, topic)
     for number, one in enumerate(info.cubes):
         rows = cube == number
-        yield _summarise(one.name, one.uid, sequence[rows], stamp_ns[rows])
+        yield _summarise(
+            one.name,
+            one.uid,
+            sequence[rows],
+            stamp_ns[rows],
+        )
 
 
 def last_diagnostics(bag: Bag) -> list[Any]:
@@ -74,9 +79,11 @@ def _summarise(
     """Summarise the samples of one cube."""
     if len(sequence) < 2:
         return CubeSummary(name, uid, len(sequence))
-    steps = np.mod(np.diff(sequence.astype(np.int64)), SEQUENCE_RANGE)
+    differences = np.diff(sequence.astype(np.int64))
+    steps = np.mod(differences, SEQUENCE_RANGE)
     # A step of half the range or more is a hub that restarted, not loss.
-    lost = (steps[(steps > 0) & (steps < SEQUENCE_RANGE // 2)] - 1).sum()
+    is_forward = (steps > 0) & (steps < SEQUENCE_RANGE // 2)
+    lost = (steps[is_forward] - 1).sum()
     periods_ns = np.diff(stamp_ns)
     median_ns = float(np.median(periods_ns))
     return CubeSummary(

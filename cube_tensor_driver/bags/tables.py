@@ -19,13 +19,16 @@ from ..core.rows import StressRows
 ROWS_PER_GROUP = 1 << 16
 """Number of rows written at a time: one row group of a Parquet file."""
 
+# A dictionary keeps each name once, however many rows a cube has.
+_CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
+_GRADIENTS = COMPONENTS[len(STRESS) :]
 _SCHEMA = pyarrow.schema(
     [
         ("stamp_ns", pyarrow.int64()),
-        ("cube", pyarrow.dictionary(pyarrow.int32(), pyarrow.string())),
+        ("cube", _CUBE_NAME),
         ("sequence", pyarrow.uint32()),
         *((f"stress_{name}_Pa", pyarrow.float32()) for name in STRESS),
-        *((f"gradient_{name}_Pa_per_m", pyarrow.float32()) for name in COMPONENTS[len(STRESS) :]),
+        *((f"gradient_{name}_Pa_per_m", pyarrow.float32()) for name in _GRADIENTS),
         ("residual", pyarrow.float32()),
         ("status", pyarrow.uint16()),
         ("observed", pyarrow.uint16()),
@@ -66,7 +69,9 @@ class TableWriter:
         self._is_csv = path.suffix == ".csv"
         self._schema = _SCHEMA
         if self._is_csv:
-            self._schema = _SCHEMA.set(1, pyarrow.field("cube", pyarrow.string()))
+            # CSV has no dictionaries.
+            plain = pyarrow.field("cube", pyarrow.string())
+            self._schema = _SCHEMA.set(1, plain)
         make = pyarrow.csv.CSVWriter if self._is_csv else pyarrow.parquet.ParquetWriter
         with report_write_errors(path):
             self._writer = make(str(path), self._schema)
@@ -85,7 +90,8 @@ class TableWriter:
         Raises:
             BagError: The disk is full or gone.
         """
-        numbers = np.minimum(rows.cube, len(self._cubes) - 1).astype(np.int32)
+        last = len(self._cubes) - 1
+        numbers = np.minimum(rows.cube, last).astype(np.int32)
         names = pyarrow.DictionaryArray.from_arrays(numbers, self._cubes)
         columns = [
             pyarrow.array(rows.stamp_ns),
@@ -93,9 +99,13 @@ class TableWriter:
             pyarrow.array(rows.sequence),
             *map(pyarrow.array, rows.stress.T),
             *map(pyarrow.array, rows.gradient.T),
-            *map(pyarrow.array, (rows.residual, rows.status, rows.observed, rows.left_out)),
+            pyarrow.array(rows.residual),
+            pyarrow.array(rows.status),
+            pyarrow.array(rows.observed),
+            pyarrow.array(rows.left_out),
         ]
-        self._batches.append(pyarrow.RecordBatch.from_arrays(columns, schema=self._schema))
+        batch = pyarrow.RecordBatch.from_arrays(columns, schema=self._schema)
+        self._batches.append(batch)
         self._waiting_rows += len(rows)
         if self._waiting_rows >= ROWS_PER_GROUP:
             with report_write_errors(self._path):

@@ -68,8 +68,13 @@ class _Part:
 
     def summary(self, topics: Sequence[Connection]) -> FileSummary:
         """Describe the file."""
-        counted = [replace(one, msgcount=self.counts.get(one.topic, 0)) for one in topics]
-        return FileSummary(self.path.name, counted, self.start_ns, self.end_ns)
+        counted = [replace(one, msgcount=self.counts[one.topic]) for one in topics]
+        return FileSummary(
+            self.path.name,
+            counted,
+            self.start_ns,
+            self.end_ns,
+        )
 
 
 class BagWriter:
@@ -170,7 +175,8 @@ class BagWriter:
         """
         part = self._open_part()
         is_large = self._max_bytes and part.bytes >= self._max_bytes
-        is_long = self._max_ns and part.messages and time_ns - part.first_ns >= self._max_ns
+        duration_ns = time_ns - part.first_ns if part.messages else 0
+        is_long = self._max_ns and duration_ns >= self._max_ns
         if is_large or is_long:
             self.close()
             self._attempt(self._begin_part)
@@ -212,6 +218,7 @@ class BagWriter:
         part = self._open_part()
         summary = part.summary(self._topics)
         part.file.finish(summary)
+        # From here on a failure does not concern this file any more.
         self._part = None
         self._complete.append(summary)
         write_metadata(self.folder, self._storage, self._complete)
@@ -219,7 +226,12 @@ class BagWriter:
     @staticmethod
     def _connect(part: _Part, one: Connection) -> None:
         """Make a topic known in a storage file."""
-        channel = part.file.add_topic(one.topic, one.msgtype, one.definition, one.qos)
+        channel = part.file.add_topic(
+            one.topic,
+            one.msgtype,
+            one.definition,
+            one.qos,
+        )
         part.channels[one.topic] = channel
         part.counts[one.topic] = 0
 
@@ -234,7 +246,7 @@ class BagWriter:
         part, self._part = self._part, None
         if part is not None:
             part.file.abort()
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        reason = getattr(error, "strerror", None) or str(error)
         raise BagError(
             f"{self.folder}: {reason}; name a folder that can be written, on a disk with room"
         ) from None

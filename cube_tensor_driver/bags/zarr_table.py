@@ -17,7 +17,10 @@ ROWS_PER_CHUNK = 1 << 16
 """Number of rows in one chunk of an array."""
 
 _UNITS = {"stamp_ns": "ns", "stress": "Pa", "gradient": "Pa/m"}
-_COMPONENTS = {"stress": COMPONENTS[: len(STRESS)], "gradient": COMPONENTS[len(STRESS) :]}
+_COMPONENTS = {
+    "stress": COMPONENTS[: len(STRESS)],
+    "gradient": COMPONENTS[len(STRESS) :],
+}
 _COLUMNS: dict[str, Any] = {
     "stamp_ns": np.int64,
     "cube": np.uint16,
@@ -95,7 +98,9 @@ def _create_column(
     """Create the array of one column, with attributes that state what it means."""
     components = _COMPONENTS.get(name, ())
     width = (len(components),) if components else ()
-    attributes: dict[str, Any] = {"units": _UNITS[name]} if name in _UNITS else {}
+    attributes: dict[str, Any] = {}
+    if name in _UNITS:
+        attributes["units"] = _UNITS[name]
     if components:
         attributes["components"] = list(components)
     if name == "cube":

@@ -43,7 +43,12 @@ COUNTED = {
 }
 """Features that every data set has, with their types."""
 
-_IMAGE = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
+_IMAGE = pyarrow.struct(
+    [
+        ("bytes", pyarrow.binary()),
+        ("path", pyarrow.string()),
+    ]
+)
 
 
 class DataSet:
@@ -81,10 +86,18 @@ class DataSet:
         self.fps, self.depth = fps, depth
         self.frames = 0
         self.episodes: list[dict[str, Any]] = []
-        self.widths = {TACTILE: len(COMPONENTS), f"{TACTILE}.residual": 1}
-        self.widths |= {topic.key: topic.shape[2] or len(topic.names) for topic in topics}
+        # Columns of whole numbers beside the stress are not normalised, so they have no statistics.
+        self.widths = {
+            TACTILE: len(COMPONENTS),
+            f"{TACTILE}.residual": 1,
+        }
+        for topic in topics:
+            bands = topic.shape[2]
+            self.widths[topic.key] = bands or len(topic.names)
         self.widths |= dict.fromkeys(COUNTED, 1)
-        self._folder, self._skin, self._topics = folder, skin, topics
+        self._folder = folder
+        self._skin = skin
+        self._topics = topics
         self._image_keys = {topic.key for topic in topics if topic.msgtype in IMAGES}
         self._statistics = {key: Statistics(width, samples) for key, width in self.widths.items()}
         self._tasks: list[str] = []
@@ -103,7 +116,9 @@ class DataSet:
         """Return the place of the next episode's file, and the number of its task."""
         if task not in self._tasks:
             self._tasks.append(task)
-        if self._writer is None or self._path.stat().st_size >= MAX_FILE_MB << 20:
+        # The size on disk lags behind by one row group, so files are a little larger.
+        is_full = self._writer is not None and self._path.stat().st_size >= MAX_FILE_MB << 20
+        if self._writer is None or is_full:
             self._close_file()
             self._file_number += 1
         chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
@@ -111,11 +126,16 @@ class DataSet:
         if self._writer is None:
             self._path = self._folder / "data" / FILE_NAME.format(**place)
             self._path.parent.mkdir(parents=True, exist_ok=True)
-        return {f"data/{name}": number for name, number in place.items()}, self._tasks.index(task)
+        described = {
+            "data/chunk_index": chunk,
+            "data/file_index": file,
+        }
+        return described, self._tasks.index(task)
 
     def write(self, columns: dict[str, AnyArray | list[EncodedImage]]) -> None:
         """Write frames that follow each other, as one row group."""
-        table = pyarrow.table({name: _column(values) for name, values in columns.items()})
+        arrays = {name: _column(values) for name, values in columns.items()}
+        table = pyarrow.table(arrays)
         if self._writer is None:
             # Measured numbers hardly repeat: a dictionary of them only costs time.
             self._writer = pyarrow.parquet.ParquetWriter(
@@ -159,7 +179,8 @@ class DataSet:
             "begin_ns": episode.begin_ns,
         }
         for key, one in statistics.items():
-            for name, values in self._as_lists(key, one.result(frames)).items():
+            result = one.result(frames)
+            for name, values in self._as_lists(key, result).items():
                 described[f"stats/{key}/{name}"] = values
         self.episodes.append(described)
 
@@ -170,16 +191,26 @@ class DataSet:
         ids: list[str],
     ) -> None:
         """Note with which calibrations of the cubes the stress of a bag is made from a stamp on."""
-        if not self._calibrations or self._calibrations[-1]["ids"] != ids:
-            self._calibrations.append({"bag": bag, "since_ns": since_ns, "ids": ids})
+        # Only changes are noted: most data sets have one calibration throughout.
+        if self._calibrations and self._calibrations[-1]["ids"] == ids:
+            return
+        self._calibrations.append(
+            {
+                "bag": bag,
+                "since_ns": since_ns,
+                "ids": ids,
+            }
+        )
 
     def write_meta(self) -> None:
         """Write what describes the data, once it is complete."""
         meta = self._folder / "meta"
         path = meta / "episodes" / FILE_NAME.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True, exist_ok=True)
-        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(self.episodes), path)
-        pyarrow.parquet.write_table(_task_table(self._tasks), meta / "tasks.parquet")
+        episodes = pyarrow.Table.from_pylist(self.episodes)
+        tasks = _task_table(self._tasks)
+        pyarrow.parquet.write_table(episodes, path)
+        pyarrow.parquet.write_table(tasks, meta / "tasks.parquet")
         _write_json(
             meta / "info.json",
             {
@@ -211,11 +242,13 @@ class DataSet:
 
     def _as_lists(self, key: str, result: dict[str, AnyArray]) -> dict[str, Any]:
         """Return statistics as lists; those of images have the shape (bands, 1, 1)."""
-        is_image = key in self._image_keys
-        return {
-            name: (values[:, None, None] if is_image and name != "count" else values).tolist()
-            for name, values in result.items()
-        }
+        lists = {}
+        for name, values in result.items():
+            if key in self._image_keys and name != "count":
+                # LeRobot applies them to images (bands, height, width) by broadcasting.
+                values = values[:, np.newaxis, np.newaxis]
+            lists[name] = values.tolist()
+        return lists
 
     def _features(self) -> dict[str, Any]:
         """Describe the features as info.json does.
@@ -225,19 +258,27 @@ class DataSet:
         cubes = len(self._skin.cubes)
         window = (self.depth, cubes)
         about = describe_skin(self._skin) | {"calibrations": self._calibrations}
-        tactile = _feature("float32", (*window, len(COMPONENTS)), ["sample", "cube", "component"])
+        tactile = _feature(
+            "float32",
+            (*window, len(COMPONENTS)),
+            ["sample", "cube", "component"],
+        )
         features = {TACTILE: tactile | {"info": about}}
         for name, kind in COLUMNS.items():
             dtype = np.dtype(kind).name
             features[f"{TACTILE}.{name}"] = _feature(dtype, window, ["sample", "cube"])
-        features[f"{TACTILE}.count"] = _feature("int64", (cubes,), list(self._skin.names))
+        names = list(self._skin.names)
+        features[f"{TACTILE}.count"] = _feature("int64", (cubes,), names)
         for topic in self._topics:
             if topic.key in self._image_keys:
-                names = ["height", "width", "channels"]
-                features[topic.key] = _feature("image", topic.shape, names)
+                axes = ["height", "width", "channels"]
+                features[topic.key] = _feature("image", topic.shape, axes)
             else:
-                features[topic.key] = _feature("float32", (len(topic.names),), topic.names)
-        return features | {key: _feature(kind, (1,), None) for key, kind in COUNTED.items()}
+                width = len(topic.names)
+                features[topic.key] = _feature("float32", (width,), topic.names)
+        for key, dtype in COUNTED.items():
+            features[key] = _feature(dtype, (1,), None)
+        return features
 
 
 def describe_skin(skin: Skin) -> dict[str, Any]:
@@ -255,7 +296,7 @@ def describe_skin(skin: Skin) -> dict[str, Any]:
     ]
     return {
         "components": list(COMPONENTS),
-        "units": ["Pa"] * len(STRESS) + ["Pa/m"] * (len(COMPONENTS) - len(STRESS)),
+        "units": ["Pa" if name in STRESS else "Pa/m" for name in COMPONENTS],
         "sign": "tension is positive",
         "frame": "each cube's own: right-handed, z out of the skin",
         "unknown": "NaN: not observed, or in front of the first sample of a window",
@@ -277,11 +318,15 @@ def _feature(
 def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
     """Return (n, ...) as lists of lists, (n, 1) as n numbers, and images as their bytes."""
     if isinstance(values, list):
-        return pyarrow.array([{"bytes": image.data, "path": None} for image in values], _IMAGE)
-    array = pyarrow.array(np.ascontiguousarray(values).reshape(-1))
+        # LeRobot reads an image from its bytes where there is no path.
+        images = [{"bytes": image.data, "path": None} for image in values]
+        return pyarrow.array(images, _IMAGE)
+    flat = np.ascontiguousarray(values).reshape(-1)
+    array = pyarrow.array(flat)
     shape = values.shape[1:]
     if shape == (1,):
         return array
+    # From the innermost dimension outwards, each list holds `size` lists of the one before.
     for size in reversed(shape):
         offsets = np.arange(0, len(array) + 1, size, dtype=np.int32)
         array = pyarrow.ListArray.from_arrays(offsets, array)
@@ -302,10 +347,14 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
     described = {
         "index_columns": ["task"],
         "column_indexes": [],
-        "columns": [column("task_index", "int64", "int64"), column("task", "unicode", "object")],
+        "columns": [
+            column("task_index", "int64", "int64"),
+            column("task", "unicode", "object"),
+        ],
         "pandas_version": "2.0.0",
     }
-    table = pyarrow.table({"task_index": range(len(tasks)), "task": tasks})
+    numbers = range(len(tasks))
+    table = pyarrow.table({"task_index": numbers, "task": tasks})
     return table.replace_schema_metadata({"pandas": json.dumps(described)})
 
 

@@ -137,15 +137,19 @@ class EpisodeWriter:
         topics: TopicReader,
     ) -> None:
         """Prepare an episode of a bag, whose other topics `topics` reads."""
-        self._data_set, self._plan, self._episode = data_set, plan, episode
+        self._data_set = data_set
+        self._plan = plan
+        self._episode = episode
         self._topics = topics
         self._windows = Windows(episode.counts, data_set.depth)
         self._place: dict[str, int] = {}
         self._task = 0
-        self._statistics = {
-            key: Statistics(width, episode.rows if key.startswith(TACTILE) else len(episode.counts))
-            for key, width in data_set.widths.items()
-        }
+        self._statistics = {}
+        for key, width in data_set.widths.items():
+            # Stress is counted by samples, everything else by frames.
+            is_stress = key.startswith(TACTILE)
+            rows = episode.rows if is_stress else len(episode.counts)
+            self._statistics[key] = Statistics(width, rows)
 
     def add(self, rows: StressRows) -> int:
         """Take the rows that belong to the episode, and return their number."""
@@ -153,8 +157,10 @@ class EpisodeWriter:
         if not inside.any():
             return 0
         rows = rows.select(inside)
-        self._windows.add(self._episode.sample_frame_of(rows.stamp_ns), rows)
-        self._count(TACTILE, np.hstack([rows.stress, rows.gradient]))
+        frame = self._episode.sample_frame_of(rows.stamp_ns)
+        self._windows.add(frame, rows)
+        components = np.hstack([rows.stress, rows.gradient])
+        self._count(TACTILE, components)
         self._count(f"{TACTILE}.residual", rows.residual[:, np.newaxis])
         return len(rows)
 
@@ -165,7 +171,8 @@ class EpisodeWriter:
         """
         for windows in self._windows.complete():
             if not self._place:
-                self._place, self._task = self._data_set.begin_episode(self._episode.task)
+                task = self._episode.task
+                self._place, self._task = self._data_set.begin_episode(task)
             self._write_frames(windows)
         is_complete = self._windows.done == len(self._episode.counts)
         if is_complete:
@@ -175,17 +182,19 @@ class EpisodeWriter:
     def _write_frames(self, windows: dict[str, AnyArray]) -> None:
         """Write the frames of windows that have just been made."""
         data_set, last = self._data_set, self._windows.done
-        first = last - len(windows[TACTILE])
+        frames = len(windows[TACTILE])
+        first = last - frames
         frame = np.arange(first, last)
         counted: dict[str, Any] = {
             "timestamp": (frame / data_set.fps).astype(np.float32),
             "frame_index": frame,
-            "episode_index": np.full(len(frame), len(data_set.episodes)),
-            "index": np.arange(data_set.frames, data_set.frames + len(frame)),
-            "task_index": np.full(len(frame), self._task),
+            "episode_index": np.full(frames, len(data_set.episodes)),
+            "index": data_set.frames + np.arange(frames),
+            "task_index": np.full(frames, self._task),
         }
         columns = self._topics.at(self._episode, first, last)
-        columns |= {key: values[:, np.newaxis] for key, values in counted.items()}
+        for key, values in counted.items():
+            columns[key] = values[:, np.newaxis]
         data_set.write(windows | columns)
 
         # Reading every pixel would take longer than everything else.
@@ -194,9 +203,11 @@ class EpisodeWriter:
             if isinstance(values, np.ndarray):
                 self._count(key, values)
                 continue
+            # The chosen frames are multiples of the stride within the episode, not in this block.
             for image in values[-first % stride :: stride]:
                 pixels = image.pixels()[::PIXEL_STRIDE, ::PIXEL_STRIDE]
-                self._count(key, pixels.reshape(-1, pixels.shape[2]))
+                bands = pixels.shape[2]
+                self._count(key, pixels.reshape(-1, bands))
 
     def _count(self, key: str, rows: AnyArray) -> None:
         self._data_set.count(key, rows, self._statistics)
@@ -204,14 +215,20 @@ class EpisodeWriter:
 
 def _check_same_skin(plans: list[BagPlan]) -> Skin:
     """Return the skin of all bags, which must have the same cubes in the same places."""
+
+    def places(plan: BagPlan) -> list[Any]:
+        return [(cube.name, cube.xyz, cube.rpy) for cube in plan.skin.cubes]
+
     first = plans[0]
-    places = [[(one.name, one.xyz, one.rpy) for one in plan.skin.cubes] for plan in plans]
-    for plan, place in zip(plans, places, strict=True):
-        if place != places[0]:
-            cube = next((one for one in place if one not in places[0]), ("none", "", ""))
+    expected = places(first)
+    for plan in plans[1:]:
+        found = places(plan)
+        if found != expected:
+            new = [place for place in found if place not in expected]
             raise BagError(
-                f"{plan.path}: {len(place)} cubes, among them {cube[0]} at {cube[1]}; {first.path} "
-                f"has {len(places[0])} cubes in other places; export them into two folders"
+                f"{plan.path}: its {len(found)} cubes are not those of {first.path}, which has "
+                f"{len(expected)}; different are {new[:1] or 'missing cubes'}: export them into "
+                "two folders"
             )
     return first.skin
 
@@ -246,8 +263,14 @@ def _stress_rows(
     with open_bag(plan.path, choices.frequencies) as source:
         settings = settings_with(source, choices.overrides)
         for segment, rows in reconstruct(source, choices.overrides):
-            rows = rows.select(rows.cube < len(source.skin.cubes))
+            is_known = rows.cube < len(source.skin.cubes)
+            rows = rows.select(is_known)
             if len(rows):
-                ids = [one.id for one in settings[segment.number].calibrations]
-                data_set.note_calibrations(plan.path.name, int(rows.stamp_ns.min()), ids)
+                calibrations = settings[segment.number].calibrations
+                since_ns = int(rows.stamp_ns.min())
+                data_set.note_calibrations(
+                    plan.path.name,
+                    since_ns,
+                    [one.id for one in calibrations],
+                )
                 yield rows

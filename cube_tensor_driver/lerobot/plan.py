@@ -97,7 +97,9 @@ class Episode:
         self.task = task
         self.begin_ns = self.rows = 0
         self.counts: AnyArray = np.zeros((0, 1), np.uint32)
-        self._since_ns, self._until_ns, self._fps = since_ns, until_ns, fps
+        self._since_ns = since_ns
+        self._until_ns = until_ns
+        self._fps = fps
 
     def contains(self, stamp_ns: Times) -> Mask:
         """Return which samples (N,) belong to the episode."""
@@ -148,15 +150,18 @@ class Episode:
             )
         if n_frames > len(self.counts):
             # The number of frames is known only at the end: the table grows by half each time.
-            larger = np.zeros((n_frames + n_frames // 2, n_cubes), np.uint32)
+            larger = np.zeros((3 * n_frames // 2, n_cubes), np.uint32)
             larger[: len(self.counts)] = self.counts
             self.counts = larger
         self.rows += len(cube)
-        np.add.at(self.counts.reshape(-1), frame * n_cubes + cube, 1)
+        # `np.add.at` is several times as fast with one index as with two.
+        cell = frame * n_cubes + cube
+        np.add.at(self.counts.reshape(-1), cell, 1)
 
     def finish(self) -> None:
         """Remove the frames behind the last sample."""
-        last = np.flatnonzero(self.counts.any(axis=1))[-1]
+        has_samples = self.counts.any(axis=1)
+        last = np.flatnonzero(has_samples)[-1]
         self.counts = self.counts[: last + 1]
 
 
@@ -207,8 +212,9 @@ def plan_bag(
         samples = np.zeros(n_cubes, np.int64)
         first_ns, last_ns = MAX_NS, MIN_NS
         for rows in source:
-            known = rows.cube < n_cubes
-            cube, stamp_ns = rows.cube[known].astype(np.intp), rows.stamp_ns[known]
+            is_known = rows.cube < n_cubes
+            cube = rows.cube[is_known].astype(np.intp)
+            stamp_ns = rows.stamp_ns[is_known]
             if len(cube):
                 samples += np.bincount(cube, minlength=n_cubes)
                 first_ns = min(first_ns, int(stamp_ns.min()))
@@ -220,18 +226,25 @@ def plan_bag(
                         raise BagError(f"{path}: {error}") from None
             report(source.messages, total, f"counting {path}")
 
-    rate = _check_rate(source, samples, (last_ns - first_ns) / SECOND, choices.fps)
+    covered_s = (last_ns - first_ns) / SECOND
+    rate = _check_rate(
+        source,
+        samples,
+        covered_s,
+        choices.fps,
+    )
     used = [episode for episode in episodes if episode.rows]
     for episode in used:
         episode.finish()
         _check_depth(source, episode, math.ceil(rate / choices.fps))
+    known_rows = int(samples.sum())
     return BagPlan(
         path=path,
         skin=source.skin,
         episodes=used,
         rate=rate,
-        outside=int(samples.sum()) - sum(episode.rows for episode in used),
-        unknown=source.rows - int(samples.sum()),
+        outside=known_rows - sum(episode.rows for episode in used),
+        unknown=source.rows - known_rows,
         empty=len(episodes) - len(used),
     )
 
@@ -259,7 +272,8 @@ def _check_rate(
         )
     rate = float(np.median(several - 1)) / seconds
     # n samples bound n - 1 periods.
-    max_fps = math.floor(rate * (1 + 1 / int(several.min())))
+    fewest = int(several.min())
+    max_fps = math.floor(rate * (1 + 1 / fewest))
     if max_fps < 1:
         raise BagError(
             f"{path}: the cubes were sampled {rate:.2g} times per second; LeRobot counts "
@@ -281,7 +295,8 @@ def _check_depth(
     """Check that no frame has far more samples than usual, which would lengthen every window."""
     depth = int(episode.counts.max())
     if depth > MAX_DEPTH_RATIO * usual + TOLERANCE:
-        frame, cube = np.unravel_index(episode.counts.argmax(), episode.counts.shape)
+        deepest = episode.counts.argmax()
+        frame, cube = np.unravel_index(deepest, episode.counts.shape)
         raise BagError(
             f"{source.bag.path}: {depth} samples of cube {source.skin.names[cube]} in frame "
             f"{frame}, usual are {usual}: stamps do not follow time; leave that time out with "
@@ -298,9 +313,14 @@ def _marked_spans(bag: Bag, topic: str) -> list[tuple[int, int, str]]:
     if topic not in bag.topics(MARK):
         names = ", ".join(bag.topics(MARK)) or "none"
         raise BagError(f"{bag.path}: no marks ({MARK}) on {topic}; topics of that type: {names}")
-    marks = [(entry.time_ns, bag.decode(entry).data.strip()) for entry in bag.entries({topic})]
-    bounded = pairwise([*marks, (MAX_NS, "")])
-    spans = [(since_ns, until_ns, task) for (since_ns, task), (until_ns, _) in bounded if task]
+    marks = []
+    for entry in bag.entries({topic}):
+        text = bag.decode(entry).data.strip()
+        marks.append((entry.time_ns, text))
+    marks.append((MAX_NS, ""))
+    spans = [
+        (since_ns, until_ns, task) for (since_ns, task), (until_ns, _) in pairwise(marks) if task
+    ]
     if not spans:
         raise BagError(f"{bag.path}: no mark on {topic} begins an episode; publish its task there")
     return spans

@@ -6,7 +6,13 @@ import numpy as np
 
 from ..core.arrays import AnyArray, Array
 
-QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+QUANTILES = {
+    "q01": 0.01,
+    "q10": 0.10,
+    "q50": 0.50,
+    "q90": 0.90,
+    "q99": 0.99,
+}
 """Quantiles by LeRobot's names."""
 
 MAX_SAMPLE_ROWS = 10_000
@@ -35,18 +41,25 @@ class Statistics:
         values = rows.astype(np.float64)
         known = np.isfinite(values)
         count = known.sum(axis=0)
-        mean = np.where(known, values, 0).sum(axis=0) / np.maximum(count, 1)
-        squares = (np.where(known, values - mean, 0) ** 2).sum(axis=0)
+        total = np.where(known, values, 0).sum(axis=0)
+        mean = total / np.maximum(count, 1)
+        deviation = np.where(known, values - mean, 0)
+        squares = (deviation**2).sum(axis=0)
 
         # Means and squares of two parts are joined as in Chan, Golub and LeVeque (1983).
-        total = np.maximum(self._count + count, 1)
+        # Sums of squares of large numbers would lose the small deviations.
+        both = np.maximum(self._count + count, 1)
         difference = mean - self._mean
-        self._squares += squares + difference**2 * self._count * count / total
-        self._mean += difference * count / total
+        self._squares += squares + difference**2 * self._count * count / both
+        self._mean += difference * count / both
         self._count += count
-        self._min = np.minimum(self._min, np.where(known, values, np.inf).min(axis=0))
-        self._max = np.maximum(self._max, np.where(known, values, -np.inf).max(axis=0))
-        self._sample.append(values[self._random.random(len(rows)) < self._share])
+
+        smallest = np.where(known, values, np.inf).min(axis=0)
+        largest = np.where(known, values, -np.inf).max(axis=0)
+        self._min = np.minimum(self._min, smallest)
+        self._max = np.maximum(self._max, largest)
+        is_chosen = self._random.random(len(rows)) < self._share
+        self._sample.append(values[is_chosen])
 
     def result(self, frames: int) -> dict[str, AnyArray]:
         """Return the statistics by LeRobot's names.
@@ -55,7 +68,8 @@ class Statistics:
             frames: Number of frames, by which LeRobot weighs data sets that it joins.
         """
         is_empty = self._count == 0
-        deviation = np.sqrt(self._squares / np.maximum(self._count, 1))
+        variance = self._squares / np.maximum(self._count, 1)
+        deviation = np.sqrt(variance)
         result = {
             "min": np.where(is_empty, 0, self._min),
             "max": np.where(is_empty, 0, self._max),
@@ -68,7 +82,6 @@ class Statistics:
             sample = self._mean[np.newaxis]
         columns = [column[np.isfinite(column)] for column in sample.T]
         for name, share in QUANTILES.items():
-            result[name] = np.array(
-                [np.quantile(column, share) if len(column) else 0.0 for column in columns]
-            )
+            quantiles = [np.quantile(column, share) if len(column) else 0.0 for column in columns]
+            result[name] = np.array(quantiles)
         return result

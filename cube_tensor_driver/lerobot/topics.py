@@ -69,9 +69,12 @@ class Signal:
         They are NaN before the first message, and for names that the bag does not have.
         """
         frames = np.arange(first, last)
-        newest = np.searchsorted(episode.frame_of(self.stamp_ns), frames, side="right") - 1
+        # What is stamped in a frame belongs to it, as samples do.
+        frame_of_message = episode.frame_of(self.stamp_ns)
+        newest = np.searchsorted(frame_of_message, frames, side="right") - 1
         has_value = newest >= 0
-        found = np.full((len(frames), len(names)), np.nan, np.float32)
+        shape = (len(frames), len(names))
+        found = np.full(shape, np.nan, np.float32)
         for column, name in enumerate(names):
             if name in self.names:
                 values = self.values[:, self.names.index(name)]
@@ -108,7 +111,12 @@ class TopicReader:
         for name, topic in self._topics.items():
             source = self._sources[name]
             if isinstance(source, Signal):
-                found[topic.key] = source.at(episode, first, last, topic.names)
+                found[topic.key] = source.at(
+                    episode,
+                    first,
+                    last,
+                    topic.names,
+                )
             else:
                 found[topic.key] = source.at(episode, first, last)
         return found
@@ -124,10 +132,12 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
     names: dict[str, dict[str, None]] = {}
     shapes: dict[str, Shape] = {}
     existing: set[str] = set()
-    wanted = {*(choices.topics or ()), choices.state, choices.action} - {None}
+    wanted = set(choices.topics or ())
+    wanted |= {topic for topic in (choices.state, choices.action) if topic}
     for path in paths:
         with Bag(path) as bag:
-            prefix = (choices.frequencies or f"{bag.skin()}frequencies").removesuffix("frequencies")
+            frequencies = choices.frequencies or f"{bag.skin()}frequencies"
+            prefix = frequencies.removesuffix("frequencies")
             for topic, msgtype in _stamped_topics(bag, prefix):
                 existing.add(topic)
                 if choices.topics is not None and topic not in wanted:
@@ -140,9 +150,11 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
                 if msgtype in IMAGES:
                     shapes.setdefault(topic, ImageStream(bag, topic).shape)
                 else:
+                    # Bags may be about different joints: the feature has the names of all.
                     found = read_signal(bag, topic, msgtype).names
-                    names.setdefault(topic, {}).update(dict.fromkeys(found))
-    missing = sorted(topic for topic in wanted if topic and topic not in msgtypes)
+                    known = names.setdefault(topic, {})
+                    known.update(dict.fromkeys(found))
+    missing = sorted(wanted - msgtypes.keys())
     if missing:
         raise BagError(
             f"{paths[0]}: no images and no stamped numbers on {', '.join(missing)}; there are "
@@ -154,7 +166,9 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
     joints = [
         topic for topic, msgtype in used.items() if msgtype == JOINTS and topic != choices.action
     ]
-    state = choices.state or (joints[0] if len(joints) == 1 else None)
+    # Of several robots nobody but the user can tell whose state is meant.
+    only_joints = joints[0] if len(joints) == 1 else None
+    state = choices.state or only_joints
     keys = {state: STATE, choices.action: ACTION}
     return {
         topic: Topic(
@@ -191,14 +205,18 @@ def read_signal(
         messages.append((stamp_ns(message), numbers))
     messages.sort(key=lambda one: one[0])
 
-    values = np.full((len(messages), len(names)), np.nan, np.float32)
+    shape = (len(messages), len(names))
+    values = np.full(shape, np.nan, np.float32)
     for row, (_, numbers) in zip(values, messages, strict=True):
-        row[[names[name] for name in numbers]] = list(numbers.values())
+        columns = [names[name] for name in numbers]
+        row[columns] = list(numbers.values())
     # A message about some of the joints leaves the others as they were.
     rows = np.arange(len(values))[:, np.newaxis]
-    newest = np.maximum.accumulate(np.where(np.isnan(values), 0, rows), axis=0)
+    rows_with_value = np.where(np.isnan(values), 0, rows)
+    newest = np.maximum.accumulate(rows_with_value, axis=0)
     values = np.take_along_axis(values, newest, axis=0)
-    return Signal(list(names), np.array([stamp for stamp, _ in messages], np.int64), values)
+    stamps = np.array([stamp for stamp, _ in messages], np.int64)
+    return Signal(list(names), stamps, values)
 
 
 def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
@@ -206,19 +224,20 @@ def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
 
     The topics of single cubes, below the prefix `skin`, repeat what the stress says.
     """
-    return sorted(
-        (one.topic, one.msgtype)
-        for one in bag.connections
-        if one.msgcount
-        and not one.topic.startswith(f"{skin}cubes/")
-        and (one.msgtype in (JOINTS, *IMAGES) or _number_names(bag, one.msgtype))
-    )
+    found = []
+    for one in bag.connections:
+        is_of_cube = one.topic.startswith(f"{skin}cubes/")
+        is_usable = one.msgtype in (JOINTS, *IMAGES) or _number_names(bag, one.msgtype)
+        if one.msgcount and is_usable and not is_of_cube:
+            found.append((one.topic, one.msgtype))
+    return sorted(found)
 
 
 def _number_names(bag: Bag, msgtype: str) -> list[str]:
     """Return the names of a type's numbers; none without a header, or with a list of any length."""
     fields = bag.fields(msgtype)
-    if msgtype.startswith(PACKAGE) or not fields or fields[0][1] != (Nodetype.NAME, HEADER):
+    has_header = bool(fields) and fields[0][1] == (Nodetype.NAME, HEADER)
+    if not has_header or msgtype.startswith(PACKAGE):
         return []
     names = list(_numbers(bag, fields[1:], ""))
     return [] if None in names else [name for name in names if name]
@@ -260,7 +279,9 @@ def _joint_numbers(message: Any, where: str) -> dict[str, float]:
 def _value(message: Any, name: str) -> float:
     """Return the number of a message that a path such as ``wrench.force.x`` names."""
     for part in name.split("."):
-        message = message[int(part)] if part.isdigit() else getattr(message, part)
+        # A part of digits is a place in an array; no field has such a name.
+        is_place = part.isdigit()
+        message = message[int(part)] if is_place else getattr(message, part)
     return float(message)
 
 

@@ -49,8 +49,10 @@ class Windows:
         """
         self.done = 0
         self._counts, self._depth = counts, depth
-        values = depth * counts.shape[1] * (len(COMPONENTS) + len(COLUMNS))
-        self._block = min(MAX_BLOCK_FRAMES, max(1, MAX_BLOCK_BYTES // (4 * values)))
+        columns = len(COMPONENTS) + len(COLUMNS)
+        frame_bytes = 4 * columns * depth * counts.shape[1]
+        fitting = max(1, MAX_BLOCK_BYTES // frame_bytes)
+        self._block = min(MAX_BLOCK_FRAMES, fitting)
         self._waiting: list[tuple[Index, StressRows]] = []
 
     def add(self, frame: Index, rows: StressRows) -> None:
@@ -62,14 +64,21 @@ class Windows:
         while self.done < len(self._counts):
             block = self._counts[self.done : self.done + self._block]
             end = self.done + len(block)
-            ready = sum(int(np.count_nonzero(frame < end)) for frame, _ in self._waiting)
-            if ready < int(block.sum(dtype=np.int64)):
+            # Late links are waited for: the first pass has counted how many rows there are.
+            expected = int(block.sum(dtype=np.int64))
+            ready = sum(np.count_nonzero(frame < end) for frame, _ in self._waiting)
+            if ready < expected:
                 return
             frame = np.concatenate([one for one, _ in self._waiting])
             rows = concatenate([one for _, one in self._waiting])
             inside = frame < end
-            windows = self._arrange(block, frame[inside] - self.done, rows.select(inside))
-            self._waiting = [(frame[~inside], rows.select(~inside))]
+            windows = self._arrange(
+                block,
+                frame[inside] - self.done,
+                rows.select(inside),
+            )
+            later = ~inside
+            self._waiting = [(frame[later], rows.select(later))]
             self.done = end
             yield windows
 
@@ -91,16 +100,21 @@ class Windows:
         order = np.argsort(cell, kind="stable")
         cell = cell[order]
         # Rows of one cell stand together now: a row's rank in it is its distance from the first.
-        rank = np.arange(len(cell)) - np.searchsorted(cell, cell)
-        slot = self._depth - counts.reshape(-1).astype(np.intp)[cell] + rank
+        first_of_cell = np.searchsorted(cell, cell)
+        rank = np.arange(len(cell)) - first_of_cell
+        # The newest sample stands at the end of the window.
+        in_cell = counts.reshape(-1).astype(np.intp)[cell]
+        slot = self._depth - in_cell + rank
         place = cell // n_cubes, slot, cell % n_cubes
 
         shape = (n_frames, self._depth, n_cubes)
+        components = np.hstack([rows.stress, rows.gradient])
         tactile = np.full((*shape, len(COMPONENTS)), np.nan, np.float32)
-        tactile[place] = np.hstack([rows.stress, rows.gradient])[order]
+        tactile[place] = components[order]
         windows: dict[str, AnyArray] = {TACTILE: tactile}
         for name, kind in COLUMNS.items():
-            column = np.full(shape, np.nan if kind is np.float32 else 0, kind)
+            empty = np.nan if kind is np.float32 else 0
+            column = np.full(shape, empty, kind)
             column[place] = getattr(rows, name)[order]
             windows[f"{TACTILE}.{name}"] = column
         windows[f"{TACTILE}.count"] = counts.astype(np.int64)

@@ -17,7 +17,12 @@ from ...core.errors import BagError, ConfigError, CubeError
 from .contacts import ContactsOverTime
 from .job import PARTIAL, Overrides, ReprocessJob, ReprocessResult, reprocess
 
-SUFFIXES = {"bag": "", "parquet": ".parquet", "csv": ".csv", "zarr": ".zarr"}
+SUFFIXES = {
+    "bag": "",
+    "parquet": ".parquet",
+    "csv": ".csv",
+    "zarr": ".zarr",
+}
 """Suffix of the output, by its format."""
 
 RECIPE = "reprocess.yaml"
@@ -79,7 +84,8 @@ def write_recipe(
         "tare_from_s": list(overrides.tare) if overrides.tare else None,
     }
     if contacts is not None:
-        recipe["contacts"] = {**asdict(contacts.settings), "rate": contacts.rate}
+        settings = asdict(contacts.settings)
+        recipe["contacts"] = {**settings, "rate": contacts.rate}
     path = folder / RECIPE
     if path.exists() and has_results(folder):
         if read_yaml(path) != recipe:
@@ -96,7 +102,8 @@ def write_recipe(
 
 def has_results(folder: Path) -> bool:
     """Return whether a folder of results has any."""
-    return any(path.name not in (RECIPE, PARTIAL) for path in folder.iterdir())
+    names = {path.name for path in folder.iterdir()}
+    return bool(names - {RECIPE, PARTIAL})
 
 
 def remove_without_results(folder: Path) -> None:
@@ -151,4 +158,5 @@ def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
 
 def useful_workers(wanted: int | None, jobs: int) -> int:
     """Return the number of workers: as wanted (None: one per core), but at most one per job."""
-    return max(1, min(wanted or os.cpu_count() or 1, jobs))
+    cores = os.cpu_count() or 1
+    return max(1, min(wanted or cores, jobs))

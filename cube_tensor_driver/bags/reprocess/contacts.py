@@ -94,13 +94,16 @@ class ContactWriter:
         for number, stamp_ns in enumerate(messages.stamp_ns.tolist()):
             if not self._is_due(stamp_ns):
                 continue
+            # Rows of the messages since the last one that was due come in, too.
             end = (number + 1) * rows_per_message
-            self._latest.update(stress.select(slice(begin, end)), stamp_ns * 1e-9)
+            rows = stress.select(slice(begin, end))
+            self._latest.update(rows, stamp_ns * 1e-9)
             begin = end
             self._write(stamp_ns, int(recorded_ns[number]))
         if begin < len(stress):
             last_ns = int(messages.stamp_ns[-1])
-            self._latest.update(stress.select(slice(begin, len(stress))), last_ns * 1e-9)
+            rows = stress.select(slice(begin, len(stress)))
+            self._latest.update(rows, last_ns * 1e-9)
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Return whether a period has passed since the last message, or time jumped back."""
@@ -114,7 +117,8 @@ class ContactWriter:
         """Write the contacts of the newest stress."""
         if self._finder is None:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
-        values = self._latest.usable_values(self._latest.health(stamp_ns * 1e-9, STALE_S))
+        health = self._latest.health(stamp_ns * 1e-9, STALE_S)
+        values = self._latest.usable_values(health)
         contacts = self._finder.update(values, self._latest.left_out)
         message = contacts_message(make_message, stamp_ns, self._frame_id, contacts)
         self._writer.write(self._contacts, recorded_ns, serialise(message))

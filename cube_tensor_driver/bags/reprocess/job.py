@@ -63,7 +63,8 @@ class Overrides:
     @property
     def any(self) -> bool:
         """Whether anything differs."""
-        return any(value is not None for value in (self.calibration, self.skin, self.tare))
+        values = (self.calibration, self.skin, self.tare)
+        return any(value is not None for value in values)
 
 
 AS_RECORDED = Overrides()
@@ -153,7 +154,8 @@ def reconstruct(
     Raises:
         BagError: The bag is damaged, or the overrides do not fit.
     """
-    return _reconstruct(source, settings_with(source, overrides), use_health=not overrides.any)
+    settings = settings_with(source, overrides)
+    return _reconstruct(source, settings, use_health=not overrides.any)
 
 
 def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
@@ -218,14 +220,19 @@ def _write_skin(
     infos = list(_infos_with(source.recording.infos, settings))
     for info in infos:
         # An info may be stamped before the first message that was recorded.
-        inside_ns = max(bag.start_ns, min(bag.end_ns, stamp_ns(info)))
+        inside_ns = min(bag.end_ns, stamp_ns(info))
+        inside_ns = max(bag.start_ns, inside_ns)
         writer.write(f"{skin}info", inside_ns, serialise(info))
 
-    contacts = None if job.contacts is None else ContactWriter(writer, skin, job.contacts)
-    for segment, stress in _reconstruct(source, settings, use_health=not job.overrides.any):
+    contacts = None
+    if job.contacts is not None:
+        contacts = ContactWriter(writer, skin, job.contacts)
+    use_health = not job.overrides.any
+    for segment, stress in _reconstruct(source, settings, use_health=use_health):
         messages = segment.messages
         encoded = stress_codec.encode_many(stress, messages.stamp_ns, messages.frame_id)
-        for time_ns, data in zip(segment.recorded_ns.tolist(), encoded, strict=True):
+        times_ns = segment.recorded_ns.tolist()
+        for time_ns, data in zip(times_ns, encoded, strict=True):
             writer.write(f"{skin}stress", time_ns, data)
         if contacts is not None:
             contacts.set_up(infos[segment.number])
@@ -330,30 +337,38 @@ def _measure_rest(
     bag = source.bag
     pipeline = Pipeline(settings.calibrations)
     exists = np.isfinite(settings.rest_frequency)
-    total, count = np.zeros(exists.shape), np.zeros(exists.shape)
-    begin_ns, end_ns = (bag.start_ns + round(time * 1e9) for time in (begin_s, end_s))
+    total = np.zeros(exists.shape)
+    count = np.zeros(exists.shape)
+    begin_ns = bag.start_ns + round(begin_s * 1e9)
+    end_ns = bag.start_ns + round(end_s * 1e9)
     for messages, _ in bag.frequencies(source.topic):
         rows = messages.rows
         inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
-        rows = rows.select(inside & (rows.cube < len(exists)))
+        is_known = rows.cube < len(exists)
+        rows = rows.select(inside & is_known)
         if not len(rows):
             continue
         cube = rows.cube.astype(np.intp)
         frequency = rows.frequency / pipeline.temperature_factor(cube, rows.temperature)
-        is_faulty = rows.pad_fault[:, None] >> np.arange(frequency.shape[1]) & 1 > 0
+        pads = np.arange(frequency.shape[1])
+        is_faulty = rows.pad_fault[:, np.newaxis] >> pads & 1 > 0
         is_usable = np.isfinite(frequency) & (frequency > 0) & ~is_faulty
-        np.add.at(total, cube, np.where(is_usable, frequency, 0))
+        usable = np.where(is_usable, frequency, 0)
+        np.add.at(total, cube, usable)
         np.add.at(count, cube, is_usable)
 
-    unmeasured = np.flatnonzero((exists & (count == 0)).any(axis=1))
+    lacks_pads = (exists & (count == 0)).any(axis=1)
+    unmeasured = np.flatnonzero(lacks_pads)
     if len(unmeasured):
-        names = ", ".join(source.skin.cubes[cube].name for cube in unmeasured[:MAX_NAMED_CUBES])
+        named = unmeasured[:MAX_NAMED_CUBES]
+        names = ", ".join(source.skin.cubes[cube].name for cube in named)
         seconds = (bag.end_ns - bag.start_ns) * 1e-9
         raise BagError(
             f"{bag.path}: --tare-from {begin_s:g} {end_s:g}: not every pad of {names} was "
             f"measured in that time; the bag lasts from 0 to {seconds:.3f} s"
         )
-    return np.where(exists, total / np.maximum(count, 1), np.nan)
+    mean = total / np.maximum(count, 1)
+    return np.where(exists, mean, np.nan)
 
 
 def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
@@ -382,11 +397,13 @@ def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
                 strict=True,
             )
         ]
+        texts = [calibration_text(current.calibrations[cube]) for cube in first_cube.values()]
+        covariance = np.array([covariances[name] for name in first_cube])
         yield replace(
             info,
             sender="reconstruction",
             cubes=cubes,
             calibration_ids=list(first_cube),
-            calibrations=[calibration_text(current.calibrations[n]) for n in first_cube.values()],
-            covariance=np.array([covariances[name] for name in first_cube]).ravel(),
+            calibrations=texts,
+            covariance=covariance.ravel(),
         )
