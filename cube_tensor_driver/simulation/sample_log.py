@@ -16,7 +16,7 @@ import numpy as np
 from ..config.output_files import atomic_write
 from ..core.arrays import Index, Times
 from ..core.errors import ConfigError
-from ..core.matching import SampleKeys, SampleRows, match_rows
+from ..core.matching import NO_MATCH, SampleKeys, SampleRows, match_rows
 from .faults import Fault
 
 ABSENT = -1
@@ -209,15 +209,24 @@ class SampleTable:
     def __len__(self) -> int:
         return len(self.link)
 
-    def match(self, rows: SampleRows) -> Index:
+    def match(self, rows: SampleRows, among: Index | None = None) -> Index:
         """Find the sample of each row (N,), or `NO_MATCH` for what no hub took.
 
         A hub that restarts gives its numbers again. Among the samples with the number of the row,
         the one whose time is nearest to the row's stamp is chosen.
+
+        Args:
+            rows: The rows.
+            among: Indices of the samples to search, all of them by default.
         """
-        known = SampleKeys(self.link, self.number % SEQUENCE_RANGE, self.time_ns)
-        link = self.link_of_cube[rows.cube]
-        return match_rows(known, SampleKeys(link, rows.sequence, rows.stamp_ns))
+        if among is None:
+            among = np.arange(len(self))
+        number = self.number[among] % SEQUENCE_RANGE
+        known = SampleKeys(self.link[among], number, self.time_ns[among])
+        wanted = SampleKeys(self.link_of_cube[rows.cube], rows.sequence, rows.stamp_ns)
+        found = match_rows(known, wanted)
+        # `NO_MATCH` is -1, so it selects the appended element.
+        return np.append(among, NO_MATCH)[found]
 
     def rows_taken(self, start_ns: int, end_ns: int) -> int:
         """Count the rows (one cube, one sample) taken from `start_ns` to before `end_ns`."""

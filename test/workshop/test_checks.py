@@ -1,4 +1,4 @@
-"""The judge of torture finds each thing that is wrong, and nothing where nothing is."""
+"""The checks of torture find each thing that is wrong, and nothing where nothing is."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.simulation.faults import Fault
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
-from workshop.checks.expected import Expected, load_tables
-from workshop.checks.record import CubeMessages, Deed, Received, Record
-from workshop.checks.rest import MARGIN_NS
+from workshop.checks.all_checks import check_all
+from workshop.checks.expected import ExpectedReadings, load_tables
+from workshop.checks.record import Action, CubeMessages, Received, Record
+from workshop.checks.rest import TRANSPORT_S
 from workshop.checks.samples import Samples
-from workshop.checks.verdict import judge
 
 INSTANTS, COUNT, PERIOD_US, EACH = 400, 2000, 2000, 2
 FAULTS = {
@@ -62,15 +62,15 @@ def played(tmp_path_factory):
     return recorded(skin, SampleLog(0, links, RECORDS))
 
 
-def recorded(skin, log, deeds=(), rest_after=None):
+def recorded(skin, log, actions=(), rest_after=None):
     """(record, log) of what a program without a fault makes of a log.
 
     rest_after: (wall clock in ns, rest frequencies of all cubes) of a tare
     """
     samples = Samples(log)
-    expected = Expected(skin, log, samples, INSTANTS)
+    expected = ExpectedReadings(skin, samples, INSTANTS)
     order = np.argsort(samples.time_us, kind="stable")
-    order = order[~samples.damaged[order]]
+    order = order[~samples.is_damaged[order]]
     cube = (EACH * samples.link[order, None] + np.arange(EACH)).ravel().astype(np.uint16)
     of = np.repeat(order, EACH)
     readings = expected.of(cube, of)
@@ -97,7 +97,7 @@ def recorded(skin, log, deeds=(), rest_after=None):
         frequencies=received(frequencies),
         stress=received(stress),
         cube_messages=CubeMessages(0, frozenset({skin.frame(skin.cubes[0])}), (), ()),
-        deeds=deeds,
+        actions=actions,
         counters={
             "lost_on_the_way": 1,
             "dropped_in_hub": 0,
@@ -127,7 +127,7 @@ def found(played, frequencies=None, stress=None, **counters):
     if stress is not None:
         record = replace(record, stress=received(stress))
     record = replace(record, counters={**record.counters, **counters})
-    figures = judge(record, log)
+    figures = check_all(record, log)
     return {name for name in WRONG if figures[name]}
 
 
@@ -141,7 +141,7 @@ def changed(rows, chosen=slice(None), **fields):
 
 def test_nothing_is_found_where_nothing_is_wrong(played):
     assert found(played) == set()
-    figures = judge(*played)
+    figures = check_all(*played)
     assert figures["faults_to_flag"] == len(FAULTS)
     assert figures["samples_sent"] - figures["delivered"] == EACH
 
@@ -207,8 +207,10 @@ def tared(played):
         rest = np.array([cube.calibration.rest_frequency for cube in skin.cubes])
         instant = start_us // PERIOD_US % INSTANTS
         rest[list(HELD_CUBES)] = readings[instant, HELD_CUBES] * 1e-3 * (1 + error)
-        deed = Deed("tare", TARED_NS, TARED_NS, True, cubes=HELD_CUBES)
-        return recorded(skin, held, (deed,), (TARED_NS, rest))
+        action = Action(
+            kind="tare", begin_ns=TARED_NS, end_ns=TARED_NS, succeeded=True, cubes=HELD_CUBES
+        )
+        return recorded(skin, held, (action,), (TARED_NS, rest))
 
     return make
 
@@ -224,8 +226,8 @@ def test_what_a_tare_of_a_load_that_did_not_stay_gives_is_not_judged(tared):
     record, log = tared(50e-6, 1_000_000_000)
     assert found((record, log)) == set()
     rows = record.stress.rows
-    after = (rows.stamp_ns >= TARED_NS - MARGIN_NS) & np.isin(rows.cube, HELD_CUBES)
-    assert judge(record, log)["tensors_not_judged"] == np.count_nonzero(after)
+    after = (rows.stamp_ns >= TARED_NS - round(1e9 * TRANSPORT_S)) & np.isin(rows.cube, HELD_CUBES)
+    assert check_all(record, log)["tensors_not_judged"] == np.count_nonzero(after)
     other_cube = 2
     wrong = changed(
         rows, np.flatnonzero(rows.cube == other_cube)[-1], stress=lambda stress: 1.1 * stress
@@ -246,7 +248,7 @@ def test_a_tensor_that_the_reconstruction_counts_as_lost_is_not_missing(played):
     rest = received(stress.select(stress.stamp_ns != stress.stamp_ns[ROW]))
     for said, figures in ((0, {"missing_tensors"}), (1, set()), (2, {"miscounted"})):
         said_so = replace(record, stress=rest, messages_lost=said)
-        assert {name for name in WRONG if judge(said_so, log)[name]} == figures
+        assert {name for name in WRONG if check_all(said_so, log)[name]} == figures
 
 
 def test_what_comes_to_a_reconstruction_that_is_down_has_no_tensor(played):
@@ -257,8 +259,10 @@ def test_what_comes_to_a_reconstruction_that_is_down_has_no_tensor(played):
     rest = received(record.stress.rows.select(~down))
     for late_ns, figures in ((0, set()), (-50_000_000, {"missing_tensors"})):
         begin_ns, end_ns = int(stamp_ns[ROW]) + 10_000_000, int(stamp_ns[down].max()) + late_ns
-        deed = Deed("restart reconstruction", begin_ns, end_ns, True)
-        killed = judge(replace(record, stress=rest, deeds=(deed,)), log)
+        action = Action(
+            kind="restart reconstruction", begin_ns=begin_ns, end_ns=end_ns, succeeded=True
+        )
+        killed = check_all(replace(record, stress=rest, actions=(action,)), log)
         assert {name for name in WRONG if killed[name]} == figures
 
 
@@ -266,12 +270,12 @@ def test_what_a_driver_counted_just_before_it_was_killed_is_not_known(played):
     record, log = played
     stamp_ns = record.frequencies.rows.stamp_ns
     dead_ns = int(stamp_ns[-1]) + 1
-    dead = Deed("restart driver", dead_ns, dead_ns, True)
+    dead = Action(kind="restart driver", begin_ns=dead_ns, end_ns=dead_ns, succeeded=True)
     for unsaid_ns, figures in ((1_400_000_000, set()), (1_600_000_000, {"miscounted"})):
         unsaid = np.count_nonzero(stamp_ns > dead_ns - unsaid_ns)
         counters = {**record.counters, "rows published": len(stamp_ns) - int(unsaid)}
-        killed = replace(record, counters=counters, deeds=(dead,))
-        assert {name for name in WRONG if judge(killed, log)[name]} == figures
+        killed = replace(record, counters=counters, actions=(dead,))
+        assert {name for name in WRONG if check_all(killed, log)[name]} == figures
 
 
 def test_what_did_not_come_here_is_nobodys_fault(played):
@@ -285,6 +289,6 @@ def test_what_did_not_come_here_is_nobodys_fault(played):
         frequencies=received(frequencies.select(rest), gaps=((4000, 100),)),
         counters={**record.counters},
     )
-    figures = judge(record, log)
+    figures = check_all(record, log)
     assert figures["missed_by_judge"] == 100
     assert {name for name in WRONG if figures[name]} == set()

@@ -49,7 +49,8 @@ def random_bytes(size: int) -> bytes:
 
 
 def random_zeros_and_ones(size: int) -> bytes:
-    return np.random.default_rng(4).integers(0, 2, size).astype(np.uint8).tobytes()
+    bits = np.random.default_rng(4).integers(0, 2, size)
+    return bytes(bits.tolist())
 
 
 # The shortest run that could be a frame, and fails in its last byte.

@@ -1,6 +1,6 @@
-"""Checks of torture: what a skin published, compared with what its simulated hubs did.
+"""Checks of a torture: what a skin published, compared with what its simulated hubs did.
 
-One comparison per file; `verdict.py` puts them together. What was sent comes from the sample log,
-what arrived from a record of both topics. What the driver counts is a claim that is checked.
-Nothing here imports ROS.
+One comparison per file; `all_checks.py` puts them together. What was sent comes from the sample log
+of the simulator, what arrived from a record of both topics. What the driver counts is a statement
+that is checked, too. Nothing here imports ROS.
 """

@@ -1,63 +1,61 @@
-"""Compares messages of one cube's own topics with the rows of `stress` of the same stamp."""
+"""Check of one cube's own topics: their messages against the rows of `stress` of the same stamp."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.status import INVALID
 from cube_tensor_driver.core.tensor import contact_wrench
 
-from .record import Record, Tensor, Wrench
+from .record import Tensor, Wrench
+from .run import Findings, Run
 
-RELATIVE = 1e-5
-"""float32 on one side, double precision on the other."""
+MAX_RELATIVE_ERROR = 1e-5
+"""Largest relative difference: a row of `stress` has float32, a message of one cube float64."""
 
 
-def judge_cube_topics(record: Record) -> dict[str, int]:
-    """How many messages were compared, and how many of them are like no row of their stamp."""
-    messages, skin = record.cube_messages, record.skin
-    rows = record.stress.rows
-    mine = rows.select(np.flatnonzero(rows.cube == messages.cube))
-    # Rows that come late may have the stamp of the one before.
-    places: dict[int, list[int]] = {}
-    for place, stamp_ns in enumerate(mine.stamp_ns.tolist()):
-        places.setdefault(stamp_ns, []).append(place)
+def check_cube_topics(run: Run) -> Findings:
+    """Count the messages, and those that agree with no row of their stamp."""
+    record, skin = run.record, run.record.skin
+    messages, rows = record.cube_messages, record.stress.rows
+    rows = rows.select(np.flatnonzero(rows.cube == messages.cube))
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float64)
-    side = 2 * skin.cubes[messages.cube].calibration.half_side
+    cube = skin.cubes[messages.cube]
 
     def is_tensor_of(message: Tensor, row: int) -> bool:
         _, values, residual, status, observed, covariance = message
-        wanted = pipeline.covariance(messages.cube, int(mine.left_out[row])).ravel()
-        return (
-            _near(values, np.concatenate([mine.stress[row], mine.gradient[row]]))
-            and _near(residual, mine.residual[row])
-            and status == mine.status[row]
-            and observed == mine.observed[row]
-            and _near(covariance, wanted)
-        )
+        wanted = pipeline.covariance(messages.cube, int(rows.left_out[row]))
+        has_bits = status == rows.status[row] and observed == rows.observed[row]
+        components = np.concatenate([rows.stress[row], rows.gradient[row]])
+        is_near = _is_near(values, components) and _is_near(residual, rows.residual[row])
+        return has_bits and is_near and _is_near(covariance, wanted.ravel())
 
     def is_wrench_of(message: Wrench, row: int) -> bool:
         one = slice(row, row + 1)
-        force, torque = contact_wrench(mine.stress[one], mine.gradient[one], side)
-        is_valid = mine.status[row] & INVALID == 0
-        return bool(is_valid) and _near(message[1], np.concatenate([force[0], torque[0]]))
+        side = 2 * cube.calibration.half_side
+        wanted = contact_wrench(rows.stress[one], rows.gradient[one], side)
+        # A row without components gives no wrench.
+        is_valid = rows.status[row] & INVALID == 0
+        return bool(is_valid) and _is_near(message[1], np.concatenate(wanted, axis=1)[0])
 
-    right = [
-        any(is_tensor_of(tensor, row) for row in places.get(tensor[0], ()))
-        for tensor in messages.tensors
-    ]
-    right += [
-        any(is_wrench_of(wrench, row) for row in places.get(wrench[0], ()))
-        for wrench in messages.wrenches
-    ]
-    wrong = len(messages.frame_ids - {skin.frame(skin.cubes[messages.cube])})
-    if not record.stress.gaps:  # else the row of a message may not have come here
-        wrong += right.count(False)
-    return {"cube_messages": len(right), "wrong_cube_messages": wrong}
+    def find(message: Tensor | Wrench) -> list[int]:
+        """Return the rows of a stamp; a row that comes late may have the stamp of another one."""
+        places: list[int] = np.flatnonzero(rows.stamp_ns == message[0]).tolist()
+        return places
+
+    agrees = [any(is_tensor_of(one, row) for row in find(one)) for one in messages.tensors]
+    agrees += [any(is_wrench_of(one, row) for row in find(one)) for one in messages.wrenches]
+    wrong = len(messages.frame_ids - {skin.frame(cube)})
+    # Where messages of `stress` are missing here, the row of a message may be missing, too.
+    if not record.stress.gaps:
+        wrong += agrees.count(False)
+    return Findings({"cube_messages": len(agrees), "wrong_cube_messages": wrong}, [])
 
 
-def _near(found: object, wanted: object) -> bool:
-    one, other = np.asarray(found, float), np.asarray(wanted, float)
-    scale = np.nan_to_num(np.abs(other)).max(initial=0.0)
-    return bool(np.allclose(one, other, rtol=RELATIVE, atol=1e-9 * scale, equal_nan=True))
+def _is_near(found: ArrayLike, wanted: ArrayLike) -> bool:
+    """Compare numbers of different precision."""
+    scale = np.nan_to_num(np.abs(np.asarray(wanted, float))).max(initial=0.0)
+    tolerance = {"rtol": MAX_RELATIVE_ERROR, "atol": 1e-9 * scale}
+    return bool(np.allclose(found, wanted, equal_nan=True, **tolerance))

@@ -1,180 +1,227 @@
-"""What each pad read in each sample: from the load, and from the faults of the sample log alone.
+"""Expected reading of each pad in each sample, from the load and the sample log alone.
 
-The hubs repeat a table of instants of the load. Faults that last change its readings; noise depends
-on the time alone, so that it can be computed again.
+The hubs repeat a table of instants of the load. Faults that last change its readings. The noise of
+a fault depends on the time alone, so that it can be computed again.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cube_tensor_driver.config.skin import Skin
+from cube_tensor_driver.core.arrays import AnyArray, Array, Index, Mask, PadMasks, Single
+from cube_tensor_driver.core.matching import NO_MATCH
+from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.wire.protocol import TEMPERATURE_UNKNOWN
 from cube_tensor_driver.simulation.cubes import SimulatedCubes, skin_components
 from cube_tensor_driver.simulation.faults import PAD_FAULTS
 from cube_tensor_driver.simulation.injector import broken_reading, centi_celsius, warmed, warming
 from cube_tensor_driver.simulation.load import Load, default_script
-from cube_tensor_driver.simulation.sample_log import FaultRecord, SampleLog
 
-from .samples import Samples
+from .record import LATEST_NS, Span
+from .samples import HubFault, Samples
 
-EDGE_US = 5_000
-"""So near to the begin or end of a fault a sample may be of either side: the simulator is late now
-and then."""
+EDGE_NS = 5_000_000
+"""Time, in nanoseconds, around the begin and the end of a fault in which it may be present or not.
+
+The simulator carries a fault out late now and then.
+"""
+
+MIN_EQUAL_SHARE = 0.5
+"""Smallest share of a row's pads that must have the expected reading. With fewer, the row is taken
+for another sample of the same number."""
+
+CHUNK = 100_000
+"""Number of rows that are compared at a time, so that memory stays below 1 GB."""
+
+MILLIHERTZ = 1e-3
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What N rows should say.
+    """Values that N rows should have.
 
-    frequency: (N, P) Hz, NaN: not measured; certain: (N, P) bool, False near the edge of a fault
-    temperature: (N,) °C, NaN: unknown; pad_fault: (N,) bits, as far as `certain`
-    sound: (N,) bool, no pad is broken and the temperature is that of the calibration
-    instant: (N,) of the load
+    Attributes:
+        frequency: Frequency of each pad (N, P), in Hz; NaN where nothing is measured.
+        is_certain: False for pads near the begin or end of a fault (N, P).
+        temperature: Temperature (N,), in °C; NaN where it is unknown.
+        pad_fault: Bit p is set if the hub reports pad p (N,), as far as it is certain.
+        is_sound: Whether no pad is broken and the temperature is that of the calibration (N,).
+        instant: Index of the instant of the load (N,).
     """
 
-    frequency: NDArray[np.float32]
-    certain: NDArray[np.bool_]
-    temperature: NDArray[np.float32]
-    pad_fault: NDArray[np.uint32]
-    sound: NDArray[np.bool_]
-    instant: NDArray[np.int64]
+    frequency: Single
+    is_certain: Mask
+    temperature: Single
+    pad_fault: PadMasks
+    is_sound: Mask
+    instant: Index
 
 
-class Expected:
-    """The readings of a skin's cubes.
+@dataclass(frozen=True)
+class _SoundReadings:
+    """Readings (N, P) of unbroken pads in mHz, warming (N,) in K, and as in `Readings`."""
 
-    truth: (instants, cubes, 15) components of the load, Pa and Pa/m
+    millihertz: Any
+    warming: Array
+    instant: Index
+    is_certain: Mask
+
+
+class ExpectedReadings:
+    """Computes the readings of a skin's cubes.
+
+    Attributes:
+        truth: Components of the load (instants, cubes, 15), in Pa and Pa/m.
     """
 
-    def __init__(self, skin: Skin, log: SampleLog, samples: Samples, instants: int) -> None:
-        """instants: how many of the load the hubs repeat."""
-        self._samples, self._log = samples, log
+    def __init__(self, skin: Skin, samples: Samples, instants: int) -> None:
+        """instants: number of instants of the load that the hubs repeat."""
+        self._samples = samples
         self._millihertz, self.truth = load_tables(skin, instants)
-        n_cubes = len(skin.cubes)
-        self._link, self._place = np.zeros((2, n_cubes), np.int64)
-        for number, link in enumerate(log.links):
-            self._link[link.members] = number
-            self._place[link.members] = [link.cubes.index(cube) for cube in link.members]
-        self._number = {link.name: number for number, link in enumerate(log.links)}
-        self._by_link: list[list[FaultRecord]] = [[] for _ in log.links]
-        for record in log.faults:
-            self._by_link[self._number[record.fault.link]].append(record)
 
-    def records(self, *kinds: str) -> list[tuple[int, FaultRecord]]:
-        """Number of the link and record of the faults of some kinds, in order."""
-        return [
-            (self._number[record.fault.link], record)
-            for record in self._log.faults
-            if record.fault.kind in kinds
-        ]
+    def of(self, cube: AnyArray, sample: Index) -> Readings:
+        """Compute the readings of cubes (N,) in samples (N,)."""
+        sound = self._compute_sound(cube, sample)
+        millihertz, certain = sound.millihertz, sound.is_certain
+        time_ns = self._samples.time_ns[sample]
+        is_sound, pad_fault = sound.warming == 0, np.zeros(len(cube), np.uint32)
 
-    def link_of(self, cube: int) -> int:
-        """Number of the link that a cube is on."""
-        return int(self._link[cube])
-
-    def cube_of(self, record: FaultRecord) -> int:
-        """Index in the skin of the cube that the fault of a pad is on."""
-        return self._log.links[self._number[record.fault.link]].cubes[record.fault.cube]
-
-    def of(self, cube: NDArray[np.integer], sample: NDArray[np.int64]) -> Readings:
-        """The readings of cubes (N,) in samples (N,) of `Samples`."""
-        time_us, period_us = self._samples.time_us[sample], self._samples.period_us[sample]
-        link = self._link[cube]
-        load_us = time_us.copy()
-        certain = np.ones((len(cube), self._millihertz.shape[2]), bool)
-        for number, record in self.records("hold"):
-            mine = link == number
-            load_us[mine & _within(record, time_us)] = record.start_us
-            certain[mine & _near_edge(record, time_us)] = False
-        instant = load_us // period_us % len(self._millihertz)
-        millihertz = self._millihertz[instant, cube]
-        warmer = self._warmer(link, time_us, certain)
-        warm = warmer != 0
-        millihertz[warm] = warmed(millihertz[warm], warmer[warm, None])
-        sound, pad_fault = ~warm, np.zeros(len(cube), np.uint32)
-        for _, record in self.records(*PAD_FAULTS):
-            fault = record.fault
-            mine = cube == self.cube_of(record)
-            edge = mine & _near_edge(record, time_us)
-            certain[edge, fault.pad] = False
-            sound &= ~edge
-            rows = np.flatnonzero(mine & _within(record, time_us))
-            if not len(rows):
-                continue
-            sound[rows] = False
+        for fault in self._samples.faults(*PAD_FAULTS):
+            pad, mine = fault.fault.pad, cube == fault.cube
+            is_edge = mine & _is_at_edge(fault, time_ns)
+            certain[is_edge, pad] = False
+            rows = np.flatnonzero(mine & fault.contains(time_ns))
+            is_sound &= ~is_edge
+            is_sound[rows] = False
             if fault.kind == "report":
-                pad_fault[rows] |= np.uint32(1 << fault.pad)
-                continue
-            first = self._first_reading(record) if fault.kind == "stuck" else 0
-            readings = zip(
-                millihertz[rows, fault.pad].tolist(), time_us[rows].tolist(), strict=True
-            )
-            millihertz[rows, fault.pad] = [
-                broken_reading(fault, sound_mhz, first, at) for sound_mhz, at in readings
-            ]
-        frequency = (millihertz * 1e-3).astype(np.float32)
+                pad_fault[rows] |= np.uint32(1 << pad)
+            elif len(rows):
+                time_us = self._samples.time_us[sample[rows]]
+                millihertz[rows, pad] = self._break(fault, millihertz[rows, pad], time_us)
+
+        frequency = (millihertz * MILLIHERTZ).astype(np.float32)
         frequency[millihertz == 0] = np.nan
-        celsius = centi_celsius(warmer)
+        celsius = centi_celsius(sound.warming)
+        # The float32 product is that of the decoder, so that it can be compared to the bit.
         temperature = celsius.astype(np.float32) * np.float32(0.01)
         temperature[celsius == TEMPERATURE_UNKNOWN] = np.nan
-        return Readings(frequency, certain, temperature, pad_fault, sound, instant)
+        return Readings(frequency, certain, temperature, pad_fault, is_sound, sound.instant)
 
-    def held(self, cubes: list[int], begin_ns: int, end_ns: int) -> NDArray[np.float64] | None:
-        """(cubes, P) Hz that sound cubes of one link read all of a simulated time; None if their
-        load did not stay, or nothing was sampled."""
-        begin_us, end_us = begin_ns // 1000, end_ns // 1000
-        link, time_us = self._link[cubes[0]], self._samples.time_us
-        mine = (self._samples.link == link) & (time_us >= begin_us) & (time_us <= end_us)
+    def _compute_sound(self, cube: AnyArray, sample: Index) -> _SoundReadings:
+        """Compute the readings of cubes (N,) in samples (N,) without broken pads."""
+        samples = self._samples
+        link, time_ns, time_us = (
+            column[sample] for column in (samples.link, samples.time_ns, samples.time_us)
+        )
+        load_us = time_us.copy()
+        certain = np.ones((len(cube), self._millihertz.shape[2]), bool)
+
+        for fault in samples.faults("hold"):
+            mine = link == fault.link
+            load_us[mine & fault.contains(time_ns)] = fault.start_us
+            certain[mine & _is_at_edge(fault, time_ns)] = False
+        instant = load_us // samples.period_us[sample] % len(self._millihertz)
+
+        warmer = np.zeros(len(cube))
+        for fault in samples.faults("temperature"):
+            # A temperature lasts until the next one: the end of the fault does not matter.
+            since = (link == fault.link) & (time_us >= fault.start_us)
+            warmer[since] = warming(fault.fault, fault.start_us, time_us[since])
+            is_edge = np.abs(time_ns - fault.begin_ns) < EDGE_NS
+            certain[(link == fault.link) & is_edge] = False
+
+        millihertz = self._millihertz[instant, cube]
+        is_warm = warmer != 0
+        millihertz[is_warm] = warmed(millihertz[is_warm], warmer[is_warm, np.newaxis])
+        return _SoundReadings(millihertz, warmer, instant, certain)
+
+    def _break(self, fault: HubFault, millihertz: Any, time_us: Index) -> list[int]:
+        """Return the readings of a broken pad (M,), given those of the sound pad, in mHz."""
+        first = 0
+        if fault.kind == "stuck":
+            # It repeats what it would have read in the first sample of the fault.
+            is_later = self._samples.time_ns >= fault.begin_ns
+            later = np.flatnonzero((self._samples.link == fault.link) & is_later)
+            sound = self._compute_sound(np.array([fault.cube]), later[:1])
+            first = int(sound.millihertz[0, fault.fault.pad])
+        return [
+            broken_reading(fault.fault, reading, first, at)
+            for reading, at in zip(millihertz.tolist(), time_us.tolist(), strict=True)
+        ]
+
+    def find_held(self, cubes: list[int], span: Span) -> Array | None:
+        """Return the readings (cubes, P), in Hz, of cubes of one link whose load is held.
+
+        Returns:
+            None if the load was not the same all the time, or if nothing was sampled.
+        """
+        samples = self._samples
+        link = samples.table.link_of_cube[cubes[0]]
+        mine = (samples.link == link) & span.contains(samples.time_ns)
         # The load is held at an instant of the hub's table, whose numbers depend on the period.
         instants = {
-            record.start_us // period % len(self._millihertz)
-            for number, record in self.records("hold")
-            if number == link and record.start_us <= begin_us and end_us < record.end_us
-            for period in np.unique(self._samples.period_us[mine]).tolist()
+            fault.start_us // period_us % len(self._millihertz)
+            for fault in samples.faults("hold")
+            if fault.link == link and fault.begin_ns <= span.begin_ns and span.end_ns < fault.end_ns
+            for period_us in np.unique(samples.period_us[mine]).tolist()
         }
         if len(instants) != 1:
             return None
-        return np.asarray(self._millihertz[instants.pop(), cubes] * 1e-3, np.float64)
+        held: Array = self._millihertz[instants.pop(), cubes] * MILLIHERTZ
+        return held
 
-    def _warmer(
-        self, link: NDArray[np.int64], time_us: NDArray[np.int64], certain: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
-        """(N,) °C above room temperature; marks what is not certain. Each fault lasts until the
-        next one."""
-        warmer = np.zeros(len(link))
-        for number, record in self.records("temperature"):
-            since = (link == number) & (time_us >= record.start_us)
-            warmer[since] = warming(record.fault, record.start_us, time_us[since])
-            certain[(link == number) & (np.abs(time_us - record.start_us) < EDGE_US)] = False
-        return warmer
+    def find_samples(self, rows: FrequencyRows) -> Index:
+        """Find the sample of each row (N,), or `NO_MATCH` for what no hub took.
 
-    def _first_reading(self, record: FaultRecord) -> int:
-        """What the pad of a fault would have read in the first sample of it, mHz."""
-        samples, cube = self._samples, self.cube_of(record)
-        number = self._number[record.fault.link]
-        later = (samples.link == number) & (samples.time_us >= record.start_us)
-        first = int(np.flatnonzero(later)[0])
-        at_us, period_us = samples.time_us[first : first + 1], int(samples.period_us[first])
-        load_us = int(at_us[0])
-        for link, held in self.records("hold"):
-            if link == number and held.start_us <= load_us < held.end_us:
-                load_us = held.start_us
-        millihertz = self._millihertz[load_us // period_us % len(self._millihertz), cube]
-        certain = np.ones((1, len(millihertz)), bool)
-        warmer = self._warmer(np.array([number]), at_us, certain)
-        if warmer[0]:
-            millihertz = warmed(millihertz, warmer[0])
-        return int(millihertz[record.fault.pad])
+        A hub that restarts gives its numbers again, and after a long cut the stamp of a row may be
+        nearer to the wrong sample of that number. So the readings decide, where they differ.
+        """
+        table, boot = self._samples.table, self._samples.boot
+        sample = table.match(rows)
+        known = np.flatnonzero(sample != NO_MATCH)
+        unlike = known[~self._resembles(rows.select(known), sample[known])]
+        others = rows.select(unlike)
+
+        best_ns = np.full(len(unlike), LATEST_NS)
+        for number in np.unique(boot):
+            candidate = table.match(others, np.flatnonzero(boot == number))
+            found = np.flatnonzero(candidate != NO_MATCH)
+            found = found[self._resembles(others.select(found), candidate[found])]
+            distance_ns = np.abs(table.time_ns[candidate[found]] - others.stamp_ns[found])
+            is_nearer = distance_ns < best_ns[found]
+            nearer = found[is_nearer]
+            best_ns[nearer] = distance_ns[is_nearer]
+            sample[unlike[nearer]] = candidate[nearer]
+        return sample
+
+    def _resembles(self, rows: FrequencyRows, sample: Index) -> Mask:
+        """Return whether rows (N,) mostly have the readings of samples (N,)."""
+        resembles = np.zeros(len(rows), bool)
+        for part in split_in_chunks(np.arange(len(rows))):
+            expected = self.of(rows.cube[part], sample[part]).frequency
+            is_equal = (expected == rows.frequency[part]) | np.isnan(expected)
+            resembles[part] = is_equal.mean(axis=1) >= MIN_EQUAL_SHARE
+        return resembles
+
+
+def split_in_chunks(index: Index) -> list[Index]:
+    """Split an index into parts of at most `CHUNK`."""
+    return np.array_split(index, 1 + len(index) // CHUNK)
+
+
+def load_tables(skin: Skin, instants: int) -> tuple[Any, Array]:
+    """Compute readings (instants, cubes, pads) of sound pads in mHz, and components (instants,
+    cubes, 15). It takes some seconds, but only once for skins of the same cubes."""
+    return _compute_tables(_SkinKey(skin), instants)
 
 
 class _SkinKey:
-    """A skin that is the same as another one of the same calibrations and poses: the tables of
-    several runs are computed once."""
+    """Compares skins by calibrations and poses, as the key of a cache of tables."""
 
     def __init__(self, skin: Skin) -> None:
         self.skin = skin
@@ -187,14 +234,8 @@ class _SkinKey:
         return isinstance(other, _SkinKey) and self._key == other._key
 
 
-def load_tables(skin: Skin, instants: int) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
-    """Readings (instants, cubes, pads) of sound pads, mHz, and components (instants, cubes, 15).
-    They take some seconds, once for skins of the same cubes."""
-    return _tables(_SkinKey(skin), instants)
-
-
 @lru_cache(maxsize=1)
-def _tables(key: _SkinKey, instants: int) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
+def _compute_tables(key: _SkinKey, instants: int) -> tuple[Any, Array]:
     skin = key.skin
     load = Load(skin, default_script())
     cubes = SimulatedCubes([cube.calibration for cube in skin.cubes])
@@ -206,11 +247,9 @@ def _tables(key: _SkinKey, instants: int) -> tuple[NDArray[np.uint32], NDArray[n
     return np.array(readings), np.array(truth)
 
 
-def _within(record: FaultRecord, time_us: NDArray[np.int64]) -> NDArray[np.bool_]:
-    return (time_us >= record.start_us) & (time_us < record.end_us)
-
-
-def _near_edge(record: FaultRecord, time_us: NDArray[np.int64]) -> NDArray[np.bool_]:
-    return (np.abs(time_us - record.start_us) < EDGE_US) | (
-        np.abs(time_us - record.end_us) < EDGE_US
-    )
+def _is_at_edge(fault: HubFault, time_ns: Index) -> Mask:
+    """Find the times (N,) close to the begin or the end of a fault."""
+    from_begin_ns = np.abs(time_ns - fault.begin_ns)
+    from_end_ns = np.abs(time_ns - fault.end_ns)
+    is_at_edge: Mask = np.minimum(from_begin_ns, from_end_ns) < EDGE_NS
+    return is_at_edge

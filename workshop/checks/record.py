@@ -1,4 +1,4 @@
-"""What the judge is given: what came, as it came, and what was done to the nodes."""
+"""Input of the checks: what arrived, in order, and what was done to the nodes."""
 
 from __future__ import annotations
 
@@ -7,60 +7,119 @@ from dataclasses import dataclass
 from typing import Generic
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cube_tensor_driver.config.skin import Skin
+from cube_tensor_driver.core.arrays import AnyArray, Array, Mask, Times
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.codec import AnyRows
+
+NS_PER_S = 1_000_000_000
+
+DRIVER_KILLS = ("restart driver",)
+"""Actions that kill the driver and start it again."""
+
+DRIVER_STOPS = ("cycle driver", *DRIVER_KILLS)
+"""Actions during which nobody takes what the hubs send."""
+
+RECONSTRUCTION_STOPS = ("restart reconstruction", "reconfigure reconstruction")
+"""Actions during which there is no reconstruction."""
+
+NODE_STARTS = (*RECONSTRUCTION_STOPS, *DRIVER_KILLS)
+"""Actions after which a node begins without a memory of what was before."""
+
+UNFLUSHED_S = 0.5
+"""Time, in seconds, before a driver is killed, in which its messages may not arrive any more.
+
+They wait in its queues, and a busy host empties them late.
+"""
+
+ROWS_AROUND_GAP = 100
+"""Number of rows before and after a gap in a topic whose stamps tell the time of the gap."""
+
+GAP_MARGIN_S = 0.05
+"""Largest time, in seconds, between a row in a missing message and the rows around the gap."""
+
+EARLIEST_NS = np.iinfo(np.int64).min
+LATEST_NS = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True, kw_only=True)
+class Span:
+    """A span of time from `begin_ns` to `end_ns` of the wall clock."""
+
+    begin_ns: int
+    end_ns: int
+
+    def contains(
+        self, time_ns: AnyArray | int, before_s: float = 0.0, after_s: float = 0.0
+    ) -> Mask:
+        """Find the times (N,) that lie in the span, or less than a margin before or after it."""
+        begin_ns = self.begin_ns - round(NS_PER_S * before_s)
+        end_ns = self.end_ns + round(NS_PER_S * after_s)
+        time_ns = np.asarray(time_ns)
+        contains: Mask = (time_ns >= begin_ns) & (time_ns < end_ns)
+        return contains
+
+    def overlaps(self, other: Span, margin_s: float) -> bool:
+        """Return whether another span is less than a margin away."""
+        margin_ns = round(NS_PER_S * margin_s)
+        begins_before = self.begin_ns - margin_ns < other.end_ns
+        return begins_before and self.end_ns + margin_ns > other.begin_ns
 
 
 @dataclass(frozen=True)
 class Received(Generic[AnyRows]):
-    """The rows of a topic, in the order in which they came.
+    """The rows of a topic, in the order in which they arrived.
 
-    gaps: (row that came next, messages) where messages were sent that did not come here, by the
-        numbers that DDS gives to messages. Nothing can be said of what was in them
-    unreadable: messages that could not be decoded, or had another frame than the skin's
-    sent_ns: (N,) wall clock at which each row was sent, as DDS says
+    Attributes:
+        rows: All rows (N).
+        sent_ns: Wall clock at which the message of each row was sent (N,), as DDS states it.
+        gaps: Pairs (next row, number of messages) where messages were sent that did not arrive
+            here, by the numbers that DDS gives to messages. Their rows cannot be checked.
+        unreadable: Number of messages that could not be decoded, or had a wrong frame.
     """
 
     rows: AnyRows
-    sent_ns: NDArray[np.int64]
+    sent_ns: Times
     gaps: tuple[tuple[int, int], ...] = ()
     unreadable: int = 0
 
     @property
     def missed(self) -> int:
-        """Messages that were sent and did not come here."""
+        """Number of messages that were sent and did not arrive here."""
         return sum(messages for _, messages in self.gaps)
 
-    def in_gap(self, stamp_ns: NDArray[np.int64], margin_ns: int) -> NDArray[np.bool_]:
-        """(N,) whether rows of these stamps may have been in messages that did not come."""
+    def is_in_gap(self, stamp_ns: Times) -> Mask:
+        """Find the stamps (N,) whose rows may have been in messages that did not arrive."""
         stamps = self.rows.stamp_ns
         inside = np.zeros(len(stamp_ns), bool)
         for row, _ in self.gaps:
-            before = stamps[max(0, row - NEAR) : row].min(initial=np.iinfo(np.int64).max)
-            after = stamps[row : row + NEAR].max(initial=np.iinfo(np.int64).min)
-            low = min(int(before), int(after)) if row else np.iinfo(np.int64).min
-            inside |= (stamp_ns >= low - margin_ns) & (stamp_ns <= int(after) + margin_ns)
+            before = stamps[max(0, row - ROWS_AROUND_GAP) : row].min(initial=LATEST_NS)
+            after = stamps[row : row + ROWS_AROUND_GAP].max(initial=EARLIEST_NS)
+            # Everything before the first row that arrived belongs to a gap at the beginning.
+            begin_ns = min(int(before), int(after)) if row else EARLIEST_NS // 2
+            gap = Span(begin_ns=begin_ns, end_ns=int(after))
+            inside |= gap.contains(stamp_ns, GAP_MARGIN_S, GAP_MARGIN_S)
         return inside
 
 
-NEAR = 100
-"""Rows before and behind a gap whose stamps say when it was."""
+Tensor = tuple[int, Array, float, int, int, Array]
+"""Message of one cube: stamp in ns, stresses and gradients (15,), residual, status, observed,
+covariance (225,)."""
 
-
-Tensor = tuple[int, NDArray[np.float64], float, int, int, NDArray[np.float64]]
-"""stamp_ns, 6 stresses and 9 gradients (15,), residual, status, observed, covariance (225,)."""
-Wrench = tuple[int, NDArray[np.float64]]
-"""stamp_ns, force and torque (6,)."""
+Wrench = tuple[int, Array]
+"""Message of one cube: stamp in ns, force and torque (6,)."""
 
 
 @dataclass(frozen=True)
 class CubeMessages:
     """Some messages of the topics of one cube.
 
-    cube: its index in the skin; frame_ids: that they had
+    Attributes:
+        cube: Index of the cube in the skin.
+        frame_ids: Frames that the messages named.
+        tensors: Messages of its topic `stress`.
+        wrenches: Messages of its topic `wrench`.
     """
 
     cube: int
@@ -69,44 +128,36 @@ class CubeMessages:
     wrenches: tuple[Wrench, ...]
 
 
-NEW_DRIVER = ("restart driver",)
-"""Deeds that kill the driver and start it again."""
-STOPPING = ("cycle driver", *NEW_DRIVER)
-"""Deeds during which nobody takes what the hubs send."""
-LAST_WORDS_NS = 500_000_000
-"""What a driver was sent, or sent itself, so shortly before it was killed may not have come: a busy
-host is late."""
-DOWN = ("restart reconstruction", "reconfigure reconstruction")
-"""Deeds during which there is no reconstruction."""
+@dataclass(frozen=True, kw_only=True)
+class Action(Span):
+    """Something that was done to the nodes, from the request to its end.
 
-
-@dataclass(frozen=True)
-class Deed:
-    """Something that was done to the nodes.
-
-    kind: one of DEEDS of workshop/torture/mix.py
-    begin_ns, end_ns: wall clock
-    done: whether it succeeded; answer: what the node said
-    cubes: that were tared
+    Attributes:
+        kind: One of `ACTIONS` of `torture/mix.py`.
+        succeeded: Whether the node did it.
+        answer: Answer of the node.
+        cubes: Indices of the cubes that were tared.
     """
 
     kind: str
-    begin_ns: int
-    end_ns: int
-    done: bool
+    succeeded: bool
     answer: str = ""
     cubes: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Record:
-    """All that came of a tortured skin.
+@dataclass(frozen=True, kw_only=True)
+class Record(Span):
+    """All that arrived from a skin. Samples taken within its span of time are checked.
 
-    instants: how many instants of the load the hubs repeat
-    counters: of the driver, summed over all links, and of all rows; the newest, summed over its
-        lives
-    messages_lost: that the reconstruction says it lost on the way, of all its lives
-    begin_ns, end_ns: samples that were taken in this time (wall clock) are judged
+    Attributes:
+        skin: The skin.
+        instants: Number of instants of the load that the hubs repeat.
+        frequencies: Rows of the topic `frequencies`.
+        stress: Rows of the topic `stress`.
+        cube_messages: Some messages of one cube's own topics.
+        actions: What was done to the nodes, in order.
+        counters: Newest counters of the driver, summed over all links and all of its lives.
+        messages_lost: Number of messages that the reconstruction states to have lost.
     """
 
     skin: Skin
@@ -114,16 +165,19 @@ class Record:
     frequencies: Received[FrequencyRows]
     stress: Received[StressRows]
     cube_messages: CubeMessages
-    deeds: tuple[Deed, ...]
+    actions: tuple[Action, ...]
     counters: Mapping[str, int]
     messages_lost: int
-    begin_ns: int
-    end_ns: int
 
-    def near_death(self, time_ns: NDArray[np.int64], before_ns: int) -> NDArray[np.bool_]:
-        """(N,) wall clock, whether there was no driver, or one that was killed so soon after."""
-        near = np.zeros(len(time_ns), bool)
-        for deed in self.deeds:
-            if deed.kind in NEW_DRIVER:
-                near |= (time_ns > deed.begin_ns - before_ns) & (time_ns < deed.end_ns)
-        return near
+    def actions_of(self, *kinds: str) -> list[Action]:
+        """Return the actions of some kinds, in order."""
+        return [action for action in self.actions if action.kind in kinds]
+
+    def is_during(
+        self, kinds: tuple[str, ...], time_ns: Times, before_s: float = 0.0, after_s: float = 0.0
+    ) -> Mask:
+        """Find the times (N,) within actions of some kinds, or less than a margin away."""
+        during = np.zeros(len(time_ns), bool)
+        for action in self.actions_of(*kinds):
+            during |= action.contains(time_ns, before_s, after_s)
+        return during

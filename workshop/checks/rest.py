@@ -1,106 +1,111 @@
-"""Which rest frequencies are in force when: the calibrations', and those of each tare.
+"""Rest frequencies in force: those of the calibrations, and those of each tare.
 
-A tare of the torture is made while the load of the tared cubes stays, so the frequencies of that
+A tare of the torture is made while the load of the tared cubes is held, so the frequencies of that
 instant are the rest frequencies that it must give. On a busy host it may come so late that the load
-did not stay all the while: then nobody knows what it gave, and tensors of these cubes are not
-judged until the next change. What is in force for a row depends on when its tensor was sent, which
-DDS says.
+was not held all the time. Then nobody knows its result, and tensors of these cubes are not checked
+until the next change. A row belongs to the rest frequencies that were in force when its tensor was
+sent, which DDS states.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .expected import Expected
-from .record import DOWN, Record
+from cube_tensor_driver.core.arrays import AnyArray, Array, Mask, Times
 
-MARGIN_NS = 100_000_000
-"""So long before a change was asked for, and after it was answered, either may be in force: that is
-how long a message may take."""
-RESTORE_NS = 2_000_000_000
-"""After a restart, until the driver has said who the cubes are and their tare is restored."""
-AVERAGED_NS = 2_500_000_000
-"""A tare averages a second, in whole windows of half a second and the one that is not over, of data
-that may be a second old."""
-CHANGES = ("tare", "clear")
+from .record import LATEST_NS, NS_PER_S, RECONSTRUCTION_STOPS, Action, Span
+from .run import Run
 
+TRANSPORT_S = 0.1
+"""Longest time, in seconds, that a message takes. So long before a change is requested and after it
+is answered, the old or the new values may be in force."""
 
-class _Epoch(NamedTuple):
-    """begin_ns: from when on; rest: (cubes, P) Hz; known: (cubes,) bool, whether they are sure."""
+RESTORE_S = 2.0
+"""Time, in seconds, after a restart until the tare is restored: the driver states the cubes once a
+second."""
 
-    begin_ns: int
-    rest: NDArray[np.float64]
-    known: NDArray[np.bool_]
+AVERAGED_S = 2.5
+"""Age, in seconds, of the oldest data in a tare.
 
-    def tared(self, cubes: list[int], held: NDArray[np.float64] | None) -> _Epoch:
-        """After a tare of cubes that read `held` (len(cubes), P); None: nobody knows what."""
-        rest, known = self.rest.copy(), self.known.copy()
-        known[cubes] = held is not None
-        if held is not None:
-            rest[cubes] = held
-        return self._replace(rest=rest, known=known)
+It averages 1 s in whole windows of 0.5 s and the one that is not over, of data that may be 1 s old.
+"""
 
 
-class Choice(NamedTuple):
+@dataclass(frozen=True)
+class RestFrequencies:
     """Rest frequencies that may be in force.
 
-    rest: (cubes, P) Hz
-    known: (cubes,) bool, False where nobody knows what a tare gave
-    applies: (N,) bool, the rows that they may be in force for
+    Attributes:
+        values: Frequencies (cubes, P), in Hz.
+        is_known: False for cubes whose tare has an unknown result (cubes,).
     """
 
-    rest: NDArray[np.float64]
-    known: NDArray[np.bool_]
-    applies: NDArray[np.bool_]
+    values: Array
+    is_known: Mask
+
+    def tare(self, cubes: list[int], held: Array | None) -> RestFrequencies:
+        """Return them after a tare of cubes that read `held` (len(cubes), P), None if unknown."""
+        values, is_known = self.values.copy(), self.is_known.copy()
+        is_known[cubes] = held is not None
+        if held is not None:
+            values[cubes] = held
+        return RestFrequencies(values, is_known)
 
 
-class RestEpochs:
-    """untared: rest frequencies (cubes, P) of the calibrations."""
+class RestHistory:
+    """All rest frequencies of a torture, each with its span of time."""
 
-    def __init__(self, record: Record, expected: Expected, start_time_ns: int) -> None:
-        calibrations = [cube.calibration for cube in record.skin.cubes]
-        self._calibrated = np.array([calibration.rest_frequency for calibration in calibrations])
-        untared = _Epoch(0, self._calibrated, np.ones(len(calibrations), bool))
-        self._epochs = [untared]
-        self._unclear: list[tuple[int, int]] = []  # when either of two may be in force
-        for deed in record.deeds:
-            if deed.kind in DOWN:
-                self._unclear.append((deed.begin_ns - MARGIN_NS, deed.end_ns + RESTORE_NS))
-            if deed.kind in CHANGES and deed.done:
-                self._unclear.append((deed.begin_ns - MARGIN_NS, deed.end_ns + MARGIN_NS))
-                epoch = untared
-                if deed.kind == "tare":
-                    cubes, begin_ns = list(deed.cubes), deed.begin_ns - AVERAGED_NS
-                    held = expected.held(
-                        cubes, begin_ns - start_time_ns, deed.end_ns - start_time_ns
-                    )
-                    epoch = self._epochs[-1].tared(cubes, held)
-                self._epochs.append(epoch._replace(begin_ns=deed.end_ns))
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        calibrations = [cube.calibration for cube in run.record.skin.cubes]
+        calibrated = np.array([calibration.rest_frequency for calibration in calibrations])
+        self._calibrated = RestFrequencies(calibrated, np.ones(len(calibrations), bool))
 
-    def choices(self, sent_ns: NDArray[np.int64]) -> Iterator[Choice]:
-        """What may be in force for rows that were sent then (N,)."""
-        unclear = self._is_unclear(sent_ns)
-        ends = [epoch.begin_ns for epoch in self._epochs[1:]] + [np.iinfo(np.int64).max]
-        for epoch, end_ns in zip(self._epochs, ends, strict=True):
-            within = (sent_ns >= epoch.begin_ns) & (sent_ns < end_ns)
-            yield Choice(epoch.rest, epoch.known, unclear | within)
+        changes = [action for action in run.record.actions_of("tare", "clear") if action.succeeded]
+        current = self._calibrated
+        self._epochs = [(Span(begin_ns=0, end_ns=LATEST_NS), current)]
+        for action in changes:
+            current = self._apply(action, current)
+            last, rest = self._epochs[-1]
+            self._epochs[-1] = (replace(last, end_ns=action.end_ns), rest)
+            self._epochs.append((Span(begin_ns=action.end_ns, end_ns=LATEST_NS), current))
 
-    def untared(self, cube: NDArray[np.integer], sent_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(N,) rows for which the calibrations' rest frequencies are in force for sure."""
+    def _apply(self, action: Action, current: RestFrequencies) -> RestFrequencies:
+        if action.kind == "clear":
+            return self._calibrated
+        averaged = replace(action, begin_ns=action.begin_ns - round(NS_PER_S * AVERAGED_S))
+        cubes = list(action.cubes)
+        return current.tare(cubes, self._run.expected.find_held(cubes, averaged))
+
+    def candidates(self, sent_ns: Times) -> Iterator[tuple[Mask, RestFrequencies]]:
+        """Yield all rest frequencies, with the rows (N,) that they may be in force for.
+
+        Args:
+            sent_ns: Wall clock at which the tensor of each row was sent (N,).
+        """
+        is_unclear = self._is_unclear(sent_ns)
+        for span, rest in self._epochs:
+            yield is_unclear | span.contains(sent_ns), rest
+
+    def is_calibrated(self, cube: AnyArray, sent_ns: Times) -> Mask:
+        """Find the rows (N,) for which those of the calibrations are certainly in force."""
         applies = np.zeros(len(cube), bool)
-        ever_tared = np.zeros(len(self._calibrated), bool)
-        for choice in self.choices(sent_ns):
-            tared = ~choice.known | (choice.rest != self._calibrated).any(axis=1)
-            applies |= choice.applies & ~tared[cube]
-            ever_tared |= tared
+        ever_tared = np.zeros(len(self._calibrated.values), bool)
+        for is_candidate, rest in self.candidates(sent_ns):
+            differs = (rest.values != self._calibrated.values).any(axis=1)
+            is_tared = ~rest.is_known | differs
+            applies |= is_candidate & ~is_tared[cube]
+            ever_tared |= is_tared
         return applies & ~(self._is_unclear(sent_ns) & ever_tared[cube])
 
-    def _is_unclear(self, sent_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        unclear = np.zeros(len(sent_ns), bool)
-        for begin, end in self._unclear:
-            unclear |= (sent_ns >= begin) & (sent_ns <= end)
-        return unclear
+    def _is_unclear(self, sent_ns: Times) -> Mask:
+        """Find the times (N,) at which the old or the new values may be in force."""
+        record = self._run.record
+        is_unclear = record.is_during(RECONSTRUCTION_STOPS, sent_ns, TRANSPORT_S, RESTORE_S)
+        for action in record.actions_of("tare", "clear"):
+            if action.succeeded:
+                is_unclear |= action.contains(sent_ns, TRANSPORT_S, TRANSPORT_S)
+        return is_unclear

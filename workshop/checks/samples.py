@@ -1,106 +1,104 @@
-"""All samples that the hubs took, from the sample log, and which of them a row is."""
+"""All samples that the hubs took, and the faults that they had, from the sample log."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.simulation.sample_log import SEQUENCE_RANGE, SampleLog
+from cube_tensor_driver.core.arrays import AnyArray, Mask
+from cube_tensor_driver.simulation.faults import Fault
+from cube_tensor_driver.simulation.sample_log import SampleLog
 
-if TYPE_CHECKING:
-    from .expected import Expected
+from .record import Span
 
-NONE = -1
-"""Number of a sample that no hub took."""
-HALF = 0.5
-"""Of a row's pads at least must read what they should, or another sample of this number is looked
-for."""
-CHUNK = 100_000
-"""Rows looked at together."""
+
+@dataclass(frozen=True, kw_only=True)
+class HubFault(Span):
+    """A fault that was carried out.
+
+    Attributes:
+        fault: What was done.
+        start_us: Simulated time of its begin.
+        link: Index of the link in the log.
+        cube: Index in the skin of the cube that a fault of a pad is on.
+    """
+
+    fault: Fault
+    start_us: int
+    link: int
+    cube: int
+
+    @property
+    def kind(self) -> str:
+        return self.fault.kind
 
 
 class Samples:
-    """One entry for each sample, hub after hub, in the order of time.
+    """Columns of all samples (S,): hub after hub, in the order of time.
 
-    link: (S,) index in the log; boot, number: (S,) as in the log
-    time_us: (S,) simulated time; time_ns: (S,) wall clock; period_us: (S,)
-    damaged: (S,) bool, harmed on purpose, or it found no room on the line
+    Attributes:
+        log: The sample log.
+        table: Columns that every simulated hub has.
+        link, number, time_ns: As in the table (S,).
+        time_us: Simulated time (S,).
+        boot: Number of restarts of the hub before the sample (S,).
+        period_us: Time from sample to sample (S,).
+        row_count: Number of the skin's cubes on the link, so the number of rows (S,).
+        is_damaged: Whether the sample was not sent as it was taken (S,).
     """
 
     def __init__(self, log: SampleLog) -> None:
-        parts, damaged = [], []
-        self._begin: list[int] = []
-        count = 0
-        for number, link in enumerate(log.links):
-            for run in link.runs:
-                self._begin.append(count)
-                count += len(run)
-                n = np.arange(len(run))
-                time_us = run.start_us + run.period_us * n
-                same = [np.full(len(run), value) for value in (number, run.boot, run.period_us)]
-                parts.append((*same, run.first + n, time_us))
-            harmed = set(link.damaged)
-            damaged += [
-                (run.boot, sample) in harmed
-                for run in link.runs
-                for sample in range(run.first, run.last + 1)
-            ]
-        columns = zip(*parts, strict=True) if parts else [[np.empty(0, int)]] * 5
-        self.link, self.boot, self.period_us, self.number, self.time_us = (
-            np.concatenate(column).astype(np.int64) for column in columns
+        self.log, self.table = log, log.table
+        self.link, self.number = self.table.link, self.table.number
+        self.time_ns = self.table.time_ns
+        self.time_us = (self.time_ns - log.start_time_ns) // 1000
+        self.row_count = self.table.rows_per_sample[self.link]
+
+        runs = [run for link in log.links for run in link.runs]
+        lengths = np.array([len(run) for run in runs], int)
+        self.boot = np.repeat(np.array([run.boot for run in runs], int), lengths)
+        self.period_us = np.repeat(np.array([run.period_us for run in runs], int), lengths)
+
+        damaged = [
+            (link, boot, number)
+            for link, link_log in enumerate(log.links)
+            for boot, number in link_log.damaged
+        ]
+        columns = np.array(damaged, np.int64).reshape(-1, 3).T
+        self.is_damaged: Mask = np.isin(
+            _join_keys(self.link, self.boot, self.number), _join_keys(*columns)
         )
-        self.time_ns = log.start_time_ns + 1000 * self.time_us
-        self.damaged = np.array(damaged, bool)
-        self._log = log
 
     def __len__(self) -> int:
         return len(self.link)
 
-    def match(self, rows: FrequencyRows, expected: Expected) -> NDArray[np.int64]:
-        """(N,) which sample each row is, NONE for what no hub took.
-
-        A hub that restarts gives its numbers again. Then the sample is meant whose readings the row
-        has; of several, or none, the one that was taken nearest to the row's stamp.
-        """
-        parts = [
-            self._match(rows.select(slice(at, at + CHUNK)), expected)
-            for at in range(0, len(rows), CHUNK)
+    def faults(self, *kinds: str) -> list[HubFault]:
+        """Return the faults of some kinds, in order."""
+        links = {link.name: index for index, link in enumerate(self.log.links)}
+        start_ns = self.log.start_time_ns
+        return [
+            HubFault(
+                begin_ns=start_ns + 1000 * record.start_us,
+                end_ns=start_ns + 1000 * record.end_us,
+                fault=record.fault,
+                start_us=record.start_us,
+                link=links[record.fault.link],
+                cube=self.log.links[links[record.fault.link]].cubes[record.fault.cube],
+            )
+            for record in self.log.faults
+            if record.fault.kind in kinds
         ]
-        return np.concatenate([np.empty(0, np.int64), *parts])
 
-    def _match(self, rows: FrequencyRows, expected: Expected) -> NDArray[np.int64]:
-        sample = self._nearest(rows)
-        known = np.flatnonzero(sample != NONE)
-        unlike = known[~_alike(rows.select(known), sample[known], expected)]
-        other = self._nearest(rows.select(unlike), expected)
-        sample[unlike[other != NONE]] = other[other != NONE]
-        return sample
-
-    def _nearest(self, rows: FrequencyRows, expected: Expected | None = None) -> NDArray[np.int64]:
-        """(N,) of all samples with a row's number the nearest to its stamp; if `expected` is given,
-        of those that it is alike."""
-        found = np.full(len(rows), NONE, np.int64)
-        best = np.full(len(rows), np.iinfo(np.int64).max)
-        runs = ((link, run) for link in self._log.links for run in link.runs)
-        for begin, (link, run) in zip(self._begin, runs, strict=True):
-            ahead = (rows.sequence.astype(np.int64) - run.first) % SEQUENCE_RANGE
-            chosen = np.flatnonzero((ahead < len(run)) & np.isin(rows.cube, link.members))
-            sample = begin + ahead[chosen]
-            if expected is not None:
-                alike = _alike(rows.select(chosen), sample, expected)
-                chosen, sample = chosen[alike], sample[alike]
-            distance = np.abs(self.time_ns[sample] - rows.stamp_ns[chosen])
-            nearer = distance < best[chosen]
-            found[chosen[nearer]], best[chosen[nearer]] = sample[nearer], distance[nearer]
-        return found
+    def is_near_fault(self, kinds: tuple[str, ...], before_s: float, after_s: float) -> Mask:
+        """Find the samples (S,) whose link had such a fault, or less than a margin away."""
+        near = np.zeros(len(self), bool)
+        for fault in self.faults(*kinds):
+            near |= (self.link == fault.link) & fault.contains(self.time_ns, before_s, after_s)
+        return near
 
 
-def _alike(rows: FrequencyRows, sample: NDArray[np.int64], expected: Expected) -> NDArray[np.bool_]:
-    """(N,) whether rows read what their cubes did in these samples, mostly."""
-    readings = expected.of(rows.cube, sample)
-    same = (readings.frequency == rows.frequency) | np.isnan(readings.frequency)
-    alike: NDArray[np.bool_] = same.mean(axis=1) >= HALF
-    return alike
+def _join_keys(link: AnyArray, boot: AnyArray, number: AnyArray) -> AnyArray:
+    """Join the columns that identify a sample in one integer each; numbers stay below 2**40."""
+    key: AnyArray = (link << 52) | (boot << 40) | number
+    return key

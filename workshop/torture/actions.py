@@ -1,4 +1,4 @@
-"""What a torture does to the nodes: as their users would, or as a crash would."""
+"""Actions of a torture on the nodes: what their users do, and what a crash does."""
 
 from __future__ import annotations
 
@@ -21,31 +21,66 @@ from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.srv import Tare
 
-from ..checks.record import Deed
-from .message_log import Tape
-from .mix import CUBES_PER_HUB, HELD_HUB
+from ..checks.record import NS_PER_S, Action
+from .message_log import TopicLog
+from .mix import HELD_CUBES
 
-START_S, ANSWER_S = 40.0, 10.0
-"""s: until a node has started; until it answers, at most."""
+MAX_START_S = 40.0
+"""Longest time, in seconds, until a node has started."""
+
+MAX_ANSWER_S = 10.0
+"""Longest time, in seconds, that is waited for one answer of a node."""
+
 ANSWER_TRIES = 4
-TARE_S, TARE_EVERY_S = 3.0, 0.3
-"""A tare is refused while data have a gap; the load stays long enough to ask again."""
-TARED_S = 1.0
-"""How long a tare is in force at least, also where this process is late: else nobody could see
-it."""
-LATE_NS = 500_000_000
-"""Where the newest row of stress is older the host is too busy for a tare, and may refuse it."""
-LATE_S = 0.5
-"""A tare that is asked for later than this may come when the load does not stay any more."""
-SUBSCRIBER = "markers"
-TRANSITIONS = "driver/transition_event"
-"""A topic that the driver has as soon as it can be configured."""
+"""Number of requests until a node counts as silent. An answer is lost if the node has not yet
+discovered our client."""
+
+MAX_TARE_S = 3.0
+"""Time, in seconds, for which a tare is requested again, because it is refused while data have a
+gap. The load is held longer."""
+
+TARE_PERIOD_S = 0.3
+"""Time, in seconds, between two requests of a tare."""
+
+MIN_TARED_S = 1.0
+"""Shortest time, in seconds, for which a tare stays in force, so that its tensors can be checked
+also where this process is late."""
+
+MAX_STRESS_AGE_S = 0.5
+"""Age, in seconds, of the newest stress above which the host is too busy for a tare, which may be
+refused then."""
+
+MAX_DELAY_S = 0.5
+"""Delay, in seconds, of an action above which a tare may come when its load is not held any
+more."""
+
 FLUSH_S = 0.3
-"""Until what a process sent just before its death has come."""
+"""Time, in seconds, in which the messages arrive that a process sent just before its end."""
+
+DISCOVERY_S = 1.0
+"""Time, in seconds, that is waited between discovery and activation, so that the first sample is
+received too."""
+
+OTHER_SUBSCRIBER = "markers"
+"""Node that subscribes to stress beside this process."""
+
+TRANSITIONS = "driver/transition_event"
+"""Topic that the driver has as soon as it can be configured."""
+
+ActionResult = tuple[bool, str]
+"""Whether a node did what was requested, and its answer."""
+
+DOWN = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+UP = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
 
 
-class Deeds:
-    """done: what was done so far; refused: why tares were refused that the host is too busy for."""
+class Actions:
+    """Carries actions out, one after the other.
+
+    Attributes:
+        done: All actions so far.
+        refused: Answers of tares that the host was too busy for.
+    """
 
     def __init__(
         self,
@@ -53,152 +88,158 @@ class Deeds:
         children: Children,
         processes: Mapping[str, Process],
         skin: Skin,
-        stress: Tape[StressRows],
-        new_driver: Callable[[], None],
+        stress: TopicLog[StressRows],
+        on_driver_killed: Callable[[], None],
     ) -> None:
-        """new_driver: called when the driver is dead and what it sent has come."""
-        self.done: list[Deed] = []
+        """on_driver_killed: called when the driver is dead and its last messages have arrived."""
+        self.done: list[Action] = []
         self.refused: list[str] = []
         self._observer, self._children, self._processes = observer, children, processes
-        self._skin, self._stress, self._new_driver = skin, stress, new_driver
-        node = observer.node
+        self._skin, self._stress = skin, stress
+        self._on_driver_killed = on_driver_killed
+        self._is_late = False
+        self._begin_ns = 0
+        make_client = observer.node.create_client
         self._states = {
-            name: node.create_client(ChangeState, f"{name}/change_state")
+            name: make_client(ChangeState, f"{name}/change_state")
             for name in ("driver", "reconstruction")
         }
-        self._tare = node.create_client(Tare, "reconstruction/tare")
-        self._clear = node.create_client(Trigger, "reconstruction/clear_tare")
-        self._parameters = node.create_client(SetParameters, "driver/set_parameters")
+        self._tare = make_client(Tare, "reconstruction/tare")
+        self._clear = make_client(Trigger, "reconstruction/clear_tare")
+        self._parameters = make_client(SetParameters, "driver/set_parameters")
+        self._kinds: dict[str, Callable[[Mapping[str, Any]], ActionResult]] = {
+            "stall reconstruction": lambda event: self._pause("reconstruction", event["seconds"]),
+            "stall subscriber": lambda event: self._pause(OTHER_SUBSCRIBER, event["seconds"]),
+            "rate": lambda event: self._set_rate(event["value"]),
+            "tare": lambda _: self._take_tare(),
+            "clear": lambda _: self._call(self._clear, Trigger.Request()),
+            "restart reconstruction": lambda _: self._restart_reconstruction(),
+            "reconfigure reconstruction": lambda _: self._reconfigure_reconstruction(),
+            "cycle driver": lambda _: self._cycle_driver(),
+            "restart driver": lambda _: self._restart_driver(),
+        }
 
-    def start_driver(self, pipe: Path) -> None:
-        """Activate the driver when both ends of every topic know each other, so that the first
-        sample is received too. CubeError: it did not become active."""
-        self._observer.spin(START_S, self._states["driver"].service_is_ready)
-        if not self._activate_driver(set(), pipe.exists):
+    def start_driver(self, fault_pipe: Path) -> None:
+        """Activate the driver when both ends of every topic have discovered each other.
+
+        Raises:
+            CubeError: It did not become active.
+        """
+        self._observer.spin(MAX_START_S, self._states["driver"].service_is_ready)
+        if not self._activate_driver(set(), fault_pipe.exists):
             log = self._children.log("driver")[-1500:]
             raise CubeError(f"the driver did not become active:\n{log}")
 
-    def _activate_driver(self, old: set[bytes], ready: Callable[[], bool]) -> bool:
-        """old: publishers of `frequencies` that are dead, as far as DDS has not noticed it."""
-        observer, node = self._observer, self._observer.node
-        # Whether this one succeeded shows at the next: a request that is sent again is refused.
-        self._change("driver", Transition.TRANSITION_CONFIGURE)
-        observer.spin(
-            START_S,
-            lambda: (
-                node.count_publishers("stress") > 0
-                and node.count_subscribers("stress") > 1
-                and node.count_subscribers("frequencies") > 1
-                and bool(self._publishers("frequencies") - old)
-                and ready()
-            ),
-        )
-        observer.spin(1.0)
-        return self._change("driver", Transition.TRANSITION_ACTIVATE)
-
-    def _publishers(self, topic: str) -> set[bytes]:
-        """Of a topic, each by its id in DDS."""
-        found = self._observer.node.get_publishers_info_by_topic(topic)
-        return {bytes(publisher.endpoint_gid) for publisher in found}
-
     def stop_driver(self) -> None:
+        """Deactivate the driver."""
         self._change("driver", Transition.TRANSITION_DEACTIVATE)
 
-    def do(self, event: Mapping[str, Any], late_s: float) -> None:
-        """Do what an event of the mix says, so many s after it should have been done."""
-        kind = event["deed"]
-        deeds: dict[str, Callable[[], tuple[bool, str]]] = {
-            "stall reconstruction": lambda: self._pause("reconstruction", event["seconds"]),
-            "stall subscriber": lambda: self._pause(SUBSCRIBER, event["seconds"]),
-            "rate": lambda: self._set_rate(event["value"]),
-            "tare": lambda: self._take_tare(late_s > LATE_S),
-            "clear": lambda: self._call(self._clear, Trigger.Request()),
-            "restart reconstruction": self._restart,
-            "reconfigure reconstruction": self._reconfigure,
-            "cycle driver": self._cycle_driver,
-            "restart driver": self._restart_driver,
-        }
+    def do(self, event: Mapping[str, Any], delay_s: float) -> None:
+        """Carry out an event of the mix, `delay_s` seconds after its time."""
+        kind = event["action"]
+        self._is_late = delay_s > MAX_DELAY_S
         self._begin_ns = time.time_ns()
-        done, answer = deeds[kind]()
-        cubes = tuple(self._held_cubes) if kind == "tare" else ()
-        self.done.append(
-            Deed(
-                kind,
-                self._begin_ns,
-                time.time_ns(),
-                done,
-                answer,
-                cubes,
-            )
+        succeeded, answer = self._kinds[kind](event)
+        action = Action(
+            kind=kind,
+            begin_ns=self._begin_ns,
+            end_ns=time.time_ns(),
+            succeeded=succeeded,
+            answer=answer,
+            cubes=HELD_CUBES if kind == "tare" else (),
         )
+        self.done.append(action)
         if kind == "tare":
-            self._observer.spin(TARED_S)
+            self._observer.spin(MIN_TARED_S)
 
-    @property
-    def _held_cubes(self) -> range:
-        return range(HELD_HUB * CUBES_PER_HUB, (HELD_HUB + 1) * CUBES_PER_HUB)
-
-    def _pause(self, name: str, seconds: float) -> tuple[bool, str]:
+    def _pause(self, name: str, seconds: float) -> ActionResult:
         self._children.pause(name)
         self._observer.spin(seconds)
         self._children.resume(name)
         return True, ""
 
-    def _set_rate(self, rate: float) -> tuple[bool, str]:
+    def _set_rate(self, rate: float) -> ActionResult:
         value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(rate))
         request = SetParameters.Request(parameters=[Parameter(name="rate", value=value)])
         answer = self._ask(self._parameters, request)
         return answer is not None and answer.results[0].successful, str(rate)
 
-    def _take_tare(self, late: bool) -> tuple[bool, str]:
-        names = [self._skin.names[cube] for cube in self._held_cubes]
+    def _take_tare(self) -> ActionResult:
+        names = [self._skin.names[cube] for cube in HELD_CUBES]
         request = Tare.Request(cubes=names, duration=1.0)
-        until = time.monotonic() + TARE_S
+        until_s = time.monotonic() + MAX_TARE_S
         while True:
+            # A tare that is refused changes nothing, so only the last request counts.
             self._begin_ns = time.time_ns()
-            late |= self._begin_ns - self._stress.newest_ns() > LATE_NS
-            done, answer = self._call(self._tare, request)
-            if done or time.monotonic() > until:
+            age_ns = self._begin_ns - self._stress.newest_ns()
+            self._is_late |= age_ns > NS_PER_S * MAX_STRESS_AGE_S
+            succeeded, answer = self._call(self._tare, request)
+            if succeeded or time.monotonic() > until_s:
                 break
-            self._observer.spin(TARE_EVERY_S)
-        if late and not done:
+            self._observer.spin(TARE_PERIOD_S)
+        if self._is_late and not succeeded:
             self.refused.append(answer)
-        return done, answer
+        return succeeded, answer
 
-    def _restart(self) -> tuple[bool, str]:
+    def _restart_reconstruction(self) -> ActionResult:
         self._children.kill("reconstruction")
-        self._stress.new_writer()
+        self._stress.expect_new_publisher()
         self._children.start(self._processes["reconstruction"])
         return self._wait_for_stress()
 
-    def _reconfigure(self) -> tuple[bool, str]:
-        down = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
-        up = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
-        done = all(self._change("reconstruction", transition) for transition in down)
-        self._stress.new_writer()
-        done &= all(self._change("reconstruction", transition) for transition in up)
-        comes, answer = self._wait_for_stress()
-        return done and comes, answer
+    def _reconfigure_reconstruction(self) -> ActionResult:
+        succeeded = all(self._change("reconstruction", transition) for transition in DOWN)
+        self._stress.expect_new_publisher()
+        succeeded &= all(self._change("reconstruction", transition) for transition in UP)
+        has_stress, answer = self._wait_for_stress()
+        return succeeded and has_stress, answer
 
-    def _cycle_driver(self) -> tuple[bool, str]:
+    def _cycle_driver(self) -> ActionResult:
         both = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE)
         return all(self._change("driver", transition) for transition in both), ""
 
-    def _restart_driver(self) -> tuple[bool, str]:
-        old = self._publishers("frequencies")
-        changes = self._publishers(TRANSITIONS)
+    def _restart_driver(self) -> ActionResult:
+        # DDS notices only after seconds that the publishers of a killed process are gone.
+        dead = self._find_publishers("frequencies")
+        dead_transitions = self._find_publishers(TRANSITIONS)
         self._children.kill("driver")
         self._observer.spin(FLUSH_S)
-        self._new_driver()
+        self._on_driver_killed()
         self._children.start(self._processes["driver"])
-        self._observer.spin(START_S, lambda: bool(self._publishers(TRANSITIONS) - changes))
-        if not self._activate_driver(old, lambda: True):
+        self._observer.spin(
+            MAX_START_S, lambda: bool(self._find_publishers(TRANSITIONS) - dead_transitions)
+        )
+        if not self._activate_driver(dead, lambda: True):
             return False, self._children.log("driver")[-500:]
         return self._wait_for_stress()
 
-    def _wait_for_stress(self) -> tuple[bool, str]:
+    def _activate_driver(self, dead: set[bytes], is_ready: Callable[[], bool]) -> bool:
+        """Configure and activate the driver; `dead` are publishers of a driver that was killed."""
+        node = self._observer.node
+
+        def is_connected() -> bool:
+            return (
+                node.count_publishers("stress") > 0
+                and node.count_subscribers("stress") > 1
+                and node.count_subscribers("frequencies") > 1
+                and bool(self._find_publishers("frequencies") - dead)
+                and is_ready()
+            )
+
+        # Whether this succeeded shows at the activation: a request that is sent again is refused.
+        self._change("driver", Transition.TRANSITION_CONFIGURE)
+        self._observer.spin(MAX_START_S, is_connected)
+        self._observer.spin(DISCOVERY_S)
+        return self._change("driver", Transition.TRANSITION_ACTIVATE)
+
+    def _find_publishers(self, topic: str) -> set[bytes]:
+        """Return the publishers of a topic, each by its identifier in DDS."""
+        found = self._observer.node.get_publishers_info_by_topic(topic)
+        return {bytes(publisher.endpoint_gid) for publisher in found}
+
+    def _wait_for_stress(self) -> ActionResult:
         count = self._stress.count
-        self._observer.spin(START_S, lambda: self._stress.count > count)
+        self._observer.spin(MAX_START_S, lambda: self._stress.count > count)
         return self._stress.count > count, ""
 
     def _change(self, node: str, transition: int) -> bool:
@@ -206,17 +247,16 @@ class Deeds:
         answer = self._ask(self._states[node], request)
         return answer is not None and bool(answer.success)
 
-    def _call(self, client: Any, request: Any) -> tuple[bool, str]:
+    def _call(self, client: Any, request: Any) -> ActionResult:
         answer = self._ask(client, request)
         return (False, "no answer") if answer is None else (answer.success, answer.message)
 
     def _ask(self, client: Any, request: Any) -> Any:
-        """The answer; None if there is none. An answer is lost if the node has not met our client
-        yet: then it is asked again."""
-        self._observer.spin(START_S, client.service_is_ready)
+        """Return the answer of a service, None if there is none after `ANSWER_TRIES`."""
+        self._observer.spin(MAX_START_S, client.service_is_ready)
         for _ in range(ANSWER_TRIES):
             future = client.call_async(request)
-            self._observer.spin(ANSWER_S, future.done)
+            self._observer.spin(MAX_ANSWER_S, future.done)
             if future.done():
                 return future.result()
         return None

@@ -1,63 +1,64 @@
-"""Memory and threads of child processes over time."""
+"""Memory and threads of the nodes over time."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 
 import numpy as np
-import psutil
 
+from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.processes.children import Children
 
-EVERY_S = 1.0
-SETTLE_S, LEAST_S = 45.0, 60.0
-"""s: memory grows in steps at first; then its slope is taken, over so long at least."""
+PERIOD_S = 1.0
+"""Time, in seconds, between two measurements."""
+
+SETTLE_S = 45.0
+"""Time, in seconds, after the start of a process in which its memory grows in steps. Only later
+growth counts."""
+
+MIN_DURATION_S = 60.0
+"""Shortest time, in seconds, over which growth is given."""
 
 
-class Memory:
-    """Looks at processes once a second. A process that is started again has a new life."""
+class MemoryMonitor:
+    """Measures the memory of processes once a second."""
 
-    def __init__(self, children: Children, names: Iterable[str]) -> None:
-        self._children, self._names = children, tuple(names)
+    def __init__(self, children: Children, names: tuple[str, ...]) -> None:
+        self._children, self._names = children, names
         self._next_s = 0.0
-        # By process id: times in s and MB resident.
-        self._lives: dict[int, tuple[list[float], list[float]]] = {}
+        # Columns of times in s and sizes in MB, by process: one that is started again has a new id.
+        self._sizes: dict[int, list[tuple[float, float]]] = {}
 
-    def look(self) -> None:
-        """To be called again and again."""
-        now = time.monotonic()
-        if now < self._next_s:
+    def measure(self) -> None:
+        """Measure if a period is over; to be called again and again."""
+        now_s = time.monotonic()
+        if now_s < self._next_s:
             return
-        self._next_s = now + EVERY_S
-        for name in set(self._names).intersection(self._children.names()):
-            pid = self._children.pid(name)
-            times, sizes = self._lives.setdefault(pid, ([], []))
-            times.append(now)
-            sizes.append(psutil.Process(pid).memory_info().rss / 2**20)
+        self._next_s = now_s + PERIOD_S
+        running = set(self._names).intersection(self._children.names())
+        for name, size_mb in Usage(self._children, running).memory_mb().items():
+            self._sizes.setdefault(self._children.pid(name), []).append((now_s, size_mb))
 
-    def threads(self) -> dict[str, int]:
-        """By process."""
-        return {
-            name: psutil.Process(self._children.pid(name)).num_threads() for name in self._names
-        }
+    def count_threads(self) -> dict[str, int]:
+        """Return the number of threads of each process."""
+        return Usage(self._children, self._names).threads()
 
-    def slope_mb_per_min(self) -> float | None:
-        """The steepest of all lives: the median of the slopes between all pairs of times (Theil,
-        Sen), which a step does not change. None: no life was long enough."""
-        slopes = [
-            slope
-            for times, sizes in self._lives.values()
-            if (slope := _slope(np.array(times), np.array(sizes))) is not None
-        ]
+    def growth_mb_per_min(self) -> float | None:
+        """Return the growth of the process that grows fastest, None if no process ran long enough.
+
+        It is the median of the slopes between all pairs of times (Theil, Sen), which a single step
+        does not change.
+        """
+        slopes = []
+        for sizes in self._sizes.values():
+            times_s, sizes_mb = np.array(sizes).T
+            settled = times_s > times_s[0] + SETTLE_S
+            if times_s[-1] - times_s[0] >= SETTLE_S + MIN_DURATION_S:
+                slopes.append(_median_slope(times_s[settled], sizes_mb[settled]))
         return round(60 * max(slopes), 2) if slopes else None
 
 
-def _slope(times: np.ndarray, sizes: np.ndarray) -> float | None:
-    """Per s, after settling."""
-    settled = times > times[0] + SETTLE_S
-    times, sizes = times[settled], sizes[settled]
-    if not len(times) or times[-1] - times[0] < LEAST_S:
-        return None
-    later, earlier = np.tril_indices(len(times), -1)
-    return float(np.median((sizes[later] - sizes[earlier]) / (times[later] - times[earlier])))
+def _median_slope(x: Array, y: Array) -> float:
+    later, earlier = np.tril_indices(len(x), -1)
+    return float(np.median((y[later] - y[earlier]) / (x[later] - x[earlier])))

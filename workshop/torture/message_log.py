@@ -1,7 +1,8 @@
-"""Keeps the messages of topics as they come, with the gaps in the numbers that DDS gives them.
+"""Log of the messages of topics as they arrive, with the gaps in the numbers that DDS gives them.
 
-A gap means that a message was sent and did not come here: so what this process missed is told from
-what nobody sent. Messages are taken without an executor, because only so their numbers come along.
+A gap means that a message was sent and did not arrive here. So what this process missed can be told
+from what nobody sent. Messages are taken without an executor, because only then the numbers are
+available.
 """
 
 from __future__ import annotations
@@ -16,192 +17,197 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from cube_tensor_driver.config.skin import Skin
+from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.errors import MessageError
 from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.messages.codec import AnyRows, MessageCodec
 from cube_tensor_driver.msg import StressTensorStamped
 from cube_tensor_driver.ros.messages import to_ns
 
-from ..checks.record import CubeMessages, Received
+from ..checks.record import CubeMessages, Received, Tensor, Wrench
 
-TOGETHER = 500
-"""Messages that are decoded at a time."""
-KEEP_ONE_OF = 8
-"""Of the messages of single cubes."""
-LISTEN = 4000
-"""Messages of single cubes that are listened to. All of them would need a third of the machine."""
-MOST = 300
-"""Messages taken at a time, so that this process does other things, too."""
+MESSAGES_PER_DECODING = 500
+"""Number of messages that are decoded together, which takes less time than one by one."""
+
+MESSAGES_PER_SAMPLE = 8
+"""Number of messages of a single cube of which one is kept."""
+
+MAX_CUBE_MESSAGES = 4000
+"""Number of messages of a single cube after which its topics are left. To receive all of them
+would take a third of the machine."""
+
+MAX_MESSAGES_TAKEN = 300
+"""Largest number of messages taken at a time, so that this process does other things, too."""
 
 
 class Message(NamedTuple):
-    """A serialised message, the number that DDS gave it, and when it was sent (wall clock)."""
+    """A serialised message, the number that DDS gave it, and the wall clock when it was sent."""
 
     data: bytes
     number: int
     sent_ns: int
 
 
-class _Subscription:
-    """Serialised messages of a topic with their numbers."""
+class _RawSubscription:
+    """Takes the serialised messages of a topic with their numbers."""
 
     def __init__(self, node: Node, kind: type, topic: str, quality: QoSProfile) -> None:
         self._node, self._kind = node, kind
-        self._subscription = node.create_subscription(kind, topic, _nothing, quality, raw=True)
+        self._subscription: Any = node.create_subscription(
+            kind, topic, lambda _: None, quality, raw=True
+        )
 
     def take(self) -> list[Message]:
-        """What has come since the last call, MOST at a time."""
+        """Return messages that have arrived since the last call."""
         taken: list[Message] = []
         handle = self._subscription.handle
         with handle:
-            while len(taken) < MOST and (item := handle.take_message(self._kind, True)) is not None:
-                data, about = item
-                number, sent_ns = about["publication_sequence_number"], about["source_timestamp"]
+            while len(taken) < MAX_MESSAGES_TAKEN:
+                item = handle.take_message(self._kind, True)
+                if item is None:
+                    break
+                data, info = item
+                number, sent_ns = info["publication_sequence_number"], info["source_timestamp"]
                 taken.append(Message(data, number, sent_ns))
         return taken
 
     def close(self) -> None:
+        """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
 
 
-class Tape(Generic[AnyRows]):
-    """All rows of one batch topic. count: messages so far."""
+class Topic(NamedTuple, Generic[AnyRows]):
+    """A batch topic: its name, type of message and codec."""
 
-    def __init__(
-        self,
-        node: Node,
-        kind: type,
-        topic: str,
-        codec: MessageCodec[AnyRows],
-        quality: QoSProfile,
-        skin: Skin,
-    ) -> None:
+    name: str
+    kind: type
+    codec: MessageCodec[AnyRows]
+
+
+class TopicLog(Generic[AnyRows]):
+    """Collects all rows of one batch topic.
+
+    Attributes:
+        count: Number of messages so far.
+    """
+
+    def __init__(self, node: Node, topic: Topic[AnyRows], quality: QoSProfile, skin: Skin) -> None:
         self.count = 0
-        self._codec: MessageCodec[AnyRows] = codec
+        self._codec: MessageCodec[AnyRows] = topic.codec
         self._frame_id = skin.parent_frame.encode() + b"\0"
-        self._subscription = _Subscription(node, kind, topic, quality)
-        self._joined: list[AnyRows] = []
+        self._subscription = _RawSubscription(node, topic.kind, topic.name, quality)
+        self._decoded: list[AnyRows] = []
         self._waiting: list[Message] = []
-        self._sent_ns: list[np.ndarray] = []
-        self._number = self._rows = 0
+        self._sent_ns: list[AnyArray] = []
+        self._last_number = self._n_rows = self._unreadable = 0
         self._gaps: list[tuple[int, int]] = []
         self._cubes: set[int] = set()
-        self._unreadable = 0
 
     def take(self) -> None:
-        """Take what has come; to be called again and again."""
+        """Take what has arrived; to be called again and again."""
         for message in self._subscription.take():
             self.count += 1
-            # A publisher that was made unnoticed begins at 1 again.
-            before = self._number if message.number > self._number else 0
-            self._number = message.number
-            if message.number > before + 1:
-                self._join()
-                self._gaps.append((self._rows, message.number - before - 1))
+            # A publisher whose start was not noticed begins at 1 again.
+            expected = self._last_number + 1 if message.number > self._last_number else 1
+            self._last_number = message.number
+            if message.number > expected:
+                self._decode()
+                self._gaps.append((self._n_rows, message.number - expected))
             self._waiting.append(message)
-        if len(self._waiting) >= TOGETHER:
-            self._join()
+        if len(self._waiting) >= MESSAGES_PER_DECODING:
+            self._decode()
 
-    def new_writer(self) -> None:
-        """The node that sends has made a new publisher: its numbers begin anew."""
+    def expect_new_publisher(self) -> None:
+        """Expect the numbers to begin again, because the sending node makes a new publisher."""
         self.take()
-        self._number = 0
+        self._last_number = 0
 
-    def cubes_so_far(self) -> int:
-        """How many cubes rows have come of."""
-        self._join()
+    def count_cubes(self) -> int:
+        """Return the number of cubes of which rows have arrived."""
+        self._decode()
         return len(self._cubes)
 
     def newest_ns(self) -> int:
-        """Stamp of the newest message; 0 before the first."""
-        self._join()
-        return int(self._joined[-1].stamp_ns[-1]) if self._joined else 0
+        """Return the stamp of the newest message, 0 before the first."""
+        self._decode()
+        return int(self._decoded[-1].stamp_ns[-1]) if self._decoded else 0
 
     def received(self) -> Received[AnyRows]:
-        """All that came. MessageError: nothing came."""
-        self._join()
-        if not self._joined:
-            raise MessageError("the driver or the reconstruction published nothing: see their logs")
-        return Received(
-            concatenate(self._joined),
-            np.concatenate(self._sent_ns),
-            tuple(self._gaps),
-            self._unreadable,
-        )
+        """Return all that arrived.
 
-    def _join(self) -> None:
-        """Decode what waits: neighbours of one shape together, because that takes less time."""
+        Raises:
+            MessageError: Nothing arrived.
+        """
+        self._decode()
+        if not self._decoded:
+            raise MessageError("the driver or the reconstruction published nothing: see their logs")
+        sent_ns = np.concatenate(self._sent_ns)
+        return Received(concatenate(self._decoded), sent_ns, tuple(self._gaps), self._unreadable)
+
+    def _decode(self) -> None:
+        """Decode what waits: neighbours of one shape together."""
         waiting, self._waiting = self._waiting, []
-        for _, group in groupby(waiting, self._shape):
+        for _, group in groupby(waiting, self._shape_of):
             messages = list(group)
             try:
                 decoded = self._codec.decode(*(message.data for message in messages))
             except MessageError:
                 self._unreadable += len(messages)
                 continue
-            self._unreadable += len(messages) * (decoded.frame_id != self._frame_id)
-            self._rows += len(decoded.rows)
-            self._joined.append(decoded.rows)
+            if decoded.frame_id != self._frame_id:
+                self._unreadable += len(messages)
+            self._n_rows += len(decoded.rows)
+            self._decoded.append(decoded.rows)
             sent_ns = [message.sent_ns for message in messages]
             self._sent_ns.append(np.repeat(sent_ns, len(decoded.rows) // len(messages)))
             self._cubes.update(np.unique(decoded.rows.cube).tolist())
 
-    def _shape(self, message: Message) -> tuple[int, bytes]:
+    def _shape_of(self, message: Message) -> tuple[int, bytes]:
         return len(message.data), self._codec.shape_bytes(message.data)
 
 
-class CubeTape:
-    """Some messages of the topics of one cube."""
+class CubeTopicLog:
+    """Collects some messages of the topics of one cube."""
 
     def __init__(self, node: Node, skin: Skin, cube: int, quality: QoSProfile) -> None:
         self._cube = cube
-        topic = f"cubes/{skin.cubes[cube].name}"
         self._kinds = {"stress": StressTensorStamped, "wrench": WrenchStamped}
         self._subscriptions = {
-            name: _Subscription(node, kind, f"{topic}/{name}", quality)
+            name: _RawSubscription(node, kind, f"cubes/{skin.cubes[cube].name}/{name}", quality)
             for name, kind in self._kinds.items()
         }
-        self._messages: dict[str, list[bytes]] = {name: [] for name in self._kinds}
+        self._kept: dict[str, list[Any]] = {name: [] for name in self._kinds}
         self._count = 0
 
     def take(self) -> None:
-        """Take what has come; to be called again and again."""
+        """Take what has arrived; to be called again and again."""
         for name, subscription in self._subscriptions.items():
             for message in subscription.take():
                 self._count += 1
-                if self._count % KEEP_ONE_OF == 0:
-                    self._messages[name].append(message.data)
-        if self._count > LISTEN:
-            self.close()
-
-    def close(self) -> None:
-        """Listen no more."""
-        for subscription in self._subscriptions.values():
-            subscription.close()
-        self._subscriptions.clear()
+                if self._count % MESSAGES_PER_SAMPLE == 0:
+                    self._kept[name].append(message.data)
+        if self._count > MAX_CUBE_MESSAGES:
+            for subscription in self._subscriptions.values():
+                subscription.close()
+            self._subscriptions.clear()
 
     def received(self) -> CubeMessages:
-        """Those that were kept."""
-        tensors = [
-            deserialize_message(data, StressTensorStamped) for data in self._messages["stress"]
-        ]
-        wrenches = [deserialize_message(data, WrenchStamped) for data in self._messages["wrench"]]
+        """Return the messages that were kept."""
+        tensors, wrenches = (
+            [deserialize_message(data, kind) for data in self._kept[name]]
+            for name, kind in self._kinds.items()
+        )
         return CubeMessages(
             self._cube,
             frozenset(message.header.frame_id for message in (*tensors, *wrenches)),
-            tuple(_tensor(message) for message in tensors),
-            tuple(_wrench(message) for message in wrenches),
+            tuple(map(_read_tensor, tensors)),
+            tuple(map(_read_wrench, wrenches)),
         )
 
 
-def _nothing(_: Any) -> None:
-    """Messages are taken by `_Subscription.take`."""
-
-
-def _tensor(message: StressTensorStamped) -> tuple[Any, ...]:
+def _read_tensor(message: StressTensorStamped) -> Tensor:
     tensor = message.tensor
-    normal, shear = tensor.normal, tensor.shear
-    values = [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z, *tensor.normal_gradient]
+    values = [*_read_vector(tensor.normal), *_read_vector(tensor.shear), *tensor.normal_gradient]
     return (
         to_ns(message.header.stamp),
         np.array(values),
@@ -212,7 +218,11 @@ def _tensor(message: StressTensorStamped) -> tuple[Any, ...]:
     )
 
 
-def _wrench(message: WrenchStamped) -> tuple[int, Any]:
-    force, torque = message.wrench.force, message.wrench.torque
-    values = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+def _read_wrench(message: WrenchStamped) -> Wrench:
+    wrench = message.wrench
+    values = [*_read_vector(wrench.force), *_read_vector(wrench.torque)]
     return to_ns(message.header.stamp), np.array(values)
+
+
+def _read_vector(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z

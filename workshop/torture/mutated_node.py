@@ -9,7 +9,7 @@ from .mutations import MUTATIONS
 
 
 def main() -> None:
-    """Patch this process, then run the node as ever."""
+    """Patch this process, then run the node as usual."""
     mutation = MUTATIONS[sys.argv.pop(1)]
     mutation.patch()
     import_module(f"cube_tensor_driver.ros.nodes.{mutation.node}").main()

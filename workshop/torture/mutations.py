@@ -1,7 +1,7 @@
-"""Faults of the program that the judge of torture must find. Each is put into a node's process when
-it starts, and into nothing else: the nodes know nothing of them.
+"""Programming errors that the checks of torture must find.
 
-A mutation wraps or replaces one function. Most change the rows of a message just before it is sent.
+Each mutation is put into the process of a node when it starts; the nodes do not know of it. It
+wraps or replaces one function. Most change the rows of a message just before it is sent.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace as with_fields
+from dataclasses import fields, replace
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,31 +35,45 @@ from cube_tensor_driver.ros.nodes.stress_publisher import CubeTopics, StressPubl
 from cube_tensor_driver.ros.nodes.taring import Taring
 
 Patch = Callable[[], None]
-SELDOM = 200
-"""Of so many messages one is changed, where a mutation does not change all."""
-EACH = 8
-"""Cubes of a hub."""
+"""Puts a mutation into this process."""
+
+Rows = TypeVar("Rows", FrequencyRows, StressRows)
+
+MESSAGES_PER_CHANGE = 200
+"""Number of messages of which one is changed, where a mutation does not change all."""
+
+CUBES_PER_HUB = 8
+"""Number of cubes on each hub of the torture."""
+
+NOISY_CUBE = 5
+"""Cube of the skin that the mutation `ghosts` flags."""
 
 
 class Mutation(NamedTuple):
-    """node: whose process is patched; what: it does wrong; needs_restart: it shows only when the
-    reconstruction starts again."""
+    """A programming error.
+
+    Attributes:
+        node: Node whose process is patched.
+        description: What it does wrong.
+        patch: Function that puts it into the process.
+        needs_restart: Whether it shows only when the reconstruction starts again.
+    """
 
     node: str
-    what: str
+    description: str
     patch: Patch
     needs_restart: bool = False
 
 
 def mutated(process: Process, name: str) -> Process:
-    """A process with a mutation, if it is of this process; else the process as it is."""
+    """Return the process with a mutation, or as it is if the mutation is of another process."""
     if not name or MUTATIONS[name].node != process.executable:
         return process
     module = "workshop.torture.mutated_node"
     return Process(process.executable, module, True, process.parameters, (name,))
 
 
-def _around(owner: Any, name: str, mutate: Callable[..., Any]) -> Patch:
+def _wrap(owner: Any, name: str, mutate: Callable[..., Any]) -> Patch:
     """Call mutate(original, self, ...) where owner.name(self, ...) was called."""
 
     def patch() -> None:
@@ -73,402 +87,391 @@ def _around(owner: Any, name: str, mutate: Callable[..., Any]) -> Patch:
     return patch
 
 
-def _frequencies(change: Callable[[FrequencyRows, int], None]) -> Patch:
-    """Change the rows of each message of frequencies in place; change(rows, message number)."""
-    numbers = count()
+def _skip(owner: Any, name: str) -> Patch:
+    """Do nothing where a function was called."""
+    return _wrap(owner, name, lambda *_, **__: None)
+
+
+def _change_result(owner: Any, name: str, change: Callable[[Any], Any]) -> Patch:
+    """Change what a function returns."""
+
+    def mutate(original: Any, *arguments: Any, **options: Any) -> Any:
+        return change(original(*arguments, **options))
+
+    return _wrap(owner, name, mutate)
+
+
+def _replace_value(owner: Any, name: str, value: Any) -> Patch:
+    """Give a constant or a function of a module another value."""
+
+    def patch() -> None:
+        getattr(owner, name)  # An error here tells that the module was changed.
+        setattr(owner, name, value)
+
+    return patch
+
+
+def _change_frequencies(change: Callable[[FrequencyRows], FrequencyRows]) -> Patch:
+    """Change the rows of each message of frequencies."""
 
     def publish(original: Any, publisher: Any) -> None:
         if publisher._next is not None:
-            change(publisher._next.rows, next(numbers))
+            rows = publisher._next.rows
+            changed = change(rows)
+            # The rows are views of the message, so they are changed in place.
+            for field in fields(rows):
+                getattr(rows, field.name)[:] = getattr(changed, field.name)
         original(publisher)
 
-    return _around(FrequenciesPublisher, "publish", publish)
+    return _wrap(FrequenciesPublisher, "publish", publish)
 
 
-def _stress(change: Callable[[StressRows, int], StressRows]) -> Patch:
-    """Publish other rows of stress; change(rows, message number)."""
-    numbers = count()
+def _change_stress(change: Callable[[StressRows], StressRows]) -> Patch:
+    """Change the rows of each message of stress."""
 
     def publish(original: Any, publisher: Any, rows: StressRows, *header: Any) -> None:
-        original(publisher, change(rows, next(numbers)), *header)
+        original(publisher, change(rows), *header)
 
-    return _around(StressPublisher, "publish", publish)
+    return _wrap(StressPublisher, "publish", publish)
 
 
-def _repeated(owner: Any, times: int) -> Patch:
-    """Publish one of SELDOM messages so many times."""
+def _columns(**changes: Callable[[Any], Any]) -> Callable[[Rows], Rows]:
+    """Change columns of rows, each by a function of its old values."""
+
+    def change(rows: Rows) -> Rows:
+        columns = {name: make(np.array(getattr(rows, name))) for name, make in changes.items()}
+        return replace(rows, **columns)
+
+    return change
+
+
+def _frequencies(**changes: Callable[[Any], Any]) -> Patch:
+    """Change columns of each message of frequencies."""
+    return _change_frequencies(_columns(**changes))
+
+
+def _stress(**changes: Callable[[Any], Any]) -> Patch:
+    """Change columns of each message of stress."""
+    return _change_stress(_columns(**changes))
+
+
+def _stale(name: str) -> Callable[[Rows], Rows]:
+    """Give one of `MESSAGES_PER_CHANGE` messages a column of the message before."""
+    numbers = count()
+    last: list[Any] = []
+
+    def change(rows: Rows) -> Rows:
+        now = np.array(getattr(rows, name))
+        before = last.pop() if last else now
+        last.append(now)
+        is_due = next(numbers) % MESSAGES_PER_CHANGE == 0 and before.shape == now.shape
+        return replace(rows, **{name: before}) if is_due else rows
+
+    return change
+
+
+def _repeat(owner: Any, times: int) -> Patch:
+    """Publish one of `MESSAGES_PER_CHANGE` messages several times, or not at all."""
     numbers = count(1)
 
     def publish(original: Any, *arguments: Any) -> None:
-        for _ in range(1 if next(numbers) % SELDOM else times):
+        for _ in range(1 if next(numbers) % MESSAGES_PER_CHANGE else times):
             original(*arguments)
 
-    return _around(owner, "publish", publish)
+    return _wrap(owner, "publish", publish)
 
 
-def _drop_last_row(original: Any, publisher: Any, numbers: Any = count(1)) -> None:  # noqa: B008
-    """Publish one of SELDOM messages without its last row; the driver counts it all the same."""
-    message = publisher._next
-    if message is not None and next(numbers) % SELDOM == 0 and len(message.rows) > 1:
-        whole = message.rows
-        part = whole.select(slice(len(whole) - 1))
-        smaller = publisher._make_buffer(len(part), part.frequency.shape[1])
-        smaller.fill(part)
-        publisher._next = smaller
-    original(publisher)
+def _drop_last_row() -> Patch:
+    """Publish some messages without their last row, which the driver counts all the same."""
+    numbers = count(1)
+
+    def publish(original: Any, publisher: Any) -> None:
+        message = publisher._next
+        is_due = message is not None and next(numbers) % MESSAGES_PER_CHANGE == 0
+        if is_due and len(message.rows) > 1:
+            part = message.rows.select(slice(len(message.rows) - 1))
+            publisher._next = publisher._make_buffer(len(part), part.frequency.shape[1])
+            publisher._next.fill(part)
+        original(publisher)
+
+    return _wrap(FrequenciesPublisher, "publish", publish)
 
 
-def _swap_pads(rows: FrequencyRows, _: int) -> None:
-    rows.frequency[:, [0, 1]] = rows.frequency[:, [1, 0]]
-
-
-def _swap_cubes(rows: FrequencyRows, _: int) -> None:
+def _swap_cubes(rows: FrequencyRows) -> FrequencyRows:
     one, other = np.flatnonzero(rows.cube == 1), np.flatnonzero(rows.cube == 2)
+    frequency = np.array(rows.frequency)
     if len(one) == len(other):
-        rows.frequency[np.r_[one, other]] = rows.frequency[np.r_[other, one]]
+        frequency[np.r_[one, other]] = frequency[np.r_[other, one]]
+    return replace(rows, frequency=frequency)
 
 
-def _swap_hubs(rows: FrequencyRows, _: int) -> None:
-    swapped = rows.cube < 2 * EACH
-    rows.cube[swapped] = (rows.cube[swapped] + EACH) % (2 * EACH)
+def _swap_hubs(cube: Any) -> Any:
+    other_hub = (cube + CUBES_PER_HUB) % (2 * CUBES_PER_HUB)
+    return np.where(cube < 2 * CUBES_PER_HUB, other_hub, cube)
 
 
-def _scale(rows: FrequencyRows, _: int) -> None:
-    rows.frequency[:] *= np.float32(1 + 1e-6)
+def _treat_as(found: Arrival, instead: Arrival) -> Patch:
+    """Treat samples of one kind as another kind."""
+    return _change_result(
+        SampleAccount, "sample", lambda arrival: instead if arrival is found else arrival
+    )
 
 
-def _to_millihertz(rows: FrequencyRows, _: int) -> None:
-    rows.frequency[:] *= np.float32(1e3)
-
-
-def _round(rows: FrequencyRows, _: int) -> None:
-    np.rint(rows.frequency, out=rows.frequency)
-
-
-def _stale_frequencies() -> Callable[[FrequencyRows, int], None]:
-    before: list[np.ndarray] = []
-
-    def change(rows: FrequencyRows, number: int) -> None:
-        now = rows.frequency.copy()
-        if number % SELDOM == 0 and before and before[0].shape == now.shape:
-            rows.frequency[:] = before[0]
-        before[:] = [now]
-
-    return change
-
-
-def _zero_for_nothing(rows: FrequencyRows, _: int) -> None:
-    rows.frequency[np.isnan(rows.frequency)] = 0.0
-
-
-def _late(milliseconds: float) -> Callable[[FrequencyRows, int], None]:
-    def change(rows: FrequencyRows, _: int) -> None:
-        rows.stamp_ns[:] += round(1e6 * milliseconds)
-
-    return change
-
-
-def _stamp_arrival(rows: FrequencyRows, _: int) -> None:
-    rows.stamp_ns[:] = time.time_ns()
-
-
-def _next_sequence(rows: FrequencyRows, _: int) -> None:
-    rows.sequence[:] += np.uint32(1)
-
-
-def _warmer(rows: FrequencyRows, _: int) -> None:
-    rows.temperature[:] += np.float32(10)
-
-
-def _no_temperature(rows: FrequencyRows, _: int) -> None:
-    rows.temperature[:] = np.nan
-
-
-def _no_pad_fault(rows: FrequencyRows, _: int) -> None:
-    rows.pad_fault[:] = 0
-
-
-def _next_pad_fault(rows: FrequencyRows, _: int) -> None:
-    rows.pad_fault[:] = np.roll(rows.pad_fault, 1)
-
-
-def _take_as(found: Arrival, instead: Arrival) -> Patch:
-    """Samples of one kind are taken for another kind."""
-
-    def sample(original: Any, account: Any, frame: Any) -> Arrival:
-        arrival: Arrival = original(account, frame)
-        return instead if arrival is found else arrival
-
-    return _around(SampleAccount, "sample", sample)
-
-
-def _no_losses(original: Any, account: Any) -> dict[str, int]:
-    return {**original(account), "lost_on_the_way": 0}
-
-
-def _believe_checksums() -> None:
+def _ignore_checksums() -> None:
     class Zlib:
         @staticmethod
         def crc32(_: bytes) -> int:
             return decoder._CRC_RESIDUE
 
-    decoder.zlib = Zlib  # type: ignore[assignment]
-    link.Decoder = decoder.PythonDecoder  # type: ignore[assignment]
+    decoder.zlib = Zlib  # type: ignore[assignment, attr-defined]
+    # Only the decoder in Python has a checksum that can be replaced.
+    link.Decoder = decoder.PythonDecoder  # type: ignore[assignment, attr-defined]
 
 
-def _leave_threads(original: Any, *arguments: Any) -> None:
+def _leave_thread(original: Any, *arguments: Any) -> None:
     threading.Thread(target=threading.Event().wait, daemon=True).start()
     original(*arguments)
 
 
-def _columns(**change: Callable[[Any], Any]) -> Callable[[StressRows, int], StressRows]:
-    """Change fields of rows of stress, by name."""
-
-    def changed(rows: StressRows, _: int) -> StressRows:
-        fields = {name: make(np.array(getattr(rows, name))) for name, make in change.items()}
-        return with_fields(rows, **fields)
-
-    return changed
+def _swap_open_and_short(status: Any) -> Any:
+    swapped = status & ~np.uint16(OPEN | SHORT)
+    swapped |= np.where(status & OPEN, SHORT, 0).astype(np.uint16)
+    return swapped | np.where(status & SHORT, OPEN, 0).astype(np.uint16)
 
 
-def _stale_stress() -> Callable[[StressRows, int], StressRows]:
-    before: list[np.ndarray] = []
-
-    def change(rows: StressRows, number: int) -> StressRows:
-        now = np.array(rows.stress)
-        old = before[0] if before else now
-        before[:] = [now]
-        return (
-            with_fields(rows, stress=old) if number % SELDOM == 0 and len(old) == len(now) else rows
-        )
-
-    return change
+def _flag_sound_pad(original: Any, health: Any, rows: FrequencyRows) -> tuple[Any, Any]:
+    left_out, status = original(health, rows)
+    flagged = rows.cube == NOISY_CUBE
+    return left_out | flagged.astype(np.uint32), status | (flagged * np.uint16(NOISY))
 
 
-def _swap_bits(status: np.ndarray, one: int, other: int) -> np.ndarray:
-    swapped = status & ~np.uint16(one | other)
-    swapped |= np.where(status & one, other, 0).astype(np.uint16)
-    return swapped | np.where(status & other, one, 0).astype(np.uint16)
+def _never_release(original: Any, conditions: Any, found: Any, came: Any) -> None:
+    kept = conditions._recent[0] | found
+    original(conditions, found, came)
+    conditions._recent[0] |= kept
 
 
-def _see_nothing(original: Any, self: Any, rows: FrequencyRows) -> tuple[Any, Any]:
-    original(self, rows)
-    return np.zeros(len(rows), np.uint32), np.zeros(len(rows), np.uint16)
+def _use_bad_pads(original: Any, pipeline: Any, rows: FrequencyRows, left_out: Any = None) -> Any:
+    wrong = original(pipeline, rows, np.zeros(len(rows), np.uint32))
+    right = original(pipeline, rows, left_out)
+    return replace(right, stress=wrong.stress, gradient=wrong.gradient)
 
 
-def _see_ghosts(original: Any, self: Any, rows: FrequencyRows) -> tuple[Any, Any]:
-    left_out, status = original(self, rows)
-    ghost = rows.cube == 5
-    return left_out | ghost.astype(np.uint32), status | (ghost * np.uint16(NOISY))
-
-
-def _never_found(original: Any, self: Any, *arguments: Any) -> Any:
-    return np.zeros_like(original(self, *arguments))
-
-
-def _keep_for_ever(original: Any, self: Any, found: np.ndarray, came: np.ndarray) -> None:
-    kept = self._recent[0] | found
-    original(self, found, came)
-    self._recent[0] |= kept
-
-
-def _slow_windows() -> None:
-    health.WINDOW_NS = 2_000_000_000
-
-
-def _use_bad_pads(original: Any, self: Any, rows: FrequencyRows, left_out: Any = None) -> Any:
-    wrong = original(self, rows, np.zeros(len(rows), np.uint32))
-    right = original(self, rows, left_out)
-    return with_fields(right, stress=wrong.stress, gradient=wrong.gradient)
-
-
-def _no_tare(original: Any, self: Any, *arguments: Any) -> Any:
-    before, changes = self.rest_frequency, self.rest_changes
-    rest = original(self, *arguments)
-    self.rest_frequency, self.rest_changes = before, changes
+def _undo_tare(original: Any, reconstructor: Any, *arguments: Any) -> Any:
+    before = reconstructor.rest_frequency, reconstructor.rest_changes
+    rest = original(reconstructor, *arguments)
+    reconstructor.rest_frequency, reconstructor.rest_changes = before
     return rest
 
 
-def _short_queue() -> None:
-    qos.MAX_PAUSE_S = 0.1
-    _around(LostMessages, "note_arrival", _nothing)()
-
-
-def _nothing(*_: Any) -> None:
-    """Instead of what should be done."""
+def _lose_silently() -> None:
+    """Make the queues short, and let nobody count what they drop."""
+    _replace_value(qos, "MAX_PAUSE_S", 0.1)()
+    _skip(LostMessages, "note_arrival")()
 
 
 DRIVER: dict[str, tuple[str, Patch]] = {
     "lost row": (
         "a row is dropped inside a message but counted as published",
-        _around(FrequenciesPublisher, "publish", _drop_last_row),
+        _drop_last_row(),
     ),
-    "lost scan": ("1 of 200 messages is not sent", _repeated(FrequenciesPublisher, 0)),
-    "scan twice": ("1 of 200 messages is sent twice", _repeated(FrequenciesPublisher, 2)),
-    "swapped pads": ("two pads of each cube are swapped", _frequencies(_swap_pads)),
-    "swapped cubes": ("the readings of two cubes are swapped", _frequencies(_swap_cubes)),
-    "swapped hubs": ("the cubes of two hubs are swapped", _frequencies(_swap_hubs)),
-    "scaled": ("frequencies are 1 ppm too high", _frequencies(_scale)),
-    "millihertz": ("frequencies are in mHz", _frequencies(_to_millihertz)),
-    "rounded": ("frequencies are rounded to 1 Hz", _frequencies(_round)),
+    "lost scan": ("1 of 200 messages is not sent", _repeat(FrequenciesPublisher, 0)),
+    "scan twice": ("1 of 200 messages is sent twice", _repeat(FrequenciesPublisher, 2)),
+    "swapped pads": (
+        "two pads of each cube are swapped",
+        _frequencies(frequency=lambda f: np.hstack([f[:, [1, 0]], f[:, 2:]])),
+    ),
+    "swapped cubes": (
+        "the readings of two cubes are swapped",
+        _change_frequencies(_swap_cubes),
+    ),
+    "swapped hubs": ("the cubes of two hubs are swapped", _frequencies(cube=_swap_hubs)),
+    "scaled": (
+        "frequencies are 1 ppm too high",
+        _frequencies(frequency=lambda f: f * np.float32(1 + 1e-6)),
+    ),
+    "millihertz": ("frequencies are in mHz", _frequencies(frequency=lambda f: 1000 * f)),
+    "rounded": ("frequencies are rounded to 1 Hz", _frequencies(frequency=np.rint)),
     "stale": (
         "1 of 200 messages has the frequencies of the one before",
-        _frequencies(_stale_frequencies()),
+        _change_frequencies(_stale("frequency")),
     ),
-    "zero": ("a pad that was not measured reads 0 Hz", _frequencies(_zero_for_nothing)),
-    "late stamps": ("stamps are 0.8 ms late", _frequencies(_late(0.8))),
-    "early stamps": ("stamps are 1 ms early", _frequencies(_late(-1.0))),
-    "arrival stamps": ("stamps are the time of sending", _frequencies(_stamp_arrival)),
-    "sequence": ("sequence numbers are one too high", _frequencies(_next_sequence)),
-    "warm": ("the temperature is 10 °C too high", _frequencies(_warmer)),
-    "no temperature": ("the temperature is unknown", _frequencies(_no_temperature)),
-    "no pad fault": ("what the hub reports of pads is left out", _frequencies(_no_pad_fault)),
+    "zero": (
+        "a pad that was not measured reads 0 Hz",
+        _frequencies(frequency=np.nan_to_num),
+    ),
+    "late stamps": ("stamps are 0.8 ms late", _frequencies(stamp_ns=lambda t: t + 800_000)),
+    "early stamps": ("stamps are 1 ms early", _frequencies(stamp_ns=lambda t: t - 1_000_000)),
+    "arrival stamps": (
+        "stamps are the time of sending",
+        _frequencies(stamp_ns=lambda t: np.full_like(t, time.time_ns())),
+    ),
+    "sequence": (
+        "sequence numbers are one too high",
+        _frequencies(sequence=lambda sequence: sequence + np.uint32(1)),
+    ),
+    "warm": (
+        "the temperature is 10 °C too high",
+        _frequencies(temperature=lambda celsius: celsius + np.float32(10)),
+    ),
+    "no temperature": (
+        "the temperature is unknown",
+        _frequencies(temperature=lambda celsius: np.full_like(celsius, np.nan)),
+    ),
+    "no pad fault": (
+        "the faults of pads that the hub reports are omitted",
+        _frequencies(pad_fault=np.zeros_like),
+    ),
     "other pad fault": (
-        "what the hub reports of pads goes to the next cube",
-        _frequencies(_next_pad_fault),
+        "the faults of pads that the hub reports are given to the next cube",
+        _frequencies(pad_fault=lambda bits: np.roll(bits, 1)),
     ),
     "duplicates": (
         "samples that came twice are delivered twice",
-        _take_as(Arrival.DUPLICATE, Arrival.NEW),
+        _treat_as(Arrival.DUPLICATE, Arrival.NEW),
     ),
     "late lost": (
-        "samples out of order are taken for duplicates",
-        _take_as(Arrival.LATE, Arrival.DUPLICATE),
+        "samples out of order are treated as duplicates",
+        _treat_as(Arrival.LATE, Arrival.DUPLICATE),
     ),
     "losses uncounted": (
         "samples lost on the way are not counted",
-        _around(SampleAccount, "counters", _no_losses),
+        _change_result(
+            SampleAccount, "counters", lambda counters: {**counters, "lost_on_the_way": 0}
+        ),
     ),
-    "checksum": ("checksums are not looked at", _believe_checksums),
-    "rate ignored": ("a new rate is not asked for", _around(LiveLinks, "set_rate", _nothing)),
+    "checksum": ("checksums are not checked", _ignore_checksums),
+    "rate ignored": ("a new rate is not requested", _skip(LiveLinks, "set_rate")),
     "threads": (
         "each change of a link's state leaves a thread",
-        _around(LiveLinks, "_on_state", _leave_threads),
+        _wrap(LiveLinks, "_on_state", _leave_thread),
     ),
 }
+"""Errors of the driver: description and patch by name."""
+
 RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
-    "lost stress": ("1 of 200 messages of stress is not sent", _repeated(StressPublisher, 0)),
-    "stress twice": ("1 of 200 messages of stress is sent twice", _repeated(StressPublisher, 2)),
-    "losses unseen": ("queues hold 0.1 s, and nobody counts what they drop", _short_queue),
-    "blind": ("health finds and flags nothing", _around(Health, "update", _see_nothing)),
-    "ghosts": ("health flags a sound pad", _around(Health, "update", _see_ghosts)),
-    "never stuck": ("stuck pads are not found", _around(PadDiagnosis, "_find_stuck", _never_found)),
-    "never noisy": ("noisy pads are not found", _around(PadDiagnosis, "_find_noisy", _never_found)),
+    "lost stress": ("1 of 200 messages of stress is not sent", _repeat(StressPublisher, 0)),
+    "stress twice": ("1 of 200 messages of stress is sent twice", _repeat(StressPublisher, 2)),
+    "losses unseen": ("queues hold 0.1 s, and nobody counts what they drop", _lose_silently),
+    "blind": (
+        "health finds and flags nothing",
+        _change_result(Health, "update", lambda flags: tuple(map(np.zeros_like, flags))),
+    ),
+    "ghosts": ("health flags a sound pad", _wrap(Health, "update", _flag_sound_pad)),
+    "never stuck": (
+        "stuck pads are not found",
+        _change_result(PadDiagnosis, "_find_stuck", np.zeros_like),
+    ),
+    "never noisy": (
+        "noisy pads are not found",
+        _change_result(PadDiagnosis, "_find_noisy", np.zeros_like),
+    ),
     "no stuck bit": (
-        "the status does not say that a pad is stuck",
-        _stress(_columns(status=lambda status: status & ~np.uint16(STUCK))),
+        "the status does not state that a pad is stuck",
+        _stress(status=lambda status: status & ~np.uint16(STUCK)),
     ),
     "open is short": (
-        "the status says short for open, and open for short",
-        _stress(_columns(status=lambda status: _swap_bits(status, OPEN, SHORT))),
+        "the status states short for open, and open for short",
+        _stress(status=_swap_open_and_short),
     ),
-    "for ever": ("a pad is never taken back", _around(Conditions, "end_window", _keep_for_ever)),
-    "slow": ("windows of statistics last 2 s", _slow_windows),
-    "no mask": ("left_out is 0", _stress(_columns(left_out=np.zeros_like))),
+    "for ever": (
+        "a pad is never used again",
+        _wrap(Conditions, "end_window", _never_release),
+    ),
+    "slow": (
+        "windows of statistics last 2 s",
+        _replace_value(health, "WINDOW_NS", 2_000_000_000),
+    ),
+    "no mask": ("left_out is 0", _stress(left_out=np.zeros_like)),
     "other mask": (
         "left_out names the next pad",
-        _stress(_columns(left_out=lambda mask: mask << np.uint32(1))),
+        _stress(left_out=lambda mask: mask << np.uint32(1)),
     ),
-    "mask unused": ("left-out pads are used", _around(Pipeline, "process", _use_bad_pads)),
-    "no residual": ("the residual is 0", _stress(_columns(residual=np.zeros_like))),
-    "residual doubled": (
-        "the residual is doubled",
-        _stress(_columns(residual=lambda residual: 2 * residual)),
-    ),
+    "mask unused": ("left-out pads are used", _wrap(Pipeline, "process", _use_bad_pads)),
+    "no residual": ("the residual is 0", _stress(residual=np.zeros_like)),
+    "residual doubled": ("the residual is doubled", _stress(residual=lambda value: 2 * value)),
     "no residual bit": (
-        "the status says nothing of residuals",
-        _stress(_columns(status=lambda status: status & ~np.uint16(RESIDUAL))),
+        "the status states nothing about residuals",
+        _stress(status=lambda status: status & ~np.uint16(RESIDUAL)),
     ),
     "swapped components": (
         "xx and zz are swapped",
-        _stress(_columns(stress=lambda stress: stress[:, [2, 1, 0, 3, 4, 5]])),
+        _stress(stress=lambda stress: stress[:, [2, 1, 0, 3, 4, 5]]),
     ),
     "shear sign": (
         "zx has the other sign",
-        _stress(_columns(stress=lambda stress: stress * [1, 1, 1, 1, -1, 1])),
+        _stress(stress=lambda stress: stress * [1, 1, 1, 1, -1, 1]),
     ),
     "pressure positive": (
         "compression is positive",
-        _stress(_columns(stress=np.negative, gradient=np.negative)),
+        _stress(stress=np.negative, gradient=np.negative),
     ),
-    "kilopascal": ("stress is in kPa", _stress(_columns(stress=lambda stress: stress / 1e3))),
-    "per millimetre": (
-        "gradients are in Pa/mm",
-        _stress(_columns(gradient=lambda gradient: gradient / 1e3)),
-    ),
+    "kilopascal": ("stress is in kPa", _stress(stress=lambda stress: stress / 1e3)),
+    "per millimetre": ("gradients are in Pa/mm", _stress(gradient=lambda value: value / 1e3)),
     "gradient transposed": (
         "gradients have columns for rows",
-        _stress(_columns(gradient=lambda g: g.reshape(-1, 3, 3).transpose(0, 2, 1).reshape(-1, 9))),
+        _stress(gradient=lambda g: g.reshape(-1, 3, 3).transpose(0, 2, 1).reshape(-1, 9)),
     ),
     "unknown is zero": (
         "components that are not observed are 0",
-        _stress(_columns(stress=np.nan_to_num, gradient=np.nan_to_num)),
+        _stress(stress=np.nan_to_num, gradient=np.nan_to_num),
     ),
     "stale stress": (
         "1 of 200 messages has the stress of the one before",
-        _stress(_stale_stress()),
+        _change_stress(_stale("stress")),
     ),
     "swapped tensors": (
         "the tensors of neighbours are swapped",
-        _stress(_columns(stress=lambda stress: stress[::-1])),
+        _stress(stress=lambda stress: stress[::-1]),
     ),
     "stress stamps": (
         "stress has stamps 1 ms later than its frequencies",
-        _stress(_columns(stamp_ns=lambda stamp_ns: stamp_ns + 1_000_000)),
+        _stress(stamp_ns=lambda stamp_ns: stamp_ns + 1_000_000),
     ),
     "stress sequence": (
         "stress has sequence numbers one higher",
-        _stress(_columns(sequence=lambda sequence: sequence + np.uint32(1))),
+        _stress(sequence=lambda sequence: sequence + np.uint32(1)),
     ),
     "observed": (
         "a component that is observed is marked as not observed",
-        _stress(_columns(observed=lambda observed: observed & ~np.uint16(1))),
+        _stress(observed=lambda observed: observed & ~np.uint16(1)),
     ),
     "wrong tare": (
         "a tare gives rest frequencies 100 ppm too high",
-        _around(
-            Reconstructor,
-            "measure_rest",
-            lambda original, *arguments: (1 + 1e-4) * original(*arguments),
-        ),
+        _change_result(Reconstructor, "measure_rest", lambda rest: (1 + 1e-4) * rest),
     ),
     "tare of others": (
         "a tare takes the frequencies of the next cube",
-        _around(
-            Reconstructor,
-            "measure_rest",
-            lambda original, *arguments: np.roll(original(*arguments), 1, axis=0),
-        ),
+        _change_result(Reconstructor, "measure_rest", lambda rest: np.roll(rest, 1, axis=0)),
     ),
-    "no tare": ("a tare changes nothing", _around(Reconstructor, "tare", _no_tare)),
-    "no clear": (
-        "clearing the tare changes nothing",
-        _around(Reconstructor, "clear_tare", _nothing),
-    ),
+    "no tare": ("a tare changes nothing", _wrap(Reconstructor, "tare", _undo_tare)),
+    "no clear": ("clearing the tare changes nothing", _skip(Reconstructor, "clear_tare")),
     "covariance": (
         "the covariance of single cubes is doubled",
-        _around(CubeTopics, "_covariance", lambda original, *arguments: 2 * original(*arguments)),
+        _change_result(CubeTopics, "_covariance", lambda covariance: 2 * covariance),
     ),
     "other cube": (
         "the topic of a cube has the tensor of another one",
-        _around(
+        _wrap(
             stress_publisher,
             "tensor_message",
-            lambda original, header, rows, row, covariance: original(
-                header, rows, row - 1, covariance
-            ),
+            lambda original, header, rows, row, *others: original(header, rows, row - 1, *others),
         ),
     ),
 }
+"""Errors of the reconstruction: description and patch by name."""
+
 RESTARTED: dict[str, tuple[str, Patch]] = {
     "tare not restored": (
         "a tare is not restored at the start",
-        _around(Taring, "_restore_tare", _nothing),
+        _skip(Taring, "_restore_tare"),
     ),
 }
+"""Errors of the reconstruction that show only when it starts again."""
+
 MUTATIONS: dict[str, Mutation] = {
     **{name: Mutation("driver", *rest) for name, rest in DRIVER.items()},
     **{name: Mutation("reconstruction", *rest) for name, rest in RECONSTRUCTION.items()},
     **{name: Mutation("reconstruction", *rest, True) for name, rest in RESTARTED.items()},
 }
-"""By name."""
+"""All mutations by name."""

@@ -1,5 +1,7 @@
-"""`./cube torture`: a skin under a random mix of all faults, in processes of its own. The judge
-compares every row that came with what was measured and what was done."""
+"""`./cube torture`: a skin under a random mix of all faults, in processes of its own.
+
+Every row that arrives is compared with what was measured and with what was done.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,18 @@ from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.stop_signals import stop_event
 from cube_tensor_driver.views.terminal.output import progress_bar
 
-from ..checks.verdict import judge
+from ..checks.all_checks import check_all
 from .mutations import MUTATIONS
-from .skin import play
+from .play import play
 
 MUTATED_S = 10.0
-"""How long a mutated torture lasts: long enough for each kind of fault and each deed but
-restarts."""
+"""Duration, in seconds, of a torture with a mutation. It is long enough for each kind of fault and
+each action except the restarts."""
+
 RESTARTED_S = 16.0
-"""The same, for mutations that show when the reconstruction starts again."""
+"""Duration, in seconds, of a torture with a mutation that shows when the reconstruction starts
+again."""
+
 LIMITS = {
     "unreadable": 0.0,
     "lost": 0.0,
@@ -47,47 +52,66 @@ LIMITS = {
     "stamp_error_p90_ms": 1.5,
     "stamp_error_p99_ms": 10.0,
 }
-"""The most that each figure may be. On a busy host queues of DDS fill, and memory grows with them;
-a leak of 200 bytes a message is 6 MB a minute."""
+"""Largest value of each figure.
+
+On a busy host the queues of DDS fill, and memory grows with them. A leak of 200 bytes per message
+would be 6 MB per minute.
+"""
 
 
 def run_torture(*, duration: float, seed: int = 0, json_path: Path | None = None) -> int:
-    """Torture a skin for `duration` s with the mix of faults of a seed, and print the figures;
-    returns the exit code, 0 when all figures are as they must be. CubeError: something does not
-    start."""
+    """Torture a skin and print the figures.
+
+    Args:
+        duration: Time in which faults begin, in seconds.
+        seed: Seed of the mix of faults.
+        json_path: File for the figures.
+
+    Returns:
+        Exit code, 0 if every figure is within its limit.
+
+    Raises:
+        CubeError: A process does not start, or ends.
+    """
     result = torture(duration, seed, stop_event())
     report(result, json_path)
     broken = failures(result)
     if broken:
-        print(f"not as it must be: {', '.join(broken)}")
+        print(f"above their limits: {', '.join(broken)}")
     return 1 if broken else 0
 
 
 def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) -> int:
-    """Torture a mutated skin, and print what caught it; returns the exit code, 0 if it was caught.
+    """Torture a mutated skin and print which figures show the mutation.
 
-    name: of one mutation; all: each in turn. ConfigError: there is no such mutation.
+    Args:
+        name: Name of one mutation, or "all" for each in turn.
+        seed: Seed of the mix of faults.
+        json_path: File for the results.
+
+    Returns:
+        Exit code, 0 if every mutation was found.
+
+    Raises:
+        ConfigError: There is no such mutation.
     """
     names = list(MUTATIONS) if name == "all" else [name]
     if not set(names) <= set(MUTATIONS):
         raise ConfigError(f"--mutate {name!r}, allowed: all, {', '.join(MUTATIONS)}")
-    stop_event()  # ends the torture, whose error comes here
+    # A signal ends the process of the torture, whose error arrives here.
+    stop_event()
     results: dict[str, dict[str, Any]] = {}
     with progress_bar() as progress:
         for number, name in enumerate(names):
             progress(number, len(names), name)
-            # Each in a process of its own: after 32 tortures in one process Fast DDS 2.14 brought
-            # nothing to it any more, each time it was tried.
+            # Each runs in a process of its own: after 32 tortures in one process, Fast DDS 2.14
+            # delivered nothing to it any more, each time it was tried.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-                figures = process.submit(_mutated_torture, name, seed).result()
-            caught_by = failures(figures)
-            results[name] = {
-                "caught": bool(caught_by),
-                "by": caught_by,
-                "seconds": figures["seconds"],
-            }
-            by = f"caught by {', '.join(caught_by)}" if caught_by else "not caught"
-            print(f"{name}: {by}, {figures['seconds']:g} s", flush=True)
+                figures = process.submit(_torture_mutated, name, seed).result()
+            found_by, seconds = failures(figures), figures["seconds"]
+            results[name] = {"caught": bool(found_by), "by": found_by, "seconds": seconds}
+            outcome = f"caught by {', '.join(found_by)}" if found_by else "not caught"
+            print(f"{name}: {outcome}, {seconds:g} s", flush=True)
     report({"mutations": results}, json_path)
     missed = [name for name, result in results.items() if not result["caught"]]
     if missed:
@@ -95,29 +119,28 @@ def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) ->
     return 1 if missed else 0
 
 
-def _mutated_torture(name: str, seed: int) -> dict[str, Any]:
-    """All figures of the torture of one mutation."""
+def _torture_mutated(name: str, seed: int) -> dict[str, Any]:
+    """Return the figures of the torture of one mutation."""
     duration = RESTARTED_S if MUTATIONS[name].needs_restart else MUTATED_S
     return torture(duration, seed, stop_event(), name)
 
 
 def failures(result: dict[str, Any]) -> list[str]:
-    """Names of the figures that are not as they must be."""
+    """Return the names of the figures that are above their limits."""
     return [name for name, limit in LIMITS.items() if (result[name] or 0) > limit]
 
 
 def torture(
     duration: float, seed: int, interrupted: threading.Event, mutation: str = ""
 ) -> dict[str, Any]:
-    """All figures. mutation: of the driver or the reconstruction; empty: none."""
+    """Play one torture and return all figures, see `play` for the arguments."""
     with own_domain(), tempfile.TemporaryDirectory(prefix="cube_torture_") as folder:
         played = play(duration, seed, Path(folder), interrupted, mutation)
-        figures = judge(played.record, played.log)
-    seconds = time.monotonic() - played.began_s
+        figures = check_all(played.record, played.log)
     return {
         "duration_s": duration,
         "seed": seed,
-        "seconds": round(seconds, 1),
+        "seconds": round(time.monotonic() - played.began_s, 1),
         **figures,
         **played.figures,
     }

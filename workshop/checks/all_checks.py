@@ -1,0 +1,62 @@
+"""All checks together: the figures of a torture."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from cube_tensor_driver.core.matching import NO_MATCH
+from cube_tensor_driver.simulation.sample_log import SampleLog
+
+from .counters import check_counters
+from .cube_topics import check_cube_topics
+from .frequencies import check_frequencies
+from .health import check_health
+from .record import Record
+from .run import Run
+from .tensors import check_tensors
+from .timing import count_wrong_periods, measure_reconnects, measure_stamp_errors
+
+MAX_EXAMPLES = 8
+"""Number of examples that are printed."""
+
+PERCENTILES = (50, 90, 99)
+"""Percentiles of the absolute stamp errors that are printed."""
+
+
+def check_all(record: Record, log: SampleLog) -> dict[str, Any]:
+    """Compute all figures. Counts are rows: one cube, one sample."""
+    run = Run(record, log)
+    frequencies = check_frequencies(run)
+    tensors = check_tensors(run)
+    # A row of stress without a source has no sample either.
+    samples = np.append(run.sample, NO_MATCH)
+    health = check_health(run, samples[tensors.source])
+    counters = check_counters(run, frequencies, tensors)
+
+    figures = Counter[str]()
+    examples: list[str] = []
+    for findings in (frequencies, counters, tensors, health, check_cube_topics(run)):
+        figures.update(findings.figures)
+        examples += findings.examples
+    topics = (record.frequencies, record.stress)
+    reconnects_s = measure_reconnects(run, frequencies)
+    stamp_errors_ms = np.abs(measure_stamp_errors(run))
+    return {
+        **figures,
+        "missed_by_judge": sum(topic.missed for topic in topics),
+        "unreadable": sum(topic.unreadable for topic in topics),
+        "wrong_periods": count_wrong_periods(run),
+        "examples": examples[:MAX_EXAMPLES],
+        "reconnects": len(reconnects_s),
+        "worst_reconnect_s": round(max(reconnects_s, default=0.0), 3),
+        "stamps_judged": len(stamp_errors_ms),
+        **{
+            f"stamp_error_p{percent}_ms": round(float(np.percentile(stamp_errors_ms, percent)), 3)
+            if len(stamp_errors_ms)
+            else None
+            for percent in PERCENTILES
+        },
+    }

@@ -1,0 +1,112 @@
+"""Check of the counters of the nodes against what was sent and what arrived."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cube_tensor_driver.core.arrays import Mask
+from cube_tensor_driver.core.matching import NO_MATCH
+
+from .frequencies import FrequencyFindings
+from .record import DRIVER_KILLS, LATEST_NS, NS_PER_S
+from .run import Findings, Run
+from .tensors import TensorFindings
+
+WRAPPED_NUMBER = 1 << 20
+"""Number of a first sample above which the hub did not begin to count at 0.
+
+A fault makes hubs begin shortly before 2**32. The driver cannot know of losses before their first
+sample.
+"""
+
+REPORT_PERIOD_S = 1.5
+"""Longest time, in seconds, between two reports of the driver's counters. What it counted so
+shortly before it was killed may not have been reported."""
+
+
+def check_counters(run: Run, frequencies: FrequencyFindings, tensors: TensorFindings) -> Findings:
+    """Compare the counters with the rows that are missing and the rows that arrived.
+
+    Nobody can know the last samples of a hub before it lost its power or restarted, nor the samples
+    around the end of a driver. All others that did not arrive must be counted, and no more. The
+    reconstruction must not state that it lost messages whose tensors arrived.
+    """
+    record, counters = run.record, run.record.counters
+    cubes_per_link = len(record.skin.cubes) // len(record.skin.links)
+    counted = (
+        cubes_per_link * (counters["lost_on_the_way"] + counters["dropped_in_hub"])
+        + counters["rows of unknown cubes"]
+        + counters["rows with another number of pads"]
+    )
+    is_countable = frequencies.is_checked & ~_is_between_drivers(run)
+    missing = int(frequencies.missing[is_countable].sum())
+    # The driver counts on after the span that is checked.
+    missing_at_end = int(frequencies.missing.sum())
+    lost_with_power = int(run.samples.row_count[_is_lost_with_power(run)].sum())
+
+    published, arrived = counters["rows published"], len(record.frequencies.rows)
+    sent_ns = record.frequencies.sent_ns
+    is_unreported = record.is_during(DRIVER_KILLS, sent_ns, REPORT_PERIOD_S)
+    reported = arrived - int(np.count_nonzero(is_unreported))
+
+    wrong = counters["rows unaccounted"] + counters["rows lost by errors"]
+    # A message that did not arrive here had an unknown number of rows.
+    if not record.frequencies.missed:
+        excesses = (
+            published - arrived,
+            reported - published,
+            missing - lost_with_power - counted,
+            counted - missing_at_end,
+            record.messages_lost - tensors.messages_without,
+        )
+        wrong += sum(max(0, excess) for excess in excesses)
+    figures = {
+        "miscounted": wrong,
+        "messages_lost": record.messages_lost,
+        "counted": counted,
+        "missing": missing,
+        "lost_with_power": lost_with_power,
+    }
+    return Findings(figures, [])
+
+
+def _is_between_drivers(run: Run) -> Mask:
+    """Find the samples (S,) that no driver can count.
+
+    These are the last ones before a driver was killed, up to the first one of the same hub that
+    reached the next driver.
+    """
+    samples, sent_ns = run.samples, run.record.frequencies.sent_ns
+    between = np.zeros(len(samples), bool)
+    for action in run.record.actions_of(*DRIVER_KILLS):
+        arrived = run.sample[(sent_ns > action.begin_ns) & (run.sample != NO_MATCH)]
+        arrived = arrived[samples.time_ns[arrived] > action.begin_ns]
+        last_ns = action.begin_ns - round(NS_PER_S * REPORT_PERIOD_S)
+        first_ns = np.full(len(samples.log.links), LATEST_NS)
+        np.minimum.at(first_ns, samples.link[arrived], samples.time_ns[arrived])
+        between |= (samples.time_ns > last_ns) & (samples.time_ns < first_ns[samples.link])
+    return between
+
+
+def _is_lost_with_power(run: Run) -> Mask:
+    """Find the samples (S,) of which nobody can know.
+
+    These are the ones after the last that arrived before a restart and, where the hub did not
+    begin at 0, those before the first that arrived.
+    """
+    samples = run.samples
+    arrived = np.zeros(len(samples), bool)
+    arrived[run.sample[run.sample != NO_MATCH]] = True
+    lost = np.zeros(len(samples), bool)
+    for link in range(len(samples.log.links)):
+        of_link = samples.link == link
+        boots = np.unique(samples.boot[of_link]).tolist()
+        for boot in boots:
+            # Samples are in the order of time, so the order of indices is that of time.
+            mine = np.flatnonzero(of_link & (samples.boot == boot))
+            mine_arrived = mine[arrived[mine]]
+            if boot != boots[-1]:
+                lost[mine[mine > mine_arrived.max(initial=-1)]] = True
+            if len(mine_arrived) and samples.number[mine[0]] > WRAPPED_NUMBER:
+                lost[mine[mine < mine_arrived[0]]] = True
+    return lost

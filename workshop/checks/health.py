@@ -1,0 +1,189 @@
+"""Check of the health of pads: flags of the reconstruction against the faults that pads had.
+
+Each fault must be flagged on its pad within its stated time, with its own bit, and no other pad may
+be flagged. An impossible reading is flagged in the same row. What needs statistics is flagged
+within two of their windows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cube_tensor_driver.core.arrays import Array, Index, Mask
+from cube_tensor_driver.core.health.statistics import WINDOW_S
+from cube_tensor_driver.core.matching import NO_MATCH
+from cube_tensor_driver.core.oscillator import stress_slope
+from cube_tensor_driver.core.rows import StressRows
+from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
+from cube_tensor_driver.simulation.faults import CUT_FAULTS, PAD_FAULTS
+
+from .expected import EDGE_NS
+from .record import DRIVER_KILLS, NODE_STARTS, NS_PER_S, Span
+from .run import Findings, Run
+from .samples import HubFault
+
+STATUS_OF_FAULT = {"open": OPEN, "short": SHORT, "stuck": STUCK, "noisy": NOISY, "report": REPORTED}
+"""Status bit that names each fault of a pad."""
+
+PERMITTED_STATUS = NOISY | RANGE | DRIFT
+"""Status bits that any broken pad may cause as well: it jumps when its fault begins and ends."""
+
+IMMEDIATE_FAULTS = ("open", "short", "report")
+"""Faults that the row itself shows."""
+
+DETECTION_NS = round(NS_PER_S * (2 * WINDOW_S + 0.1))
+"""Time, in nanoseconds, after which the other faults must be flagged: two windows, and the scan
+that shows that the second one is over."""
+
+RELEASE_S = 6.0
+"""Time, in seconds, for which a pad that works again may still be left out.
+
+The reconstruction waits for 2 s of rows, and the link may be cut for 2 s meanwhile.
+"""
+
+MIN_COMPLETENESS = 0.9
+"""Share of the rows of a cube that must have arrived for its fault to be detectable."""
+
+MIN_MOVEMENT = 10.0
+"""Smallest movement of the cube's other pads in each window, as a multiple of their noise, for a
+stuck pad to be detectable. The diagnosis needs half of it."""
+
+DISTURBANCE_S = 1.0
+"""Time, in seconds, around a cut in which rows come late. Late rows end a window early."""
+
+RESTART_S = 2.0
+"""Time, in seconds, around a start of a node in which the statistics are not complete."""
+
+NOMINAL_PERIOD_S = 1.5
+"""Time, in seconds, around a fault within which the period of the hubs is looked up."""
+
+WINDOW_STEP_NS = 100_000_000
+"""Step, in nanoseconds, between the windows in which movement is looked for."""
+
+EXAMPLES = 4
+"""Number of examples of each kind."""
+
+
+def check_health(run: Run, sample: Index) -> Findings:
+    """Check the flags of all rows of stress.
+
+    The figures are: `faults_to_flag`, faults that had to be flagged; `unflagged`, rows of them that
+    were not; `false_alarms`, rows that flag a pad or name a condition without a fault.
+
+    Args:
+        run: The torture.
+        sample: Index of the sample of each row of stress (M,), or `NO_MATCH`.
+    """
+    known = np.flatnonzero(sample != NO_MATCH)
+    rows, time_ns = run.record.stress.rows.select(known), run.samples.time_ns[sample[known]]
+    permitted_pads = np.zeros(len(rows), np.uint32)
+    permitted_status = np.zeros(len(rows), np.uint16)
+    evidence = _Evidence(run)
+    examples, n_faults, n_unflagged = [], 0, 0
+
+    for fault in run.samples.faults(*PAD_FAULTS):
+        pad, bit = fault.fault.pad, STATUS_OF_FAULT[fault.kind]
+        mine = np.flatnonzero(rows.cube == fault.cube)
+        may_be_flagged = mine[evidence.flagged_span(fault).contains(time_ns[mine])]
+        permitted_pads[may_be_flagged] |= np.uint32(1 << pad)
+        permitted_status[may_be_flagged] |= np.uint16(bit | PERMITTED_STATUS)
+
+        delay_ns = EDGE_NS if fault.kind in IMMEDIATE_FAULTS else DETECTION_NS
+        required = Span(begin_ns=fault.begin_ns + delay_ns, end_ns=fault.end_ns - EDGE_NS)
+        must_be_flagged = mine[required.contains(time_ns[mine])]
+        if not len(must_be_flagged) or not evidence.suffices(fault):
+            continue
+        unflagged = must_be_flagged[~_is_flagged(rows.select(must_be_flagged), pad, bit)]
+        n_faults += 1
+        n_unflagged += len(unflagged)
+        if len(unflagged):
+            what = f"not flagged: {fault.kind}, cube {fault.cube} pad {pad}, {len(unflagged)} rows"
+            examples.append(run.describe(what, time_ns[unflagged[0]]))
+
+    conditions = np.uint16(sum(STATUS_OF_FAULT.values()) | RANGE | DRIFT)
+    is_false = rows.left_out & ~permitted_pads != 0
+    is_false |= rows.status & conditions & ~permitted_status != 0
+    for row in np.flatnonzero(is_false)[:EXAMPLES]:
+        flags = f"left out {rows.left_out[row]:#x}, status {rows.status[row]:#x}"
+        examples.append(run.describe(f"false alarm: cube {rows.cube[row]}, {flags}", time_ns[row]))
+    figures = {
+        "faults_to_flag": n_faults,
+        "unflagged": n_unflagged,
+        "false_alarms": int(np.count_nonzero(is_false)),
+    }
+    return Findings(figures, examples)
+
+
+def _is_flagged(rows: StressRows, pad: int, bit: int) -> Mask:
+    """Find the rows (N,) that leave the pad out and name its condition."""
+    is_left_out = rows.left_out >> np.uint32(pad) & 1 == 1
+    is_flagged: Mask = is_left_out & (rows.status & bit != 0)
+    return is_flagged
+
+
+class _Evidence:
+    """Decides whether enough arrived for a fault to be found, and until when it may be flagged."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._noise: list[Array] = []  # standard deviation of each pad's frequency, in Hz
+        for calibration in (cube.calibration for cube in run.record.skin.cubes):
+            rest = calibration.rest_frequency
+            slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
+            self._noise.append(calibration.noise / slope)
+
+    def flagged_span(self, fault: HubFault) -> Span:
+        """Return the span of time in which the pad of a fault may be flagged."""
+        end_ns = fault.end_ns + round(NS_PER_S * RELEASE_S)
+        for action in self._run.record.actions_of(*DRIVER_KILLS):
+            # No rows arrive while there is no driver, so the pad is released later.
+            if fault.begin_ns < action.end_ns and action.begin_ns < end_ns:
+                end_ns += action.end_ns - action.begin_ns
+        return Span(begin_ns=fault.begin_ns - EDGE_NS, end_ns=end_ns)
+
+    def suffices(self, fault: HubFault) -> bool:
+        """Return whether a fault is detectable.
+
+        Faults that show in the row itself always are. Others need all rows of two windows that
+        nothing disturbs, and a stuck pad needs other pads that move.
+        """
+        if fault.kind in IMMEDIATE_FAULTS:
+            return True
+        span = Span(begin_ns=fault.begin_ns, end_ns=fault.begin_ns + DETECTION_NS)
+        if self._is_disturbed(span) or not self._is_complete(fault.cube, span):
+            return False
+        return fault.kind != "stuck" or self._moves(fault, span)
+
+    def _is_disturbed(self, span: Span) -> bool:
+        """Return whether the statistics began again in a span, as after a cut of any link."""
+        cuts = self._run.samples.faults(*CUT_FAULTS)
+        starts = self._run.record.actions_of(*NODE_STARTS)
+        return any(cut.overlaps(span, DISTURBANCE_S) for cut in cuts) or any(
+            start.overlaps(span, RESTART_S) for start in starts
+        )
+
+    def _is_complete(self, cube: int, span: Span) -> bool:
+        """Return whether nearly all rows of a cube arrived in a span."""
+        samples, rows = self._run.samples, self._run.record.stress.rows
+        arrived = np.count_nonzero((rows.cube == cube) & span.contains(rows.stamp_ns))
+        begin = Span(begin_ns=span.begin_ns, end_ns=span.begin_ns)
+        is_near = begin.contains(samples.time_ns, NOMINAL_PERIOD_S, NOMINAL_PERIOD_S)
+        period_us = int(samples.period_us[is_near].max(initial=1))
+        expected = (span.end_ns - span.begin_ns) / (1000 * period_us)
+        return bool(arrived >= MIN_COMPLETENESS * expected)
+
+    def _moves(self, fault: HubFault, span: Span) -> bool:
+        """Return whether half of the pads of the cube move in every window of a span."""
+        samples = self._run.samples
+        chosen = np.flatnonzero((samples.link == fault.link) & span.contains(samples.time_ns))
+        readings = self._run.expected.of(np.full(len(chosen), fault.cube), chosen)
+        window_ns = round(NS_PER_S * WINDOW_S)
+        for begin_ns in range(span.begin_ns, span.end_ns - window_ns, WINDOW_STEP_NS):
+            window = Span(begin_ns=begin_ns, end_ns=begin_ns + window_ns)
+            frequency = readings.frequency[window.contains(samples.time_ns[chosen])]
+            if not len(frequency):
+                return False
+            movement = np.sort(np.ptp(frequency, axis=0) / self._noise[fault.cube])
+            if movement[(len(movement) - 1) // 2] < MIN_MOVEMENT:
+                return False
+        return True

@@ -1,0 +1,46 @@
+"""One torture, prepared for the checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cube_tensor_driver.simulation.sample_log import SampleLog
+
+from .expected import ExpectedReadings
+from .record import NS_PER_S, Record
+from .samples import Samples
+
+
+class Run:
+    """What a torture sent and received.
+
+    Attributes:
+        record: What arrived and what was done.
+        samples: All samples that the hubs took, S in number.
+        expected: What the pads should read in them.
+        sample: Index of the sample of each row of frequencies (N,), or `NO_MATCH`.
+    """
+
+    def __init__(self, record: Record, log: SampleLog) -> None:
+        self.record, self.samples = record, Samples(log)
+        self.expected = ExpectedReadings(record.skin, self.samples, record.instants)
+        self.sample = self.expected.find_samples(record.frequencies.rows)
+        self._start_ns = log.start_time_ns
+
+    def describe(self, finding: str, time_ns: int) -> str:
+        """Return a line about a finding, with its simulated time in seconds."""
+        return f"{finding}, {(int(time_ns) - self._start_ns) / NS_PER_S:.3f} s"
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Result of one check.
+
+    Attributes:
+        figures: Counts by the name that torture prints; those of several checks are added.
+        examples: Lines about the first findings.
+    """
+
+    figures: Mapping[str, int]
+    examples: list[str]

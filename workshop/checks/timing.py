@@ -1,0 +1,89 @@
+"""Checks of time: stamps, sampling periods, and how fast the driver connects again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.matching import NO_MATCH
+from cube_tensor_driver.core.status import STAMP
+from cube_tensor_driver.simulation.faults import CUT_FAULTS
+
+from .frequencies import RECOVERY_S, FrequencyFindings
+from .record import DRIVER_KILLS, DRIVER_STOPS, NS_PER_S, Span
+from .run import Run
+
+CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "drift")
+"""Faults after which the driver fits the clock of the hub from the start."""
+
+BEFORE_FAULT_S = 0.1
+"""Time, in seconds, before a fault in which samples may already be affected."""
+
+CLOCK_SETTLE_S = 6.0
+"""Time, in seconds, after a restart of a hub or of the driver from which stamps are checked,
+because the rate of the hub's clock is known then."""
+
+RATE_CHANGE_S = 1.0
+"""Time, in seconds, after a request in which each hub that is not cut must sample at a new rate."""
+
+BEFORE_CUT_S = 1.0
+"""Time, in seconds, before a cut in which a hub may not have received a request."""
+
+
+def measure_stamp_errors(run: Run) -> Array:
+    """Compute the time from each sample to its stamp (K,), in ms.
+
+    Hubs answer TIME, so what remains is half the difference of the smallest delays of both
+    directions. How late single samples arrive does not matter. Only samples are used whose hub's
+    clock has been undisturbed for a while, and no stamps that the driver marks as doubtful.
+    """
+    record, samples = run.record, run.samples
+    settled = samples.time_ns > record.begin_ns + NS_PER_S * CLOCK_SETTLE_S
+    settled &= ~samples.is_near_fault(CLOCK_FAULTS, BEFORE_FAULT_S, CLOCK_SETTLE_S)
+    settled &= ~record.is_during(DRIVER_KILLS, samples.time_ns, after_s=CLOCK_SETTLE_S)
+
+    # All cubes of a hub have the same stamp, so one of each is enough.
+    rows = record.frequencies.rows
+    first_cubes = [link.members[0] for link in samples.log.links]
+    is_certain = (rows.status & np.uint16(STAMP) == 0) & (run.sample != NO_MATCH)
+    chosen = np.flatnonzero(np.isin(rows.cube, first_cubes) & is_certain)
+    chosen = chosen[settled[run.sample[chosen]]]
+    error_ms = 1e-6 * (rows.stamp_ns[chosen] - samples.time_ns[run.sample[chosen]])
+    return np.asarray(error_ms, np.float64)
+
+
+def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
+    """Compute the time, in seconds, from the end of each unplugging to the first sample after it
+    that arrived."""
+    samples = run.samples
+    arrived = (frequencies.missing < samples.row_count) & (samples.time_ns < run.record.end_ns)
+    gaps_s = []
+    for fault in samples.faults("unplug", "rename"):
+        is_later = (samples.link == fault.link) & (samples.time_ns >= fault.end_ns)
+        times_ns = samples.time_ns[arrived & is_later]
+        if len(times_ns):
+            gaps_s.append(float(times_ns.min() - fault.end_ns) / NS_PER_S)
+    return gaps_s
+
+
+def count_wrong_periods(run: Run) -> int:
+    """Count the hubs that did not sample at the rate that was asked for, over all changes."""
+    record, samples = run.record, run.samples
+    disturbances = [action.begin_ns for action in record.actions_of("rate", *DRIVER_STOPS)]
+    disturbances.append(record.end_ns)
+    cuts = samples.faults(*CUT_FAULTS)
+    wrong = 0
+    for action in record.actions_of("rate"):
+        settled = Span(begin_ns=action.end_ns, end_ns=action.end_ns + round(1e9 * RATE_CHANGE_S))
+        if not action.succeeded or any(settled.contains(np.array(disturbances))):
+            continue
+        wanted_us = round(1e6 / float(action.answer))
+        for link, log in enumerate(samples.log.links):
+            is_cut = any(
+                cut.link == link and cut.contains(settled.end_ns, BEFORE_CUT_S, RECOVERY_S)
+                for cut in cuts
+            )
+            time_us = (settled.end_ns - samples.log.start_time_ns) // 1000
+            periods = {run.period_us for run in log.runs if run.start_us <= time_us < run.end_us}
+            wrong += not is_cut and periods != {wanted_us}
+    return wrong

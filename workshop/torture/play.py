@@ -1,0 +1,208 @@
+"""One torture: its processes, what is done to them, and the record of what arrives.
+
+Nothing is checked here.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.errors import CubeError
+from cube_tensor_driver.demo.running import Observer, end_simulator
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.simulation.inject import fault_line
+from cube_tensor_driver.simulation.sample_log import SampleLog
+from cube_tensor_driver.simulation.simulator import FAULT_PIPE
+
+from ..checks.expected import load_tables
+from ..checks.record import NS_PER_S, Action, Record, Span
+from .actions import MAX_START_S, Actions
+from .memory import MemoryMonitor
+from .mix import CUBES_PER_HUB, HUBS, RATE, schedule
+from .mutations import mutated
+from .recorder import INSTANTS, recording
+
+CUBES_PER_ROW = 8
+"""Number of cubes side by side on the skin."""
+
+PITCH = 0.012
+"""Distance of the cubes, in m."""
+
+SETTLE_S = 3.0
+"""Time, in seconds, from the last fault to the end."""
+
+UNCHECKED_S = 2.0
+"""Time, in seconds, before the end in which samples are not checked."""
+
+ARRIVAL_S = 2.5
+"""Time, in seconds, from the end of the checked span until its samples have arrived."""
+
+MAX_DRAIN_S = 60.0
+"""Longest time, in seconds, until everything that was sent has arrived."""
+
+NODES = ("driver", "reconstruction")
+"""Processes whose memory and threads are measured."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """A torture that is over.
+
+    Attributes:
+        record: What arrived and what was done.
+        log: What the hubs did.
+        began_s: Monotonic time at which the driver became active, in seconds.
+        figures: Figures of the processes, by the name that torture prints.
+    """
+
+    record: Record
+    log: SampleLog
+    began_s: float
+    figures: dict[str, Any]
+
+
+def play(
+    duration: float, seed: int, folder: Path, interrupted: Event, mutation: str = ""
+) -> Played:
+    """Torture a skin.
+
+    Args:
+        duration: Time in which faults begin, in seconds.
+        seed: Seed of the mix.
+        folder: Folder for all files.
+        interrupted: Event that ends the torture.
+        mutation: Mutation of the driver or the reconstruction, if any.
+
+    Raises:
+        CubeError: A process does not start, or ends.
+    """
+    ports, log_path = folder / "ports", folder / "log.json"
+    skin_path = _write_skin(folder, ports)
+    skin = read_skin(skin_path)
+    # The tables are computed before the skin runs, because they take seconds of both processors.
+    load_tables(skin, INSTANTS)
+    processes = _make_processes(skin_path, ports, log_path, mutation)
+
+    with Children(folder) as children:
+        for process in processes.values():
+            children.start(process)
+        memory = MemoryMonitor(children, NODES)
+        with recording(skin, children, interrupted, memory) as recorder:
+            observer, stress = recorder.observer, recorder.stress
+            actions = Actions(
+                observer, children, processes, skin, stress, recorder.on_driver_killed
+            )
+            actions.start_driver(ports / FAULT_PIPE)
+            began_s, begin_ns = time.monotonic(), time.time_ns()
+            observer.spin(MAX_START_S, lambda: stress.count_cubes() == len(skin.cubes))
+            if not stress.count:
+                logs = "\n".join(children.log(name)[-500:] for name in NODES)
+                raise CubeError(f"no tensor arrived within {MAX_START_S:g} s:\n{logs}")
+
+            threads = memory.count_threads()
+            _carry_out(observer, actions, ports / FAULT_PIPE, schedule(duration, seed), duration)
+            observer.spin(SETTLE_S - ARRIVAL_S)
+            end_ns = time.time_ns() - round(NS_PER_S * UNCHECKED_S)
+            observer.spin(ARRIVAL_S)
+            leaked = Counter(memory.count_threads())
+            leaked.subtract(threads)
+            growth = memory.growth_mb_per_min()
+
+            stopped_ns = time.time_ns()
+            actions.stop_driver()
+            observer.spin(MAX_DRAIN_S, lambda: recorder.is_complete(stopped_ns))
+            record = recorder.finish(Span(begin_ns=begin_ns, end_ns=end_ns), actions.done)
+        logs_text = "".join(children.log(name) for name in processes)
+        log = end_simulator(children, log_path)
+    figures = {
+        **_describe(actions, log),
+        "counters": dict(record.counters),
+        "threads_leaked": (+leaked).total(),
+        "rss_slope_mb_per_min": growth,
+        "crashes": logs_text.count("Traceback"),
+    }
+    return Played(record, log, began_s, figures)
+
+
+def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
+    """Return the figures of faults and actions."""
+
+    def seconds(time_ns: int) -> float:
+        return round((time_ns - log.start_time_ns) / NS_PER_S, 3)
+
+    def span(action: Action) -> str:
+        return f"{action.kind}: {seconds(action.begin_ns)} to {seconds(action.end_ns)} s"
+
+    failed = [f"{action.kind}: {action.answer}" for action in actions.done if not action.succeeded]
+    return {
+        "faults": dict(sorted(Counter(record.fault.kind for record in log.faults).items())),
+        "deeds": dict(sorted(Counter(action.kind for action in actions.done).items())),
+        "timeline": [span(action) for action in actions.done],
+        # A busy host may refuse a tare.
+        "deeds_failed": len(failed) - len(actions.refused),
+        "failed": failed,
+        "refused": [f"tare: {answer}" for answer in actions.refused],
+    }
+
+
+def _make_processes(
+    skin_path: Path, ports: Path, log_path: Path, mutation: str
+) -> dict[str, Process]:
+    """Return the processes by name; the node `markers` is the other subscriber of stress."""
+    hubs = SimulatedHubs(ports, sample_log=log_path, instants=INSTANTS)
+    processes = {}
+    for process in skin_processes(skin_path, rate=RATE, markers=True, simulated=hubs):
+        if process.executable == "driver":
+            process.parameters.update({"autostart": False, "port_directory": ""})
+        if process.executable == "reconstruction":
+            process.parameters["tare_folder"] = str(skin_path.parent / "tare")
+        if process.executable == "simulator":
+            process = replace(process, arguments=(*process.arguments, "--tcp"))
+        processes[process.executable] = mutated(process, mutation)
+    return processes
+
+
+def _write_skin(folder: Path, ports: Path) -> Path:
+    """Write a skin whose links may each be behind every port: only its uid identifies a hub.
+
+    The last hub is behind a TCP bridge and has the same faults there.
+    """
+    rows = HUBS * CUBES_PER_HUB // CUBES_PER_ROW
+    data = grid(nx=CUBES_PER_ROW, ny=rows, pitch=PITCH, links=HUBS, rate=RATE, port="{}")
+    for number, link in enumerate(data["links"]):
+        link["port"], link["hub_uid"] = str(ports / "*"), number + 1
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        data["links"][-1]["port"] = f"socket://127.0.0.1:{free.getsockname()[1]}"
+    path = folder / "skin.yaml"
+    write_yaml(path, data)
+    return path
+
+
+def _carry_out(
+    observer: Observer,
+    actions: Actions,
+    fault_pipe: Path,
+    events: list[tuple[float, dict[str, Any]]],
+    duration: float,
+) -> None:
+    """Carry out events at their times, and wait for the end of the duration."""
+    began_s = time.monotonic()
+    with fault_pipe.open("w") as pipe:
+        for at_s, event in events:
+            observer.spin(began_s + at_s - time.monotonic())
+            if "action" in event:
+                actions.do(event, time.monotonic() - began_s - at_s)
+            else:
+                pipe.write(fault_line(event))
+                pipe.flush()
+    observer.spin(began_s + duration - time.monotonic())
