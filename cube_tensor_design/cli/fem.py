@@ -136,7 +136,7 @@ def _run_surface(options: argparse.Namespace, model: Model) -> None:
     from cube_tensor_driver.views.terminal.interrupt import ends_at_once
     from cube_tensor_driver.views.terminal.output import progress_bar
 
-    from ..figures.influence import draw_influence
+    from ..figures.response import draw_influence
     from ..studies.surface_study import study_surface
 
     body, layout = model.body, model.layout

@@ -317,7 +317,7 @@ def _parity_part(field: Array, parity: Parity) -> Array:
     indices = np.indices(field.shape[1:])
     is_odd = [np.sum(indices == k, axis=0) % 2 == 1 for k in range(len(parity))]
     matches = (np.stack(is_odd, axis=-1) == (signs < 0)) | (signs == 0)
-    return field * np.all(matches, axis=-1)
+    return np.asarray(field * np.all(matches, axis=-1))
 
 
 def has_stress(layout: Layout, pad: int, parity: Parity) -> bool:

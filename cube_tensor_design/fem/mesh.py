@@ -179,7 +179,7 @@ def _graded(length: float, first: float, growth: float) -> Array:
     exact = np.log1p(length * (growth - 1.0) / first) / np.log(growth)
     n = max(1, int(np.ceil(exact - 1e-9)))
     steps = growth ** np.arange(n, dtype=float)
-    points = np.concatenate([[0.0], np.cumsum(steps)]) * (length / steps.sum())
+    points: Array = np.concatenate([[0.0], np.cumsum(steps)]) * (length / steps.sum())
     points[-1] = length  # free of rounding
     return points
 

@@ -61,7 +61,7 @@ def stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
         basis: The elements.
         moduli: Lame's constants lambda and mu.
     """
-    return _virtual_work.assemble(basis, lam=moduli[0], mu=moduli[1]).tocsr()
+    return skfem.BilinearForm(_virtual_work).assemble(basis, lam=moduli[0], mu=moduli[1]).tocsr()
 
 
 def brick_stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
@@ -104,21 +104,16 @@ def _unit_slopes(basis: skfem.Basis) -> Array:
     return np.asarray(np.einsum("maq,nbq,q->abmn", gradient, gradient, unit.dx[0]))
 
 
-@skfem.BilinearForm
 def _virtual_work(u: Any, w: Any, p: Any) -> Any:
     strain, test_strain = sym_grad(u), sym_grad(w)
     volume_part = p.lam * trace(strain) * trace(test_strain)
     return volume_part + 2.0 * p.mu * ddot(strain, test_strain)
 
 
-@skfem.LinearForm
-def _stress_work(w: Any, p: Any) -> Any:
-    return ddot(p.sigma, sym_grad(w))
-
-
-@skfem.LinearForm
-def _traction_work(w: Any, p: Any) -> Any:
-    return dot(p.t, w)
+_STRESS_WORK = skfem.LinearForm(lambda w, p: ddot(p.sigma, sym_grad(w)))
+"""Work of a stress sigma in the strain of a test function w."""
+_TRACTION_WORK = skfem.LinearForm(lambda w, p: dot(p.t, w))
+"""Work of a traction t in a test function w."""
 
 
 class _Factors(NamedTuple):
@@ -194,7 +189,7 @@ class Solid:
         """
         x = np.asarray(self.basis.default_parameters()["x"])
         sigma = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, x)
-        return np.asarray(_stress_work.assemble(self.basis, sigma=sigma))
+        return np.asarray(_STRESS_WORK.assemble(self.basis, sigma=sigma))
 
     def outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
         """Return the nodal forces (dofs, n) of n fields that act as tractions on the outer faces.
@@ -214,7 +209,7 @@ class Solid:
             stress = _parity_part(field, x.reshape(self.dim, -1).T, parity)
             traction = stress[..., axis]  # (q, n, dim)
             loads = np.moveaxis(traction, (1, 2), (0, 1)).reshape(-1, *x.shape)
-            forces = [_traction_work.assemble(face, t=load) for load in loads]
+            forces = [_TRACTION_WORK.assemble(face, t=load) for load in loads]
             total = total + np.stack(forces, axis=1)
         return np.asarray(total)
 

@@ -16,17 +16,24 @@ from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style, 
 
 from ..paper.virtual_bench import Deformation
 
-_FIGURE_4_TITLES = {
+FIGURE_4_TITLES = {
     "zx": r"(a) shear alone: $\sigma_{zx}$ = 10 kPa",
     "zz_x": r"(b) $\sigma_{zz}$ grows along $x$: $d_0\,\partial\sigma_{zz}/\partial x$ = 10 kPa",
 }
+"""Titles of the panels of the paper's Fig. 4 by mode."""
+MAX_DISPLACEMENT = 0.4
+"""Largest displacement of the drawn outline, in d0."""
+COLOUR_PERCENTILE = 95
+"""Percentile of the stress at which the colours end. It is infinite at the corners of the cube."""
 
 
 @print_style()
 def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
-    """The section under every plane mode, with pads, deformed outline and displacements.
+    """Draw the section under every plane mode, with pads, deformed outline and displacements.
 
-    deformations: of 10 kPa of each plane mode, by the mode's name
+    Args:
+        layout: Pads of the cube.
+        deformations: Deformation under 10 kPa of each plane mode, by the mode's name.
     """
     figure = Figure(figsize=(10, 12))
     axes = figure.subplots(4, 2)
@@ -43,16 +50,16 @@ def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
 
 @print_style()
 def draw_figure_4(deformations: dict[str, Deformation]) -> Figure:
-    """The paper's Fig. 4: the section under shear alone, and under a growing normal stress.
+    """Draw the paper's Fig. 4: the section under shear alone, and under a growing normal stress.
 
-    deformations: of 10 kPa of the modes zx and zz_x
+    Args:
+        deformations: Deformation under 10 kPa of the modes zx and zz_x.
     """
     figure = Figure(figsize=(6, 6))
     axes = figure.subplots(2, 1)
-    scale = 1.0
     for axis, (name, deformation) in zip(axes, deformations.items(), strict=True):
         scale = _draw_deformation(axis, deformation, 6)
-        axis.set(title=_FIGURE_4_TITLES[name])
+        axis.set(title=FIGURE_4_TITLES[name])
     axes[-1].set_xlabel(r"$x$ / mm")
     figure.supxlabel(
         f"White: the cube. Outlines are displaced by {scale:.2g} times\n"
@@ -63,45 +70,46 @@ def draw_figure_4(deformations: dict[str, Deformation]) -> Figure:
 
 
 def _draw_pads(axis: Any, layout: Layout, half_side: float) -> None:
-    """Pads on the faces of an undeformed cube; half_side in mm."""
-    faces = layout.normals[:, [0, 2]]
-    for centre, normal in zip(layout.positions[:, [0, 2]], faces, strict=True):
+    """Draw pads on the faces of an undeformed cube; half_side in mm."""
+    centres, normals = layout.positions[:, [0, 2]], layout.normals[:, [0, 2]]
+    for centre, normal in zip(centres, normals, strict=True):
         along = layout.pad_size * (1 - np.abs(normal))
         ends = half_side * (centre + np.outer((-0.5, 0.5), along)).T
         axis.plot(*ends, color="black", linewidth=7, solid_capstyle="butt")
-        axis.plot(
-            *ends,
-            color="white",
-            linewidth=3.5,
-            linestyle=(0, (0.5, 0.5)),
-            dash_capstyle="butt",
-        )
+        # White dashes on the black line are the hatches of the pad.
+        dashes = (0, (0.5, 0.5))
+        axis.plot(*ends, color="white", linewidth=3.5, linestyle=dashes, dash_capstyle="butt")
 
 
 def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> float:
-    """σzz on the deformed body within `window` d0 of the cube. Returns the displacements' scale."""
+    """Draw σzz on the deformed body within `window` d0 of the cube.
+
+    Returns:
+        Scale of the displacements.
+    """
     d0, points, moved = deformation.half_side, deformation.points, deformation.displacement
-    near = np.abs(points[0]) < window
-    scale = 0.4 * d0 / np.hypot(*moved[:, near]).max()
+    is_near = np.abs(points[0]) < window
+    scale = MAX_DISPLACEMENT * d0 / np.hypot(*moved[:, is_near]).max()
     drawn = 1e3 * (d0 * points + scale * moved)
+    half_width = 1e3 * d0 * window
+    limits = np.array([half_width, min(half_width, 600 * deformation.height)])
     _draw_stress(axis, deformation, drawn, window)
-    _draw_arrows(axis, deformation, drawn, window)
+    _draw_arrows(axis, deformation, drawn, limits)
+
     corners = 1e3 * d0 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
     axis.plot(*corners, "k:", linewidth=0.8)
-    ring = np.abs(points).max(axis=0)
-    face = np.flatnonzero(np.isclose(ring, 1))
+    face = np.flatnonzero(np.isclose(np.abs(points).max(axis=0), 1))
     by_angle = np.argsort(np.arctan2(*points[::-1, face]))
     outline = drawn[:, face[by_angle]]
     axis.fill(*outline, facecolor="white", edgecolor="black", linewidth=1.2)
-    edge = 1e3 * d0 * window
-    top = min(edge, 600 * deformation.height)
-    axis.set(xlim=(-edge, edge), ylim=(-top, top), aspect="equal", ylabel=r"$z$ / mm")
+    x, z = limits
+    axis.set(xlim=(-x, x), ylim=(-z, z), aspect="equal", ylabel=r"$z$ / mm")
     axis.grid(False)
     return float(scale)
 
 
 def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: float) -> None:
-    """σzz of the elastomer as colours and contour lines on the points `drawn` (2, nodes), mm."""
+    """Draw σzz of the elastomer as colours and contour lines on the points `drawn` (2, n), mm."""
     points, triangles = deformation.points, deformation.triangles
     ring = np.abs(points).max(axis=0)
     outside_cube = ring[triangles].max(axis=0) > 1 + 1e-9
@@ -109,18 +117,20 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
     in_view = np.all(np.abs(points[0, triangles]) < window + 1, axis=0)
     chosen = outside_cube & in_view
     around = triangles[:, chosen]
+
+    # The value of a node is the mean of the triangles around it.
     stress = np.tile(deformation.stress_zz[chosen] / 1e3, 3)
     total = np.bincount(around.ravel(), stress, len(ring))
     count = np.bincount(around.ravel(), minlength=len(ring))
     kilopascal = total / np.maximum(count, 1)
-    near = np.abs(points[0]) < window
-    limit = np.percentile(np.abs(kilopascal[near & (ring >= 1)]), 95)
+    is_near = (np.abs(points[0]) < window) & (ring >= 1)
+    limit = np.percentile(np.abs(kilopascal[is_near]), COLOUR_PERCENTILE)
+
     mesh = Triangulation(drawn[0], drawn[1], around.T)
-    image = axis.tripcolor(
-        mesh, kilopascal, cmap=SIGNED_COLOURS, vmin=-limit, vmax=limit, shading="gouraud"
-    )
-    levels = _contour_levels(limit)
+    colours = {"cmap": SIGNED_COLOURS, "vmin": -limit, "vmax": limit}
+    image = axis.tripcolor(mesh, kilopascal, shading="gouraud", **colours)
     # matplotlib dashes the lines below zero.
+    levels = _contour_levels(limit)
     lines = axis.tricontour(mesh, kilopascal, levels, colors="black", linewidths=0.7)
     for label in axis.clabel(lines, fontsize=7, fmt="%g", inline=False):
         label.set_rotation(0)
@@ -133,32 +143,30 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
 
 
 def _contour_levels(limit: float) -> Array:
-    """Ten levels at round steps. None is 0 or 10 kPa, which large parts of the body may have."""
+    """Return ten levels at round steps. None is 0 or 10 kPa, which large parts of a body have."""
     steps = np.multiply.outer([1, 2, 3, 5], 10.0 ** np.arange(-9, 10)).ravel()
     step = steps[np.argmin(np.abs(np.log(4 * steps / limit)))]
-    levels: Array = step * (np.arange(-5, 5) + 0.5)
-    return levels
+    return np.asarray(step * (np.arange(-5, 5) + 0.5))
 
 
-def _draw_arrows(axis: Any, deformation: Deformation, drawn: Array, window: float) -> None:
-    """Displacements of the mesh's nodes next to a regular grid."""
-    tall = min(window, deformation.height / 2 / deformation.half_side) - 0.25
-    grid = np.mgrid[-window + 1 : window - 0.9, -tall : tall + 0.1 : tall / 2.5]
-    nodes = [
-        np.argmin(np.hypot(*(deformation.points - point[:, None])))
-        for point in grid.reshape(2, -1).T
-    ]
+def _draw_arrows(axis: Any, deformation: Deformation, drawn: Array, limits: Array) -> None:
+    """Draw the displacements of the mesh's nodes next to a regular grid; limits (2,) in mm."""
+    d0 = deformation.half_side
+    window = limits[0] / (1e3 * d0)
+    height = min(window, deformation.height / 2 / d0) - 0.25
+    grid = np.mgrid[-window + 1 : window - 0.9, -height : height + 0.1 : height / 2.5]
+    nodes = []
+    for point in grid.reshape(2, -1).T:
+        distance = np.hypot(*(deformation.points - point[:, None]))
+        nodes.append(np.argmin(distance))
     tails, moved = drawn[:, nodes], deformation.displacement[:, nodes]
-    # As long as d0, the longest one; only those that are in view as a whole.
-    arrows = 1e3 * deformation.half_side * moved / np.hypot(*moved).max()
-    tips = tails + arrows
-    edge = 1e3 * deformation.half_side * window
-    top = min(edge, 600 * deformation.height)
-    limits = np.array([[edge], [top]])
-    whole = (np.abs(tips) < limits).all(axis=0) & (np.abs(tails) < limits).all(axis=0)
+    # The longest arrow is as long as d0; only those are drawn that are in view as a whole.
+    arrows = 1e3 * d0 * moved / np.hypot(*moved).max()
+    ends = np.abs([tails, tails + arrows])
+    in_view = np.all(ends < limits[:, None], axis=(0, 1))
     axis.quiver(
-        *tails[:, whole],
-        *arrows[:, whole],
+        *tails[:, in_view],
+        *arrows[:, in_view],
         color="black",
         edgecolor="white",
         linewidth=0.3,

@@ -1,4 +1,4 @@
-"""Pictures of docs/stress_tensor.md: loads on a cube, what its pads show, what two pads mistake."""
+"""Pictures of docs/stress_tensor.md: loads on a cube, its pads' stresses, two pads' wrong shear."""
 
 from __future__ import annotations
 
@@ -6,86 +6,91 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
+from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, curve_style, print_style
 
 from ..studies.pads_example import BALL_X, LOAD, Sweep, simple_loads
 
-_ARROWS = np.linspace(-0.8, 0.8, 5)
-"""Where arrows stand on a face, in half sides."""
-_ARROW_LENGTH = 0.45
-"""Of the stress LOAD, in half sides."""
+ARROWS = np.linspace(-0.8, 0.8, 5)
+"""Positions of the arrows on a face, in half sides."""
+ARROW_LENGTH = 0.45
+"""Length of the arrow for the stress LOAD, in half sides."""
+PAD_WIDTH = 0.85
+"""Width of a drawn pad along its face, in half sides."""
+PAD_THICKNESS = 0.22
+"""Thickness of a drawn pad, in half sides."""
 
 
 @print_style()
 def draw_pads(calibration: Calibration) -> Figure:
-    """Three loads as arrows on a piece of the elastomer, and below what eight pads show of each."""
+    """Draw three loads as arrows on a piece of the elastomer, and the pads' stresses below."""
     loads = simple_loads(calibration)
     figure = Figure(figsize=(9, 5.6))
     axes = figure.subplots(2, len(loads))
-    values = {title: calibration.response @ state for title, state in loads.items()}
-    top = 1e-3 * max(np.abs(value).max() for value in values.values())
-    colours, norm = colormaps[SIGNED_COLOURS], Normalize(-top, top)
+    pads = 1e-3 * np.array([calibration.response @ state for state in loads.values()])
+    limit = np.abs(pads).max()
+    colours = ScalarMappable(Normalize(-limit, limit), colormaps[SIGNED_COLOURS])
     for column, (title, state) in enumerate(loads.items()):
-        named = dict(zip(calibration.modes.names, state, strict=True))
-        _draw_load(axes[0, column], named, title)
-        _draw_cube(axes[1, column], calibration, 1e-3 * values[title], colours, norm)
-    axes[0, 0].set_ylabel("$z\\,/\\,d_0$")
-    axes[1, 0].set_ylabel("$z\\,/\\,d_0$")
+        _draw_load(axes[0, column], dict(zip(calibration.modes.names, state, strict=True)))
+        _draw_frame(axes[0, column], title)
+        _draw_cube(axes[1, column], calibration.layout, pads[column], colours)
+        _draw_frame(axes[1, column], "stress of the pads / kPa")
+        axes[1, column].set_xlabel("$x\\,/\\,d_0$")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("$z\\,/\\,d_0$")
     return figure
 
 
-def _draw_load(axis: Any, state: dict[str, float], title: str) -> None:
-    """The force that the surroundings exert on each face of a square around the cube."""
-    axis.add_patch(Rectangle((-1, -1), 2, 2, fc="0.93", ec="black"))
-    scale = _ARROW_LENGTH / abs(LOAD)
+def _draw_load(axis: Any, state: dict[str, float]) -> None:
+    """Draw the forces that the surroundings exert on the faces of a square around the cube."""
+    scale = ARROW_LENGTH / abs(LOAD)
     for side in (1, -1):
-        for x in _ARROWS:
+        for x in ARROWS:
             length = scale * abs(state["zz"] + state["zz_x"] * x)
             if length > 0.1:
-                _arrow(axis, (x, side * (1 + length)), (x, side))
+                _draw_arrow(axis, (x, side * (1 + length)), (x, side))
         if state["zx"]:
             near, far = 1.15 * side, 0.9 * side
-            _arrow(axis, (-far, near), (far, near))
-            _arrow(axis, (near, -far), (near, far))
-    _frame(axis, title)
+            _draw_arrow(axis, (-far, near), (far, near))
+            _draw_arrow(axis, (near, -far), (near, far))
 
 
-def _arrow(axis: Any, tail: tuple[float, float], tip: tuple[float, float]) -> None:
+def _draw_arrow(axis: Any, tail: tuple[float, float], tip: tuple[float, float]) -> None:
     style = {"arrowstyle": "-|>", "color": "tab:blue", "shrinkA": 0, "shrinkB": 0}
     axis.annotate("", xy=tip, xytext=tail, arrowprops=style)
 
 
-def _draw_cube(axis: Any, calibration: Calibration, values: Any, colours: Any, norm: Any) -> None:
-    """The section of the cube; each pad has the colour and the number of its stress in kPa."""
-    axis.add_patch(Rectangle((-1, -1), 2, 2, fc="0.93", ec="black"))
-    layout = calibration.layout
-    for centre, normal, value in zip(layout.positions, layout.normals, values, strict=True):
-        place, out = centre[[0, 2]], normal[[0, 2]]
-        size = np.where(out == 0, 0.85, 0.22)
-        corner = place + 0.11 * out - size / 2
-        axis.add_patch(Rectangle(corner, *size, fc=colours(norm(value)), ec="black"))
-        shown = place + 0.55 * out
-        axis.text(*shown, f"{value:.1f}".replace("-", "−"), ha="center", va="center", fontsize=8)
-    _frame(axis, "stress of the pads / kPa")
-    axis.set_xlabel("$x\\,/\\,d_0$")
+def _draw_cube(axis: Any, layout: Layout, pads: Array, colours: ScalarMappable) -> None:
+    """Draw pads on the section of the cube in the colour and with the number of their stress."""
+    centres, normals = layout.positions[:, [0, 2]], layout.normals[:, [0, 2]]
+    for centre, normal, value in zip(centres, normals, pads, strict=True):
+        size = np.where(normal == 0, PAD_WIDTH, PAD_THICKNESS)
+        corner = centre + PAD_THICKNESS / 2 * normal - size / 2
+        axis.add_patch(Rectangle(corner, *size, fc=colours.to_rgba(value), ec="black"))
+        text = f"{value:.1f}".replace("-", "−")
+        axis.text(*(centre + 0.55 * normal), text, ha="center", va="center", fontsize=8)
 
 
-def _frame(axis: Any, title: str) -> None:
-    axis.set(title=title, xlim=(-2, 2), ylim=(-2, 2), aspect="equal")
-    axis.set_xticks((-1, 0, 1))
-    axis.set_yticks((-1, 0, 1))
+def _draw_frame(axis: Any, title: str) -> None:
+    axis.add_patch(Rectangle((-1, -1), 2, 2, fc="0.93", ec="black", zorder=0.5))
+    ticks = (-1, 0, 1)
+    axis.set(xlim=(-2, 2), ylim=(-2, 2), xticks=ticks, yticks=ticks, aspect="equal", title=title)
     axis.grid(False)
 
 
 @print_style()
 def draw_sweep(sweep: Sweep) -> Figure:
-    """Left: the stress under a ball, with value and slope at the sensor. Right: true and found
-    shear over the place of the ball."""
+    """Draw the stress under a ball, and beside it true and measured shear over the ball's place.
+
+    On the left, a line shows value and slope at the sensor.
+    """
     figure = Figure(figsize=(9, 3.4))
     left, right = figure.subplots(1, 2)
     x = 1e3 * sweep.place
@@ -96,11 +101,11 @@ def draw_sweep(sweep: Sweep) -> Figure:
     left.plot(0, 1e-3 * sweep.value, "s", color="tab:red")
     left.axvline(1e3 * BALL_X, color="0.6", ls=":", label="the ball presses here")
     left.set(xlabel="$x$ / mm", ylabel="$\\sigma_{zz}$ / kPa")
-    left.legend(fontsize=7)
-    names = {"true": sweep.truth, "eight pads": sweep.cube, "two upper pads": sweep.pair}
-    for number, (name, value) in enumerate(names.items()):
+    curves = {"true": sweep.truth, "eight pads": sweep.cube, "two upper pads": sweep.pair}
+    for number, (name, value) in enumerate(curves.items()):
         style = curve_style(number) | {"markevery": (4 * number, 16)}
         right.plot(x, 1e-3 * value, label=name, **style)
     right.set(xlabel="place of the ball, $x$ / mm", ylabel="shear $\\sigma_{zx}$ / kPa")
-    right.legend(fontsize=7)
+    for axis in (left, right):
+        axis.legend(fontsize=7)
     return figure

@@ -1,4 +1,4 @@
-"""Pictures of a computed response matrix."""
+"""Pictures of a computed response matrix, and of influence functions."""
 
 from __future__ import annotations
 
@@ -6,34 +6,43 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.layout import Layout
+from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, curve_style, print_style, symbol
 
 from ..fem.fem import Response
 
-_MOST_COEFFICIENTS = 12
-"""The largest ones are drawn."""
+MAX_COEFFICIENTS = 12
+"""Number of coefficients in the picture of convergence; the largest ones are drawn."""
+MIN_LABELLED = 5e-3
+"""Share of the largest entry of the matrix below which an entry has no number."""
+POINTS = 201
+"""Number of points of a curve of influence."""
+REACH = 8
+"""Half width of the picture of influence, in half sides of the cube."""
+SAME_CURVE = 1e-3
+"""Share of the largest stress up to which the curves of two pads may differ to share one curve."""
 
 
 @print_style()
 def draw_convergence(result: Response) -> Figure:
-    """How far each coefficient on the coarser meshes is from that on the finest mesh.
+    """Draw the distance of each coefficient from its value on the finest mesh, over unknowns.
 
     The distance is relative to the largest coefficient.
     """
     figure = Figure(figsize=(6, 4))
     axis = figure.subplots()
-    rows = result.convergence
-    last = rows[-1]["coefficients"]
-    largest = max(map(abs, last.values()))
-    unknowns = [row["unknowns"] for row in rows[:-1]]
-    shown = sorted(last, key=lambda name: -abs(last[name]))[:_MOST_COEFFICIENTS]
+    *coarser, finest = result.convergence
+    values = finest["coefficients"]
+    largest = max(map(abs, values.values()))
+    unknowns = [row["unknowns"] for row in coarser]
+    shown = sorted(values, key=lambda name: -abs(values[name]))[:MAX_COEFFICIENTS]
     for number, name in enumerate(shown):
-        distance = [
-            100 * abs(row["coefficients"][name] - last[name]) / largest for row in rows[:-1]
-        ]
-        axis.loglog(unknowns, distance, label=name, **curve_style(number))
-    finest = f"distance from the result with {rows[-1]['unknowns']} unknowns / % of the largest"
-    axis.set(xlabel="unknowns of the mesh", ylabel=finest)
+        change = np.array([row["coefficients"][name] - values[name] for row in coarser])
+        axis.loglog(unknowns, 100 * abs(change) / largest, label=name, **curve_style(number))
+    label = f"distance from the result with {finest['unknowns']} unknowns / % of the largest"
+    axis.set(xlabel="unknowns of the mesh", ylabel=label)
     if unknowns:
         axis.set_xticks(unknowns, [str(n) for n in unknowns], minor=False)
         axis.xaxis.set_minor_formatter(NullFormatter())
@@ -45,20 +54,68 @@ def draw_convergence(result: Response) -> Figure:
 
 @print_style()
 def draw_response(result: Response) -> Figure:
-    """The response matrix, pads down and modes across. Below zero is dark, in grey too."""
+    """Draw the response matrix, pads down and modes across. Negative is dark, in grey too."""
     n_pads, n_modes = result.matrix.shape
     figure = Figure(figsize=(0.6 * n_modes + 2.5, 0.35 * n_pads + 1.5))
     axis = figure.subplots()
     limit = np.abs(result.matrix).max()
     image = axis.imshow(result.matrix, cmap=SIGNED_COLOURS, vmin=-limit, vmax=limit, aspect="auto")
     axis.grid(False)
-    axis.set_xticks(
-        range(n_modes), [symbol(mode) for mode in result.modes], rotation=60 if n_modes > 7 else 0
-    )
-    axis.set_yticks(range(n_pads), [f"V{k + 1}  {pad}" for k, pad in enumerate(result.layout.pads)])
+    labels = [symbol(mode) for mode in result.modes]
+    axis.set_xticks(range(n_modes), labels, rotation=60 if n_modes > 7 else 0)
+    axis.set_yticks(range(n_pads), [f"V{k}  {pad}" for k, pad in enumerate(result.layout.pads, 1)])
     for (pad, mode), value in np.ndenumerate(result.matrix):
-        if abs(value) > 5e-3 * limit:
+        if abs(value) > MIN_LABELLED * limit:
             color = "black" if value > -0.1 * limit else "white"
             axis.text(mode, pad, f"{value:.2f}", ha="center", va="center", fontsize=7, color=color)
     figure.colorbar(image, ax=axis, label="pad stress over amplitude of the mode / (Pa/Pa)")
     return figure
+
+
+@print_style()
+def draw_influence(influence: Influence, layout: Layout, half_side: float) -> Figure:
+    """Draw the stress of each pad over the place of a force along x, above the cube's centre line.
+
+    There is a panel for each direction of the force. Pads with the same curve share one.
+
+    Args:
+        influence: The influence functions.
+        layout: Pads of the cube.
+        half_side: Half side of the cube, in m.
+    """
+    ends = influence.place[[0, -1], 0]
+    reach = min(REACH * half_side, *np.abs(ends))
+    x = np.linspace(-reach, reach, POINTS)
+    along_x = np.eye(influence.place.shape[1])[0]
+    stress = influence.at(x[:, None] * along_x)[:, :, [-1, 0]] * [-1, 1]  # against z, along x
+    unit, force = (1.0, "1 N/mm") if layout.planar else (1e3, "1 N")
+    figure = Figure(figsize=(10, 4.5))
+    axes = figure.subplots(1, 2)
+    for number, pads in enumerate(_equal_curves(stress)):
+        label = ", ".join(layout.pads[pad] for pad in pads)
+        for k, axis in enumerate(axes):
+            curve = stress[pads[0], :, k] / unit
+            axis.plot(1e3 * x, curve, label=label, markevery=20, **curve_style(number))
+    for axis, direction in zip(axes, ("pressing", "along x"), strict=True):
+        axis.set(
+            xlabel="place of the force from the cube's centre, x / mm",
+            ylabel="stress of the pad / kPa",
+            title=f"a force of {force} {direction}",
+        )
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncol=3, fontsize="small")
+    return figure
+
+
+def _equal_curves(stress: Array) -> list[list[int]]:
+    """Group the numbers of pads (P, ...) that have the same values."""
+    groups: list[list[int]] = []
+    tolerance = SAME_CURVE * np.abs(stress).max()
+    for pad, values in enumerate(stress):
+        for group in groups:
+            if np.abs(stress[group[0]] - values).max() < tolerance:
+                group.append(pad)
+                break
+        else:
+            groups.append([pad])
+    return groups

@@ -4,7 +4,7 @@ Numbers only; `figures/experiments.py` and `figures/deformation.py` draw them. T
 say on which faces the prototype's pads C1 .. C4 are. Here C1 and C2 are on the lower face: then
 P_shear and P_grad grow in its experiments as they do in the paper. With C1 and C2 on the upper face
 P_shear has the other sign, and nothing else changes. The paper does not give the modulus of the
-pads' foam: FOAM is ours, stiff enough that no pad is crushed at 27 % compression.
+pads' foam either; `FOAM_MODULUS` is ours.
 """
 
 from __future__ import annotations
@@ -26,33 +26,42 @@ from cube_tensor_driver.core.oscillator import pad_frequency
 from ..fem.body import Body
 from ..fem.fem import Progress, Response, compute_response
 from .rod import Rod
-from .virtual_bench import Deformation, Step, VirtualBench
+from .virtual_bench import Deformation, LoadStep, VirtualBench
 
-FOAM = {"rest_frequency": REST_FREQUENCY, "beta": BETA, "modulus": 3e6}
+FOAM_MODULUS = 3e6
+"""Modulus of the pads' foam, in Pa: stiff enough that no pad is crushed at 27 % compression."""
 MODE_AMPLITUDE = 1e4
-"""Of each mode in the pictures of deformation, Pa."""
-ON_LOWER, ON_UPPER = [2, 3, 0, 1], [0, 1, 2, 3]
-"""Columns of V1 .. V8 that are C1 .. C4, with C1 and C2 on the lower or on the upper face."""
-# Signs of P_shear and P_grad, the paper's eqs. 9 and 10.
-_SHEAR = np.array([-1.0, 1.0, 1.0, -1.0])
-_GRAD = np.array([1.0, -1.0, 1.0, -1.0])
+"""Amplitude of each mode in the pictures of deformation, in Pa."""
+ON_LOWER = [2, 3, 0, 1]
+"""Columns of V1 .. V8 that are C1 .. C4, with C1 and C2 on the lower face."""
+ON_UPPER = [0, 1, 2, 3]
+"""The same with C1 and C2 on the upper face."""
+SHEAR_SIGNS = np.array([-1.0, 1.0, 1.0, -1.0])
+"""Signs of C1 .. C4 in P_shear, the paper's eq. 9."""
+GRAD_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
+"""Signs of C1 .. C4 in P_grad, the paper's eq. 10."""
+DISPLACEMENTS = np.linspace(0.25e-3, 3e-3, 12)
+"""Displacements of plates and rods in the steps of an experiment, in m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """One experiment of section 4, a row per step.
 
-    displacement: (n,) m
-    pads: (n, 8) Pa; frequency: (n, 4) Hz of C1 .. C4, with C1 and C2 on the lower face
-    prototype: (n, 3) P_normal, P_shear, P_grad, Hz; upper: the same, C1 and C2 on the upper face
-    recovered, truth: (n, 7) plane modes in Pa, from all eight pads, and of the body without a cube
-    rotation: (n,) of the cube, rad
+    Attributes:
+        name: Name of the experiment.
+        displacement: (n,) displacement of the plate or rod that moves, in m.
+        pads: (n, 8) stress of the pads, in Pa.
+        prototype: (n, 3) P_normal, P_shear, P_grad with C1 and C2 on the lower face, in Hz.
+        upper: The same with C1 and C2 on the upper face.
+        recovered: (n, 7) plane modes from all eight pads, in Pa.
+        truth: (n, 7) plane modes in the body without a cube, in Pa.
+        rotation: (n,) rotation of the cube, in rad.
     """
 
     name: str
     displacement: Array
     pads: Array
-    frequency: Array
     prototype: Array
     upper: Array
     recovered: Array
@@ -62,74 +71,77 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class _Protocol:
-    """Name and steps of an experiment; displacement: (n,) m of the plate or rod that moves."""
+    """Name and steps of an experiment; displacement (n,) of the plate or rod that moves, in m."""
 
     name: str
     displacement: Array
-    steps: list[Step]
+    steps: list[LoadStep]
 
 
 def experiments(
     body: Body | None = None, finite: bool = False, progress: Progress | None = None
 ) -> list[Experiment]:
-    """The three experiments, with bonded plates and, where they do not shear, sliding ones."""
+    """Run the three experiments, with bonded plates and with plates that slide.
+
+    Plates that shear the body must hold it, so they grip after they have slid.
+
+    Args:
+        body: The body, by default that of the paper.
+        finite: Whether the material is neo-Hookean.
+        progress: Called after every step.
+    """
     body = body or Body()
     protocols = _protocols(body)
-    pressing = len(protocols[-1].steps)
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
     done = itertools.count(1)
+    # With the cube and without it.
     total = 2 * sum(len(protocol.steps) for protocol in protocols)
 
     def report(name: str) -> None:
         if progress is not None:
             progress(next(done), total, name)
 
-    found = [
-        _experiment(protocol, body, finite, calibration, partial(report, protocol.name))
-        for protocol in protocols
-    ]
+    found = []
+    for protocol in protocols:
+        told = partial(report, protocol.name)
+        found.append(_run_experiment(protocol, body, finite, calibration, told))
     # Experiment (a) is how (b) begins.
     bonded, sliding = found[:2]
     return [
-        _beginning(bonded, "a, top plate pressed, bonded", pressing),
-        _beginning(sliding, "a, top plate pressed, sliding", pressing),
+        _first_half(bonded, "a, top plate pressed, bonded"),
+        _first_half(sliding, "a, top plate pressed, sliding"),
         *found,
     ]
 
 
 def _protocols(body: Body) -> list[_Protocol]:
-    press = shear = np.linspace(0.25e-3, 3e-3, 12)
-    both = np.concatenate([press, 3e-3 + shear])
-    rods = [Rod(depth, body.side / 4) for depth in press]
-    bonded = [plates(body, p) for p in press]
-    sheared = [plates(body, 3e-3, s) for s in shear]
-    sliding = [plates(body, p, bonded=False) for p in press]
-    gripped = [plates(body, 3e-3, s, gripped=True) for s in shear]
+    both = np.concatenate([DISPLACEMENTS, 3e-3 + DISPLACEMENTS])
+    rods = [Rod(depth, body.side / 4) for depth in DISPLACEMENTS]
+    bonded = [plates(body, pressed) for pressed in DISPLACEMENTS]
+    sheared = [plates(body, 3e-3, shear) for shear in DISPLACEMENTS]
+    sliding = [plates(body, pressed, bonded=False) for pressed in DISPLACEMENTS]
+    gripped = [plates(body, 3e-3, shear, gripped=True) for shear in DISPLACEMENTS]
+    dents = [dent(body, rod) for rod in rods]
+    sliding_dents = [dent(body, rod, bonded=False) for rod in rods]
     return [
         _Protocol("b, pressed 3 mm then sheared, bonded", both, bonded + sheared),
         _Protocol(
             "b, pressed 3 mm by sliding plates that then grip, sheared", both, sliding + gripped
         ),
-        _Protocol("c, 5 mm rod above C2, bonded bottom", press, [dent(body, rod) for rod in rods]),
-        _Protocol(
-            "c, 5 mm rod above C2, sliding bottom",
-            press,
-            [dent(body, rod, bonded=False) for rod in rods],
-        ),
+        _Protocol("c, 5 mm rod above C2, bonded bottom", DISPLACEMENTS, dents),
+        _Protocol("c, 5 mm rod above C2, sliding bottom", DISPLACEMENTS, sliding_dents),
     ]
 
 
-def _beginning(experiment: Experiment, name: str, steps: int) -> Experiment:
-    """The first steps of an experiment, under another name."""
-    columns = {
-        field.name: getattr(experiment, field.name)[:steps]
-        for field in fields(Experiment)
-        if field.name != "name"
-    }
+def _first_half(experiment: Experiment, name: str) -> Experiment:
+    """Return the pressing steps of an experiment, under another name."""
+    columns = {}
+    for field in fields(Experiment)[1:]:
+        columns[field.name] = getattr(experiment, field.name)[: len(DISPLACEMENTS)]
     return Experiment(name=name, **columns)
 
 
-def _experiment(
+def _run_experiment(
     protocol: _Protocol,
     body: Body,
     finite: bool,
@@ -138,54 +150,66 @@ def _experiment(
 ) -> Experiment:
     with_cube = VirtualBench(body, finite=finite).run(protocol.steps, report)
     without = VirtualBench(body, cube=False, finite=finite).run(protocol.steps, report)
-    frequency = pad_frequency(with_cube.pads, **FOAM)
-    recover = make_estimator(calibration.matrix, np.ones(8), PLANE, targets=np.eye(7)).matrix
+    frequency = foam_frequency(with_cube.pads)
+    estimator = make_estimator(calibration.matrix, np.ones(8), PLANE, targets=np.eye(7))
     return Experiment(
         name=protocol.name,
         displacement=protocol.displacement,
         pads=with_cube.pads,
-        frequency=frequency[:, ON_LOWER],
         prototype=prototype(frequency[:, ON_LOWER]),
         upper=prototype(frequency[:, ON_UPPER]),
-        recovered=with_cube.pads @ recover.T,
+        recovered=with_cube.pads @ estimator.matrix.T,
         truth=without.state,
         rotation=with_cube.rotation,
     )
 
 
+def foam_frequency(pads: Array) -> Array:
+    """Return the frequencies in Hz of pads under a stress in Pa, by the pad law."""
+    rest, beta, modulus = np.array([REST_FREQUENCY, BETA, FOAM_MODULUS])
+    return pad_frequency(pads, rest, beta, modulus)
+
+
 def prototype(frequency: Array) -> Array:
-    """P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4) of C1 .. C4, eqs. 8 to 10."""
-    change = frequency - FOAM["rest_frequency"]
-    return np.stack([-change.sum(axis=1), change @ _SHEAR, change @ _GRAD], axis=1)
+    """Return P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4), eqs. 8 to 10."""
+    change = frequency - REST_FREQUENCY
+    return np.stack(
+        [-change.sum(axis=1), change @ SHEAR_SIGNS, change @ GRAD_SIGNS],
+        axis=1,
+    )
 
 
 def plates(
     body: Body, pressed: float, sheared: float = 0.0, bonded: bool = True, gripped: bool = False
-) -> Step:
-    """The top plate pressed down and the bottom plate moved along x, in m.
+) -> LoadStep:
+    """Press the top plate down and move the bottom plate along x.
 
-    Plates that are not bonded slide: they leave x free. gripped: plates that slid before hold the
-    body from now on, as it stands between them.
+    Args:
+        body: The body.
+        pressed: Displacement of the top plate, in m.
+        sheared: Displacement of the bottom plate, in m.
+        bonded: Whether the plates hold the body; otherwise they slide and leave x free.
+        gripped: Whether plates that slid before hold the body from now on, as it stands.
     """
 
     def prescribed(x: Array) -> Array:
-        moved = _on_bottom(body, x, bonded, sheared)
+        moved = _bottom_plate(body, x, bonded, sheared)
         top = x[1] > body.height / 2 - 1e-9
         moved[1, top] = -pressed
         if bonded:
             moved[0, top] = 0.0
         return moved
 
-    return Step(prescribed, gripped=gripped, sliding=not bonded)
+    return LoadStep(prescribed, gripped=gripped, sliding=not bonded)
 
 
-def dent(body: Body, rod: Rod, bonded: bool = True) -> Step:
-    """A rod pressed into the top, the bottom bonded to its plate or sliding on it."""
-    return Step(lambda x: _on_bottom(body, x, bonded, 0.0), rod, sliding=not bonded)
+def dent(body: Body, rod: Rod, bonded: bool = True) -> LoadStep:
+    """Press a rod into the top, with the bottom bonded to its plate or sliding on it."""
+    return LoadStep(lambda x: _bottom_plate(body, x, bonded, 0.0), rod, sliding=not bonded)
 
 
-def _on_bottom(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
-    """Displacements (2, n) that the bottom plate prescribes, NaN elsewhere."""
+def _bottom_plate(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
+    """Return the displacements (2, n) that the bottom plate prescribes, NaN elsewhere."""
     moved = np.full(x.shape, np.nan)
     bottom = x[1] < -body.height / 2 + 1e-9
     moved[1, bottom] = 0.0
@@ -195,12 +219,12 @@ def _on_bottom(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
 
 
 def figure_4(body: Body | None = None) -> dict[str, Deformation]:
-    """Section 3: shear only ("zx"), and a normal stress that grows along x ("zz_x"); 10 kPa."""
+    """Return section 3: shear only ("zx"), and a normal stress that grows along x ("zz_x")."""
     return _deformations(VirtualBench(body or Body(), size=0.2), ("zx", "zz_x"))
 
 
 def mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
-    """The section under 10 kPa of each plane mode, by the mode's name."""
+    """Return the section under `MODE_AMPLITUDE` of each plane mode, by the mode's name."""
     return _deformations(VirtualBench(body, layout=layout, size=0.3), PLANE.names)
 
 
@@ -209,7 +233,7 @@ def _deformations(bench: VirtualBench, names: Sequence[str]) -> dict[str, Deform
     deformations = {}
     for name in names:
         mode = PLANE.names.index(name)
-        stress = MODE_AMPLITUDE * PLANE.stress[mode][np.ix_(axes, axes)]
-        gradient = MODE_AMPLITUDE * PLANE.gradient[mode][np.ix_(axes, axes, axes)]
-        deformations[name] = bench.loaded(stress, gradient)
+        stress = PLANE.stress[mode][np.ix_(axes, axes)]
+        gradient = PLANE.gradient[mode][np.ix_(axes, axes, axes)]
+        deformations[name] = bench.loaded(MODE_AMPLITUDE * stress, MODE_AMPLITUDE * gradient)
     return deformations

@@ -24,54 +24,69 @@ _ONE = np.eye(2)
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """lam, mu: Lamé's constants, Pa, of shapes that broadcast against F without its last axes."""
+    """A linear or a neo-Hookean material.
+
+    Attributes:
+        lam: Lamé's constant λ in Pa, of a shape that broadcasts against F without its last axes.
+        mu: Lamé's constant μ, the same.
+        finite: Whether the material is neo-Hookean.
+    """
 
     lam: Array
     mu: Array
     finite: bool
 
     def energy(self, f: Array) -> Array:
-        """W (...), Pa."""
+        """Return W (...), in Pa."""
         if not self.finite:
-            e = _strain(f)
-            squares = np.sum(e * e, axis=(-2, -1))
-            return np.asarray(self.lam / 2 * _trace(e) ** 2 + self.mu * squares)
+            strain = _strain(f)
+            squares = np.sum(strain * strain, axis=(-2, -1))
+            return np.asarray(self.lam / 2 * _trace(strain) ** 2 + self.mu * squares)
         log = np.log(determinant(f))
         squares = np.sum(f * f, axis=(-2, -1))
         return np.asarray(self.mu / 2 * (squares - 2 - 2 * log) + self.lam / 2 * log**2)
 
     def stress(self, f: Array) -> Array:
-        """First Piola-Kirchhoff stress P = dW/dF (..., 2, 2), Pa: force over undeformed area."""
+        """Return the first Piola-Kirchhoff stress P = dW/dF (..., 2, 2), in Pa.
+
+        It is the force over the undeformed area.
+        """
         lam, mu = self.lam[..., None, None], self.mu[..., None, None]
         if not self.finite:
-            e = _strain(f)
-            return np.asarray(lam * _trace(e)[..., None, None] * _ONE + 2 * mu * e)
-        g = _inverse_transposed(f)
-        return np.asarray(mu * (f - g) + lam * np.log(determinant(f))[..., None, None] * g)
+            strain = _strain(f)
+            return np.asarray(lam * _trace(strain)[..., None, None] * _ONE + 2 * mu * strain)
+        inverse = _inverse_transposed(f)
+        log = np.log(determinant(f))[..., None, None]
+        return np.asarray(mu * (f - inverse) + lam * log * inverse)
 
     def cauchy(self, f: Array) -> Array:
-        """True stress P Fᵀ / J (..., 2, 2), Pa: force over deformed area; P itself if linear."""
+        """Return the true stress P Fᵀ / J (..., 2, 2), in Pa: the force over the deformed area.
+
+        A linear material does not distinguish it from P.
+        """
         p = self.stress(f)
         if not self.finite:
             return p
         return np.asarray(p @ np.swapaxes(f, -2, -1) / determinant(f)[..., None, None])
 
     def moduli(self, f: Array) -> Array:
-        """dP_ij/dF_kl (..., 2, 2, 2, 2), Pa."""
+        """Return dP_ij/dF_kl (..., 2, 2, 2, 2), in Pa."""
         lam, mu = (x[..., None, None, None, None] for x in (self.lam, self.mu))
-        same = np.einsum("ik,jl->ijkl", _ONE, _ONE)
+        identity = np.einsum("ik,jl->ijkl", _ONE, _ONE)
         if not self.finite:
+            outer = np.einsum("ij,kl->ijkl", _ONE, _ONE)
             crossed = np.einsum("il,jk->ijkl", _ONE, _ONE)
-            return np.asarray(lam * np.einsum("ij,kl->ijkl", _ONE, _ONE) + mu * (same + crossed))
-        g = _inverse_transposed(f)
+            return np.asarray(lam * outer + mu * (identity + crossed))
+        inverse = _inverse_transposed(f)
         log = np.log(determinant(f))[..., None, None, None, None]
-        outer = g[..., :, :, None, None] * g[..., None, None, :, :]  # g_ij g_kl
-        crossed = np.swapaxes(outer, -3, -1)  # g_il g_kj
-        return np.asarray(mu * same + (mu - lam * log) * crossed + lam * outer)
+        # With g = F^-T, these are g_ij g_kl and g_il g_kj.
+        outer = inverse[..., :, :, None, None] * inverse[..., None, None, :, :]
+        crossed = np.swapaxes(outer, -3, -1)
+        return np.asarray(mu * identity + (mu - lam * log) * crossed + lam * outer)
 
 
 def determinant(f: Array) -> Array:
-    """det F (...)."""
+    """Return det F (...)."""
     return np.asarray(f[..., 0, 0] * f[..., 1, 1] - f[..., 0, 1] * f[..., 1, 0])
 
 

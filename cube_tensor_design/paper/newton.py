@@ -1,7 +1,7 @@
 """Newton's method for displacements u (dofs,) at which forces balance, some of them prescribed.
 
 Each step lowers the energy (by Armijo's rule) or the forces out of balance. One linear combination
-of the unknowns may be held at zero, row @ u = 0: the force that holds it is a multiple of the row.
+of the unknowns may be held at zero, row @ u = 0; the force that holds it is a multiple of the row.
 
 Source: J. Nocedal, S. J. Wright, Numerical Optimization (2006), 3.1 and 18.1.
 """
@@ -14,19 +14,21 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
-from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.arrays import Array, Index
 
-_TOLERANCE = 1e-9
-"""Of the correction, over the largest displacement."""
-_ITERATIONS = 60
-"""A deep rod's tries converge at 32 to 54; given up at 30, they cost twice the corrections."""
-_LONGEST = 0.3
-"""Largest correction of any unknown in one step."""
-_SHORTENINGS = 7
-_ARMIJO = 1e-4
+TOLERANCE = 1e-9
+"""Largest correction over the largest displacement at which the method has converged."""
+MAX_ITERATIONS = 60
+"""Number of corrections after which the method counts as failed. For a deep rod it converges in 32
+to 54; with a limit of 30 the load steps would be halved, at twice the number of corrections."""
+MAX_CORRECTION = 0.3
+"""Largest correction of any unknown in one step, in d0."""
+MAX_HALVINGS = 7
+"""Number of times that one correction is halved at most."""
+ARMIJO = 1e-4
+"""Part of the linear decrease of the energy that a step must reach (Armijo's rule)."""
 
 
 class Balance(NamedTuple):
@@ -38,10 +40,11 @@ class Balance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """What the unknowns must fulfil.
+    """Conditions on the unknowns.
 
-    prescribed: (dofs,) values, NaN where free
-    row: (dofs,) weights with row @ u = 0, or None
+    Attributes:
+        prescribed: (dofs,) values, NaN where an unknown is free.
+        row: (dofs,) weights with row @ u = 0, or None.
     """
 
     prescribed: Array
@@ -55,85 +58,107 @@ def find_balance(
     tangents: Callable[[Array], Iterable[sp.csr_matrix]],
     linear: bool = False,
 ) -> Array | None:
-    """u (dofs,) in balance from the guess u; None where the method does not converge.
+    """Find displacements at which the free forces balance.
 
-    balance: gives None where u is not possible
-    tangents: the derivative of the forces, then what to try where that one gives no descent
-    linear: one step is enough
+    Args:
+        u: (dofs,) the guess.
+        constraints: Conditions on the unknowns.
+        balance: Returns forces and energy, or None at displacements that are not possible.
+        tangents: Yields the derivative of the forces, then matrices to try where that one gives no
+            descent.
+        linear: Whether one step is enough.
+
+    Returns:
+        u (dofs,), or None where the method does not converge.
     """
     fixed = ~np.isnan(constraints.prescribed)
-    free = np.flatnonzero(~fixed)
     jump = np.where(fixed, constraints.prescribed - u, 0.0)
-    held = None if constraints.row is None else constraints.row[free]
+    search = _Search(np.flatnonzero(~fixed), constraints.row, balance)
     state = balance(u)
-    for _ in range(_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         if state is None:
             return None
-        tried = None
+        reached = None
         for matrix in tangents(u):
-            right = -(state.force + matrix @ jump)[free]
-            product = 0.0 if constraints.row is None else -float(constraints.row @ u)
-            change = jump.copy()
-            change[free] = _correction(matrix[free][:, free], right, held, product)
-            if linear or np.abs(change).max() < _TOLERANCE * np.abs(u).max():
+            change = search.correction(u, state, matrix, jump)
+            if linear or np.abs(change).max() < TOLERANCE * np.abs(u).max():
                 return np.asarray(u + change)
             if jump.any():  # prescribed displacements are not shortened
-                tried = u + change, balance(u + change)
+                reached = u + change, balance(u + change)
             else:
-                tried = _search(u, change, state, balance, free, held)
-            if tried is not None:
+                reached = search.descend(u, state, change)
+            if reached is not None:
                 break
-        if tried is None:
+        if reached is None:
             return None
-        u, state = tried
+        u, state = reached
         jump = np.zeros_like(u)
     return None
 
 
+class _Search:
+    """Corrections of the free unknowns `free` (m,), and how much of a correction is taken."""
+
+    def __init__(
+        self, free: Index, row: Array | None, balance: Callable[[Array], Balance | None]
+    ) -> None:
+        self._free = free
+        self._row = row
+        self._held = None if row is None else row[free]
+        self._balance = balance
+
+    def correction(self, u: Array, state: Balance, matrix: sp.csr_matrix, jump: Array) -> Array:
+        """Return the change (dofs,) of u that balances the linearised forces.
+
+        Args:
+            u: (dofs,) displacements.
+            state: Forces and energy there.
+            matrix: Derivative of the forces.
+            jump: (dofs,) change of the prescribed unknowns.
+        """
+        free = self._free
+        right: Array = -(state.force + matrix @ jump)[free]
+        inner = matrix[free][:, free]
+        change: Array = jump.copy()
+        if self._held is None or self._row is None:
+            change[free] = factors(inner).solve(right)
+            return change
+        # A force along the row holds row @ (u + change) = 0.
+        border = sp.csr_matrix(self._held)
+        bordered = sp.bmat([[inner, border.T], [border, None]])
+        right = np.append(right, -float(self._row @ u))
+        change[free] = factors(bordered).solve(right)[:-1]
+        return change
+
+    def descend(self, u: Array, state: Balance, change: Array) -> tuple[Array, Balance] | None:
+        """Take as much of a change as lowers the energy or the forces out of balance, or None."""
+        slope = float(state.force @ change)
+        unbalanced = self._unbalanced(state.force)
+        size = min(1.0, MAX_CORRECTION / np.abs(change).max())
+        for _ in range(MAX_HALVINGS):
+            reached = self._balance(u + size * change)
+            if reached is not None:
+                lower_force = self._unbalanced(reached.force) < unbalanced
+                allowed = state.energy + ARMIJO * size * slope
+                lower_energy = slope < 0 and reached.energy <= allowed
+                if lower_force or lower_energy:
+                    return u + size * change, reached
+            size /= 2
+        return None
+
+    def _unbalanced(self, force: Array) -> float:
+        """Return the norm of the forces that nothing holds."""
+        free, held = force[self._free], self._held
+        if held is not None:
+            free = free - held * (held @ free) / (held @ held)
+        return float(np.linalg.norm(free))
+
+
 def factors(matrix: sp.spmatrix) -> SuperLU:
-    """LU factors of a nearly symmetric matrix, in half the time of free pivoting."""
+    """Return LU factors of a nearly symmetric matrix, in half the time of free pivoting."""
     return splu(
         matrix.tocsc(),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.01,
         options={"SymmetricMode": True},
     )
-
-
-def _correction(matrix: sp.csr_matrix, right: Array, held: Array | None, product: float) -> Array:
-    """x with matrix @ x = right. With `held`: plus a force along it, so that held @ x = product."""
-    if held is None:
-        return np.asarray(factors(matrix).solve(right))
-    border = sp.csr_matrix(held)
-    bordered = sp.bmat([[matrix, border.T], [border, None]])
-    return np.asarray(factors(bordered).solve(np.append(right, product))[:-1])
-
-
-def _search(
-    u: Array,
-    change: Array,
-    state: Balance,
-    balance: Callable[[Array], Balance | None],
-    free: NDArray[np.int64],
-    held: Array | None,
-) -> tuple[Array, Balance] | None:
-    """As much of a change of u as lowers the energy or the forces out of balance; None: nothing."""
-    slope = float(state.force @ change)
-    left = _unbalanced(state.force[free], held)
-    size = min(1.0, _LONGEST / np.abs(change).max())
-    for _ in range(_SHORTENINGS):
-        there = balance(u + size * change)
-        if there is not None:
-            lower_force = _unbalanced(there.force[free], held) < left
-            lower_energy = slope < 0 and there.energy <= state.energy + _ARMIJO * size * slope
-            if lower_force or lower_energy:
-                return u + size * change, there
-        size /= 2
-    return None
-
-
-def _unbalanced(force: Array, held: Array | None) -> float:
-    """Size of the forces that nothing holds."""
-    if held is not None:
-        force = force - held * (held @ force) / (held @ held)
-    return float(np.linalg.norm(force))

@@ -12,6 +12,7 @@ is ours.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,25 +20,28 @@ import skfem
 
 from cube_tensor_driver.core.arrays import Array
 
-_STIFFNESS = 300.0
-"""k over Young's modulus, per d0: a pressure of three times E pushes in by a hundredth of d0."""
-_ONSET = 0.001
-"""Length over which the contact sets in, d0."""
-_SAME = 1e-9
-"""Displacements that differ by less are the same, d0."""
+STIFFNESS_RATIO = 300.0
+"""Ratio of k to Young's modulus, per d0. A pressure of three times E penetrates a hundredth of
+d0."""
+ONSET_LENGTH = 0.001
+"""Length over which the contact sets in, in d0."""
+SAME_DISPLACEMENT = 1e-9
+"""Difference below which two displacements are the same, in d0."""
 
 
 @dataclass(frozen=True)
 class Rod:
-    """A rod; its flat part ends `edge_radius` before its edges, in parabolas. Lengths in m.
+    """A rod whose flat part ends `edge_radius` before its edges, in parabolas; lengths in m.
 
-    pressed: how deep its lowest point is below the undeformed top
-    position: of its middle along x
-    edge_radius: of curvature of the parabolas at their apex
+    Sides of elements, as far as they are stretched, must be short compared with the radius.
+    Otherwise a node stays on the rod's edge while the surface slides around it, and how far it
+    slides depends on the steps of the load.
 
-    Sides of elements, as far as they are stretched, must be short beside the radius. Where they are
-    not, a node stays on the rod's edge while the surface slides round it, and how far it slides
-    depends on the steps of the load.
+    Attributes:
+        pressed: Depth of its lowest point below the undeformed top.
+        position: Position of its centre along x.
+        width: Width along x.
+        edge_radius: Radius of curvature of the parabolas at their apex.
     """
 
     pressed: float
@@ -46,77 +50,108 @@ class Rod:
     edge_radius: float = 1e-3
 
     def lower_side(self, x: Array, top: float, unit: float) -> tuple[Array, Array, Array]:
-        """h, dh/dx and d²h/dx² at x; x, top and h are in units of `unit` m."""
+        """Return h, dh/dx and d²h/dx² at x; x, top and h are in units of `unit` m."""
         radius = self.edge_radius / unit
         flat = (self.width / 2 - self.edge_radius) / unit
-        away = x - self.position / unit
-        s = np.maximum(np.abs(away) - flat, 0.0)
-        h = top - self.pressed / unit + s**2 / (2 * radius)
-        return h, np.sign(away) * s / radius, (s > 0) / radius
+        from_centre = x - self.position / unit
+        beyond_flat = np.maximum(np.abs(from_centre) - flat, 0.0)
+        height = top - self.pressed / unit + beyond_flat**2 / (2 * radius)
+        slope = np.sign(from_centre) * beyond_flat / radius
+        return height, slope, (beyond_flat > 0) / radius
+
+
+class _Penetration(NamedTuple):
+    """p, dp/dg, d²p/dg², dh/dx and d²h/dx² at the quadrature points."""
+
+    p: Array
+    dp: Array
+    ddp: Array
+    slope: Array
+    curvature: Array
 
 
 class RodContact:
-    """Energy, nodal forces and tangent of a rod on the facets of a basis.
-
-    unit: m per unit of length of the basis; young: Young's modulus of the body, Pa
-    finite: the rod meets the surface where it has moved to along x; otherwise (linear theory) where
-    it was
-    """
+    """Energy, nodal forces and tangent of a rod on the facets of a basis."""
 
     def __init__(
         self, facets: skfem.FacetBasis, rod: Rod, unit: float, young: float, finite: bool
     ) -> None:
-        self._facets, self._rod, self._unit = facets, rod, unit
-        self._stiffness, self._finite = _STIFFNESS * young, float(finite)
+        """Set up the contact.
+
+        Args:
+            facets: The top of the body.
+            rod: The rod.
+            unit: Metres per unit of length of the basis.
+            young: Young's modulus of the body, in Pa.
+            finite: Whether the rod meets the surface where it has moved to along x. In linear
+                theory it meets it where it was.
+        """
+        self._facets = facets
+        self._rod = rod
+        self._unit = unit
+        self._stiffness = STIFFNESS_RATIO * young
+        self._finite = float(finite)
 
     def energy(self, u: Array) -> float:
-        p, *_ = self._penetration(u)
+        """Return the energy at displacements u (dofs,)."""
+        p = self._penetration(u).p
         return float((self._stiffness / 2 * p**2 * self._facets.dx).sum())
 
     def force(self, u: Array) -> Array:
-        """Nodal forces (dofs,) at displacements u (dofs,)."""
-        p, dp, _, slope, _ = self._penetration(u)
-        return _push.assemble(self._facets, pressure=self._stiffness * p * dp, slope=slope)
+        """Return the nodal forces (dofs,) at displacements u (dofs,)."""
+        at = self._penetration(u)
+        pressure = self._stiffness * at.p * at.dp
+        return np.asarray(_PUSH.assemble(self._facets, pressure=pressure, slope=at.slope))
 
-    def tangent(self, u: Array, curved: bool = True) -> Array:
-        """Derivative of the nodal forces, sparse (dofs, dofs).
+    def tangent(self, u: Array, curved: bool = True) -> sp.csr_matrix:
+        """Return the derivative of the nodal forces, sparse (dofs, dofs).
 
-        curved=False leaves out the rod's curvature, which can make the tangent indefinite.
+        Args:
+            u: (dofs,) displacements.
+            curved: Whether the rod's curvature counts, which can make the tangent indefinite.
         """
-        p, dp, ddp, slope, curvature = self._penetration(u)
-        normal = self._stiffness * (dp**2 + p * ddp)
-        bending = -self._stiffness * p * dp * curvature * curved
-        return _push_change.assemble(self._facets, normal=normal, slope=slope, bending=bending)
+        at = self._penetration(u)
+        normal = self._stiffness * (at.dp**2 + at.p * at.ddp)
+        bending = -self._stiffness * at.p * at.dp * at.curvature * curved
+        return self._assemble(normal, at.slope, bending)
 
     def secant(self, u: Array, v: Array) -> sp.csr_matrix:
-        """Sparse (dofs, dofs) S with S (u - v) = force(u) - force(v), for linear theory."""
-        (p, dp, ddp, *_), (q, dq, *_) = self._penetration(u), self._penetration(v)
+        """Return S, sparse (dofs, dofs), with S (u - v) = force(u) - force(v); linear theory."""
+        at, other = self._penetration(u), self._penetration(v)
         change = np.asarray(self._facets.interpolate(u - v))[1]
-        moved = np.abs(change) > _SAME
-        slope = (p * dp - q * dq) / np.where(moved, change, 1.0)
-        normal = self._stiffness * np.where(moved, slope, dp**2 + p * ddp)
-        none = np.zeros_like(normal)
-        return _push_change.assemble(self._facets, normal=normal, slope=none, bending=none)
+        has_moved = np.abs(change) > SAME_DISPLACEMENT
+        quotient = (at.p * at.dp - other.p * other.dp) / np.where(has_moved, change, 1.0)
+        # Where nothing has moved, the secant is the tangent.
+        normal = self._stiffness * np.where(has_moved, quotient, at.dp**2 + at.p * at.ddp)
+        zero = np.zeros_like(normal)
+        return self._assemble(normal, zero, zero)
 
-    def _penetration(self, u: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """p, dp/dg, d²p/dg², dh/dx and d²h/dx² at the quadrature points."""
+    def _assemble(self, normal: Array, slope: Array, bending: Array) -> sp.csr_matrix:
+        form = skfem.BilinearForm(_push_change)
+        return form.assemble(self._facets, normal=normal, slope=slope, bending=bending)
+
+    def _penetration(self, u: Array) -> _Penetration:
         x = np.asarray(self._facets.default_parameters()["x"])
         moved = np.asarray(self._facets.interpolate(u))
-        at = x[0] + self._finite * moved[0]
-        h, slope, curvature = self._rod.lower_side(at, x[1].max(), self._unit)
-        g = x[1] + moved[1] - h
-        root = np.hypot(g, _ONSET)
+        position = x[0] + self._finite * moved[0]
+        height, slope, curvature = self._rod.lower_side(position, x[1].max(), self._unit)
+        g = x[1] + moved[1] - height
+        root = np.hypot(g, ONSET_LENGTH)
         p = (g + root) / 2
-        dp, ddp = p / root, _ONSET**2 / (2 * root**3)
-        return p, dp, ddp, self._finite * slope, self._finite * curvature
+        return _Penetration(
+            p=p,
+            dp=p / root,
+            ddp=ONSET_LENGTH**2 / (2 * root**3),
+            slope=self._finite * slope,
+            curvature=self._finite * curvature,
+        )
 
 
-@skfem.LinearForm
-def _push(w, p):
-    return p.pressure * (w[1] - p.slope * w[0])
+_PUSH = skfem.LinearForm(lambda w, p: p.pressure * (w[1] - p.slope * w[0]))
+"""Work of the pressure along the rod's normal in a test function w."""
 
 
-@skfem.BilinearForm
-def _push_change(u, w, p):
-    along_normal = p.normal * (w[1] - p.slope * w[0]) * (u[1] - p.slope * u[0])
-    return along_normal + p.bending * w[0] * u[0]
+def _push_change(u: Any, w: Any, p: Any) -> Any:
+    """Derivative of `_PUSH` by u: the penetration changes, and so does the normal."""
+    along_normal = (w[1] - p.slope * w[0]) * (u[1] - p.slope * u[0])
+    return p.normal * along_normal + p.bending * w[0] * u[0]

@@ -1,13 +1,13 @@
-"""What makes P_shear under the paper's rod: its signal split by superposition; linear, plane.
+"""Parts of P_shear under the paper's rod, by superposition; linear, in a plane.
 
 Without the cube the rod makes a field u0 in the cube's place. The same body with the cube is in
 balance at u = u0 + w. Plates stay where they are, and the rod's contact pushes back as it does
-between u0 and u (S, its secant). So w is what the stiffer cube alone makes of u0::
+between u0 and u (S, its secant). So w is the displacement that the stiffer cube alone adds to u0::
 
     (K + S) w = -(K_cube - K_elastomer) u0        matrices of the cube's place on the right
 
-That holds if the rod's displacement is held. If its force is, the cube drives the rod back by d
-along z (e is one there, and zero along x), and the change of the contact's force sums to zero::
+That holds if the rod's displacement is held. If its force is held, the cube drives the rod back by
+d along z (e is one there, and zero along x), and the change of the contact's force sums to zero::
 
     K w + S (w - d e) = -(K_cube - K_elastomer) u0,        e' S (w - d e) = 0
 
@@ -32,41 +32,47 @@ from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.optimize import newton
 
-from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.arrays import Array, Index, Mask
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 
 from ..fem.body import Body, strip_layout
 from ..fem.fem import Progress
 from ..fem.solid import lame
-from .experiments import dent
+from .experiments import SHEAR_SIGNS, dent
 from .newton import factors
 from .rod import Rod
-from .virtual_bench import Step, VirtualBench
+from .virtual_bench import LoadStep, VirtualBench
 
 Held = Literal["displacement", "force"]
-"""What of the rod is the same with the cube as without it."""
+"""Quantity of the rod that is the same with the cube as without it."""
 
 PARTS = ("shear", "normal", "gradients", "second", "higher")
 """Uniform shear, uniform normal stresses, gradients, second derivatives of stress, the rest."""
 PADS = {"strips": LAYOUTS["planar"], "half faces": strip_layout(LAYOUTS["planar"], 1.0)}
+"""Layouts whose signal is split."""
 RADII = {"rounded rod": 1e-3, "sharp rod": 1e-5}
-"""Of the rod's edges, m."""
-P_SHEAR = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0])
-"""-v1 + v2 + v3 - v4, eq. 9 of the eight pads' stresses."""
-
-_ORDER = 8
-"""Of the polynomials; beyond it 0.2 % of the signal is left."""
-_SAME_DEPTH = 1e-8
-"""Of rods, m; the method of secants is then far closer to the force that is held."""
+"""Radii of the rod's edges, in m."""
+P_SHEAR = np.append(SHEAR_SIGNS, np.zeros(4))
+"""Signs -v1 + v2 + v3 - v4 of the eight pads' stresses in P_shear, eq. 9."""
+ORDERS = 8
+"""Number of orders of the polynomials. Beyond them 0.2 % of the signal is left."""
+SAME_DEPTH = 1e-8
+"""Difference below which two depths of a rod are the same, in m. The force is then far closer to
+the one that is held, as the secant method converges fast."""
 
 
 @dataclass(frozen=True, eq=False)
 class RodParts:
-    """place: (n,) of the rod, m; signal: (n,) Pa; parts: (n, 5) Pa, which sum to the signal."""
+    """Parts of the signal by the position of the rod.
+
+    Attributes:
+        place: (n,) position of the rod along x, in m.
+        signal: (n,) in Pa.
+        parts: (n, 5) in Pa, in the order of `PARTS`; they sum to the signal.
+    """
 
     place: Array
     signal: Array
@@ -80,83 +86,93 @@ def rod_parts(
     progress: Progress | None = None,
     held: Held = "displacement",
 ) -> dict[str, RodParts]:
-    """Parts of -v1 + v2 + v3 - v4 by the rod's place along x, m; bottom bonded, no friction.
+    """Split -v1 + v2 + v3 - v4 for each position of a rod; the bottom is bonded, without friction.
 
-    pressed: how deep the rod is without the cube, m
-    Keys: "rounded rod, strips" and so on, of RADII and PADS.
+    Args:
+        body: The body, by default that of the paper.
+        places: Positions of the rod along x, in m.
+        pressed: Depth of the rod without the cube, in m.
+        progress: Called before every position.
+        held: Quantity of the rod that the cube does not change.
+
+    Returns:
+        Parts by "rounded rod, strips" and so on, of `RADII` and `PADS`.
     """
     bench = VirtualBench(body or Body())
     signals = [P_SHEAR @ bench.pad_weights(layout) for layout in PADS.values()]
     found: dict[str, RodParts] = {}
+    total = len(RADII) * len(places)
     for number, (rod, radius) in enumerate(RADII.items()):
         rows = []
         for row, place in enumerate(places):
             if progress is not None:
-                done, total = number * len(places) + row, len(RADII) * len(places)
+                done = number * len(places) + row
                 progress(done, total, f"{rod} at {1e3 * place:g} mm")
             step = dent(bench.body, Rod(pressed, place, edge_radius=radius))
-            rows.append(split(bench, step, signals, held))
+            rows.append(split_signals(bench, step, signals, held))
         for pads, parts in zip(PADS, np.moveaxis(np.array(rows), 1, 0), strict=True):
             found[f"{rod}, {pads}"] = RodParts(np.array(places), parts.sum(axis=1), parts)
     return found
 
 
-def eased(bench: VirtualBench, step: Step) -> Step:
-    """The step with its rod drawn back until its force is that on the body without the cube."""
+def draw_back(bench: VirtualBench, step: LoadStep) -> LoadStep:
+    """Return the step with its rod drawn back until its force is that without the cube."""
     rod = step.rod
     if rod is None:
         raise ElasticError("the step has no rod whose force could be held; give it one")
 
-    def at(depth: float) -> Step:
+    def step_to(depth: float) -> LoadStep:
         return replace(step, rod=replace(rod, pressed=depth))
 
     @cache
     def excess(depth: float) -> float:
-        return float(bench.rod_pressure(at(depth))[1].sum() / force - 1)
+        """Return how much larger the force is, relative to that without the cube."""
+        return float(bench.rod_pressure(step_to(depth))[1].sum() / force - 1)
 
     force = bench.without_cube().rod_pressure(step)[1].sum()
     guess = rod.pressed / (1 + excess(rod.pressed))
-    return at(newton(excess, rod.pressed, x1=guess, tol=_SAME_DEPTH))
+    return step_to(newton(excess, rod.pressed, x1=guess, tol=SAME_DEPTH))
 
 
-def split(
-    bench: VirtualBench, step: Step, signals: Sequence[Array], held: Held = "displacement"
+def split_signals(
+    bench: VirtualBench, step: LoadStep, signals: Sequence[Array], held: Held = "displacement"
 ) -> Array:
-    """(signals, 5) parts of each signal under a step of a linear bench.
+    """Return the parts (signals, 5) of each signal under a step of a linear bench.
 
-    signals: (dofs,) weights of the nodal forces on the cube, as bench.pad_weights gives them
+    Args:
+        bench: A linear bench with the cube.
+        step: A step with a bonded bottom.
+        signals: (dofs,) weights of the nodal forces on the cube, from `VirtualBench.pad_weights`.
+        held: Quantity of the rod that the cube does not change.
     """
     if bench.finite or step.sliding:
         raise ElasticError("fields superpose on a linear bench whose bottom is bonded; take that")
-    empty = bench.without_cube()
-    with_cube = eased(bench, step) if held == "force" else step
+    empty, in_cube = bench.without_cube(), bench.in_cube
+    with_cube = draw_back(bench, step) if held == "force" else step
     u, field = bench.solve(with_cube), empty.solve(step)
     if u is None or field is None:
         raise ElasticError("the load is too large for one step; press less")
-    free, inside = bench.free(step), bench.in_cube
-    matrix = bench.section.tangent(u)[free][:, free]
-    if step.rod is not None and with_cube.rod is not None:
-        up = (bench.section.component == 1).astype(float)
-        back = (step.rod.pressed - with_cube.rod.pressed) / (bench.body.side / 2)
-        springs = bench.rod_contact(step.rod).secant(u - back * up, field)
-        matrix = matrix + springs[free][:, free]
-        if held == "force":
-            push = sp.csr_matrix((springs @ up)[free])
-            matrix = sp.bmat([[matrix, push.T], [push, [[up @ springs @ up]]]])
+
+    free = bench.free(step)
+    matrix = _superposed_matrix(bench, step, with_cube, u, field)
     solver = factors(matrix)
-    dofs = np.unique(bench.section.basis.element_dofs[:, inside])
+    dofs = np.unique(bench.section.basis.element_dofs[:, in_cube])
     polynomials, part = _polynomials(bench)
     polynomials = polynomials[:, dofs]
+    # Columns of one size keep the fit well conditioned.
     size = np.linalg.norm(polynomials, axis=1)
-    amplitude = np.linalg.lstsq((polynomials / size[:, None]).T, field[dofs], rcond=None)[0] / size
+    scaled = (polynomials / size[:, None]).T
+    amplitude = np.linalg.lstsq(scaled, field[dofs], rcond=None)[0] / size
 
     rows = []
     for weights in signals:
         adjoint = np.zeros_like(u)
         right = np.zeros(matrix.shape[0])
-        right[: len(free)] = -_forces(bench, weights, ~inside)[free]
+        right[: len(free)] = -_forces(bench, weights, ~in_cube)[free]
         adjoint[free] = solver.solve(right)[: len(free)]
-        response = _forces(empty, weights + adjoint, inside) - _forces(bench, adjoint, inside)
+        # The signal is response @ u0.
+        response = _forces(empty, weights + adjoint, in_cube)
+        response -= _forces(bench, adjoint, in_cube)
         each = (polynomials @ response[dofs]) * amplitude
         parts = np.bincount(part, each, len(PARTS))
         parts[-1] += response @ field - each.sum()
@@ -164,26 +180,55 @@ def split(
     return np.array(rows)
 
 
-def _forces(bench: VirtualBench, u: Array, elements: NDArray[np.bool_]) -> Array:
-    """Nodal forces (dofs,) of some elements at displacements u: their stiffness times u."""
+def _superposed_matrix(
+    bench: VirtualBench, step: LoadStep, with_cube: LoadStep, u: Array, field: Array
+) -> sp.spmatrix:
+    """Return the matrix of w: K + S of the free unknowns, bordered where the force is held.
+
+    Args:
+        bench: The bench with the cube.
+        step: The step without the cube.
+        with_cube: The step with it, in which the rod may be drawn back.
+        u: (dofs,) displacements with the cube.
+        field: (dofs,) displacements without it.
+    """
+    free = bench.free(step)
+    matrix = bench.section.tangent(u)[free][:, free]
+    if step.rod is None or with_cube.rod is None:
+        return matrix
+    along_z = (bench.section.component == 1).astype(float)
+    drawn_back = (step.rod.pressed - with_cube.rod.pressed) / (bench.body.side / 2)
+    contact = bench.rod_contact(step.rod)
+    springs = contact.secant(u - drawn_back * along_z, field)
+    matrix = matrix + springs[free][:, free]
+    if with_cube is step:
+        return matrix
+    push = sp.csr_matrix((springs @ along_z)[free])
+    return sp.bmat([[matrix, push.T], [push, [[along_z @ springs @ along_z]]]])
+
+
+def _forces(bench: VirtualBench, u: Array, elements: Mask) -> Array:
+    """Return the nodal forces (dofs,) of some elements at u: their stiffness times u."""
     section = bench.section
     return section.forces(section.material.stress(section.deformation(u)), elements)
 
 
-def _polynomials(bench: VirtualBench) -> tuple[Array, NDArray[np.int64]]:
-    """(n, dofs) displacements in balance without a cube, and the number (n,) of each one's part."""
+def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
+    """Return displacements (n, dofs) in balance without a cube, and the part (n,) of each one."""
     body, section = bench.body, bench.section
     lam, mu = lame(body.young, body.poisson, body.plane)
     ratio = (lam + 3 * mu) / (lam + mu)
     z = section.basis.doflocs[0] + 1j * section.basis.doflocs[1]
-    fields = [1.0 + 0 * z, 1j + 0 * z, 1j * z]  # rigid motions, which no pad feels
+    # No pad feels the rigid motions, which come first.
+    fields = [1.0 + 0 * z, 1j + 0 * z, 1j * z]
     part = [PARTS.index("higher")] * 3
-    for order in range(1, _ORDER + 1):
+    for order in range(1, ORDERS + 1):
         for a, b in ((1, 0), (1j, 0), (0, 1), (0, 1j)):
             if order == 1 and a == 1j:  # a rotation
                 continue
             slope = order * z * np.conj(a * z ** (order - 1))
             fields.append(ratio * a * z**order - slope - np.conj(b * z**order))
-            part.append(min(order, 4) if (order, b) != (1, 1j) else PARTS.index("shear"))
+            is_shear = order == 1 and b == 1j
+            part.append(PARTS.index("shear") if is_shear else min(order, 4))
     values = np.array(fields)
     return np.where(section.component == 0, values.real, values.imag), np.array(part)

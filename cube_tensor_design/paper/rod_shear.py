@@ -1,8 +1,8 @@
 """Shear that is recovered under the paper's rod, by eq. 4, a cube's tensor, points and pads.
 
 The rod presses on the linear bench with a bonded bottom. *Points* and *pads* take the traction t on
-the surface for a Gaussian process, as touch/posterior.py does, along x alone. What the cube gives
-is y = int H(x) t(x) dx, and the shear at its place, in the body without it, s = int h(x) t(x) dx::
+the surface for a Gaussian process, as touch/posterior.py does, along x alone. The cube measures
+y = int H(x) t(x) dx, and the shear at its place in the body without it is s = int h(x) t(x) dx::
 
     s = h S H' (H S H' + N)^-1 y
 
@@ -30,25 +30,28 @@ from ..fem.body import Body
 from ..fem.fem import Progress, compute_response
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
-from .experiments import dent
+from .experiments import SHEAR_SIGNS, dent
 from .rod import Rod
 from .virtual_bench import VirtualBench
 
-_STEP = 1e-4
-"""Of the grid on the surface, m."""
-_SIGNAL = np.array([-1.0, 1.0, 1.0, -1.0])
-"""Eq. 4 of the four upper and lower pads, tension positive."""
+GRID_STEP = 1e-4
+"""Distance between the points of the grid on the surface, in m."""
 
 
 @dataclass(frozen=True, eq=False)
 class RodShear:
-    """A row per place of the rod; m and Pa.
+    """Shear σzx at the cube's place, in Pa; one row per place of the rod.
 
-    truth: sigma_zx at the cube's place, of the same rod on the body without a cube
-    same_load: of the pressure that the rod has with the cube, on the layer without it
-    eq_4, tensor, points, pads: what is recovered
-    seen, predicted: (n, 8) mean stress of the pads on the bench, and by influence functions from
-    the traction under the rod
+    Attributes:
+        place: (n,) position of the rod along x, in m.
+        truth: (n,) of the same rod on the body without a cube.
+        same_load: (n,) of the pressure that the rod has with the cube, on the layer without it.
+        eq_4: (n,) from the four upper and lower pads by eq. 4.
+        tensor: (n,) from the tensor of all eight pads.
+        points: (n,) from the traction that the tensor gives.
+        pads: (n,) from the traction that the pads give.
+        seen: (n, 8) mean stress of the pads on the bench.
+        predicted: (n, 8) the same by influence functions from the traction under the rod.
     """
 
     place: Array
@@ -68,48 +71,75 @@ def rod_shear(
     pressed: float = 1e-3,
     progress: Progress | None = None,
 ) -> RodShear:
-    """Recover the shear for each place of the rod along x, m."""
+    """Recover the shear for each place of the rod.
+
+    Args:
+        body: The body, by default that of the paper.
+        places: Positions of the rod along x, in m.
+        pressed: Depth of the rod, in m.
+        progress: Called before every place.
+    """
     body = body or Body()
     layout, depth = LAYOUTS["planar"], body.height / 2
     with_cube, without = VirtualBench(body), VirtualBench(body, cube=False)
     response = compute_response(body, layout, "slab", meshes=1).matrix
-    tensor = make_estimator(response, np.ones(8), PLANE, targets=np.eye(7)).matrix
+    estimator = make_estimator(response, np.ones(8), PLANE, targets=np.eye(7)).matrix
     zx = PLANE.names.index("zx")
     influence = compute_influence(replace(body, ground=True), layout)
 
-    x = np.arange(-body.width / 2, body.width / 2 + _STEP / 2, _STEP)
-    of_points = line_load(Layer(body.height, body.poisson), x, depth, body.side / 2)  # (7, m, 2)
-    of_pads = influence.at(x[:, None])  # (8, m, 2)
-    shear = of_points[zx]
-    from_points = _estimate(of_points, shear, x, depth)
-    from_pads = _estimate(of_pads, shear, x, depth)
+    # Components of the tensor (7, m, 2) and stresses of the pads (8, m, 2) per traction at x.
+    x = np.arange(-body.width / 2, body.width / 2 + GRID_STEP / 2, GRID_STEP)
+    tensor_kernel = line_load(Layer(body.height, body.poisson), x, depth, body.side / 2)
+    pad_kernel = influence.at(x[:, None])
+    shear_kernel = tensor_kernel[zx]
+    from_tensor = _shear_weights(tensor_kernel, shear_kernel, x, depth)
+    from_pads = _shear_weights(pad_kernel, shear_kernel, x, depth)
 
     rows = []
     for number, place in enumerate(places):
         if progress is not None:
             progress(number, len(places), f"rod at {1e3 * place:g} mm")
         step = dent(body, Rod(pressed, place))
-        seen = with_cube.run([step]).pads[0]
-        truth = without.run([step]).state[0, zx]
-        modes = tensor @ seen
-        four = _SIGNAL @ seen[:4] / (_SIGNAL @ response[:4, zx])
-        at, force = with_cube.rod_pressure(step)
-        predicted = -influence.at(at[:, None])[:, :, 1] @ force
-        same_load = -np.interp(at, x, shear[:, 1]) @ force
-        found_shear = four, modes[zx], from_points @ modes, from_pads @ seen
-        rows.append((truth, same_load, *found_shear, seen, predicted))
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return RodShear(np.array(places), *columns)
+        pads = with_cube.run([step]).pads[0]
+        modes = estimator @ pads
+        positions, force = with_cube.rod_pressure(step)
+        rows.append(
+            RodShear(
+                place=np.array(place),
+                truth=without.run([step]).state[0, zx],
+                # The rod presses against z.
+                same_load=-np.interp(positions, x, shear_kernel[:, 1]) @ force,
+                eq_4=SHEAR_SIGNS @ pads[:4] / (SHEAR_SIGNS @ response[:4, zx]),
+                tensor=modes[zx],
+                points=from_tensor @ modes,
+                pads=from_pads @ pads,
+                seen=pads,
+                predicted=-influence.at(positions[:, None])[:, :, 1] @ force,
+            )
+        )
+    columns = {name: np.array([getattr(row, name) for row in rows]) for name in vars(rows[0])}
+    return RodShear(**columns)
 
 
-def _estimate(seen: Array, shear: Array, x: Array, depth: float) -> Array:
-    """(n,) weights of y for the shear; seen (n, m, 2), shear (m, 2): per traction at x (m,)."""
-    apart = np.subtract.outer(x, x) ** 2
-    prior = np.mean([np.exp(-apart / 2 / (l * depth) ** 2) for l in PRIOR_LENGTHS], axis=0)
-    total, cross = np.zeros((len(seen),) * 2), np.zeros(len(seen))
+def _shear_weights(kernel: Array, shear_kernel: Array, x: Array, depth: float) -> Array:
+    """Return the weights h S H' (H S H' + N)^-1 (n,) of the measurements y for the shear.
+
+    Args:
+        kernel: H (n, m, 2) per traction along x and z.
+        shear_kernel: h (m, 2).
+        x: (m,) positions on the surface, in m.
+        depth: Depth of the cube's centre, in m.
+    """
+    square_distance = np.subtract.outer(x, x) ** 2
+    gaussians = []
+    for length in PRIOR_LENGTHS:
+        gaussians.append(np.exp(-square_distance / 2 / (length * depth) ** 2))
+    prior = np.mean(gaussians, axis=0)
+
+    total, cross = np.zeros((len(kernel), len(kernel))), np.zeros(len(kernel))
     for component, size in enumerate((SHEAR_RATIO, 1.0)):
-        smooth = size**2 * seen[:, :, component] @ prior
-        total += smooth @ seen[:, :, component].T
-        cross += smooth @ shear[:, component]
-    total[np.diag_indices(len(seen))] *= 1 + MODEL_ERROR**2
+        smooth = size**2 * kernel[:, :, component] @ prior
+        total += smooth @ kernel[:, :, component].T
+        cross += smooth @ shear_kernel[:, component]
+    total[np.diag_indices(len(kernel))] *= 1 + MODEL_ERROR**2
     return np.asarray(np.linalg.solve(total, cross), dtype=float)

@@ -1,9 +1,10 @@
 """Finite elements of a plane section: quadratic triangles, a linear or a neo-Hookean material.
 
-    nodal forces  ∫ P(F) : grad w dV        F = 1 + grad u
+    nodal forces = ∫ P(F) : grad w dV,       F = 1 + grad u
 
-Lengths are in units of d0, stresses in Pa. Source: J. Bonet, R. D. Wood, Nonlinear Continuum
-Mechanics for Finite Element Analysis (2008), 9.6.
+Lengths are in units of d0, stresses in Pa.
+
+Source: J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), 9.6.
 """
 
 from __future__ import annotations
@@ -11,20 +12,22 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 import skfem
-from numpy.typing import NDArray
 
-from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.arrays import Array, Mask
 
 from .material import Material, determinant
 from .newton import Balance
 
 
 class Section:
-    """A meshed section. material: its constants are (elements, 1).
+    """A meshed section.
 
-    basis: the elements, whose dofs are the unknowns u (dofs,), displacements in d0
-    component: (dofs,) 0 where an unknown is along x, 1 along z
-    points: (elements, points, 2) where the quadrature points are
+    Attributes:
+        mesh: The triangles.
+        material: The material; its constants have the shape (elements, 1).
+        basis: The elements, whose dofs are the unknown displacements u (dofs,), in d0.
+        component: (dofs,) 0 where an unknown is along x, 1 along z.
+        points: (elements, points, 2) positions of the quadrature points.
     """
 
     def __init__(self, mesh: skfem.MeshTri, material: Material) -> None:
@@ -33,52 +36,63 @@ class Section:
         self.points = np.moveaxis(np.asarray(self.basis.default_parameters()["x"]), 0, -1)
         self.component = np.zeros(self.basis.N, dtype=int)
         self.component[self.basis.get_dofs(elements=True).all("u^2")] = 1
+        self._dofs = self.basis.element_dofs.T
+        self._shape = self.basis.dx.shape  # (elements, points)
         # d u_i / d x_j at the quadrature points is
         # slopes (elements, points, 2 i + j, n) @ u[dofs] (elements, n).
-        self._dofs = self.basis.element_dofs.T
         slopes = np.stack([shape[0].grad for shape in self.basis.basis], axis=-1)
-        self._slopes = np.moveaxis(slopes, (0, 1), (2, 3)).reshape(*self.basis.dx.shape, 4, -1)
+        self._slopes = np.moveaxis(slopes, (0, 1), (2, 3)).reshape(*self._shape, 4, -1)
         self._linear_tangent: sp.csr_matrix | None = None
 
     def node(self, x: float, z: float) -> int:
-        """The corner of an element that is nearest to this point."""
+        """Return the number of the corner of an element that is nearest to this point."""
         return int(np.argmin(np.hypot(self.mesh.p[0] - x, self.mesh.p[1] - z)))
 
     def deformation(self, u: Array) -> Array:
-        """F = 1 + grad u (elements, points, 2, 2)."""
+        """Return F = 1 + grad u (elements, points, 2, 2)."""
         gradient = self._slopes @ u[self._dofs][:, None, :, None]
-        return np.asarray(gradient.reshape(*self.basis.dx.shape, 2, 2) + np.eye(2))
+        return np.asarray(gradient.reshape(*self._shape, 2, 2) + np.eye(2))
 
     def balance(self, u: Array) -> Balance | None:
-        """Nodal forces and energy; None when an element is inside out."""
+        """Return nodal forces and energy; None when an element is inside out."""
         f = self.deformation(u)
         if self.material.finite and determinant(f).min() <= 0:
             return None
         energy = float((self.material.energy(f) * self.basis.dx).sum())
         return Balance(self.forces(self.material.stress(f)), energy)
 
-    def forces(self, stress: Array, elements: NDArray[np.bool_] | slice = slice(None)) -> Array:
-        """Nodal forces (dofs,) of a stress (elements, points, 2, 2) over some of the elements."""
-        weighted = (stress * self.basis.dx[..., None, None]).reshape(*self.basis.dx.shape, 4)
+    def forces(self, stress: Array, elements: Mask | slice = slice(None)) -> Array:
+        """Return the nodal forces (dofs,) of a stress over some of the elements.
+
+        Args:
+            stress: (elements, points, 2, 2) in Pa.
+            elements: Which elements count.
+        """
+        weighted = (stress * self.basis.dx[..., None, None]).reshape(*self._shape, 4)
         local = np.einsum("epi,epin->en", weighted[elements], self._slopes[elements])
-        total = np.bincount(self._dofs[elements].ravel(), local.ravel(), self.basis.N)
+        dofs = self._dofs[elements]
+        total = np.bincount(dofs.ravel(), local.ravel(), self.basis.N)
         return np.asarray(total, dtype=float)
 
     def tangent(self, u: Array) -> sp.csr_matrix:
-        """Derivative of the nodal forces by u (dofs, dofs); of a linear material it is kept."""
+        """Return the derivative of the nodal forces by u, sparse (dofs, dofs).
+
+        That of a linear material is the same everywhere, and is assembled once.
+        """
         if self._linear_tangent is not None:
             return self._linear_tangent
-        n, points = len(self.basis.basis), self.basis.dx.shape[1]
-        f = self.deformation(u)
+        elements = len(self._dofs)
+        n = len(self.basis.basis)
         # The moduli of a linear material are the same at all points of an element.
-        own_points = points if self.material.finite else 1
-        moduli = self.material.moduli(f).reshape(-1, own_points, 4, 4)
+        own_points = self._shape[1] if self.material.finite else 1
+        moduli = self.material.moduli(self.deformation(u)).reshape(-1, own_points, 4, 4)
         weighted = (moduli * self.basis.dx[..., None, None]) @ self._slopes
-        left = np.swapaxes(self._slopes.reshape(len(f), -1, n), 1, 2)
-        local = left @ weighted.reshape(len(f), -1, n)
+        left = np.swapaxes(self._slopes.reshape(elements, -1, n), 1, 2)
+        local = left @ weighted.reshape(elements, -1, n)
         rows = np.broadcast_to(self._dofs[:, :, None], local.shape).ravel()
         columns = np.broadcast_to(self._dofs[:, None], local.shape).ravel()
-        matrix = sp.coo_matrix((local.ravel(), (rows, columns)), (self.basis.N,) * 2).tocsr()
+        size = (self.basis.N, self.basis.N)
+        matrix = sp.coo_matrix((local.ravel(), (rows, columns)), size).tocsr()
         if not self.material.finite:
             self._linear_tangent = matrix
         return matrix

@@ -1,8 +1,8 @@
-"""A virtual bench: plates and rods move the surface of the elastomer, and pads feel it.
+"""A virtual bench: plates and rods move the surface of the elastomer, and pads measure the stress.
 
-A section of the body with the cube, or without it for the true field, of a linear or a neo-Hookean
-material (section.py). Forces balance (newton.py) under prescribed displacements and contact with a
-rod (rod.py), in steps of the load. No step may turn an element inside out.
+It is a section of the body with the cube, or without it for the true field, of a linear or a
+neo-Hookean material (section.py). Forces balance (newton.py) under prescribed displacements and
+contact with a rod (rod.py), in steps of the load. No step may turn an element inside out.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from functools import partial
 import numpy as np
 import scipy.sparse as sp
 import skfem
-from numpy.typing import NDArray
 
-from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.arrays import Array, Index, Mask
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
 
@@ -32,29 +31,32 @@ from .rod import Rod, RodContact
 from .section import Section
 
 CUBE_REFINEMENTS = 2
-"""How often the triangles that touch the cube are cut in four.
-
-P_shear is a small difference of pad stresses: with no cut it is 2 % off.
-"""
+"""Number of times that the triangles at the cube are cut in four. P_shear is a small difference of
+pad stresses; without a cut it is 2 % off."""
 STEP_HALVINGS = 5
-"""How often a step of the load is halved before it counts as too large."""
-
-_BYTES_PER_CORNER = 6e4
-"""Memory at the peak, per corner of a triangle; measured."""
-_CUBE_STIFFNESS = 1e4
-"""Of the cube over the body: rigid to 1e-4, and Newton's numbers stay well conditioned."""
+"""Number of times that a step of the load is halved before it counts as too large."""
+BYTES_PER_CORNER = 6e4
+"""Peak memory of the solver in bytes per corner of a triangle; measured."""
+CUBE_STIFFNESS_RATIO = 1e4
+"""Ratio of the Young's moduli of cube and body. The cube is then rigid to 1e-4, and the equations
+of Newton's method stay well conditioned."""
+SURFACE_TOLERANCE = 1e-9
+"""Distance from a surface below which a point counts as on it, in the unit of the coordinates."""
 
 
 @dataclass(frozen=True)
-class Step:
+class LoadStep:
     """One step of the load.
 
-    prescribed: maps node positions (2, n) in m to displacements (2, n) in m, NaN where a component
-    is free
-    rod: presses into the top
-    gripped: displacements along x count from where the body was after the last step without a grip
-    sliding: the bottom is free along x, but its mean stays. What keeps the body in place is spread
-    evenly over the bottom: a force on one point would move that point the more, the finer the mesh
+    Attributes:
+        prescribed: Maps node positions (2, n) in m to displacements (2, n) in m, NaN where a
+            component is free.
+        rod: Rod that presses into the top.
+        gripped: Whether displacements along x count from where the body was after the last step
+            without a grip.
+        sliding: Whether the bottom is free along x, except that its mean stays. The force that
+            keeps the body in place is spread evenly over the bottom: on one point it would move
+            that point the more, the finer the mesh.
     """
 
     prescribed: Callable[[Array], Array]
@@ -65,12 +67,14 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class BenchRun:
-    """Results of a run, a row per step. Stress in Pa, tension positive; gradients times d0.
+    """Results of a run, one row per step; tension is positive, gradients are times d0.
 
-    pads: (n, P) mean normal stress of each pad, along its own normal as the cube rotates
-    state: (n, 7) the modes zz, zx, xx, zz_x, zz_z, xx_z, xx_x fitted to the stress within d0/2 of
-    the centre: the true field where there is no cube, meaningless in a cube
-    rotation: (n,) angle of the cube, rad; displacement: (n, 2, nodes) of the mesh's corners, m
+    Attributes:
+        pads: (n, P) mean normal stress of each pad in Pa, along its own normal as the cube rotates.
+        state: (n, 7) modes zz, zx, xx, zz_x, zz_z, xx_z, xx_x in Pa, fitted to the stress within
+            d0/2 of the centre. It is the true field if there is no cube, and meaningless in a cube.
+        rotation: (n,) angle of the cube, in rad.
+        displacement: (n, 2, nodes) of the mesh's corners, in m.
     """
 
     pads: Array
@@ -83,13 +87,17 @@ class BenchRun:
 class Deformation:
     """A deformed section, as plain arrays.
 
-    points: (2, nodes) in d0; triangles: (3, elements) numbers of nodes
-    half_side: d0 in m; height: of the body, m
-    displacement: (2, nodes) m; stress_zz: (elements,) Pa
+    Attributes:
+        points: (2, nodes) in d0.
+        triangles: (3, elements) numbers of nodes.
+        half_side: d0, in m.
+        height: Height of the body, in m.
+        displacement: (2, nodes) in m.
+        stress_zz: (elements,) in Pa.
     """
 
     points: Array
-    triangles: NDArray[np.int64]
+    triangles: Index
     half_side: float
     height: float
     displacement: Array
@@ -98,7 +106,7 @@ class Deformation:
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """What a step asks of the unknowns."""
+    """Constraints of the unknowns in one step, and the rod that presses."""
 
     constraints: Constraints
     rod: Rod | None
@@ -113,13 +121,14 @@ class _Position:
 
 
 class VirtualBench:
-    """The body on the bench. Lengths in d0 unless stated otherwise.
+    """The body on the bench. Lengths are in d0 unless stated otherwise.
 
-    cube: False replaces the cube by elastomer; finite: True is the neo-Hookean body
-    layout: of the pads, by default the planar one
-    size: the longest side of an element away from the cube, in d0; below the top it is half of that
-
-    section: the finite elements; in_cube: (elements,) those in the cube's place
+    Attributes:
+        body: The body.
+        finite: Whether the material is neo-Hookean.
+        layout: Pads of the cube.
+        section: The finite elements.
+        in_cube: (elements,) which elements are in the cube's place.
     """
 
     def __init__(
@@ -130,133 +139,165 @@ class VirtualBench:
         layout: Layout | None = None,
         size: float = 0.5,
     ) -> None:
+        """Mesh the body.
+
+        Args:
+            body: The body.
+            cube: Whether the cube is there; elastomer replaces it otherwise.
+            finite: Whether the material is neo-Hookean.
+            layout: Pads of the cube, by default the planar layout.
+            size: Longest side of an element away from the cube; below the top it is half of that.
+        """
         if finite and body.plane != "strain":
             raise ElasticError(f"plane is {body.plane!r}; the finite bench knows 'strain' only")
         self.body, self.finite = body, finite
         self.layout = layout or LAYOUTS["planar"]
         self._half_side = body.side / 2
+
         mesh = _bench_mesh(body, self.layout, cube, size)
-        check_memory(mesh, _BYTES_PER_CORNER)
+        check_memory(mesh, BYTES_PER_CORNER)
         self.in_cube = np.all(np.abs(mesh.p[:, mesh.t].mean(axis=1)) < 1.0, axis=0)
         lam, mu = lame(body.young, body.poisson, body.plane)
-        stiffness = np.where(self.in_cube & cube, _CUBE_STIFFNESS, 1.0)[:, None]
+        stiffness = np.where(self.in_cube & cube, CUBE_STIFFNESS_RATIO, 1.0)[:, None]
         self.section = Section(mesh, Material(lam * stiffness, mu * stiffness, finite))
+
         top = body.height / 2 / self._half_side
-        self._top, bottom = self._horizontal(top), self._horizontal(-top)
-        self._bottom_mean = _along_x.assemble(bottom) * body.young  # in the size of the stiffness
+        self._top = self._horizontal_facets(top)
+        along_x = skfem.LinearForm(lambda w, _: w[0])
+        bottom_mean = along_x.assemble(self._horizontal_facets(-top))
+        # Its numbers have the size of the stiffness, so that the equations are well conditioned.
+        self._bottom_mean = bottom_mean * body.young
 
-    def run(self, steps: Sequence[Step], report: Callable[[], None] = lambda: None) -> BenchRun:
-        """Solve the steps, each starting from the last solution; report() is called after each.
+    def run(self, steps: Sequence[LoadStep], report: Callable[[], None] = lambda: None) -> BenchRun:
+        """Solve the steps, each starting from the last solution.
 
-        Raises ElasticError when a step is too large for Newton's method.
+        Args:
+            steps: Steps of the load.
+            report: Called after each step.
+
+        Raises:
+            ElasticError: A step is too large for Newton's method.
         """
         position = before = _Position(np.zeros(self.section.basis.N), None)
         loose = position.u
-        pads, states, rotations, displacements = [], [], [], []
+        rows = []
         for number, step in enumerate(steps, 1):
-            guess = 2 * position.u - before.u  # as the last step went
+            guess = 2 * position.u - before.u  # continues as the last step went
             reached = self._advance(position, guess, self._task(step, loose), number)
             before, position = position, reached
+            u = position.u
             if not step.gripped:
-                loose = position.u
-            pads.append(self._pad_stresses(position.u))
-            states.append(self._state(position.u))
-            rotations.append(self._rotation(position.u))
-            displacements.append(self._half_side * position.u[self.section.basis.nodal_dofs])
+                loose = u
+            displacement = self._half_side * u[self.section.basis.nodal_dofs]
+            rows.append((self._pad_stresses(u), self._state(u), self._rotation(u), displacement))
             report()
-        return BenchRun(*map(np.array, (pads, states, rotations, displacements)))
+        return BenchRun(*map(np.array, zip(*rows, strict=True)))
 
-    def solve(self, step: Step) -> Array | None:
-        """Displacements u (dofs,) under one step from rest; None where Newton's method fails."""
+    def solve(self, step: LoadStep) -> Array | None:
+        """Return the displacements (dofs,) under one step from rest, or None if it is too large."""
         rest = np.zeros(self.section.basis.N)
         return self._newton(rest, self._task(step, rest))
 
     def unbalanced_forces(self, u: Array, rod: Rod) -> Array:
-        """Nodal forces (dofs,) on the body at u, which plates must hold."""
+        """Return the nodal forces (dofs,) on the body at u, which plates must hold."""
         balance = self._balance(u, self.rod_contact(rod))
         if balance is None:
             raise ElasticError("an element is inside out; press less")
         return balance.force
 
-    def rod_pressure(self, step: Step) -> tuple[Array, Array]:
-        """Places (n,) m along x and forces (n,) N/m with which the rod of a linear step presses."""
+    def rod_pressure(self, step: LoadStep) -> tuple[Array, Array]:
+        """Return positions (n,) in m along x and forces (n,) in N/m of the rod of a linear step."""
         u = self.solve(step)
         if u is None or step.rod is None or self.finite:
             raise ElasticError("give a linear step with a rod, that presses less")
         force = self.rod_contact(step.rod).force(u)
         dofs = np.flatnonzero((force != 0) & (self.section.component == 1))
-        return self._half_side * self.section.basis.doflocs[0, dofs], self._half_side * force[dofs]
+        positions = self.section.basis.doflocs[0, dofs]
+        return self._half_side * positions, self._half_side * force[dofs]
 
     def pad_weights(self, layout: Layout, angle: float = 0.0) -> Array:
-        """(P, dofs): nodal forces of the elastomer on a cube at an angle to pads' mean stresses.
+        """Return weights (P, dofs) from nodal forces on the cube to the mean stresses of the pads.
 
-        layout: its pads end where elements of this bench's mesh end
+        Args:
+            layout: Pads that end where elements of this bench's mesh end.
+            angle: Rotation of the cube, in rad.
         """
-        c, s = np.cos(angle), np.sin(angle)
-        axes = np.array([[c, s], [-s, c]])
+        cos, sin = np.cos(angle), np.sin(angle)
+        axes = np.array([[cos, sin], [-sin, cos]])
         x, component = self.section.basis.doflocs, self.section.component
         half = layout.pad_size / 2
         weights = np.zeros((layout.n_pads, self.section.basis.N))
         positions, normals = layout.positions[:, [0, 2]], layout.normals[:, [0, 2]]
         for pad, (position, normal) in enumerate(zip(positions, normals, strict=True)):
             axis = 0 if normal[0] else 1
-            start, stop = position[1 - axis] - half, position[1 - axis] + half
-            on_face = np.abs(x[axis] - normal[axis]) < 1e-9
-            on_face &= np.abs(x[1 - axis]) < 1 + 1e-9
+            other = 1 - axis
+            start, stop = position[other] - half, position[other] + half
+            on_face = np.abs(x[axis] - normal[axis]) < SURFACE_TOLERANCE
+            on_face &= np.abs(x[other]) < 1 + SURFACE_TOLERANCE
             for along in (0, 1):
                 face = np.flatnonzero(on_face & (component == along))
-                face = face[np.argsort(x[1 - axis, face])]
-                integral = face_weights(x[1 - axis, face], 2, start, stop)
-                weights[pad, face] = axes[axis, along] * normal[axis] * integral / (2 * half)
+                face = face[np.argsort(x[other, face])]
+                integral = face_weights(x[other, face], 2, start, stop)
+                mean = integral / (2 * half)
+                weights[pad, face] = axes[axis, along] * normal[axis] * mean
         return weights
 
     def without_cube(self) -> VirtualBench:
-        """A linear bench of the same mesh, with elastomer in the cube's place."""
+        """Return a linear bench of the same mesh, with elastomer in the cube's place."""
         bench = copy(self)
         material = self.section.material
         lam, mu = (np.full_like(one, one.min()) for one in (material.lam, material.mu))
         bench.section = Section(self.section.mesh, Material(lam, mu, False))
         return bench
 
-    def free(self, step: Step) -> NDArray[np.int64]:
-        """Numbers of the unknowns that a step from rest does not prescribe."""
+    def free(self, step: LoadStep) -> Index:
+        """Return the numbers of the unknowns that a step from rest does not prescribe."""
         rest = np.zeros(self.section.basis.N)
         return np.flatnonzero(np.isnan(self._task(step, rest).constraints.prescribed))
 
     def rod_contact(self, rod: Rod) -> RodContact:
-        """A rod's contact with the top."""
+        """Return the contact of a rod with the top."""
         return RodContact(self._top, rod, self._half_side, self.body.young, self.finite)
 
     def loaded(self, stress: Array, gradient: Array) -> Deformation:
-        """Linear solution under the outer tractions of sigma_ij = S_ij + G_ijk x_k / d0.
+        """Solve for the outer tractions of the field sigma_ij = S_ij + G_ijk x_k / d0, linearly.
 
-        stress (2, 2) and gradient (2, 2, 2) in Pa, axes x and z. The cube's middle stays where it
-        is and its x axis does not rotate.
+        The cube's centre stays where it is and its x axis does not rotate.
+
+        Args:
+            stress: S (2, 2) in Pa, axes x and z.
+            gradient: G (2, 2, 2) in Pa.
         """
         section, mesh = self.section, self.section.mesh
-        force = section.forces(stress + np.einsum("ijk,epk->epij", gradient, section.points))
-        middle, side = section.node(0.0, 0.0), section.node(1.0, 0.0)
-        pinned = [*section.basis.nodal_dofs[:, middle], section.basis.nodal_dofs[1, side]]
+        field = stress + np.einsum("ijk,epk->epij", gradient, section.points)
+        force = section.forces(field)
+        centre, side = section.node(0.0, 0.0), section.node(1.0, 0.0)
+        pinned = [*section.basis.nodal_dofs[:, centre], section.basis.nodal_dofs[1, side]]
         free = np.setdiff1d(np.arange(section.basis.N), pinned)
         u = np.zeros(section.basis.N)
         u[free] = factors(section.tangent(u)[free][:, free]).solve(force[free])
+        result = section.material.stress(section.deformation(u))
         return Deformation(
             points=mesh.p,
             triangles=mesh.t,
             half_side=self._half_side,
             height=self.body.height,
             displacement=self._half_side * u[section.basis.nodal_dofs],
-            stress_zz=section.material.stress(section.deformation(u))[..., 1, 1].mean(axis=1),
+            stress_zz=result[..., 1, 1].mean(axis=1),
         )
 
-    def _horizontal(self, z: float) -> skfem.FacetBasis:
-        """The surface at this height."""
+    def _horizontal_facets(self, z: float) -> skfem.FacetBasis:
+        """Return the surface at this height."""
         mesh = self.section.mesh
-        facets = mesh.facets_satisfying(lambda x: np.abs(x[1] - z) < 1e-9, boundaries_only=True)
+
+        def is_at_height(x: Array) -> Mask:
+            return np.asarray(np.abs(x[1] - z) < SURFACE_TOLERANCE)
+
+        facets = mesh.facets_satisfying(is_at_height, boundaries_only=True)
         return skfem.FacetBasis(mesh, self.section.basis.elem, facets=facets, intorder=8)
 
-    def _task(self, step: Step, loose: Array) -> _Task:
-        """A step of the load; loose (dofs,): the last displacement of a body without a grip."""
+    def _task(self, step: LoadStep, loose: Array) -> _Task:
+        """Return a step as constraints; loose (dofs,) is the last position without a grip."""
         basis, component = self.section.basis, self.section.component
         by_component = step.prescribed(self._half_side * basis.doflocs)
         prescribed = by_component[component, np.arange(basis.N)] / self._half_side
@@ -268,7 +309,7 @@ class VirtualBench:
     def _advance(
         self, start: _Position, guess: Array, task: _Task, number: int, halvings: int = 0
     ) -> _Position:
-        """Newton's method from a guess for one step of the load; it is halved where that fails."""
+        """Solve one step of the load from a guess; the step is halved where that fails."""
         u = self._newton(guess, task)
         if u is not None:
             return _Position(u, task.rod)
@@ -283,7 +324,7 @@ class VirtualBench:
         return self._advance(middle, 2 * middle.u - start.u, task, number, halvings + 1)
 
     def _half_task(self, start: _Position, task: _Task) -> _Task:
-        """Half of the way from the start to what a task asks for."""
+        """Return the task that is half of the way from the start."""
         rod = task.rod
         if rod is not None:
             pressed = start.rod.pressed if start.rod else 0.0
@@ -292,7 +333,7 @@ class VirtualBench:
         return _Task(replace(task.constraints, prescribed=halfway), rod)
 
     def _newton(self, u: Array, task: _Task) -> Array | None:
-        """Displacements (dofs,) in balance, from the guess u; None where Newton's method fails."""
+        """Return the displacements (dofs,) in balance from the guess u, or None on failure."""
         contact = self.rod_contact(task.rod) if task.rod else None
 
         def tangents(u: Array) -> Iterator[sp.csr_matrix]:
@@ -305,75 +346,64 @@ class VirtualBench:
 
         linear = not self.finite and contact is None
         balance = partial(self._balance, contact=contact)
-        with np.errstate(all="ignore"):  # a failed try passes through inverted elements
+        with np.errstate(all="ignore"):  # a failed attempt passes through inverted elements
             return find_balance(u, task.constraints, balance, tangents, linear)
 
     def _balance(self, u: Array, contact: RodContact | None) -> Balance | None:
-        """Nodal forces out of balance and energy; None when an element is inside out."""
+        """Return nodal forces out of balance and energy; None when an element is inside out."""
         inner = self.section.balance(u)
         if inner is None or contact is None:
             return inner
         return Balance(inner.force + contact.force(u), inner.energy + contact.energy(u))
 
     def _rotation(self, u: Array) -> float:
-        """Angle of the cube in rad, from the line between the middles of its sides."""
-        left, right = (u[self.section.basis.nodal_dofs[:, self._side(x)]] for x in (-1.0, 1.0))
+        """Return the angle of the cube in rad, of the line between the centres of its sides."""
+        nodal_dofs = self.section.basis.nodal_dofs
+        left, right = (u[nodal_dofs[:, self.section.node(x, 0.0)]] for x in (-1.0, 1.0))
         along = right - left
         return float(np.arctan2(along[1], 2.0 + along[0]))
 
-    def _side(self, x: float) -> int:
-        """The node in the middle of the cube's left or right side."""
-        return self.section.node(x, 0.0)
-
     def _pad_stresses(self, u: Array) -> Array:
-        """Mean normal stress (P,) of the pads, in the rotated frame of the cube, in Pa.
+        """Return the mean normal stress (P,) of the pads in the rotated frame of the cube, in Pa.
 
-        From the nodal forces of the elastomer on the cube.
+        It comes from the nodal forces of the elastomer on the cube.
         """
         section = self.section
         stress = section.material.stress(section.deformation(u))
         force = -section.forces(stress, ~self.in_cube)
         angle = self._rotation(u) if self.finite else 0.0  # linear: no second-order terms
-        return self.pad_weights(self.layout, angle) @ force
+        return np.asarray(self.pad_weights(self.layout, angle) @ force)
 
     def _state(self, u: Array) -> Array:
-        """The seven plane modes fitted to the Cauchy stress within d0/2 of the centre."""
+        """Fit the seven plane modes to the Cauchy stress within d0/2 of the centre."""
         points, section = self.section.points, self.section
-        near = np.all(np.abs(points) < 0.5, axis=-1)
-        stress, x = section.material.cauchy(section.deformation(u))[near], points[near]
+        is_near = np.all(np.abs(points) < 0.5, axis=-1)
+        stress = section.material.cauchy(section.deformation(u))[is_near]
+        x = points[is_near]
         design = np.column_stack([np.ones(len(x)), x])
-        xx, zz, zx = (
-            np.linalg.lstsq(design, stress[:, i, j], rcond=None)[0]
-            for i, j in ((0, 0), (1, 1), (0, 1))
-        )
+        columns = np.stack([stress[:, 0, 0], stress[:, 1, 1], stress[:, 0, 1]], axis=1)
+        xx, zz, zx = np.linalg.lstsq(design, columns, rcond=None)[0].T
         return np.array([zz[0], zx[0], xx[0], zz[1], zz[2], xx[2], xx[1]])
 
 
 def _bench_mesh(body: Body, layout: Layout, cube: bool, size: float) -> skfem.MeshTri:
-    """Triangles of the section, in d0, refined at the cube and where rods press."""
+    """Return triangles of the section, in d0, refined at the cube and where rods press."""
     half_side, half_pad = body.side / 2, layout.pad_size / 2
     across = np.abs(layout.positions - layout.normals).max(axis=1)
     stops = np.unique(np.round([across - half_pad, across + half_pad], 9))
     top = body.height / 2 / half_side
     half = [body.width / 2 / half_side, top]
     quarter = mesh_quarter(half, stops, 1, smallest=0.3, largest=size)
-    quarter = _refined(quarter, lambda x, z: (z > top - 0.9) & (x < 6.0))
-    # Here rods stretch the surface most.
-    quarter = _refined(quarter, lambda x, z: (z > top - 0.25) & (x < 2.4))
+    quarter = _refine(quarter, lambda x, z: (z > top - 0.9) & (x < 6.0))
+    # Rods stretch the surface most here.
+    quarter = _refine(quarter, lambda x, z: (z > top - 0.25) & (x < 2.4))
     for _ in range(CUBE_REFINEMENTS if cube else 0):
-        quarter = _refined(quarter, lambda x, z: np.abs(np.maximum(x, z) - 1.15) < 0.15)
+        quarter = _refine(quarter, lambda x, z: np.abs(np.maximum(x, z) - 1.15) < 0.15)
     return mirror_quarter(quarter)
 
 
-def _refined(
-    mesh: skfem.MeshTri, where: Callable[[Array, Array], NDArray[np.bool_]]
-) -> skfem.MeshTri:
-    """The same mesh; triangles whose centroid is `where` are cut in four."""
+def _refine(mesh: skfem.MeshTri, where: Callable[[Array, Array], Mask]) -> skfem.MeshTri:
+    """Cut the triangles in four for whose centroids `where` is true."""
     x, z = mesh.p[:, mesh.t].mean(axis=1)
     mesh = mesh.refined(np.flatnonzero(where(x, z)))
     return skfem.MeshTri(mesh.p.copy(), mesh.t.copy())
-
-
-@skfem.LinearForm
-def _along_x(w, _):
-    return w[0]

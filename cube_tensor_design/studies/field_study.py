@@ -1,7 +1,8 @@
-"""What gradients buy: error of the field between the cubes against the contact model.
+"""What gradients gain: error of the field between the cubes against the contact model.
 
-Three kinds of skin are compared: values alone; cubes that see all of stress and gradient; planar
-cubes, whose section lies along x, so that they see ∂σzz/∂x of the gradient and σzx of the shear.
+Three kinds of skin are compared: values alone; cubes that observe all of stress and gradient;
+planar cubes, whose section lies along x, so that they observe ∂σzz/∂x of the gradient and σzx of
+the shear.
 """
 
 from __future__ import annotations
@@ -18,32 +19,42 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.touch.surface import Surface
 
 SKIN_KINDS = ("values alone", "values and gradients", "planar cubes")
-_UNSEEN_BY_PLANAR = [k for k, name in enumerate(COMPONENTS) if "y" in name]
+"""Kinds of skin that are compared."""
+UNOBSERVED_BY_PLANAR = [k for k, name in enumerate(COMPONENTS) if "y" in name]
+"""Indices of the components that planar cubes do not observe."""
 
 FORCE = 3.0
-"""Of the ball, N."""
+"""Normal force of the ball, in N."""
 FRICTION = 0.3
-"""Shear over normal force of the ball."""
+"""Ratio of the ball's shear force to its normal force."""
 PITCHES = np.array([6, 8, 10, 12, 16, 20, 24]) * 1e-3
+"""Distances between neighbouring cubes, in m."""
 WIDTHS = np.array([2, 5, 10, 15, 20]) * 1e-3
+"""Widths of the contact, in m."""
 CASES = 16
-"""Contacts per pitch and width, anywhere in the cell between four cubes."""
+"""Number of contacts per pitch and width, anywhere in the cell between four cubes."""
 SKIN_SIDE = 0.1
-"""Of the skin, m."""
+"""Side of the skin, in m."""
 WINDOW = 0.04
-"""Side of the middle of the skin in which fields are compared, m."""
-_POINT_SPACING = 2e-3
+"""Side of the square in the middle of the skin in which fields are compared, in m."""
+POINT_SPACING = 2e-3
+"""Distance between the points at which fields are compared, in m."""
+SEED = 8
+"""Seed of the random contacts, so that every run has the same numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldStudy:
-    """Errors for each width (rows), pitch (columns) and one of SKIN_KINDS (last axis).
+    """Errors for each width (rows), pitch (columns) and one of `SKIN_KINDS` (last axis).
 
-    pitches, widths: m
-    error: rms of the pressure's error over rms of the pressure, in the window
-    position: 95th percentile of the contact's position error, m
-    force: rms error of the contact's normal force over the force
-    A contact that was not found counts as a position error of WINDOW and an error of all the force.
+    A contact that was not found counts as a position error of `WINDOW` and a force error of 1.
+
+    Attributes:
+        pitches: (columns,) in m.
+        widths: (rows,) in m.
+        error: rms of the pressure's error over rms of the pressure, in the window.
+        position: 95th percentile of the contact's position error, in m.
+        force: rms error of the contact's normal force over the force.
     """
 
     pitches: Array
@@ -53,9 +64,13 @@ class FieldStudy:
     force: Array
 
     def cubes_saved(self, error: float) -> Array:
-        """(widths, kinds) how many times fewer cubes per area give this error than values alone do.
+        """Return how many times fewer cubes per area reach an error than values alone do.
 
-        NaN where no pitch of the study gives it.
+        Args:
+            error: Relative rms error of the pressure.
+
+        Returns:
+            (widths, kinds); NaN where no pitch of the study reaches the error.
         """
         saved = np.full((len(self.widths), len(SKIN_KINDS)), np.nan)
         for row, curves in enumerate(self.error):
@@ -64,19 +79,23 @@ class FieldStudy:
         return saved
 
     def _pitch_for(self, error: float, curve: Array) -> float:
-        """The pitch at which the errors (pitches,) reach this one; NaN: at none."""
+        """Return the pitch at which a curve of errors (pitches,) reaches this one, or NaN."""
         rising = np.maximum.accumulate(curve)
         if not rising[0] < error < rising[-1]:
             return np.nan
-        return float(np.exp(np.interp(np.log(error), np.log(rising), np.log(self.pitches))))
+        pitch = np.interp(np.log(error), np.log(rising), np.log(self.pitches))
+        return float(np.exp(pitch))
 
 
 @dataclass(frozen=True, eq=False)
 class FieldExample:
-    """One contact between the cubes, and the field that different skins make of it.
+    """One contact between the cubes, and the field that different methods compute of it.
 
-    points: (M, 3) m; pressure: {"truth" or one of SKIN_KINDS: (M,) Pa}
-    cubes: (cubes, 3) m; centre: (2,) m of the contact
+    Attributes:
+        points: (M, 3) in m.
+        pressure: (M,) pressure in Pa by the name of the method; "truth" is the true one.
+        cubes: (cubes, 3) positions of the cubes, in m.
+        centre: (2,) position of the contact, in m.
     """
 
     points: Array
@@ -86,7 +105,12 @@ class FieldExample:
 
 
 def flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
-    """A square grid of cubes about the origin, an odd number along each side; lengths in m."""
+    """Return a square grid of cubes about the origin, with an odd number along each side.
+
+    Args:
+        pitch: Distance between neighbouring cubes, in m.
+        side: Side of the skin, in m.
+    """
     count = 2 * round(side / pitch / 2) + 1
     line = (np.arange(count) - count // 2) * pitch
     x, y = np.meshgrid(line, line)
@@ -95,41 +119,56 @@ def flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
     return CubePoses(position, rotation, np.full(len(position), SURFACE_DEPTH / 2))
 
 
-def true_components(points: Array, width: float, force: Array, centre: Array) -> Array:
-    """COMPONENTS (N, 15) at points (N, 3) of the cubes' plane, below a ball that presses.
+def draw_force(random: np.random.Generator) -> Array:
+    """Return the force (3,) of the ball in N, with its shear in a random direction."""
+    angle = 2 * np.pi * random.random()
+    return FORCE * np.array([FRICTION * np.cos(angle), FRICTION * np.sin(angle), -1.0])
 
-    width: of the contact, m; force: (3,) N; centre: (2,) m. The gradient is in Pa/m.
+
+def true_components(points: Array, width: float, force: Array, centre: Array) -> Array:
+    """Return the components at points of the cubes' plane below a ball.
+
+    Args:
+        points: (N, 3) in m.
+        width: Width of the contact, in m.
+        force: (3,) in N.
+        centre: (2,) position of the contact, in m.
+
+    Returns:
+        `COMPONENTS` (N, 15), stresses in Pa and gradients in Pa/m.
     """
-    below = np.column_stack([points[:, :2], np.full(len(points), -SURFACE_DEPTH)])
+    depth = np.full(len(points), -SURFACE_DEPTH)
+    below = np.column_stack([points[:, :2], depth])
     order = contact.hertz_order(width / 2, SURFACE_DEPTH)
     sources, forces = contact.hertz(width / 2, force, centre, order)
     stress, gradient = contact.field(below, sources, forces, POISSONS_RATIO)
-    return np.concatenate([stress, gradient[:, :3].reshape(len(points), 9)], axis=1)
+    slopes = gradient[:, :3].reshape(len(points), 9)
+    return np.concatenate([stress, slopes], axis=1)
 
 
 def field_example(pitch: float = 0.010, width: float = 0.012) -> FieldExample:
-    """A contact beside the middle of a cell: its true pressure, and the field of two skins."""
-    skin, centre = flat_skin(pitch, 0.05), pitch * np.array([0.35, 0.25])
-    load = FORCE * np.array([FRICTION, 0.0, -1.0])
-    surfaces = {
-        name: Surface(skin, SURFACE_DEPTH, 20, gradients=name != "values alone")
-        for name in ("values alone", "values and gradients")
-    }
-    points = surfaces["values alone"].points
-    pressure = {"truth": -true_components(points, width, load, centre)[:, 2]}
-    values = true_components(skin.position, width, load, centre)
-    pressure |= {name: surface.field(values).pressure for name, surface in surfaces.items()}
-    return FieldExample(points, pressure, skin.position, centre)
+    """Return a contact beside the centre of a cell: true pressure, and the field of two skins."""
+    skin = flat_skin(pitch, 0.05)
+    centre = pitch * np.array([0.35, 0.25])
+    force = FORCE * np.array([FRICTION, 0.0, -1.0])
+    values = true_components(skin.position, width, force, centre)
+    pressure = {}
+    for kind in SKIN_KINDS[:2]:
+        surface = Surface(skin, SURFACE_DEPTH, 20, gradients=kind != "values alone")
+        true = true_components(surface.points, width, force, centre)
+        pressure["truth"] = -true[:, COMPONENTS.index("zz")]
+        pressure[kind] = surface.field(values).pressure
+    return FieldExample(surface.points, pressure, skin.position, centre)
 
 
 def field_study(pitches: Array = PITCHES, widths: Array = WIDTHS, cases: int = CASES) -> FieldStudy:
-    """Run the study, with the same numbers every time. About two minutes with the defaults."""
-    shape = len(widths), len(pitches), len(SKIN_KINDS)
-    error, position, force = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    """Run the study, with the same numbers every time. It takes about two minutes."""
+    shape = (len(widths), len(pitches), len(SKIN_KINDS))
+    error, position, force = np.zeros((3, *shape))
     for column, pitch in enumerate(pitches):
         trial = _Trial(pitch)
         for row, width in enumerate(widths):
-            random = np.random.default_rng(8)
+            random = np.random.default_rng(SEED)
             errors = np.array([trial.errors(width, random) for _ in range(cases)])
             squares, distances, forces = np.moveaxis(errors, 1, 0)  # each (cases, kinds)
             error[row, column] = np.sqrt(squares.mean(axis=0))
@@ -142,39 +181,39 @@ class _Trial:
     """Skins of one pitch, and the errors that they make of one contact."""
 
     def __init__(self, pitch: float) -> None:
-        self.pitch = pitch
-        self.skin = flat_skin(pitch)
-        side = round(pitch / _POINT_SPACING)
-        self.surfaces = {
-            kind: Surface(self.skin, SURFACE_DEPTH, side, gradients=kind != "values alone")
-            for kind in SKIN_KINDS
-        }
-        points = self.surfaces["values alone"].points
-        self.window = np.abs(points[:, :2]).max(axis=1) < WINDOW / 2
-        self.points = points[self.window]
+        self._pitch = pitch
+        self._skin = flat_skin(pitch)
+        side = round(pitch / POINT_SPACING)
+        self._surfaces = {}
+        for kind in SKIN_KINDS:
+            has_gradients = kind != "values alone"
+            self._surfaces[kind] = Surface(self._skin, SURFACE_DEPTH, side, gradients=has_gradients)
+        points = self._surfaces["values alone"].points
+        self._window = np.abs(points[:, :2]).max(axis=1) < WINDOW / 2
+        self._points = points[self._window]
 
     def errors(self, width: float, random: np.random.Generator) -> Array:
-        """(3, kinds) of a random contact of this width.
+        """Return the errors (3, kinds) of a random contact of this width.
 
-        The rows: square error of the pressure over its square, distance of the contact's position
-        in m, relative error of its force.
+        The rows are the square error of the pressure over its square, the distance of the contact's
+        position in m, and the relative error of its force.
         """
-        centre = self.pitch * (random.random(2) - 0.5)
-        angle = 2 * np.pi * random.random()
-        load = FORCE * np.array([FRICTION * np.cos(angle), FRICTION * np.sin(angle), -1.0])
-        pressure = -true_components(self.points, width, load, centre)[:, 2]
-        seen = true_components(self.skin.position, width, load, centre)
-        errors = np.zeros((3, len(SKIN_KINDS)))
-        for k, (kind, surface) in enumerate(self.surfaces.items()):
-            values = seen.copy()
+        centre = self._pitch * (random.random(2) - 0.5)
+        force = draw_force(random)
+        true = true_components(self._points, width, force, centre)
+        pressure = -true[:, COMPONENTS.index("zz")]
+        measured = true_components(self._skin.position, width, force, centre)
+        columns = []
+        for kind, surface in self._surfaces.items():
+            values = measured.copy()
             if kind == "planar cubes":
-                values[:, _UNSEEN_BY_PLANAR] = np.nan
-            computed = surface.field(values).pressure[self.window]
-            errors[0, k] = ((computed - pressure) ** 2).mean() / (pressure**2).mean()
+                values[:, UNOBSERVED_BY_PLANAR] = np.nan
+            computed = surface.field(values).pressure[self._window]
+            square = ((computed - pressure) ** 2).mean() / (pressure**2).mean()
+            distance, force_error = WINDOW, -1.0
             contacts = surface.contacts(values, CONTACT_PRESSURE)
             if contacts:
-                errors[1, k] = np.linalg.norm(contacts[0].position[:2] - centre)
-                errors[2, k] = contacts[0].normal_force / FORCE - 1
-            else:
-                errors[1, k], errors[2, k] = WINDOW, -1.0
-        return errors
+                distance = float(np.linalg.norm(contacts[0].position[:2] - centre))
+                force_error = contacts[0].normal_force / FORCE - 1
+            columns.append([square, distance, force_error])
+        return np.transpose(columns)

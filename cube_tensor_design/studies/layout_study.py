@@ -1,10 +1,10 @@
-"""How far each layout can be trusted under contacts that are not wide beside the cube.
+"""How far each layout can be trusted under contacts that are not wide compared with the cube.
 
 An indenter of growing width moves over a cube. The stress and gradient recovered from the pads are
-compared with the true ones at the cube's centre. The pads see the true field all over the cube, not
-only its value and slope at the centre: the error shown is what the field's higher orders add.
+compared with the true ones at the cube's centre. The pads feel the true field all over the cube,
+not only its value and slope at the centre: the error shown is what the field's higher orders add.
 
-Model: the contact field (elastic.contact) acts as tractions on a box of twice the cube's side
+Model: the contact field (mechanics/contact.py) acts as tractions on a box of twice the cube's side
 around the rigid cube. The box moves with the cube, so a surface nearer than its top is not part of
 the model. Each layout is calibrated with the linear modes on the same box.
 """
@@ -23,27 +23,31 @@ from cube_tensor_driver.core.defaults import POISSONS_RATIO
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS
-from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE, Modes, to_matrix
+from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE, to_matrix
 from cube_tensor_driver.mechanics import contact
 
 from ..fem.body import Body, make_mesh
 from ..fem.fem import Progress, linear_response, make_solid, pad_stresses
 from ..fem.memory import check_memory
 
-TRUSTED_ERROR = 0.2
-"""A component can be trusted while its error is at most this part of its range."""
-
-_BOX = 2.0
-"""Sides of the box over the cube's side."""
-_FRICTION = 0.3
-"""The indenter slides towards +x, so that there is shear under its middle, too."""
-_LATERAL_OFFSET = 1e-3
-"""The indenter passes the cube at this y, m."""
-_NEGLECTED_MODES = {"quad": ("xx", "xx_z", "xx_x"), "planar": (), "cube": ()}
+MAX_TRUSTED_ERROR = 0.2
+"""Largest error of a component, relative to its range, with which it counts as trusted."""
+BOX_RATIO = 2.0
+"""Ratio of the sides of box and cube."""
+FRICTION = 0.3
+"""Ratio of the indenter's shear force to its normal force. It slides towards +x, so that there is
+shear under its centre, too."""
+LATERAL_OFFSET = 1e-3
+"""Distance along y at which the indenter passes the cube, in m."""
+MAX_POINT_SPACING = 4e-3
+"""Largest distance between the points of the contact's quadrature, in m: the side of the largest
+cube."""
+NEGLECTED_MODES = {"quad": ("xx", "xx_z", "xx_x"), "planar": (), "cube": ()}
+"""Modes that each layout takes as zero."""
 
 
 class TrustedWidth(NamedTuple):
-    """From this width (m) of the indenter on, the error stays small; None: at no width."""
+    """The narrowest indenter, in m, from which on the error stays small; None if there is none."""
 
     layout: str
     side: float
@@ -55,11 +59,16 @@ class TrustedWidth(NamedTuple):
 class LayoutStudy:
     """Error of each component, relative to the range that it takes as the indenter passes.
 
-    sides: (S,) of the cube, m; widths: (W,) and offsets: (X,) along x of the indenter, m
-    depth: of the cube's centre, m
-    truth: (S, W, X, C) components in the order of COMPONENTS, gradients times d0, Pa per N of force
-    recovered: {layout: (S, W, X, C)}, NaN where a layout does not observe a component
-    error: {layout: (S, W, C)} largest |recovered - truth| over the offsets / (max - min of truth)
+    Attributes:
+        sides: (S,) sides of the cube, in m.
+        widths: (W,) widths of the indenter, in m.
+        offsets: (X,) positions of the indenter along x, in m.
+        depth: Depth of the cube's centre, in m.
+        truth: (S, W, X, C) components in the order of `COMPONENTS`, gradients times d0, in Pa per N
+            of force.
+        recovered: By layout (S, W, X, C), NaN where a layout does not observe a component.
+        error: By layout (S, W, C), the largest |recovered - truth| over the offsets divided by
+            (max - min) of truth.
     """
 
     sides: Array
@@ -70,9 +79,9 @@ class LayoutStudy:
     recovered: dict[str, Array]
     error: dict[str, Array]
 
-    def trusted(self, limit: float = TRUSTED_ERROR) -> list[TrustedWidth]:
-        """The narrowest trusted indenter for each layout, side and component that it observes."""
-        rows: list[TrustedWidth] = []
+    def trusted(self, limit: float = MAX_TRUSTED_ERROR) -> list[TrustedWidth]:
+        """Return the narrowest trusted indenter for each layout, side and observed component."""
+        rows = []
         for (name, error), (i, side) in itertools.product(
             self.error.items(), enumerate(self.sides)
         ):
@@ -86,22 +95,20 @@ class LayoutStudy:
         return rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types for JSON; None where a layout does not observe a component."""
+        """Return plain types for JSON; None where a layout does not observe a component."""
+        errors = {}
+        for name, error in self.error.items():
+            plain = error.astype(object)
+            plain[np.isnan(error)] = None
+            errors[name] = plain.tolist()
         return {
             "sides": self.sides.tolist(),
             "widths": self.widths.tolist(),
             "offsets": self.offsets.tolist(),
             "depth": self.depth,
             "components": list(COMPONENTS),
-            "error": {name: _none_for_nan(error.tolist()) for name, error in self.error.items()},
+            "error": errors,
         }
-
-
-def _none_for_nan(value: Any) -> Any:
-    """Nested lists of numbers with None for NaN, which JSON does not know."""
-    if isinstance(value, list):
-        return [_none_for_nan(item) for item in value]
-    return None if np.isnan(value) else value
 
 
 @dataclass(frozen=True)
@@ -115,18 +122,18 @@ class _Passage:
     poisson: float
 
     def field(self, x: Array) -> tuple[Array, Array]:
-        """Stress (n, 6) and gradient (n, 6, 3) at x (n, 3), m from the cube's centre."""
-        # Points of the quadrature are no further apart than the largest cube's side.
-        order = 4 + int(np.ceil(self.width / 4e-3))
-        force = [_FRICTION, 0.0, -1.0]
+        """Return stress (n, 6) and gradient (n, 6, 3) at x (n, 3), in m from the cube's centre."""
+        order = 4 + int(np.ceil(self.width / MAX_POINT_SPACING))
+        force = [FRICTION, 0.0, -1.0]
         sources, forces = contact.disc(self.width / 2, force, (self.offset, 0.0), order)
-        points = x + np.array([0.0, _LATERAL_OFFSET, -self.depth])
+        points = x + np.array([0.0, LATERAL_OFFSET, -self.depth])
         return contact.field(points, sources, forces, self.poisson)
 
     def components(self) -> Array:
-        """True COMPONENTS (1, 15) at the cube's centre, gradients times d0."""
+        """Return the true `COMPONENTS` (15,) at the cube's centre, gradients times d0."""
         stress, gradient = self.field(np.zeros((1, 3)))
-        return np.concatenate([stress, self.side / 2 * gradient[:, :3].reshape(1, 9)], axis=1)
+        slopes = self.side / 2 * gradient[0, :3]
+        return np.concatenate([stress[0], slopes.ravel()])
 
 
 def layout_study(
@@ -137,32 +144,41 @@ def layout_study(
     poisson: float = POISSONS_RATIO,
     progress: Progress | None = None,
 ) -> LayoutStudy:
-    """Slide a round indenter of each width (its diameter) over a cube of each side, along x.
+    """Slide a round indenter of each width over a cube of each side, along x.
 
-    The indenter passes at y = 1 mm. It presses with 1 N, spread evenly, and drags with 0.3 N.
-    Raises ElasticError when a cube's box would reach the surface.
+    The indenter presses with 1 N, spread evenly, and drags with `FRICTION` N.
+
+    Args:
+        sides: Sides of the cube, in m.
+        widths: Diameters of the indenter, in m.
+        offsets: Positions of the indenter along x, in m.
+        depth: Depth of the cube's centre, in m.
+        poisson: Poisson's ratio of the elastomer.
+        progress: Called before every solve and at the end.
+
+    Raises:
+        ElasticError: The box of a cube would reach the surface.
     """
-    if depth <= _BOX * max(sides) / 2:
+    box_height = BOX_RATIO * max(sides) / 2
+    if depth <= box_height:
         raise ElasticError(
             f"the cube's centre is {depth * 1e3:g} mm deep; a cube of {max(sides) * 1e3:g} mm "
-            f"needs more than {_BOX * max(sides) / 2 * 1e3:g} mm, or the study's box leaves the "
-            "skin"
+            f"needs more than {box_height * 1e3:g} mm, or the study's box leaves the skin"
         )
-    passages = [
-        _Passage(side, width, offset, depth, poisson)
-        for side, width, offset in itertools.product(sides, widths, offsets)
-    ]
-    matrix, pads = _pad_stresses(passages, poisson, progress)
+    passages = []
+    for side, width, offset in itertools.product(sides, widths, offsets):
+        passages.append(_Passage(side, width, offset, depth, poisson))
+    matrix, pads = _solve_box(passages, poisson, progress)
+
     shape = (len(sides), len(widths), len(offsets), len(COMPONENTS))
-    truth = np.concatenate([passage.components() for passage in passages]).reshape(shape)
-    recovered = {
-        name: (pads[: LAYOUTS[name].n_pads].T @ _recovery(matrix, name).T).reshape(shape)
-        for name in LAYOUTS
-    }
-    error = {
-        name: np.abs(found - truth).max(axis=2) / np.ptp(truth, axis=2)
-        for name, found in recovered.items()
-    }
+    truth = np.array([passage.components() for passage in passages]).reshape(shape)
+    recovered, error = {}, {}
+    for name, layout in LAYOUTS.items():
+        # The pads of quad and planar are the first ones of the cube.
+        estimate = pads[: layout.n_pads].T @ _recovery_matrix(matrix, name).T
+        recovered[name] = estimate.reshape(shape)
+        largest = np.abs(recovered[name] - truth).max(axis=2)
+        error[name] = largest / np.ptp(truth, axis=2)
     return LayoutStudy(
         sides=np.asarray(sides),
         widths=np.asarray(widths),
@@ -174,23 +190,25 @@ def layout_study(
     )
 
 
-def _pad_stresses(
+def _solve_box(
     passages: Sequence[_Passage], poisson: float, progress: Progress | None
 ) -> tuple[Array, Array]:
-    """Response (pads, modes) of the 24-pad cube in its box, and its pads (pads, passages), Pa."""
-    # A rigid cube; lengths are in units of its side.
-    body = Body(_BOX, _BOX, _BOX, side=1.0, poisson=poisson, cube_young=np.inf)
+    """Return response (pads, modes) and pad stresses (pads, passages) of a cube in its box."""
+    # The cube is rigid; lengths are in units of its side.
+    body = Body(BOX_RATIO, BOX_RATIO, BOX_RATIO, side=1.0, poisson=poisson, cube_young=np.inf)
     layout = LAYOUTS["cube"]
     grid = make_mesh(body, layout, 0)
     check_memory(grid)
     solid = make_solid(body, layout, grid)
-    fields: dict[bytes, Array] = {}
+
+    known_fields: dict[bytes, Array] = {}
 
     def field(x: Array) -> Array:
-        if x.tobytes() not in fields:  # every parity asks for the same points
+        key = x.tobytes()
+        if key not in known_fields:  # every parity asks for the same points
             stresses = [passage.field(passage.side / 2 * x)[0] for passage in passages]
-            fields[x.tobytes()] = to_matrix(np.stack(stresses, axis=1))
-        return fields[x.tobytes()]
+            known_fields[key] = to_matrix(np.stack(stresses, axis=1))
+        return known_fields[key]
 
     steps = itertools.count()
     total = 2 * 2**solid.dim  # all parities, of the modes and of the passages
@@ -205,14 +223,12 @@ def _pad_stresses(
     return matrix, pads
 
 
-def _recovery(matrix: Array, name: str) -> Array:
-    """COMPONENTS (15, pads) from pad stresses (pads,).
-
-    The pads of quad and planar are the first ones of the cube; these layouts know plane modes only.
-    """
+def _recovery_matrix(matrix: Array, name: str) -> Array:
+    """Return the matrix (15, pads) from the pad stresses of a layout to `COMPONENTS`."""
     layout = LAYOUTS[name]
-    modes: Modes = PLANE if layout.planar else SPACE
-    plane = SPACE.state(modes.stress, modes.gradient).T
-    response = matrix[: layout.n_pads] @ plane
+    modes = PLANE if layout.planar else SPACE
+    # The layouts in a plane know plane modes only, whose states in space these are.
+    states = SPACE.state(modes.stress, modes.gradient).T
+    response = matrix[: layout.n_pads] @ states
     noise = np.ones(layout.n_pads)
-    return make_estimator(response, noise, modes, neglect=_NEGLECTED_MODES[name]).matrix
+    return make_estimator(response, noise, modes, neglect=NEGLECTED_MODES[name]).matrix

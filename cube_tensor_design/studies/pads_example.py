@@ -1,7 +1,7 @@
-"""What the pads of one planar cube show of simple loads, and what two pads alone take for shear.
+"""Pad stresses of one planar cube under simple loads, and the shear that two pads alone would give.
 
-For docs/stress_tensor.md. The response is that of the shipped planar calibration, the load is a
-frictionless ball on a half space.
+The numbers are for docs/stress_tensor.md. The response is that of the shipped planar calibration,
+the load is a frictionless ball on a half space.
 """
 
 from __future__ import annotations
@@ -16,51 +16,54 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from cube_tensor_driver.core.estimator import make_estimator
-from cube_tensor_driver.core.modes import COMPONENTS
+from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.mechanics import contact
 
 LOAD = -10e3
-"""Stress of each simple load, Pa."""
-BALL_RADIUS, BALL_FORCE = 0.004, (0.0, 0.0, -2.0)
-"""Of the contact, m; on the skin, N."""
+"""Stress of each simple load, in Pa."""
+BALL_RADIUS = 0.004
+"""Radius of the ball's contact, in m."""
+BALL_FORCE = (0.0, 0.0, -2.0)
+"""Force of the ball on the skin, in N."""
 REACH = 0.016
-"""The ball presses at places from minus to plus this, m."""
+"""Largest distance of the ball from the sensor along x, in m."""
 BALL_X = 0.005
-"""Where the ball presses in the picture of the field, m."""
+"""Position of the ball in the picture of the field, in m."""
 PAIR = ("+z-x", "+z+x")
 """The two pads of a sensor that has pads on its upper face only."""
 
 
 def planar_calibration() -> Calibration:
+    """Return the shipped planar calibration."""
     return read_calibration(package_data() / "config" / "calibration" / "planar.yaml")
 
 
 def simple_loads(calibration: Calibration) -> dict[str, Array]:
-    """State (7,) of each load by its title: pressure, shear, pressure that grows along x."""
-    names = calibration.modes.names
-    size = f"{abs(LOAD) / 1e3:g}$ kPa"
+    """Return the state (7,) of each load by its title: pressure, shear, growing pressure."""
+    size = f"{abs(LOAD) / 1e3:g}"
     states = {
-        rf"pressure: $\sigma_{{zz}} = -{size}": {"zz": LOAD},
-        rf"shear: $\sigma_{{zx}} = {size}": {"zx": -LOAD},
-        rf"growing pressure: $-{abs(LOAD) / 1e3:g}\,(1 + x/d_0)$ kPa": {
-            "zz": LOAD,
-            "zz_x": LOAD,
-        },
+        rf"pressure: $\sigma_{{zz}} = -{size}$ kPa": {"zz": LOAD},
+        rf"shear: $\sigma_{{zx}} = {size}$ kPa": {"zx": -LOAD},
+        rf"growing pressure: $-{size}\,(1 + x/d_0)$ kPa": {"zz": LOAD, "zz_x": LOAD},
     }
-    return {
-        title: np.array([state.get(name, 0.0) for name in names]) for title, state in states.items()
-    }
+    loads = {}
+    for title, state in states.items():
+        loads[title] = np.array([state.get(name, 0.0) for name in calibration.modes.names])
+    return loads
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """A frictionless ball, and what sensors under x = 0 make of it.
+    """A frictionless ball at many places, and the shear that sensors at x = 0 measure.
 
-    place: (M,) along x, m
-    profile: (M,) σzz there in the plane of the sensor while the ball presses at BALL_X, Pa
-    value, slope: σzz and ∂σzz/∂x at the sensor then, Pa and Pa/m
-    truth, cube, pair: (M,) σzx at the sensor while the ball presses at `place`: true, found by all
-        eight pads, taken for shear by the two upper pads, Pa
+    Attributes:
+        place: (M,) positions along x, in m.
+        profile: (M,) σzz there in the plane of the sensor while the ball is at `BALL_X`, in Pa.
+        value: σzz at the sensor then, in Pa.
+        slope: ∂σzz/∂x at the sensor then, in Pa/m.
+        truth: (M,) true σzx at the sensor while the ball is at `place`, in Pa.
+        cube: (M,) σzx from all eight pads.
+        pair: (M,) σzx from the two upper pads, calibrated by uniform shear alone.
     """
 
     place: Array
@@ -73,35 +76,45 @@ class Sweep:
 
 
 def sweep(points: int = 129) -> Sweep:
-    """Stress at the sensor for each place of the ball, and what the pads make of it.
+    """Return stress and measured shear for each place of the ball.
 
-    The response is linear in stress and gradient, as in the driver. The pair is calibrated by
-    uniform shear alone.
+    The response is linear in stress and gradient, as in the driver.
     """
     calibration = planar_calibration()
     place = np.linspace(-REACH, REACH, points)
-    profile = _field(place - BALL_X)[0][:, 2]
-    at_sensor, its_gradient = _field([-BALL_X])
+    profile = _stress_and_slope(place - BALL_X)[0]["zz"]
+    at_sensor, slope_at_sensor = _stress_and_slope(np.array([-BALL_X]))
 
-    stress, gradient = _field(-place)
-    slopes = calibration.half_side * gradient
-    state = {"zz": stress[:, 2], "zx": stress[:, 4], "xx": stress[:, 0]}
-    state |= {"zz_x": slopes[:, 2, 0], "zz_z": slopes[:, 2, 2]}
-    state |= {"xx_x": slopes[:, 0, 0], "xx_z": slopes[:, 0, 2]}
-    states = np.stack([state[name] for name in calibration.modes.names], axis=1)
-    pads = states @ calibration.response.T
+    stress, slope = _stress_and_slope(-place)
+    state = []
+    for name in calibration.modes.names:
+        component, _, axis = name.partition("_")
+        if axis:
+            state.append(calibration.half_side * slope[component][:, "xyz".index(axis)])
+        else:
+            state.append(stress[component])
+    pads = np.stack(state, axis=1) @ calibration.response.T
 
-    every_pad = make_estimator(calibration.response, calibration.noise, calibration.modes)
-    cube = pads @ every_pad.matrix[COMPONENTS.index("zx")]
+    estimator = make_estimator(calibration.response, calibration.noise, calibration.modes)
     left, right = (calibration.layout.index(name) for name in PAIR)
-    of_shear = calibration.response[:, calibration.modes.names.index("zx")]
-    shown = float(at_sensor[0, 2]), float(its_gradient[0, 2, 0])
-    pair = (pads[:, left] - pads[:, right]) / (of_shear[left] - of_shear[right])
-    return Sweep(place, profile, *shown, stress[:, 4], cube, pair)
+    to_shear = calibration.response[:, calibration.modes.names.index("zx")]
+    return Sweep(
+        place=place,
+        profile=profile,
+        value=float(at_sensor["zz"][0]),
+        slope=float(slope_at_sensor["zz"][0, 0]),
+        truth=stress["zx"],
+        cube=pads @ estimator.matrix[COMPONENTS.index("zx")],
+        pair=(pads[:, left] - pads[:, right]) / (to_shear[left] - to_shear[right]),
+    )
 
 
-def _field(x: Array | list[float]) -> tuple[Array, Array]:
-    """Stress (N, 6) and gradient (N, 6, 3) at places x from the ball, in the sensor's plane."""
-    points = np.stack([x, np.zeros(len(x)), np.full(len(x), -SURFACE_DEPTH)], axis=1)
+def _stress_and_slope(x: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return stress (N,) and gradient (N, 3) by component, at x (N,) from the ball's centre."""
+    points = np.stack([x, 0 * x, np.full(len(x), -SURFACE_DEPTH)], axis=1)
     ball = contact.hertz(BALL_RADIUS, BALL_FORCE, np.zeros(2))
-    return contact.field(points, *ball, POISSONS_RATIO)
+    stress, gradient = contact.field(points, *ball, POISSONS_RATIO)
+    numbers = list(enumerate(STRESS))
+    return {name: stress[:, k] for k, name in numbers}, {
+        name: gradient[:, k] for k, name in numbers
+    }

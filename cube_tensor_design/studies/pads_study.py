@@ -1,8 +1,8 @@
-"""What it gains to know the pads: contacts on a thin layer, with cubes as points and as pads.
+"""Contacts on a thin layer, with the cubes taken for points or for pads.
 
-The truth comes from influence functions of finite elements on a coarser mesh than those which the
-inverse knows, integrated over the contact's point forces: neither the table's circular components
-nor its Hankel transforms are in it.
+The true stress comes from influence functions of finite elements on a coarser mesh than those which
+the inverse knows, integrated over the contact's point forces: neither the table's circular
+components nor its Hankel transforms are in it.
 """
 
 from __future__ import annotations
@@ -25,58 +25,61 @@ from .field_study import FORCE, FRICTION, FieldExample
 from .traction_study import CUBES, Bench, Errors, Setting
 
 FORMS = ("points", "pads")
+"""What the inverse takes the cubes for."""
 BODY = Body(width=80e-3, depth=80e-3, cube_young=np.inf, ground=True)
-"""Of the shipped influence functions."""
+"""The body of the shipped influence functions."""
 THIN = tuple(
-    Setting(
-        cubes=cubes,
-        depth=BODY.height / 2,
-        thickness=BODY.height,
-        known_thickness=BODY.height,
-    )
+    Setting(cubes=cubes, depth=BODY.height / 2, thickness=BODY.height, known_thickness=BODY.height)
     for cubes in CUBES
 )
-"""Pitch 8 mm, cubes in the middle of that layer, which is known."""
+"""Skins with a pitch of 8 mm and cubes in the middle of that layer, whose thickness is known."""
 
 
 class LayerBench(Bench):
-    """A skin in a layer, whose pads see what finite elements of the cube in it say.
-
-    Parameters: setting: with the layer and depth of the influence functions. true: what the pads
-    really see. known: as in Bench.
-    """
+    """A skin in a layer, whose pads have the stress that finite elements of a cube in it give."""
 
     def __init__(
         self, setting: Setting, true: Influence, known: Influence | None = None, side: int = 4
     ) -> None:
+        """Set up the inverse.
+
+        Args:
+            setting: Skin with the layer and the depth of the influence functions.
+            true: Influence functions of the pads.
+            known: Influence functions that the inverse assumes; None: cubes count as points.
+            side: Number of points along the side of a cube's patch.
+        """
         super().__init__(setting, side, known)
-        given = true.layout.positions
-        pads = self.calibration.layout.positions
         self._true = true
-        self._pads = [int(np.argmin(np.abs(given - pad).max(axis=1))) for pad in pads]
+        # The influence functions of the planar cube are among those of the 24-pad cube.
+        self._pads = []
+        for position in self.calibration.layout.positions:
+            distance = np.abs(true.layout.positions - position).max(axis=1)
+            self._pads.append(int(np.argmin(distance)))
 
     def pads_under(self, width: float, force: Array, centre: Array) -> Array:
-        sources, forces = self._load(width, force, centre)
-        turn = self.poses.rotation
-        apart = np.einsum("nji,nsj->nsi", turn, sources - self.poses.position[:, None])
-        seen = self._true.at(apart[..., :2].reshape(-1, 2))[self._pads]
-        seen = seen.reshape(-1, len(turn), len(sources), 3)
-        local = np.einsum("nji,sj->nsi", turn, forces)
-        return np.asarray(np.einsum("pnsi,nsi->np", seen, local))
+        sources, forces = self.point_forces(width, force, centre)
+        rotation = self.poses.rotation
+        # Positions and forces in the frame of each cube.
+        from_cube = sources - self.poses.position[:, None]
+        place = np.einsum("nji,nsj->nsi", rotation, from_cube)[..., :2]
+        local_forces = np.einsum("nji,sj->nsi", rotation, forces)
+
+        influence = self._true.at(place.reshape(-1, 2))[self._pads]
+        influence = influence.reshape(-1, len(rotation), len(sources), 3)
+        return np.asarray(np.einsum("pnsi,nsi->np", influence, local_forces))
 
 
 def coarse_influence() -> Influence:
-    """What the pads really see: finite elements on the coarsest mesh. Takes minutes."""
+    """Return the true influence functions, from the coarsest mesh. This takes minutes."""
     return compute_influence(BODY, LAYOUTS["cube"], 0)
 
 
-def benches(setting: Setting, true: Influence, side: int = 4) -> dict[str, LayerBench]:
-    """A bench for each of FORMS; pads are taken for those of the shipped influence functions."""
-    known = read_influence(find_influence("cube_11mm"))
-    return {
-        form: LayerBench(setting, true, influence, side)
-        for form, influence in zip(FORMS, (None, known), strict=True)
-    }
+def _make_benches(setting: Setting, true: Influence, side: int = 4) -> dict[str, LayerBench]:
+    """Return a bench for each of `FORMS`; pads have the shipped influence functions."""
+    shipped = read_influence(find_influence("cube_11mm"))
+    known = {"points": None, "pads": shipped}
+    return {form: LayerBench(setting, true, known[form], side) for form in FORMS}
 
 
 def study_pads(
@@ -87,27 +90,33 @@ def study_pads(
     settings: Sequence[Setting] = THIN,
     progress: Callable[[Setting, str, Errors], None] | None = None,
 ) -> dict[tuple[Setting, str], list[Errors]]:
-    """Errors of each setting and each of FORMS at each width (m)."""
+    """Return the errors of each setting and each of `FORMS` at each width (m)."""
     results: dict[tuple[Setting, str], list[Errors]] = {}
     for setting in settings:
-        for form, bench in benches(setting, true).items():
+        for form, bench in _make_benches(setting, true).items():
             results[setting, form] = []
             for width in widths:
-                results[setting, form].append(bench.errors(width, cases, seed))
+                errors = bench.errors(width, cases, seed)
+                results[setting, form].append(errors)
                 if progress is not None:
-                    progress(setting, form, results[setting, form][-1])
+                    progress(setting, form, errors)
     return results
 
 
 def layer_example(true: Influence) -> FieldExample:
-    """A contact of 5 mm between 24-pad cubes: pressure at the cubes' depth as it is, and as the
-    inverse with contacts computes it from points and from pads."""
-    load, centre = FORCE * np.array([FRICTION, 0.0, -1.0]), np.array([2.4e-3, 1.6e-3])
+    """Return a contact of 5 mm between 24-pad cubes.
+
+    The pressure at the cubes' depth is the true one, and that of the inverse with contacts for each
+    of `FORMS`.
+    """
+    force = FORCE * np.array([FRICTION, 0.0, -1.0])
+    centre = np.array([2.4e-3, 1.6e-3])
+    width = 5e-3
     pressure = {}
-    for form, bench in benches(THIN[0], true, side=10).items():
+    for form, bench in _make_benches(THIN[0], true, side=10).items():
         points = bench.inverse.points
-        pressure["truth"] = -bench.truth(points[:, :2], 5e-3, load, centre)[:, 2]
-        values = bench.values(5e-3, load, centre, np.random.default_rng(1))
+        pressure["truth"] = -bench.truth(points[:, :2], width, force, centre)[:, 2]
+        values = bench.values(width, force, centre, np.random.default_rng(1))
         tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
         tracker.update(values)
         pressure[form] = tracker.field.depth_pressure

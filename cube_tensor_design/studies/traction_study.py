@@ -1,8 +1,8 @@
-"""What the surface's traction from all cubes is worth: errors and stated deviations against truth.
+"""Accuracy of the surface's traction from all cubes: errors and predicted deviations against truth.
 
 Contacts press anywhere in the cell between four cubes of a flat skin. Their stress comes from the
 point forces of contact.py, not from what the inverse uses. It goes through the whole chain: pads
-whose gains are known to GAIN_ERROR, the pad law, a counter's noise, the pipeline.
+whose gains are known to `GAIN_ERROR`, the pad law, a counter's noise, the pipeline.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from cube_tensor_driver.core.defaults import CONTACT_PRESSURE, FREQUENCY_NOISE, 
 from cube_tensor_driver.core.modes import to_matrix
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
@@ -34,30 +35,50 @@ from cube_tensor_driver.touch.pad_noise import noise_of_all_pads
 from cube_tensor_driver.touch.surface import Surface
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
-from .field_study import FORCE, FRICTION, WINDOW, FieldExample, flat_skin
+from .field_study import FORCE, FRICTION, WINDOW, FieldExample, draw_force, flat_skin
 
 CUBES = ("24-pad", "planar", "planar, crosswise")
+"""Kinds of cubes. Crosswise, every second planar cube is turned by a quarter about z."""
 METHODS = ("interpolation", "inverse", "inverse with contacts")
+"""Methods that compute the field between the cubes."""
 SHAPES = ("ball", "flat punch", "rounded punch", "two balls")
-"""A rounded punch is the mean of flat ones from 0.6 of its radius on. Two balls touch each other,
-and together are as wide as a ball."""
+"""Shapes of the load. Two balls touch each other, and together are as wide as a ball."""
+ROUNDED_RADII = np.linspace(0.6, 1.0, 8)
+"""Relative radii of the flat punches whose mean is a rounded punch."""
 GAIN_ERROR = 0.01
-"""Standard deviation of a pad's true gain against its calibration; pad_noise.py has what the
-inverse takes it for."""
+"""Standard deviation of a pad's true gain relative to its calibration. The inverse assumes the
+value in pad_noise.py."""
 CASES = 16
-_SIDE = 0.072
-_ORDER, _SURFACE_ORDER = 14, 100
-"""Of the quadrature of a ball: stress at 4 mm below one of 20 mm is within 1e-3 of its peak; the
-second one is for the surface itself."""
-PRESSED = 0.1
+"""Number of loads for each setting and width."""
+SKIN_SIDE = 0.072
+"""Smallest side of the skin, in m; it is at least five pitches."""
+ORDER = 14
+"""Order of the quadrature of a ball. The stress at 4 mm below a contact of 20 mm is then within
+1e-3 of its peak."""
+SURFACE_ORDER = 100
+"""Order of the quadrature of a ball for the pressure on the surface itself."""
+MIN_PRESSURE_SHARE = 0.1
+"""Share of the peak pressure below which a point does not count for the ratio of a field."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One skin and its loads: lengths in m. What follows `known_thickness` is true and
-    not known to the inverse.
+    """One skin and its loads; lengths in m.
 
-    depth: of the cubes; gain_error: of pads; thickness: of the elastomer, inf: a half space
+    The inverse knows the first five values, and takes the elastomer for a layer of
+    `known_thickness`. The others are true and not known to it.
+
+    Attributes:
+        cubes: One of `CUBES`.
+        pitch: Distance between neighbouring cubes.
+        depth: Depth of the cubes' centres.
+        shape: One of `SHAPES`.
+        known_thickness: Thickness of the elastomer as the inverse knows it; infinite for a half
+            space.
+        depth_error: How much deeper the cubes are.
+        poisson: Poisson's ratio of the elastomer.
+        thickness: Thickness of the elastomer.
+        gain_error: Standard deviation of the pads' gains.
     """
 
     cubes: str = CUBES[0]
@@ -73,273 +94,346 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Of loads of one width (m) on one skin; several contacts of one load count together.
+    """Errors for loads of one width on one skin; several contacts of one load count together.
 
-    field: rms error of the pressure at the cubes' depth over its rms, of each of METHODS
-    force: rms error of the normal force over the force; place: 95th percentile, m; both of the
-        interpolation and of the contacts
-    seen: rms of force error and of place error, over what was stated; of interpolation and contacts
-    seen_field: rms of the errors of pressure over their stated deviations, with contacts: at the
-        cubes' depth and on the surface, where it exceeds PRESSED of its peak
-    found: part of the loads with exactly one contact
+    A calibration ratio is an rms error over the predicted standard deviation.
+
+    Attributes:
+        width: Width of the contact, in m.
+        field: (3,) rms error of the pressure at the cubes' depth over its rms, by `METHODS`.
+        force: (2,) rms error of the normal force over the force, of interpolation and contacts.
+        position: (2,) 95th percentile of the position error, in m, of both.
+        ratio: (2, 2) calibration ratios of force and position, of both.
+        field_ratio: (2,) calibration ratios of the pressure with contacts, at the cubes' depth and
+            on the surface, where it exceeds `MIN_PRESSURE_SHARE` of its peak.
+        found: Part of the loads with exactly one contact.
     """
 
     width: float
     field: Array
     force: Array
-    place: Array
-    seen: Array
-    seen_field: Array
+    position: Array
+    ratio: Array
+    field_ratio: Array
     found: float
 
 
 class Bench:
-    """A skin of one setting, its inverse, and loads on it."""
+    """A skin of one setting, its inverse, and loads on it.
+
+    Attributes:
+        setting: The setting.
+        poses: Poses of the cubes.
+        calibration: Calibration of all cubes.
+        inverse: Computes the traction on the surface.
+        surface: Interpolates between the cubes.
+        window: (M,) which points of the inverse are in the middle of the skin.
+    """
 
     def __init__(self, setting: Setting, side: int = 4, influence: Influence | None = None) -> None:
-        """side: points along the side of a cube's patch; influence: what the inverse takes the pads
-        for, None: cubes count as points"""
+        """Set up the inverse.
+
+        Args:
+            setting: Skin and loads.
+            side: Number of points along the side of a cube's patch.
+            influence: Influence functions that the inverse assumes; None: cubes count as points.
+        """
         self.setting = setting
-        skin = flat_skin(setting.pitch, max(_SIDE, 5 * setting.pitch))
-        n = len(skin.position)
-        self.poses = skin
-        if setting.cubes == CUBES[2]:
-            across = np.round(skin.position[:, :2] / setting.pitch).sum(axis=1).astype(int) % 2 == 1
-            turned = np.where(across[:, None, None], rotation_from_rpy(0, 0, np.pi / 2), np.eye(3))
-            self.poses = skin._replace(rotation=turned)
-        name = "cube.yaml" if setting.cubes == CUBES[0] else "planar.yaml"
-        folder = package_data() / "config" / "calibration"
-        self.calibration: Calibration = read_calibration(find_calibration(name, folder))
-        self._pipeline = Pipeline([self.calibration] * n)
-        by_pad = noise_of_all_pads([self.calibration] * n)
-        layer, reading = Layer(setting.known_thickness), None
-        if influence is not None:
-            reading = model_pads(influence, [self.calibration] * n)
+        self.poses = _place_cubes(setting)
+        self.calibration = _shipped_calibration(setting)
+        calibrations = [self.calibration] * len(self.poses.position)
+        self._pipeline = Pipeline(calibrations)
+
+        by_pad = noise_of_all_pads(calibrations)
+        reading = None if influence is None else model_pads(influence, calibrations)
+        known_layer = Layer(setting.known_thickness)
         self.inverse = SurfaceInverse.from_poses(
-            self.poses, by_pad, layer, setting.depth, side, reading
+            self.poses, by_pad, known_layer, setting.depth, side, reading
         )
         self.surface = Surface(self.poses, setting.depth, side)
         self.window = np.abs(self.inverse.points[:, :2]).max(axis=1) < WINDOW / 2
-        self._layer: Kernels | None = None
+
+        self._true_layer: Kernels | None = None
         if np.isfinite(setting.thickness):
             layer = Layer(setting.thickness, setting.poisson)
-            self._layer = Kernels(layer, setting.depth, 1.0)
+            self._true_layer = Kernels(layer, setting.depth, 1.0)
 
     def truth(self, points: Array, width: float, force: Array, centre: Array) -> Array:
-        """(N, 24) stress and its gradient, Pa and Pa/m, below points (N, 2)."""
+        """Return stress and gradient (N, 24), in Pa and Pa/m, below points (N, 2)."""
+        if self._true_layer is not None:
+            return np.asarray(self._true_layer.field(points - centre, width / 2) @ force)
         depth = self.setting.depth + self.setting.depth_error
-        sources, forces = self._load(width, force, centre)
-        if self._layer is not None:
-            return self._layer.field(points - centre, width / 2) @ force
         below = np.column_stack([points, np.full(len(points), -depth)])
+        sources, forces = self.point_forces(width, force, centre)
         stress, gradient = contact.field(below, sources, forces, self.setting.poisson)
         return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
 
     def surface_truth(self, width: float, force: Array, centre: Array) -> Array:
-        """(M,) pressure on the surface, Pa, as the mean over the square of each point."""
+        """Return the pressure (M,) on the surface, in Pa, as the mean over each point's square."""
         inverse = self.inverse
-        sources, forces = self._load(width, force, centre, _SURFACE_ORDER)
+        sources, forces = self.point_forces(width, force, centre, SURFACE_ORDER)
         nearest = cKDTree(inverse.points[:, :2]).query(sources[:, :2])[1]
         total = np.bincount(nearest, -forces[:, 2], len(inverse.points))
         return np.asarray(total / inverse.area)
 
-    def _load(
-        self, width: float, force: Array, centre: Array, order: int = _ORDER
+    def point_forces(
+        self, width: float, force: Array, centre: Array, order: int = ORDER
     ) -> tuple[Array, Array]:
+        """Return the load as point forces: positions (S, 3) in m and forces (S, 3) in N."""
         shape, radius = self.setting.shape, width / 2
-        if shape == SHAPES[0]:
+        if shape == "ball":
             return contact.hertz(radius, force, centre, order)
-        if shape == SHAPES[1]:
+        if shape == "flat punch":
             return flat_punch(radius, force, centre, order)
-        if shape == SHAPES[2]:
-            radii = np.linspace(0.6, 1.0, 8) * radius
-            parts = [flat_punch(one, force / 8, centre, order) for one in radii]
+        if shape == "rounded punch":
+            share = force / len(ROUNDED_RADII)
+            parts = [flat_punch(r * radius, share, centre, order) for r in ROUNDED_RADII]
         else:
-            apart = radius / 2 * np.array([0.8, 0.6])
-            places = (centre - apart, centre + apart)
-            parts = [contact.hertz(radius / 2, force / 2, place, order) for place in places]
+            offset = radius / 2 * np.array([0.8, 0.6])
+            centres = (centre - offset, centre + offset)
+            parts = [contact.hertz(radius / 2, force / 2, one, order) for one in centres]
         sources, forces = zip(*parts, strict=True)
         return np.concatenate(sources), np.concatenate(forces)
 
     def values(
         self, width: float, force: Array, centre: Array, random: np.random.Generator
     ) -> Array:
-        """(cubes, 15) what the pipeline makes of a load."""
+        """Return the components (cubes, 15) that the pipeline computes under a load."""
         return self.measured(self.pads_under(width, force, centre), random)
 
     def pads_under(self, width: float, force: Array, centre: Array) -> Array:
-        """(cubes, P) pad stresses, Pa, under a load."""
+        """Return the pad stresses (cubes, P), in Pa, under a load."""
         return self.pads_in(self.truth(self.poses.position[:, :2], width, force, centre))
 
     def pads_in(self, field: Array) -> Array:
-        """(cubes, P) pad stresses, Pa, in a field (cubes, 24) in the skin's frame."""
-        calibration, turn = self.calibration, self.poses.rotation
-        stress = np.einsum("nai,nbj,nab->nij", turn, turn, to_matrix(field[:, :6]))
+        """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 24) in the skin's frame."""
+        calibration, rotation = self.calibration, self.poses.rotation
+        # Tensors of the skin's frame become those of each cube's frame.
+        stress = to_matrix(field[:, :6])
+        stress = np.einsum("nai,nbj,nab->nij", rotation, rotation, stress)
         gradient = to_matrix(field[:, 6:].reshape(-1, 6, 3).swapaxes(1, 2))  # (n, axis, 3, 3)
-        gradient = np.einsum("nai,nbj,nck,ncab->nijk", turn, turn, turn, gradient)
+        gradient = np.einsum("nai,nbj,nck,ncab->nijk", rotation, rotation, rotation, gradient)
         state = calibration.modes.state(stress, calibration.half_side * gradient)
         return np.asarray(state @ calibration.response.T)
 
     def measured(
         self, pads: Array, random: np.random.Generator, left_out: PadMasks | None = None
     ) -> Array:
-        """(cubes, 15) what the pipeline makes of pad stresses (cubes, P), Pa. left_out: (cubes,)
-        bits of pads."""
+        """Return the components (cubes, 15) that the pipeline computes of pad stresses.
+
+        Args:
+            pads: (cubes, P) in Pa.
+            random: Source of the gain errors and of the counter's noise.
+            left_out: (cubes,) one bit for each pad that is not used.
+        """
         calibration = self.calibration
         pads = pads * (1 + self.setting.gain_error * random.standard_normal(pads.shape))
         rest = calibration.rest_frequency
-        hertz = pad_frequency(pads, rest, calibration.beta, calibration.modulus)
-        hertz *= 1 + FREQUENCY_NOISE * random.standard_normal(hertz.shape)
-        rows = self._pipeline.process(FrequencyRows.of(np.arange(len(hertz)), hertz), left_out)
-        return np.concatenate([rows.stress, rows.gradient], axis=1)
+        frequency = pad_frequency(pads, rest, calibration.beta, calibration.modulus)
+        frequency *= 1 + FREQUENCY_NOISE * random.standard_normal(frequency.shape)
+        rows = FrequencyRows.of(np.arange(len(frequency)), frequency)
+        result = self._pipeline.process(rows, left_out)
+        return np.concatenate([result.stress, result.gradient], axis=1)
 
     def load(self, random: np.random.Generator) -> tuple[Array, Array]:
-        """A force (3,) and where it acts (2,), in the cell in the middle."""
-        angle = 2 * np.pi * random.random()
-        force = FORCE * np.array([FRICTION * np.cos(angle), FRICTION * np.sin(angle), -1.0])
+        """Return a random force (3,) in N, and its position (2,) in the middle cell, in m."""
+        force = draw_force(random)
         return force, self.setting.pitch * (random.random(2) - 0.5)
 
     def errors(self, width: float, cases: int = CASES, seed: int = 8) -> Errors:
-        """Of random loads of this width, with the same numbers for the same seed."""
+        """Return the errors for random loads of this width; a seed gives the same loads."""
         random = np.random.default_rng(seed)
-        field, force = np.zeros((cases, 3)), np.full((cases, 2), -1.0)
-        place, seen = np.full((cases, 2), WINDOW), np.full((cases, 2, 2), np.nan)
-        seen_field: list[list[Array]] = []
-        one = 0
-        for case in range(cases):
-            load, centre = self.load(random)
-            points = self.inverse.points[self.window, :2]
-            true = -self.truth(points, width, load, centre)[:, 2]
-            values = self.values(width, load, centre, random)
-            tracker = ContactTracker(self.inverse, CONTACT_PRESSURE)
-            found: list[Any] = [
-                self.surface.contacts(values, CONTACT_PRESSURE),
-                tracker.update(values),
-            ]
-            one += len(found[1]) == 1
-            fields = [
-                self.surface.field(values).pressure,
-                self.inverse.field(values).depth_pressure,
-                tracker.field.depth_pressure,
-            ]
-            stated = tracker.deviation(values)
-            surface = self.surface_truth(width, load, centre)
-            pressed = true > PRESSED * true.max(), surface > PRESSED * surface.max()
-            errors = fields[2][self.window] - true, tracker.field.pressure - surface
-            over = errors[0] / stated.depth_pressure[self.window], errors[1] / stated.pressure
-            seen_field.append([z[where] ** 2 for z, where in zip(over, pressed, strict=True)])
-            for k, computed in enumerate(fields):
-                field[case, k] = ((computed[self.window] - true) ** 2).mean() / (true**2).mean()
-            for k, contacts in enumerate(found):
-                if contacts:
-                    whole = _together(contacts)
-                    force[case, k] = whole.force / FORCE - 1
-                    place[case, k] = np.linalg.norm(whole.place - centre)
-                    error = whole.force - FORCE
-                    sigma = whole.place_deviation * np.sqrt(2)
-                    seen[case, k] = error / whole.force_deviation, place[case, k] / sigma
+        results = [self._case_errors(width, random) for _ in range(cases)]
+        square, force, position, ratio, field_squares, found = zip(*results, strict=True)
+        field_ratio = [np.sqrt(np.concatenate(z).mean()) for z in zip(*field_squares, strict=True)]
         return Errors(
             width=width,
-            field=np.sqrt(field.mean(axis=0)),
-            force=np.sqrt((force**2).mean(axis=0)),
-            place=np.percentile(place, 95, axis=0),
-            seen=np.sqrt(np.nanmean(seen**2, axis=0)),
-            seen_field=np.array(
-                [np.sqrt(np.concatenate(z).mean()) for z in zip(*seen_field, strict=True)]
-            ),
-            found=one / cases,
+            field=np.sqrt(np.mean(square, axis=0)),
+            force=np.sqrt(np.mean(np.square(force), axis=0)),
+            position=np.percentile(position, 95, axis=0),
+            ratio=np.sqrt(np.nanmean(np.square(ratio), axis=0)),
+            field_ratio=np.array(field_ratio),
+            found=float(np.mean(found)),
         )
 
+    def _case_errors(self, width: float, random: np.random.Generator) -> _CaseErrors:
+        """Return the errors for one random load."""
+        force, centre = self.load(random)
+        points = self.inverse.points[self.window, :2]
+        true = -self.truth(points, width, force, centre)[:, 2]
+        values = self.values(width, force, centre, random)
+        tracker = ContactTracker(self.inverse, CONTACT_PRESSURE)
+        interpolated = self.surface.contacts(values, CONTACT_PRESSURE)
+        tracked = tracker.update(values)
 
-class _Whole(NamedTuple):
-    """Normal force of all contacts, N, and where it acts (2,), m, with standard deviations."""
+        fields = [
+            self.surface.field(values).pressure[self.window],
+            self.inverse.field(values).depth_pressure[self.window],
+            tracker.field.depth_pressure[self.window],
+        ]
+        square = [((field - true) ** 2).mean() / (true**2).mean() for field in fields]
+
+        predicted = tracker.deviation(values)
+        on_surface = self.surface_truth(width, force, centre)
+        below_error = (fields[-1] - true) / predicted.depth_pressure[self.window]
+        surface_error = (tracker.field.pressure - on_surface) / predicted.pressure
+        field_squares = [
+            below_error[true > MIN_PRESSURE_SHARE * true.max()] ** 2,
+            surface_error[on_surface > MIN_PRESSURE_SHARE * on_surface.max()] ** 2,
+        ]
+
+        # Without a contact the force is off by all of it, and no deviation was predicted.
+        force_error, position_error = np.full(2, -1.0), np.full(2, WINDOW)
+        ratio = np.full((2, 2), np.nan)
+        both: list[list[Any]] = [list(interpolated), list(tracked)]
+        for k, contacts in enumerate(both):
+            if contacts:
+                total = _sum_contacts(contacts)
+                difference = total.force - FORCE
+                force_error[k] = difference / FORCE
+                position_error[k] = np.linalg.norm(total.position - centre)
+                # The deviation is that of each coordinate, the error a distance.
+                ratio[k, 0] = difference / total.force_deviation
+                ratio[k, 1] = position_error[k] / (total.position_deviation * np.sqrt(2))
+        is_single = len(tracked) == 1
+        return _CaseErrors(square, force_error, position_error, ratio, field_squares, is_single)
+
+
+class _CaseErrors(NamedTuple):
+    """Errors for one load; the attributes of `Errors` before the mean over all loads."""
+
+    square: list[float]
+    force: Array
+    position: Array
+    ratio: Array
+    field_squares: list[Array]
+    is_single: bool
+
+
+class _TotalContact(NamedTuple):
+    """Normal force of all contacts in N and where it acts (2,) in m, with standard deviations."""
 
     force: float
     force_deviation: float
-    place: Array
-    place_deviation: float
+    position: Array
+    position_deviation: float
 
 
-def _together(contacts: list[Any]) -> _Whole:
-    """As if the contacts were independent of each other."""
+def _sum_contacts(contacts: list[Any]) -> _TotalContact:
+    """Add up contacts as if they were independent of each other."""
     forces = np.array([one.normal_force for one in contacts])
-    deviations = np.array([one.force_uncertainty for one in contacts])
-    places = np.array([one.position[:2] for one in contacts])
-    own = np.array([one.position_uncertainty for one in contacts])
-    whole = float(forces.sum())
-    place = forces @ places / whole
-    lever = np.linalg.norm(places - place, axis=1) / np.sqrt(2)
-    variance = ((forces * own) ** 2 + (lever * deviations) ** 2).sum()
-    deviation = float(np.sqrt(variance)) / whole
-    return _Whole(whole, float(np.linalg.norm(deviations)), place, deviation)
+    force_deviations = np.array([one.force_uncertainty for one in contacts])
+    positions = np.array([one.position[:2] for one in contacts])
+    position_deviations = np.array([one.position_uncertainty for one in contacts])
+    total = float(forces.sum())
+    centre = forces @ positions / total
+    lever = np.linalg.norm(positions - centre, axis=1) / np.sqrt(2)
+    moment_variance = (forces * position_deviations) ** 2 + (lever * force_deviations) ** 2
+    deviation = float(np.sqrt(moment_variance.sum())) / total
+    return _TotalContact(total, float(np.linalg.norm(force_deviations)), centre, deviation)
+
+
+def _place_cubes(setting: Setting) -> CubePoses:
+    skin = flat_skin(setting.pitch, max(SKIN_SIDE, 5 * setting.pitch))
+    if setting.cubes != "planar, crosswise":
+        return skin
+    cell = np.round(skin.position[:, :2] / setting.pitch).astype(int)
+    is_turned = cell.sum(axis=1) % 2 == 1
+    quarter = rotation_from_rpy(0, 0, np.pi / 2)
+    return skin._replace(rotation=np.where(is_turned[:, None, None], quarter, np.eye(3)))
+
+
+def _shipped_calibration(setting: Setting) -> Calibration:
+    name = "cube.yaml" if setting.cubes == "24-pad" else "planar.yaml"
+    folder = package_data() / "config" / "calibration"
+    return read_calibration(find_calibration(name, folder))
 
 
 def traction_example() -> FieldExample:
-    """A narrow contact between planar cubes, crosswise: pressure at the cubes' depth as it is, as
-    two methods compute it, and the standard deviation that the inverse states, Pa."""
+    """Return a narrow contact between planar cubes, crosswise.
+
+    The pressure at the cubes' depth is the true one, that of each of `METHODS`, and the "standard
+    deviation" that the inverse predicts, in Pa.
+    """
     bench = Bench(Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3), side=10)
-    centre, width = bench.setting.pitch * np.array([0.35, 0.25]), 6e-3
-    load = FORCE * np.array([FRICTION, 0.0, -1.0])
-    values = bench.values(width, load, centre, np.random.default_rng(1))
+    centre = bench.setting.pitch * np.array([0.35, 0.25])
+    width = 6e-3
+    force = FORCE * np.array([FRICTION, 0.0, -1.0])
+    values = bench.values(width, force, centre, np.random.default_rng(1))
     points = bench.inverse.points
     tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
     tracker.update(values)
     pressure = {
-        "truth": -bench.truth(points[:, :2], width, load, centre)[:, 2],
-        METHODS[0]: bench.surface.field(values).pressure,
-        METHODS[1]: bench.inverse.field(values).depth_pressure,
-        METHODS[2]: tracker.field.depth_pressure,
+        "truth": -bench.truth(points[:, :2], width, force, centre)[:, 2],
+        "interpolation": bench.surface.field(values).pressure,
+        "inverse": bench.inverse.field(values).depth_pressure,
+        "inverse with contacts": tracker.field.depth_pressure,
         "standard deviation": tracker.deviation(values).depth_pressure,
     }
     return FieldExample(points, pressure, bench.poses.position, centre)
 
 
 def flat_punch(radius: float, force: Array, centre: Array, order: int) -> tuple[Array, Array]:
-    """Traction F / (2 pi a sqrt(a^2 - r^2)) as point forces: a rigid flat punch (Johnson 3.8)."""
+    """Return the load of a rigid flat punch as point forces.
+
+    The traction is F / (2 pi a sqrt(a^2 - r^2)) (Johnson, Contact Mechanics, 3.8).
+
+    Args:
+        radius: a, in m.
+        force: F (3,), in N.
+        centre: (2,) in m.
+        order: Number of rings; each has four times as many points.
+    """
     nodes, weight = np.polynomial.legendre.leggauss(order)
-    r, count = radius * np.sqrt(1 - ((nodes + 1) / 2) ** 2), 4 * order
+    # With s = sqrt(1 - r^2 / a^2) the traction is uniform in s.
+    s = (nodes + 1) / 2
+    r = radius * np.sqrt(1 - s**2)
+    count = 4 * order
     angle = 2 * np.pi * np.arange(count) / count
-    x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
+    x = np.outer(r, np.cos(angle)).ravel()
+    y = np.outer(r, np.sin(angle)).ravel()
     sources = np.stack([centre[0] + x, centre[1] + y, 0 * x], axis=1)
-    return sources, np.repeat(weight / 2 / count, count)[:, None] * np.asarray(force)
+    shares = np.repeat(weight / 2 / count, count)
+    return sources, shares[:, None] * np.asarray(force)
 
 
-def study(
+def traction_study(
     settings: Sequence[Setting],
     widths: Sequence[float],
     cases: int = CASES,
-    progress: Callable[[Setting, Errors], None] | None = None,
     seed: int = 8,
+    progress: Callable[[Setting, Errors], None] | None = None,
 ) -> dict[Setting, list[Errors]]:
-    """Errors of each setting at each width (m)."""
+    """Return the errors of each setting at each width (m)."""
     results: dict[Setting, list[Errors]] = {}
     for setting in settings:
         bench = Bench(setting)
         results[setting] = []
         for width in widths:
-            results[setting].append(bench.errors(width, cases, seed))
+            errors = bench.errors(width, cases, seed)
+            results[setting].append(errors)
             if progress is not None:
-                progress(setting, results[setting][-1])
+                progress(setting, errors)
     return results
 
 
 MAIN = tuple(Setting(cubes=cubes) for cubes in CUBES)
-"""Pitch 8 mm, depth 5 mm, a half space that is one."""
+"""Skins with a pitch of 8 mm and a depth of 5 mm in a half space that is one."""
 PITCHES = tuple(
     Setting(cubes=cubes, pitch=pitch, depth=4e-3) for pitch in (12e-3, 24e-3) for cubes in CUBES[:2]
 )
-_PLAIN = Setting()
+"""Skins with larger pitches."""
 SHAPED = tuple(
     replace(setting, shape=shape) for shape in SHAPES[1:] for setting in (*MAIN[:2], *PITCHES)
 )
-"""Loads that are no balls."""
+"""Skins under loads that are no balls."""
 WRONG = {
-    "everything as known": _PLAIN,
-    "5 % gain spread": replace(_PLAIN, gain_error=0.05),
-    "cubes 0.5 mm deeper": replace(_PLAIN, depth_error=0.5e-3),
-    "Poisson's ratio 0.46": replace(_PLAIN, poisson=0.46),
-    "layer of 11 mm taken for a half space": replace(_PLAIN, thickness=11e-3),
-    "layer of 11 mm, known": replace(_PLAIN, thickness=11e-3, known_thickness=11e-3),
-    "flat punch instead of a ball": replace(_PLAIN, shape=SHAPES[1]),
+    "everything as known": Setting(),
+    "5 % gain spread": Setting(gain_error=0.05),
+    "cubes 0.5 mm deeper": Setting(depth_error=0.5e-3),
+    "Poisson's ratio 0.46": Setting(poisson=0.46),
+    "layer of 11 mm taken for a half space": Setting(thickness=11e-3),
+    "layer of 11 mm, known": Setting(thickness=11e-3, known_thickness=11e-3),
+    "flat punch instead of a ball": Setting(shape="flat punch"),
 }
-"""What the inverse does not know, and what it costs."""
+"""Skins about which the inverse knows something wrong."""

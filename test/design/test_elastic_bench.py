@@ -13,12 +13,11 @@ from cube_tensor_design.paper.experiments import dent, plates
 from cube_tensor_design.paper.material import Material
 from cube_tensor_design.paper.normal_fall import normal_fall
 from cube_tensor_design.paper.rod import Rod
-from cube_tensor_design.paper.rod_parts import P_SHEAR, PARTS, eased, split
-from cube_tensor_design.paper.virtual_bench import Step, VirtualBench
+from cube_tensor_design.paper.rod_parts import P_SHEAR, PARTS, draw_back, split_signals
+from cube_tensor_design.paper.virtual_bench import LoadStep, VirtualBench
 from cube_tensor_design.studies.layout_study import layout_study
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS
-from cube_tensor_driver.core.oscillator import pad_frequency
 
 BODY, NARROW = Body(), Body(width=20e-3)
 NU = BODY.poisson
@@ -205,10 +204,10 @@ def test_prototype_signs():
 
 
 def experiment(pads, truth, rotation):
-    frequency = pad_frequency(pads[:, :4], **paper.FOAM)
+    frequency = paper.foam_frequency(pads[:, :4])
     signals = paper.prototype(frequency)
     steps = np.arange(float(len(pads)))
-    return paper.Experiment("b", steps, pads, frequency, signals, signals, truth, truth, rotation)
+    return paper.Experiment("b", steps, pads, signals, signals, truth, truth, rotation)
 
 
 def test_the_parts_of_a_falling_p_normal_sum_to_its_fall():
@@ -231,7 +230,7 @@ def test_a_body_that_is_turned_as_a_whole_has_parts_that_sum_to_nothing(coarse):
         moved = pressed.prescribed(x)
         return turn @ (x + moved) - x
 
-    steps = [pressed, Step(turned)]
+    steps = [pressed, LoadStep(turned)]
     with_cube, without = (
         VirtualBench(NARROW, cube=cube, finite=True, size=2.0).run(steps) for cube in (True, False)
     )
@@ -247,7 +246,7 @@ def test_a_body_that_is_turned_as_a_whole_has_parts_that_sum_to_nothing(coarse):
 def test_a_rod_above_c2_raises_p_shear_only_with_c2_on_the_lower_face(coarse):
     """C2's side is x > 0 on either face; P_grad rises with both, as in the paper's Fig. 8 (c)."""
     pads = VirtualBench(NARROW, size=2.0).run([dent(NARROW, Rod(1e-3, 1e-3))]).pads
-    frequency = pad_frequency(pads, **paper.FOAM)
+    frequency = paper.foam_frequency(pads)
     lower, upper = (
         paper.prototype(frequency[:, face])[0] for face in (paper.ON_LOWER, paper.ON_UPPER)
     )
@@ -260,7 +259,7 @@ def test_the_parts_under_a_rod_sum_to_the_signal_of_the_bench(coarse):
     bench = VirtualBench(NARROW, size=1.0)
     signal = P_SHEAR @ bench.pad_weights(bench.layout)
     middle, beside = (dent(NARROW, Rod(1e-3, place)) for place in (0.0, 2e-3))
-    none, parts = (split(bench, step, [signal])[0] for step in (middle, beside))
+    none, parts = (split_signals(bench, step, [signal])[0] for step in (middle, beside))
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([beside]).pads[0], rel=1e-6)
     assert np.abs(none).max() < 1e-6 * np.abs(parts).max()
 
@@ -269,9 +268,9 @@ def test_the_parts_sum_to_the_signal_of_a_rod_with_the_force_it_has_without_the_
     """The force is what the bottom bears."""
     bench = VirtualBench(Body(width=12e-3), size=2.0)
     step = dent(bench.body, Rod(1e-3, 1e-3, edge_radius=1e-5))  # sharp: soon solved
-    drawn_back, bottom = eased(bench, step), bottom_weights(bench.section.basis, along=1) > 0
+    drawn_back, bottom = draw_back(bench, step), bottom_weights(bench.section.basis, along=1) > 0
     signal = P_SHEAR @ bench.pad_weights(bench.layout)
-    parts = split(bench, step, [signal], "force")[0]
+    parts = split_signals(bench, step, [signal], "force")[0]
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([drawn_back]).pads[0], rel=1e-6)
     force, without = (
         body.unbalanced_forces(body.solve(one), one.rod)[bottom].sum()
@@ -303,7 +302,7 @@ def test_a_field_of_one_order_has_one_part(monkeypatch, part, field):
         return np.where(outside, 1e-4 * np.array(field(*(x / NARROW.side))), np.nan)
 
     bench = VirtualBench(NARROW, size=1.0)
-    parts = split(bench, Step(moved), [bench.pad_weights(bench.layout)[1]])[0]
+    parts = split_signals(bench, LoadStep(moved), [bench.pad_weights(bench.layout)[1]])[0]
     assert np.argmax(np.abs(parts)) == PARTS.index(part)
     others = np.delete(parts, PARTS.index(part))
     assert np.abs(others).max() < 5e-3 * np.abs(parts).max()

@@ -520,7 +520,7 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
 
 def _experiment() -> paper.Experiment:
     step = np.linspace(0, 1, 3)
-    rows = [np.outer(step, np.ones(n)) for n in (8, 4, 3, 3, 7, 7)]
+    rows = [np.outer(step, np.ones(n)) for n in (8, 3, 3, 7, 7)]
     return paper.Experiment("test", step, *rows, rotation=step)
 
 

@@ -91,12 +91,12 @@ def test_stated_deviations_are_those_of_the_errors(cubes):
     """Through the whole chain: gains of pads, pad law, counter, pipeline. The number of loads
     leaves 0.65 to 1.35 open."""
     errors = Bench(Setting(cubes=cubes), side=2).errors(8e-3, cases=8)
-    force, place = errors.seen[1]
+    force, place = errors.ratio[1]
     assert 0.5 < force < 1.6 and 0.5 < place < 1.6
-    assert errors.force[1] < 0.01 and errors.place[1] < 0.1e-3 and errors.found == 1
+    assert errors.force[1] < 0.01 and errors.position[1] < 0.1e-3 and errors.found == 1
     assert errors.field[2] < 0.03 and errors.field[2] < errors.field[1] < errors.field[0]
     # Points that lie close together are off together; a ball needs none of the shapes.
-    below, surface = errors.seen_field
+    below, surface = errors.field_ratio
     assert 0.7 < below < 1.4 and 0.3 < surface < 1.4
 
 

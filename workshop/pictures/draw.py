@@ -15,21 +15,15 @@ from pathlib import Path
 import numpy as np
 
 from cube_tensor_design.figures.experiments import draw_prototype
-from cube_tensor_design.figures.field import draw_field, draw_field_study, field_tables
+from cube_tensor_design.figures.field import draw_field_study, draw_methods, draw_traction
 from cube_tensor_design.figures.pads_example import draw_pads, draw_sweep
-from cube_tensor_design.figures.traction import (
-    draw_layer,
-    draw_traction,
-    pads_table,
-    traction_table,
-)
 from cube_tensor_design.paper.experiments import experiments
 from cube_tensor_design.studies.field_study import field_example, field_study
 from cube_tensor_design.studies.pads_example import planar_calibration, sweep
-from cube_tensor_design.studies.pads_study import coarse_influence, layer_example, study_pads
-from cube_tensor_design.studies.traction_study import MAIN, PITCHES, SHAPED, WRONG, traction_example
-from cube_tensor_design.studies.traction_study import study as traction_study
+from cube_tensor_design.studies.pads_study import coarse_influence, layer_example
+from cube_tensor_design.studies.traction_study import traction_example
 from cube_tensor_driver.cli import ROOT
+from cube_tensor_driver.config.output_files import atomic_write
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError, CubeError
@@ -39,11 +33,12 @@ from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
 from cube_tensor_driver.views.figures.style import save
 
 from ..bench.skin import bench_scale
+from .contact_tables import write_contact_tables
 from .cube_drawing import draw_cube
 from .fingers import draw_fingers
 
 START_S = 30.0
-"""How long the processes may take to start."""
+"""Longest time for the processes to start, in s."""
 LOAD = """\
 period: 8.0
 indenters:
@@ -59,22 +54,25 @@ indenters:
       force: [0, 2.6, 2.6, 2.6, 0]
       shear: [1.0, 0.4, 0]
 """
-"""Presses beside the cube c05, whose numbers the browser view shows at first, and rests there."""
+"""Load script of the browser view's picture. It presses beside the cube c05, whose numbers the view
+shows at first, and stays there."""
 SHAKEN_S = 2.62
-"""When the box of the gripper is accelerated most, s."""
+"""Time at which the acceleration of the gripper's box is largest, in s."""
 PHOTOGRAPH_S = 120.0
-"""How long the browser may take to make its picture."""
-CONTACT_WIDTHS, LOADS, SEED = [2e-3, 5e-3, 10e-3, 20e-3], 100, 7031
-"""Balls of the traction's tables: widths, m, how many, and a seed that nothing was chosen with."""
-COUNTS, RATE, MEASURE_S = [1, 4, 16, 64, 256, 1024, 4096], 100.0, 6.0
-"""Cubes, Hz and seconds of the scale plot: most machines can do that."""
+"""Longest time for the browser to make its picture, in s."""
+COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
+"""Numbers of cubes in the scale plot."""
+RATE = 100.0
+"""Rate of the cubes in the scale plot, in Hz; most machines can do that."""
+MEASURE_S = 6.0
+"""Duration of each measurement of the scale plot, in s."""
 
 
 def make_pictures(folder: Path) -> None:
-    """Write all pictures and figures of the documentation; view.png only where Chromium is.
+    """Write all pictures and tables of the documentation; view.png only where Chromium is.
 
-    Prints the tables of the field study and of the traction study. CubeError: something did not
-    start, or cannot be written.
+    Raises:
+        CubeError: Something did not start, or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -106,29 +104,27 @@ def make_pictures(folder: Path) -> None:
     save(draw_sweep(sweep()), folder / "mistaken_shear.png")
     a, _, b, _, c, _ = experiments()
     save(draw_prototype([a, b, c]), folder / "prototype.png")
-    save(draw_field(field_example()), folder / "field.png")
+    save(draw_methods(field_example()), folder / "field.png")
     study = field_study()
     save(draw_field_study(study), folder / "field_error.png")
+    table = {name: column.tolist() for name, column in vars(study).items()}
+    with atomic_write(folder / "field.json") as partial:
+        partial.write_text(json.dumps(table) + "\n")
+
     save(draw_traction(traction_example()), folder / "traction.png")
-    balls = traction_study((*MAIN, *PITCHES), CONTACT_WIDTHS, LOADS, seed=SEED)
-    print(traction_table({f"{s.cubes}, {1e3 * s.pitch:g} mm": e for s, e in balls.items()}))
-    settings = traction_study(list(WRONG.values()), [5e-3, 15e-3], cases=6, seed=SEED)
-    print(traction_table({name: settings[one] for name, one in WRONG.items()}))
-    shaped = traction_study(SHAPED, CONTACT_WIDTHS, cases=6, seed=SEED)
-    names_of = {s: f"{s.shape}, {s.cubes}, {1e3 * s.pitch:g} mm" for s in shaped}
-    print(traction_table({names_of[s]: errors for s, errors in shaped.items()}))
-    pads = coarse_influence()
-    save(draw_layer(layer_example(pads)), folder / "thin_layer.png")
-    print(pads_table(study_pads(pads, CONTACT_WIDTHS, cases=40, seed=SEED)))
-    names = ("pitches", "widths", "error", "position", "force")
-    table = {name: getattr(study, name).tolist() for name in names}
-    (folder / "field.json").write_text(json.dumps(table) + "\n")
+    true_pads = coarse_influence()
+    save(draw_methods(layer_example(true_pads), "cubes as "), folder / "thin_layer.png")
+    write_contact_tables(folder / "contacts.json", true_pads)
     written = ", ".join(sorted(path.name for path in folder.iterdir()))
-    print(f"{field_tables(study)}\nwrote {written} to {folder}")
+    print(f"wrote {written} to {folder}")
 
 
 def _draw_gripper(path: Path) -> None:
-    """The gripper while it shakes its box, and what its fingers feel. ConfigError: no OpenGL."""
+    """Draw the gripper while it shakes its box, and the stress on its fingers.
+
+    Raises:
+        ConfigError: There is no OpenGL.
+    """
     os.environ.setdefault("MUJOCO_GL", "egl")
     scene = package_data() / "config" / "mujoco" / "gripper.xml"
     skin = read_skin(scene_skin(scene))
@@ -142,7 +138,7 @@ def _draw_gripper(path: Path) -> None:
 
 @contextmanager
 def _demo_skin() -> Iterator[Children]:
-    """The simulated demo skin under its load, with the browser view."""
+    """Run the simulated demo skin under its load, with the browser view."""
     skin = package_data() / "config" / "skin_demo.yaml"
     with (
         tempfile.TemporaryDirectory(prefix="cube_pictures_") as name,
@@ -158,7 +154,11 @@ def _demo_skin() -> Iterator[Children]:
 
 
 def _photograph(children: Children, path: Path) -> None:
-    """The browser view. CubeError: no picture came."""
+    """Save a picture of the browser view.
+
+    Raises:
+        CubeError: The browser made no picture.
+    """
     url = children.wait_for_line("view", "http://", START_S).split()[0]
     # In a process of its own, so that only a machine with Chromium needs selenium.
     command = [sys.executable, "-m", "workshop.pictures.photograph", url, str(path.resolve())]

@@ -1,0 +1,187 @@
+"""The tables of docs/pictures/contacts.json: accuracy of contacts, from the studies of traction."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cube_tensor_design.studies.pads_study import FORMS, study_pads
+from cube_tensor_design.studies.traction_study import (
+    MAIN,
+    PITCHES,
+    SHAPED,
+    WRONG,
+    Errors,
+    Setting,
+    traction_study,
+)
+from cube_tensor_driver.config.output_files import atomic_write
+from cube_tensor_driver.mechanics.influence import Influence
+
+Table = dict[str, Any]
+"""A table: what it is about, its columns, its rows."""
+
+WIDTHS = [2e-3, 5e-3, 10e-3, 20e-3]
+"""Widths of the contacts, in m."""
+WRONG_WIDTHS = [5e-3, 15e-3]
+"""Widths of the contacts for the table of wrong assumptions, in m."""
+BALL_LOADS = 100
+"""Number of balls for each line."""
+PAD_LOADS = 40
+"""Number of loads for each line about cubes as points and as pads."""
+FEW_LOADS = 6
+"""Number of loads for each line of the other tables."""
+SEED = 7031
+"""Seed of the random loads, with which nothing was chosen."""
+
+METHOD_COLUMNS = [
+    "contact width, mm",
+    "pressure field, relative rms error: interpolation, inverse, inverse with contacts",
+    "normal force, relative rms error in %: interpolation, inverse",
+    "position, 95th percentile of the error in mm: interpolation, inverse",
+    "force, rms error / predicted deviation: interpolation, inverse",
+    "position, rms error / predicted deviation: interpolation, inverse",
+    "pressure field of the inverse with contacts, rms error / predicted deviation: at the depth of "
+    "the cubes, on the surface",
+]
+"""Columns of one setting under loads of one width, with all methods."""
+FORM_COLUMNS = [
+    "contact width, mm",
+    "pressure field, relative rms error: points, pads",
+    "normal force, relative rms error in %: points, pads",
+    "position, 95th percentile of the error in mm: points, pads",
+    "force, rms error / predicted deviation: points, pads",
+    "position, rms error / predicted deviation: points, pads",
+]
+"""Columns of one setting under loads of one width, with cubes taken for points and for pads."""
+
+
+def write_contact_tables(path: Path, true_pads: Influence) -> None:
+    """Run the studies and write their tables; other tables of the file stay as they are.
+
+    Args:
+        path: The JSON file.
+        true_pads: True influence functions of the pads in a layer.
+    """
+    tables = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    tables |= contact_tables(true_pads)
+    text = json.dumps(tables, indent=1, ensure_ascii=False)
+    # One line for each row: the indents of what is in a row are deeper than three.
+    text = re.sub(r"\n(?: {4,}| {3}(?=\]))", " ", text)
+    with atomic_write(path) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+def contact_tables(true_pads: Influence) -> dict[str, Table]:
+    """Run the studies and return their tables by name."""
+    balls = traction_study((*MAIN, *PITCHES), WIDTHS, BALL_LOADS, SEED)
+    wrong = traction_study(list(WRONG.values()), WRONG_WIDTHS, FEW_LOADS, SEED)
+    shaped = traction_study(SHAPED, WIDTHS, FEW_LOADS, SEED)
+    forms = study_pads(true_pads, WIDTHS, PAD_LOADS, SEED)
+    return {
+        "balls, pitch 8 mm, depth 5 mm": {
+            "about": f"3 N normal, 0.9 N tangential, {BALL_LOADS} loads for each line. A contact "
+            "that was not found counts as 40 mm.",
+            "columns": ["cubes", *METHOD_COLUMNS],
+            "rows": _method_rows({setting.cubes: balls[setting] for setting in MAIN}),
+        },
+        "balls, pitches 12 and 24 mm, depth 4 mm": {
+            "about": f"As above, {BALL_LOADS} loads for each line.",
+            "columns": ["cubes and pitch", *METHOD_COLUMNS],
+            "rows": _method_rows({_name(setting): balls[setting] for setting in PITCHES}),
+        },
+        "wrong assumptions": {
+            "about": f"24-pad cubes, pitch 8 mm, depth 5 mm, {FEW_LOADS} loads for each line.",
+            "columns": ["assumption", *METHOD_COLUMNS],
+            "rows": _method_rows({name: wrong[setting] for name, setting in WRONG.items()}),
+        },
+        "other shapes": {
+            "about": f"{FEW_LOADS} loads for each cell; depth 5 mm at the pitch of 8 mm, otherwise "
+            "4 mm. A rounded punch is the mean of flat ones of 0.6 to 1 of its radius.",
+            "columns": [
+                "cubes and pitch",
+                "contact width, mm",
+                "rounded punch: force error in %, error / predicted deviation, position error in "
+                "mm, error / predicted deviation",
+                "two balls: the same four",
+                "loads of two balls that did not become one contact",
+                "flat punch: the same four",
+            ],
+            "rows": _shape_rows(shaped),
+        },
+        "cubes as points and as pads": {
+            "about": f"Layer of 11 mm, cubes in its middle, pitch 8 mm, {PAD_LOADS} loads for each "
+            "line, inverse with contacts.",
+            "columns": ["cubes", *FORM_COLUMNS],
+            "rows": _form_rows(forms),
+        },
+    }
+
+
+def _name(setting: Setting) -> str:
+    return f"{setting.cubes}, {1e3 * setting.pitch:g} mm"
+
+
+def _method_rows(results: Mapping[str, Sequence[Errors]]) -> list[list[Any]]:
+    rows = []
+    for name, all_widths in results.items():
+        for one in all_widths:
+            ratios = [[round(before, 1), round(now, 2)] for before, now in one.ratio.T.tolist()]
+            rows.append(
+                [
+                    name,
+                    1e3 * one.width,
+                    one.field.round(3).tolist(),
+                    (100 * one.force).round(1).tolist(),
+                    (1e3 * one.position).round(2).tolist(),
+                    *ratios,
+                    one.field_ratio.round(2).tolist(),
+                ]
+            )
+    return rows
+
+
+def _shape_rows(results: Mapping[Setting, Sequence[Errors]]) -> list[list[Any]]:
+    """Return one row for each skin and width, with the errors of the contacts for each shape."""
+    by_skin: dict[str, dict[str, Sequence[Errors]]] = {}
+    for setting, all_widths in results.items():
+        by_skin.setdefault(_name(setting), {})[setting.shape] = all_widths
+    rows = []
+    for name, by_shape in by_skin.items():
+        for k, width in enumerate(WIDTHS):
+            flat, rounded, balls = (
+                by_shape[shape][k] for shape in ("flat punch", "rounded punch", "two balls")
+            )
+            others = round((1 - balls.found) * FEW_LOADS)
+            counted = f"{others} of {FEW_LOADS}"
+            cells = [_contact_cell(rounded), _contact_cell(balls), counted, _contact_cell(flat)]
+            rows.append([name, 1e3 * width, *cells])
+    return rows
+
+
+def _contact_cell(one: Errors) -> list[float]:
+    """Return force error in % and position error in mm, each with its calibration ratio."""
+    force, position = 100 * one.force[1], 1e3 * one.position[1]
+    force_ratio, position_ratio = one.ratio[1]
+    digits = ((force, 1), (force_ratio, 1), (position, 2), (position_ratio, 1))
+    return [round(float(value), count) for value, count in digits]
+
+
+def _form_rows(results: Mapping[tuple[Setting, str], Sequence[Errors]]) -> list[list[Any]]:
+    rows = []
+    for setting in dict.fromkeys(setting for setting, _ in results):
+        for both in zip(*(results[setting, form] for form in FORMS), strict=True):
+            cells = (
+                (one.field[2], 100 * one.force[1], 1e3 * one.position[1], *one.ratio[1])
+                for one in both
+            )
+            columns = zip(*cells, strict=True)
+            rounded = [
+                [round(float(value), digits) for value in column]
+                for column, digits in zip(columns, (3, 1, 2, 2, 2), strict=True)
+            ]
+            rows.append([setting.cubes, 1e3 * both[0].width, *rounded])
+    return rows
