@@ -4,19 +4,21 @@ import os
 import signal
 import sys
 
-from .main import interrupt_again, main
+from .main import INTERRUPTED, interrupt_again, main
 
 if __name__ == "__main__":
     sys.unraisablehook = interrupt_again
-    # Ended from outside as by Ctrl-C: processes that a command started are ended too.
+    # A command that is ended from outside ends the processes that it has started, as by Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = main()
         sys.stdout.flush()
-    except KeyboardInterrupt:  # while the arguments were read
-        code = 130
+    except KeyboardInterrupt:
+        # It came while the arguments were parsed.
+        code = INTERRUPTED
     except BrokenPipeError:
-        # The reader has enough, as in ./cube urdf skin.yaml | head. What is left goes nowhere.
+        # The reader has closed the pipe, as in ./cube urdf skin.yaml | head. Python flushes stdout
+        # once more when it ends, which must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     sys.exit(code)

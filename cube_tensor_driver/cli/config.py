@@ -1,4 +1,4 @@
-"""./cube config grid, ./cube config check: skin files."""
+"""./cube config grid, ./cube config check: write the skin file of a grid, check a skin file."""
 
 from __future__ import annotations
 
@@ -63,7 +63,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def write_grid(options: argparse.Namespace) -> int:
-    """ConfigError: the file is there, or would be one that `config check` refuses."""
+    """Write the skin file of a grid.
+
+    Raises:
+        ConfigError: The file exists, or `config check` would refuse it.
+    """
     from ..config.grid import grid
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
@@ -71,7 +75,7 @@ def write_grid(options: argparse.Namespace) -> int:
     from ..views.terminal.output import working
 
     if options.output.exists():
-        raise ConfigError(f"-o {options.output}: the file is there; remove it, or name another one")
+        raise ConfigError(f"-o {options.output}: the file exists; remove it, or name another one")
     skin = grid(
         options.name,
         nx=options.nx,
@@ -95,8 +99,10 @@ def write_grid(options: argparse.Namespace) -> int:
 
 
 def ends_of_links(skin: dict[str, Any]) -> dict[str, Any]:
-    """The content of a grid's file with the first and the last cube of each link only: the others
-    have no mistake that these do not have."""
+    """Return the content of the file of a grid with the first and last cube of each link only.
+
+    It is enough to check these: the other cubes have no mistake that these do not have.
+    """
     first: dict[str, Any] = {}
     last: dict[str, Any] = {}
     for cube in skin["cubes"]:
@@ -107,7 +113,7 @@ def ends_of_links(skin: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_file(path: Path) -> int:
-    """Print what is wrong with a skin file and return 1, or print what the file holds."""
+    """Print what is wrong with a skin file and return 1, or print what it contains."""
     from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin
     from ..device.links.line_load import line_doubts
@@ -115,6 +121,7 @@ def check_file(path: Path) -> int:
 
     with working(f"checking {path}"):
         skin, mistakes = check_skin(path)
+        # Doubts about poses and lines make sense only for a file without mistakes.
         if skin is not None:
             mistakes = [*pose_doubts(skin), *line_doubts(skin)]
     for mistake in mistakes:

@@ -1,4 +1,4 @@
-"""./cube exec: any command inside the environment that ./cube made."""
+"""./cube exec: run any command inside the environment that ./cube has made."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import sys
 from .parser import Parser
 
 NOT_FOUND = 127
-"""Exit code of a shell for a command that it does not find."""
+"""Exit code that shells give for a command that is not found."""
 
 
 def arguments(parser: Parser) -> None:
@@ -23,8 +23,8 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Become the command."""
-    # Python ignores SIGPIPE, and a command would inherit that.
+    """Replace this process by the command."""
+    # Python ignores SIGPIPE, and the command would inherit that.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     name = options.words[0]
     try:

@@ -1,4 +1,4 @@
-"""./cube inject: a fault for simulated hubs that run in another process."""
+"""./cube inject: inject a fault into simulated hubs that run in another process."""
 
 from __future__ import annotations
 

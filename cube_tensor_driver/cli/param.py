@@ -1,4 +1,4 @@
-"""./cube param: parameters of nodes that run."""
+"""./cube param: list, read or set parameters of running nodes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def shown(value: object) -> str:
-    """As it would be written in YAML."""
+    """Return a value as it is written in YAML."""
     from ..config.yaml import to_yaml
 
+    # A single text would be followed by an end-of-document mark, a list is not.
     return to_yaml([value]).strip()[1:-1]

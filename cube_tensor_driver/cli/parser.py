@@ -1,4 +1,4 @@
-"""How words become options: a parser whose errors are short, and the types of arguments."""
+"""Parsing of the words of a command: a parser with short errors, and the types of arguments."""
 
 from __future__ import annotations
 
@@ -11,15 +11,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-WIDEST = 100
-"""Columns of a help text, however wide the terminal is."""
+MAX_WIDTH = 100
+"""Width of a help text in columns, however wide the terminal is: longer lines are hard to read."""
+
+MAX_UID = (1 << 64) - 1
+"""Largest uid of a hub or cube."""
 
 
 @dataclass(frozen=True)
 class Output:
     """A file or folder that a command writes, to be checked before any work.
 
-    kind: file, yaml (its suffix says so), picture (its suffix must be a format) or folder.
+    Attributes:
+        flag: Option that names it.
+        name: Name of the option in the parsed options.
+        kind: `file`, `yaml` (it must have that suffix), `picture` (its suffix must be a format) or
+            `folder`.
     """
 
     flag: str
@@ -45,26 +52,35 @@ class Parser(argparse.ArgumentParser):
         return action
 
     def add_output(self, *flags: str, kind: str = "file", **settings: Any) -> None:
-        """An argument that names an output. Its default may be a function of the options."""
+        """Add an argument that names an output; its default may be a function of the options."""
         metavar = "DIR" if kind == "folder" else "FILE"
         action = self.add_argument(*flags, **{"type": Path, "metavar": metavar} | settings)
         self._outputs.append(Output(flags[0], action.dest, kind))
         self.set_defaults(outputs=self._outputs)
 
     def add_json(self) -> None:
-        """--json FILE, which has one meaning in all commands."""
+        """Add --json FILE, which has one meaning in all commands."""
         self.add_output("--json", help="write the figures to FILE as well")
 
     def add_subcommand(self, name: str, text: str) -> Parser:
-        """The parser of a word that has to follow this command; it becomes options.what."""
+        """Add a word that can follow this command, and return its parser.
+
+        The word becomes `options.what`.
+        """
         if self._subcommands is None:
             self._subcommands = self.add_subparsers(dest="what", metavar="WHAT", required=True)
         added: Parser = self._subcommands.add_parser(name, help=text, description=sentence(text))
         return added
 
     def add_words(self, name: str, metavar: str, text: str, missing: str = "") -> None:
-        """All words that follow, options too, belong to another program; missing: what to say
-        without any."""
+        """Take all words that follow, options too, as those of another program.
+
+        Args:
+            name: Name of the words in the parsed options.
+            metavar: Their name in the help.
+            text: Their help.
+            missing: Error message if there are no words; empty: none are needed.
+        """
         self.add_argument(name, nargs=argparse.REMAINDER, metavar=metavar, help=text)
         self.usage = f"%(prog)s {metavar} ..."
         self._words, self._missing = name, missing
@@ -84,7 +100,7 @@ class Parser(argparse.ArgumentParser):
         return namespace, []
 
     def _refuse_unknown(self, words: list[str]) -> None:
-        """Before argparse looks, which would call a mistyped option a missing one."""
+        """Refuse unknown words, before argparse reports a mistyped option as a missing one."""
         if self._subcommands is not None:
             known = list(self._subcommands.choices)
             word = next((word for word in words if not word.startswith("-")), None)
@@ -99,6 +115,7 @@ class Parser(argparse.ArgumentParser):
             flag = word.partition("=")[0]
             if flag.startswith("--"):
                 fits = any(known.startswith(flag) for known in self._flags)
+            # A negative number begins with a dash, too, and is no option.
             elif flag[:1] == "-" and flag[1:2].isalpha():
                 fits = flag[:2] in self._flags
             else:
@@ -107,7 +124,7 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"unknown option {flag}; {nearest(flag, self._flags)}")
 
     def error(self, message: str) -> NoReturn:
-        """Exit with 2. What is wrong in one line, where the help is in another."""
+        """Print what is wrong and where the help is, and exit with 2."""
         message = self._prefix() + message.removeprefix("argument ")
         self.exit(2, f"{message}\n      {self.prog} --help lists what is possible\n")
 
@@ -117,22 +134,23 @@ class Parser(argparse.ArgumentParser):
 
 
 def formatter(prog: str) -> argparse.HelpFormatter:
-    """As wide as the terminal, but not wider than a person likes to read."""
+    """Return a formatter for the width of the terminal."""
     return argparse.HelpFormatter(prog, width=columns() - 2)
 
 
 def columns() -> int:
-    return min(shutil.get_terminal_size().columns, WIDEST)
+    """Return the width of help texts."""
+    return min(shutil.get_terminal_size().columns, MAX_WIDTH)
 
 
 def sentence(text: str) -> str:
-    """A line of the table as a sentence."""
+    """Return a line of the table of commands as a sentence."""
     return f"{text[0].upper()}{text[1:]}."
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """The question after an unknown word, or all words that are known."""
-    # Without the dashes, which would make all options alike.
+    """Return a question that suggests close words, or the list of all known words."""
+    # The words are compared without dashes, which all options have in common.
     names = {one.lstrip("-"): one for one in known if len(one) > 2}
     close = difflib.get_close_matches(word.lstrip("-"), names, n=2)
     if close:
@@ -141,7 +159,11 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def check_outputs(options: argparse.Namespace) -> None:
-    """ConfigError, before any work: an output that cannot be written. Fills in their defaults."""
+    """Check all outputs before any work, and fill in defaults that are functions.
+
+    Raises:
+        ConfigError: An output cannot be written.
+    """
     from ..config.output_files import check_folder, check_outputs, check_yaml
 
     files: dict[str, Path | None] = {}
@@ -160,6 +182,7 @@ def check_outputs(options: argparse.Namespace) -> None:
         if output.kind == "picture" and value is not None:
             pictures.append(value)
     check_outputs(files)
+    # matplotlib, which knows the formats, is imported only where there is a picture.
     if pictures:
         from ..views.figures.style import check_picture
 
@@ -168,6 +191,14 @@ def check_outputs(options: argparse.Namespace) -> None:
 
 
 def _number(kind: Callable[[str], Any], text: str, what: str, fits: Callable[[Any], bool]) -> Any:
+    """Convert a text into a number.
+
+    Args:
+        kind: Function that converts it.
+        text: The text.
+        what: What is expected, for the error message.
+        fits: Function that tells whether the number is allowed.
+    """
     try:
         value = kind(text)
     except ValueError:
@@ -178,36 +209,42 @@ def _number(kind: Callable[[str], Any], text: str, what: str, fits: Callable[[An
 
 
 def number(text: str) -> float:
+    """Convert the text of a finite number."""
     return float(_number(float, text, "a finite number", math.isfinite))
 
 
 def positive(text: str) -> float:
+    """Convert the text of a number above 0."""
     return float(_number(float, text, "a number above 0", lambda x: 0 < x < math.inf))
 
 
 def sample_rate(text: str) -> float:
-    """What hubs and skin files take."""
+    """Convert the text of a sample rate in Hz, with the limits of hubs and skin files."""
     what = "a rate from 0.1 to 10000 samples per second"
     return float(_number(float, text, what, lambda x: 0.1 <= x <= 10_000))
 
 
 def not_negative(text: str) -> float:
+    """Convert the text of a number of at least 0."""
     return float(_number(float, text, "a number of at least 0", lambda x: 0 <= x < math.inf))
 
 
 def count(text: str) -> int:
+    """Convert the text of a whole number of at least 1."""
     return int(_number(int, text, "a whole number of at least 1", lambda n: n >= 1))
 
 
 def whole_number(text: str) -> int:
+    """Convert the text of a whole number of at least 0."""
     return int(_number(int, text, "a whole number of at least 0", lambda n: n >= 0))
 
 
 def tcp_port(text: str) -> int:
+    """Convert the text of a TCP port."""
     return int(_number(int, text, "a TCP port, 1 to 65535", lambda n: 1 <= n <= 65535))
 
 
 def uid(text: str) -> int:
-    """Decimal, or hexadecimal with 0x in front."""
+    """Convert the text of a uid: decimal, or hexadecimal with 0x in front."""
     what = "a uid, 0 to 2^64 - 1"
-    return int(_number(lambda word: int(word, 0), text, what, lambda n: 0 <= n < 1 << 64))
+    return int(_number(lambda word: int(word, 0), text, what, lambda n: 0 <= n <= MAX_UID))

@@ -1,4 +1,4 @@
-"""./cube plot: one cube of a bag over time, as a picture."""
+"""./cube plot: draw one cube of a bag over time."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def arguments(parser: Parser) -> None:
         dest="start",
         type=number,
         metavar="S",
-        help="begin so many seconds after the start of the bag",
+        help="begin S seconds after the start of the bag",
     )
     parser.add_argument(
         "--to",
         dest="end",
         type=number,
         metavar="S",
-        help="end so many seconds after the start of the bag",
+        help="end S seconds after the start of the bag",
     )
     parser.add_output("-o", "--output", kind="picture", required=True, help="picture to write")
 

@@ -1,4 +1,4 @@
-"""./cube ports: which serial ports there are, and which answer as hubs."""
+"""./cube ports: list the serial ports, and which of them answer as hubs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """1 if there is no serial port, else 0."""
+    """Print one line per port.
+
+    Raises:
+        CubeError: There is no serial port.
+    """
     from ..core.errors import CubeError
     from ..device.links.search import ask_ports, find_ports
 
@@ -39,4 +43,5 @@ def run(options: argparse.Namespace) -> int:
 
 
 def rate(period_us: int) -> str:
+    """Return the rate of a hub with a sample period in µs; 0: it has none yet."""
     return f"{1e6 / period_us:.4g} Hz" if period_us else "rate not set"

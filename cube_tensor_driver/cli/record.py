@@ -43,10 +43,10 @@ def arguments(parser: Parser) -> None:
         help="format of the files (default: %(default)s)",
     )
     parser.add_argument(
-        "--split-size", type=positive, metavar="MB", help="begin a new file after so many megabytes"
+        "--split-size", type=positive, metavar="MB", help="begin a new file after MB megabytes"
     )
     parser.add_argument(
-        "--split-time", type=positive, metavar="S", help="begin a new file after so many seconds"
+        "--split-time", type=positive, metavar="S", help="begin a new file after S seconds"
     )
 
 

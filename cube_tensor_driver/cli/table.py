@@ -1,4 +1,4 @@
-"""The table of commands: what ./cube --help prints. The module of a command has its name."""
+"""The table of commands, which ./cube --help prints. The module of a command has its name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""./cube tare: the present load of a running skin becomes zero load."""
+"""./cube tare: take the present load of a running skin as zero load, or clear that."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """1 if a reconstruction refuses, else 0."""
+    """Return 1 if a reconstruction node refuses, else 0."""
     from ..core.errors import TareError
     from ..ros.commands.services import request_tare
 

@@ -1,4 +1,4 @@
-"""./cube topics: which topics there are, and what comes on them."""
+"""./cube topics: list the topics that are published, with types and rates."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ def run(options: argparse.Namespace) -> int:
     width = max(len(topic.name) for topic in topics)
     for topic in topics:
         rate = "not installed here" if topic.rate is None else f"{topic.rate:.0f} Hz"
-        print(f"{topic.name:{width}}  {rate:>8}  {', '.join(topic.kinds)}{_of(topic.cubes)}")
+        kinds = ", ".join(topic.kinds)
+        print(f"{topic.name:{width}}  {rate:>8}  {kinds}{cubes_text(topic.cubes)}")
     return 0
 
 
-def _of(cubes: list[str]) -> str:
-    """Whose topics a line stands for."""
+def cubes_text(cubes: list[str]) -> str:
+    """Return the cubes whose topics a line stands for, empty for a topic of the whole skin."""
     if not cubes:
         return ""
     names = ", ".join(cubes) if len(cubes) < 3 else f"{cubes[0]} … {cubes[-1]}"

@@ -1,4 +1,4 @@
-"""./cube urdf: the frames of a skin for a robot's description."""
+"""./cube urdf: print the frames of a skin for the description of a robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""./cube view: a page that shows a running skin."""
+"""./cube view: show a running skin in the browser."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from ..core.defaults import SURFACE_DEPTH
 from .parser import Parser, positive, tcp_port
 
 RECORDINGS = Path("~/cube_recordings")
+"""Folder for bags that are recorded from the page, unless another one is named."""
 
 
 def arguments(parser: Parser) -> None:

@@ -1,4 +1,4 @@
-"""How results are shown: the scene of a skin, pictures and terminal output.
+"""How results are shown: the scene of a skin, pictures, and what commands print.
 
-`scene` says how a skin looks, for RViz and for the browser. Nothing is measured here.
+`scene` computes what a skin looks like, for RViz and for the browser. Nothing is measured here.
 """

@@ -92,7 +92,7 @@ def test_a_grid_of_another_layout_has_its_calibration_and_replaces_no_file(tmp_p
     assert {cube.calibration.layout.name for cube in read_skin(path).cubes} == {"cube"}
     before = path.read_bytes()
     done = cube("config", "grid", *arguments, path)
-    assert done.returncode == 1 and f"{path}: the file is there" in done.stderr
+    assert done.returncode == 1 and f"{path}: the file exists" in done.stderr
     assert path.read_bytes() == before
 
 

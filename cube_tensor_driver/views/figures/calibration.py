@@ -1,4 +1,4 @@
-"""Pictures of a cube's pads and of the fit of its calibration."""
+"""Pictures of the pads of a cube and of the fit of its calibration."""
 
 from __future__ import annotations
 
@@ -7,20 +7,25 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from numpy.typing import NDArray
 
 from ...calibrate.fit import Fit
+from ...core.arrays import Array
 from ...core.layout import Layout
 from .style import MARKERS, print_style
 
 _VIEW = np.array([0.75, -1.0, 0.75])
 """Direction from the cube to the viewer."""
+
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+"""Corners of a square as a closed line."""
+
+MAX_ONE_COLUMN_PADS = 12
+"""Number of pads whose legend fits into two columns."""
 
 
 @print_style()
 def draw_layout(layout: Layout) -> Figure:
-    """The cube with its pads: those towards the viewer filled, those behind as an outline."""
+    """Draw a cube with its pads: those towards the viewer filled, those behind as an outline."""
     figure = Figure(figsize=(5, 4.6))
     axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
     _draw_edges(axes)
@@ -42,51 +47,54 @@ def draw_layout(layout: Layout) -> Figure:
 
 
 def _draw_edges(axes: Any) -> None:
-    """The edges of the cube; those that end in its hidden corner are dotted."""
+    """Draw the edges of the cube; those that end in its hidden corner are dotted."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     hidden = -np.sign(_VIEW)
     for i, a in enumerate(corners):
         for b in corners[i + 1 :]:
+            # The ends of an edge differ in one coordinate.
             if np.count_nonzero(a != b) != 1:
                 continue
-            behind = np.array_equal(a, hidden) or np.array_equal(b, hidden)
-            color, dash = ("0.6", ":") if behind else ("0.2", "-")
+            is_hidden = np.array_equal(a, hidden) or np.array_equal(b, hidden)
+            color, dash = ("0.6", ":") if is_hidden else ("0.2", "-")
             axes.plot(*np.stack([a, b], axis=1), color=color, ls=dash, lw=1)
 
 
-def _draw_pad(
-    axes: Any, name: str, centre: NDArray[np.float64], normal: NDArray[np.float64], size: float
-) -> None:
+def _draw_pad(axes: Any, name: str, centre: Array, normal: Array, size: float) -> None:
+    """Draw a square pad with its name; size: side, in units of the half side of the cube."""
     u, w = np.eye(3)[np.flatnonzero(normal == 0)] * size / 2
     outline = np.array([centre + a * u + b * w for a, b in _SQUARE])
-    front = normal @ _VIEW > 0
-    color, dash, order = ("C0", "-", 3) if front else ("0.55", "--", 1)
+    is_in_front = normal @ _VIEW > 0
+    color, dash, order = ("C0", "-", 3) if is_in_front else ("0.55", "--", 1)
     axes.plot(*outline.T, color=color, lw=1.2, ls=dash, zorder=order)
-    if front:
+    if is_in_front:
         axes.add_collection3d(Poly3DCollection([outline], facecolor="C0", alpha=0.25, zorder=2))
     axes.text(
+        # A little above the face, so that the pad does not cover it.
         *(centre + 0.02 * normal),
         name,
         ha="center",
         va="center",
         fontsize=7,
-        color="black" if front else "0.45",
+        color="black" if is_in_front else "0.45",
         zorder=4,
     )
 
 
 @print_style()
-def draw_fit(fit: Fit, measured: NDArray[np.float64]) -> Figure:
-    """Measured over fitted pad stresses, and their differences; outliers are crossed.
+def draw_fit(fit: Fit, measured: Array) -> Figure:
+    """Draw measured over fitted pad stresses, and their differences; outliers are crossed.
 
-    measured: (N, P) Pa, the readings that were fitted
+    Args:
+        fit: The fit.
+        measured: (N, P) pad stresses that were fitted, in Pa.
     """
     figure = Figure(figsize=(8, 4))
     left, right = figure.subplots(1, 2)
     pads = fit.structure.layout.pads
     for pad, name in enumerate(pads):
-        keep = ~fit.outliers[:, pad]
-        x, y = fit.fitted[keep, pad] * 1e-3, measured[keep, pad] * 1e-3
+        is_used = ~fit.outliers[:, pad]
+        x, y = fit.fitted[is_used, pad] * 1e-3, measured[is_used, pad] * 1e-3
         style: dict[str, Any] = {
             "marker": MARKERS[pad % len(MARKERS)],
             "color": str(0.7 * pad / max(1, len(pads) - 1)),
@@ -96,14 +104,15 @@ def draw_fit(fit: Fit, measured: NDArray[np.float64]) -> Figure:
         }
         left.plot(x, y, label=name, **style)
         right.plot(x, (y - x) * 1e3, **style)
-    out = fit.outliers
-    if out.any():
-        fitted, read = fit.fitted[out] * 1e-3, measured[out] * 1e-3
-        left.plot(fitted, read, "x", color="C3", ms=7, label="outlier")
+
+    outliers = fit.outliers
+    if outliers.any():
+        x, y = fit.fitted[outliers] * 1e-3, measured[outliers] * 1e-3
+        left.plot(x, y, "x", color="C3", ms=7, label="outlier")
     ends = np.array([np.nanmin(fit.fitted), np.nanmax(fit.fitted)]) * 1e-3
     left.plot(ends, ends, color="0.5", lw=0.8, zorder=0)
     left.set(xlabel="fitted pad stress / kPa", ylabel="measured pad stress / kPa")
-    left.legend(fontsize=7, ncol=2 if len(pads) <= 12 else 3)
+    left.legend(fontsize=7, ncol=2 if len(pads) <= MAX_ONE_COLUMN_PADS else 3)
     right.axhline(0, color="0.5", lw=0.8)
     right.set(xlabel="fitted pad stress / kPa", ylabel="measured − fitted / Pa")
     right.set_title(

@@ -1,4 +1,4 @@
-"""The picture of the demo: the force on a whole skin over time."""
+"""The picture of the demo: force on the whole skin and centre of pressure over time."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from matplotlib.figure import Figure
 from ...core.arrays import Array
 from .style import print_style
 
-_AXES = (("x", "o", "C0", "--"), ("y", "s", "C1", ":"), ("z", "D", "black", "-"))
-"""Letter, marker, colour and dashes."""
+_AXIS_STYLES = (("x", "o", "C0", "--"), ("y", "s", "C1", ":"), ("z", "D", "black", "-"))
+"""Letter, marker, colour and dashes of each axis; they differ in grey, too."""
+
+MM = 1e3
+"""Millimetres in a metre."""
 
 
 @print_style()
@@ -23,10 +26,15 @@ def draw_forces(
     measured_centre: Array,
     cubes: Array,
 ) -> Figure:
-    """Force on a skin and its centre of pressure: as the script says (lines) and as measured.
+    """Draw what the load applies (lines) and what was measured (markers).
 
-    seconds: (N,) of the rows; force, measured_force: (N, 3) N; centre, measured_centre: (N, 3) m
-    cubes: (cubes, 3) m, where the cubes are; the centre's path is drawn over them
+    Args:
+        seconds: (N,) times.
+        force: (N, 3) applied force on the skin, in N.
+        measured_force: (N, 3) measured force, in N.
+        centre: (N, 3) applied centre of pressure, in metres.
+        measured_centre: (N, 3) measured centre of pressure, in metres.
+        cubes: (cubes, 3) positions of the cubes, in metres.
     """
     figure = Figure(figsize=(9, 5))
     panels: Any = figure.subplot_mosaic(
@@ -34,7 +42,7 @@ def draw_forces(
     )
     times = seconds - seconds.min()
     _draw_components(panels["force"], times, force, measured_force)
-    _draw_components(panels["centre"], times, 1e3 * centre, 1e3 * measured_centre)
+    _draw_components(panels["centre"], times, MM * centre, MM * measured_centre)
     handles, labels = panels["force"].get_legend_handles_labels()
     panels["force"].legend(
         handles,
@@ -48,19 +56,21 @@ def draw_forces(
     panels["centre"].set(
         xlabel="time / s", ylabel="centre of pressure / mm", xlim=panels["force"].get_xlim()
     )
+
+    # The x axis points up, as in the view of a person behind the skin.
     path = panels["path"]
-    path.plot(1e3 * cubes[:, 1], 1e3 * cubes[:, 0], "s", color="0.8", ms=3)
-    path.plot(1e3 * centre[:, 1], 1e3 * centre[:, 0], color="black", lw=1)
-    measured = 1e3 * measured_centre
+    path.plot(MM * cubes[:, 1], MM * cubes[:, 0], "s", color="0.8", ms=3)
+    path.plot(MM * centre[:, 1], MM * centre[:, 0], color="black", lw=1)
+    measured = MM * measured_centre
     path.plot(measured[:, 1], measured[:, 0], "o", color="C3", mfc="none", ms=3)
     path.set(xlabel="$y$ / mm", ylabel="$x$ / mm", aspect="equal")
     path.set_title("path of the centre of pressure\n(grey: cubes; circles: measured)", fontsize=9)
     return figure
 
 
-def _draw_components(panel: Any, times: Array, script: Array, measured: Array) -> None:
-    for axis, (letter, marker, color, dash) in enumerate(_AXES):
-        panel.plot(times, script[:, axis], color=color, lw=1, ls=dash)
+def _draw_components(panel: Any, times: Array, applied: Array, measured: Array) -> None:
+    for axis, (letter, marker, color, dash) in enumerate(_AXIS_STYLES):
+        panel.plot(times, applied[:, axis], color=color, lw=1, ls=dash)
         panel.plot(
             times, measured[:, axis], marker, color=color, mfc="none", ms=3, label=f"${letter}$"
         )

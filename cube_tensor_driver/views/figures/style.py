@@ -1,7 +1,7 @@
-"""How every picture looks: for print, readable in grey, with no display needed.
+"""The style of all pictures: for print, readable in grey, made without a display.
 
-matplotlib's global settings stay as they are. A drawing function has the decorator
-`@print_style()`, makes a `Figure` of its own and returns it; `save` writes it.
+A drawing function has the decorator `@print_style()`, makes a `Figure` and returns it; `save`
+writes it. The global settings of matplotlib stay as they are.
 """
 
 from __future__ import annotations
@@ -30,12 +30,16 @@ SETTINGS: Any = {
     "figure.constrained_layout.use": True,
     "savefig.dpi": 200,
 }
+"""Settings of matplotlib for a picture."""
+
 MARKERS = "osD^v<>pP*hX"
+"""Markers in the order in which they are used."""
 
 SIGNED_COLOURS = "cividis"
-"""Colour map of signed values. Its lightness grows all the way, unlike that of red to blue."""
+"""Colour map of signed values. Its lightness grows from end to end, unlike that of a map from red
+to blue, so that it can be read in grey."""
 
-# The same colour never comes with the same marker and dashes: curves differ in grey, too.
+# The lists have different lengths, so that no two curves look the same in grey.
 _CURVE_COLOURS = (
     "black",
     "tab:red",
@@ -52,13 +56,17 @@ _CURVE_DASHES = ("-", "--", "-.", ":")
 
 @contextmanager
 def print_style() -> Iterator[None]:
-    """matplotlib's settings for a picture, as a context or as a decorator."""
+    """Apply `SETTINGS`, in a block or as a decorator."""
     with matplotlib.rc_context(SETTINGS):
         yield
 
 
 def symbol(component: str) -> str:
-    """A component or mode in mathematical type: zz, zz_x for its derivative along x, xy_y-zx_z."""
+    """Return a component or mode in mathematical type.
+
+    Args:
+        component: Such as zz, zz_x (its derivative along x) or xy_y-zx_z (a difference).
+    """
     if "-" in component:
         return " − ".join(symbol(part) for part in component.split("-"))
     stress, _, direction = component.partition("_")
@@ -68,7 +76,7 @@ def symbol(component: str) -> str:
 
 
 def curve_style(number: int) -> dict[str, Any]:
-    """Colour, marker and dashes of a panel's curve of this number."""
+    """Return colour, marker and dashes of the curve with this number in a panel."""
     count = len(_CURVE_COLOURS)
     dashes = (number + number // count) % len(_CURVE_DASHES)
     return {
@@ -83,9 +91,14 @@ def curve_style(number: int) -> dict[str, Any]:
 
 @print_style()
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure, completely or not at all. The suffix tells the format, none means PNG.
+    """Write a figure, completely or not at all.
 
-    Raises ConfigError when the format is unknown or the file cannot be written.
+    Args:
+        figure: The figure.
+        path: The file; its suffix tells the format, and without one it is PNG.
+
+    Raises:
+        ConfigError: The format is unknown, or the file cannot be written.
     """
     check_picture(path)
     with atomic_write(path) as partial:
@@ -94,21 +107,21 @@ def save(figure: Figure, path: Path) -> None:
 
 @print_style()
 def png(figure: Figure) -> bytes:
-    """A figure as the content of a PNG file."""
+    """Return a figure as the content of a PNG file."""
     content = io.BytesIO()
     figure.savefig(content, format="png")
     return content.getvalue()
 
 
 def png_of_pixels(pixels: NDArray[np.uint8]) -> bytes:
-    """Pixels (rows, columns, 4) as the content of a PNG file."""
+    """Return pixels (rows, columns, 4) as the content of a PNG file."""
     content = io.BytesIO()
     imsave(content, pixels, format="png")
     return content.getvalue()
 
 
 def check_picture(path: Path) -> None:
-    """Raise ConfigError when the suffix is no picture format that matplotlib can write."""
+    """Raise ConfigError if the suffix is no picture format that matplotlib can write."""
     formats = FigureCanvasAgg.get_supported_filetypes()
     if path.suffix and path.suffix[1:].lower() not in formats:
         raise ConfigError(

@@ -1,7 +1,8 @@
-"""./cube plot: frequencies, stress, gradient and residual of one cube of a bag over time."""
+"""The picture of `./cube plot`: one cube of a bag over time."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,57 +11,78 @@ from matplotlib.figure import Figure
 
 from ...bags.reprocess.job import reconstruct
 from ...bags.source import BagSource
+from ...core.arrays import AnyArray
 from ...core.errors import BagError
 from ...core.modes import COMPONENTS, STRESS
 from ...core.status import INVALID, RESIDUAL
 from .style import MARKERS, print_style, symbol
 
 DASHES = ("-", "--", "-.", ":")
-GAP = 3.0
-"""Times the usual step: a longer one is a gap, which no line bridges."""
-MARKS = 12
-"""Markers on a line."""
-POINTS = 20_000
-"""Most points of a line; more do not show on paper."""
+
+MIN_GAP_STEPS = 3.0
+"""Time between two samples, in multiples of the usual one, above which no line connects them."""
+
+MARKERS_PER_LINE = 12
+"""Number of markers on a line."""
+
+MAX_POINTS = 20_000
+"""Approximate number of points of a line; more cannot be distinguished on paper."""
+
+MAX_NAMED_CUBES = 20
+"""Number of cubes that an error message names."""
 
 
 @dataclass(frozen=True, eq=False)
 class TimeSeries:
     """One cube over time, a row per sample.
 
-    seconds: (N,) after the start of the bag
-    frequency: (N, P) Hz; rest: (P,) Hz, the frequencies at rest
-    values: (N, 15) stress in Pa and gradient in Pa/m; NaN: not observed
-    residual: (N,) over noise; status: (N,) bits of core.status
+    Attributes:
+        name: Name of the cube.
+        pads: Names of its pads.
+        seconds: (N,) time after the start of the bag, in seconds.
+        frequency: (N, P) frequencies of the pads, in Hz.
+        rest: (P,) frequencies of the pads without load, in Hz.
+        values: (N, 15) stress in Pa and gradient in Pa/m; NaN where it is not observed.
+        residual: (N,) residual relative to the expected noise.
+        status: (N,) bits of core.status.
     """
 
     name: str
     pads: list[str]
-    seconds: np.ndarray
-    frequency: np.ndarray
-    rest: np.ndarray
-    values: np.ndarray
-    residual: np.ndarray
-    status: np.ndarray
+    seconds: AnyArray
+    frequency: AnyArray
+    rest: AnyArray
+    values: AnyArray
+    residual: AnyArray
+    status: AnyArray
 
 
 def cube_series(
     source: BagSource, name: str | None, start_s: float | None, end_s: float | None
 ) -> TimeSeries:
-    """A cube between two times after the bag's start; None: the first cube, from start to end.
+    """Read a cube of a bag; the stress is reconstructed from the recorded frequencies.
 
-    Stress is reconstructed from the frequencies, as it was when they were recorded. Raises BagError
-    when there is no such cube, or no sample in that time.
+    Args:
+        source: The bag.
+        name: Name of the cube; None: the first one.
+        start_s: Time after the start of the bag to begin at, in seconds; None: the start.
+        end_s: Time after the start of the bag to end at, in seconds; None: the end.
+
+    Raises:
+        BagError: There is no such cube, or it has no sample in this time.
     """
     bag = source.bag
     cubes = source.recording.infos[-1].cubes
     names = [cube.name for cube in cubes]
     if name is not None and name not in names:
-        raise BagError(f"{bag.path}: no cube {name!r}; there are {', '.join(names[:20])}")
+        raise BagError(
+            f"{bag.path}: no cube {name!r}; there are {', '.join(names[:MAX_NAMED_CUBES])}"
+        )
     number = 0 if name is None else names.index(name)
     n_pads = len(cubes[number].pads)
     start = 0.0 if start_s is None else start_s
     end = np.inf if end_s is None else end_s
+
     parts = []
     for segment, rows in reconstruct(source):
         seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
@@ -77,7 +99,7 @@ def cube_series(
             f"the bag is {length:.3f} s long"
         )
     joined = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    every = -(-len(joined[0]) // POINTS)
+    every = math.ceil(len(joined[0]) / MAX_POINTS)
     seconds, frequency, values, residual, status = (column[::every] for column in joined)
     return TimeSeries(
         name=names[number],
@@ -93,56 +115,66 @@ def cube_series(
 
 @print_style()
 def draw_series(series: TimeSeries, title: str) -> Figure:
-    """Four panels over one axis of time; components that are not observed are left out."""
+    """Draw four panels over one time axis, without components that are not observed."""
     series = _with_breaks(series)
     figure = Figure(figsize=(8, 9))
-    axes = figure.subplots(4, 1, sharex=True)
-    seconds, stresses = series.seconds, len(STRESS)
-    change = 100 * (series.frequency / series.rest - 1)
-    _draw_columns(axes[0], seconds, change, series.pads)
-    axes[0].set(ylabel="frequency above rest / %", title=f"{title}: cube {series.name}")
-    _draw_columns(
-        axes[1], seconds, series.values[:, :stresses] * 1e-3, [symbol(name) for name in STRESS]
-    )
-    axes[1].set(ylabel="stress / kPa (tension: +)")
-    gradients = [symbol(name) for name in COMPONENTS[stresses:]]
-    _draw_columns(axes[2], seconds, series.values[:, stresses:] * 1e-6, gradients)
-    axes[2].set(ylabel="gradient / (kPa/mm)")
-    axes[3].plot(seconds, series.residual, color="0.3", lw=0.8, label="residual")
+    top, stress_axes, gradient_axes, bottom = figure.subplots(4, 1, sharex=True)
+    seconds, n_stress = series.seconds, len(STRESS)
+
+    change_percent = 100 * (series.frequency / series.rest - 1)
+    _draw_columns(top, seconds, change_percent, series.pads)
+    top.set(ylabel="frequency above rest / %", title=f"{title}: cube {series.name}")
+
+    symbols = [symbol(name) for name in COMPONENTS]
+    stress_kpa = series.values[:, :n_stress] * 1e-3
+    _draw_columns(stress_axes, seconds, stress_kpa, symbols[:n_stress])
+    stress_axes.set(ylabel="stress / kPa (tension: +)")
+    gradient_kpa_per_mm = series.values[:, n_stress:] * 1e-6
+    _draw_columns(gradient_axes, seconds, gradient_kpa_per_mm, symbols[n_stress:])
+    gradient_axes.set(ylabel="gradient / (kPa/mm)")
+
+    bottom.plot(seconds, series.residual, color="0.3", lw=0.8, label="residual")
     for bit, label, marker in ((RESIDUAL, "residual too large", "x"), (INVALID, "invalid", "v")):
-        bad = series.status & bit > 0
-        if bad.any():
-            residual = np.nan_to_num(series.residual[bad])
-            axes[3].plot(seconds[bad], residual, marker, color="C3", ms=4, label=label)
-    axes[3].set(ylabel="residual / expected noise", xlabel="time after the start of the bag / s")
-    axes[3].legend(loc="upper right", fontsize=7)
+        is_marked = series.status & bit > 0
+        if is_marked.any():
+            residual = np.nan_to_num(series.residual[is_marked])
+            bottom.plot(seconds[is_marked], residual, marker, color="C3", ms=4, label=label)
+    bottom.set(ylabel="residual / expected noise", xlabel="time after the start of the bag / s")
+    bottom.legend(loc="upper right", fontsize=7)
     return figure
 
 
 def _with_breaks(series: TimeSeries) -> TimeSeries:
-    """The series with a row of NaN in each gap, where a line breaks off."""
+    """Insert a row of NaN in each gap, because lines end at NaN."""
     step = np.diff(series.seconds)
     if not len(step):
         return series
-    at = np.flatnonzero(step > GAP * np.median(step)) + 1
+    gaps = np.flatnonzero(step > MIN_GAP_STEPS * np.median(step)) + 1
     return replace(
         series,
-        seconds=np.insert(series.seconds, at, np.nan),
-        frequency=np.insert(series.frequency, at, np.nan, axis=0),
-        values=np.insert(series.values, at, np.nan, axis=0),
-        residual=np.insert(series.residual, at, np.nan),
-        status=np.insert(series.status, at, 0),
+        seconds=np.insert(series.seconds, gaps, np.nan),
+        frequency=np.insert(series.frequency, gaps, np.nan, axis=0),
+        values=np.insert(series.values, gaps, np.nan, axis=0),
+        residual=np.insert(series.residual, gaps, np.nan),
+        status=np.insert(series.status, gaps, 0),
     )
 
 
-def _draw_columns(axes: Any, seconds: np.ndarray, columns: np.ndarray, names: list[str]) -> None:
-    """Lines that differ in dashes, markers and lightness: they can be told apart in grey."""
+def _draw_columns(axes: Any, seconds: AnyArray, columns: AnyArray, names: list[str]) -> None:
+    """Draw lines that differ in dashes, markers and lightness, so that grey is enough.
+
+    Args:
+        axes: The panel.
+        seconds: (N,) times.
+        columns: (N, K) values; columns of NaN are left out.
+        names: K labels.
+    """
     shown = [
         (values, name)
         for values, name in zip(columns.T, names, strict=True)
         if np.isfinite(values).any()
     ]
-    step = max(1, len(seconds) // MARKS)
+    step = max(1, len(seconds) // MARKERS_PER_LINE)
     for number, (values, name) in enumerate(shown):
         axes.plot(
             seconds,
@@ -153,6 +185,7 @@ def _draw_columns(axes: Any, seconds: np.ndarray, columns: np.ndarray, names: li
             ms=4,
             marker=MARKERS[number % len(MARKERS)],
             mfc="white",
+            # Each line has its markers at other samples than the others.
             markevery=(number * step // len(shown), step),
             label=name,
         )
