@@ -79,8 +79,9 @@ def link_configs(
         )
     configs = []
     for link in skin.links:
-        in_directory = str(Path(port_directory) / link.name) if port_directory else ""
-        path = port or in_directory or link.port
+        path = port or link.port
+        if port_directory and not port:
+            path = str(Path(port_directory) / link.name)
         problem = port_problem(path)
         if problem:
             raise ConfigError(f"link {link.name}: port: {problem}")

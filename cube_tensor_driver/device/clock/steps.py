@@ -110,8 +110,11 @@ class SampleTiming:
         else:
             # Bounded, because a clock that stands still must not pass for a shorter period.
             bound = period / PERIOD_SAMPLES
-            bounded = bound if error > bound else -bound if error < -bound else error
-            self._period_us = period + bounded / PERIOD_SAMPLES
+            if error > bound:
+                error = bound
+            elif error < -bound:
+                error = -bound
+            self._period_us = period + error / PERIOD_SAMPLES
         # While the clock stands still, the deviation adds up from the last sample before.
         if interval or is_step or period <= 0.0:
             self._reference, self._reference_us = number, device_us

@@ -109,6 +109,7 @@ class CubeTable:
         cubes, problems = self._match(link, hello)
         if is_same and np.array_equal(cubes, hub.cubes):
             return None
+
         hub.cubes = cubes
         hub.complete = None
         is_known = cubes != ABSENT
@@ -150,7 +151,7 @@ class CubeTable:
         hub: _HubCubes,
         sample: Sample,
     ) -> tuple[RowIndex, Sample] | None:
-        """Find the cubes of the skin in a sample with other rows, and count these."""
+        """Find the cubes of the skin in a sample that also has other rows, and count those."""
         end = sample.first_cube + sample.n_cubes
         cubes = hub.cubes[sample.first_cube : end]
         is_known = cubes != ABSENT
@@ -187,14 +188,19 @@ class CubeTable:
         cubes = np.full(hello.n_cubes, ABSENT, np.int32)
         names: dict[str, list[str]] = {}  # of the cubes of the skin, by what is wrong with them
         for number, address in enumerate(self._addresses):
-            found, problem = _locate(address, link, hello, index_of_uid, number in claimed)
+            is_claimed = number in claimed
+            found, problem = _locate(address, link, hello, index_of_uid, is_claimed)
             if found is not None:
                 cubes[found] = number
             if problem:
                 names.setdefault(problem, []).append(str(address))
         self._hubs[link].waits_for_cube = _OTHER_LINK_HAS_IT in names
-        problems = [_join_names("cube", group, text) for text, group in names.items()]
+        problems = [
+            _join_names("cube", group, text)  # one line for all cubes with the same problem
+            for text, group in names.items()
+        ]
 
+        # The other cubes of the hub are not in the skin, or their uid is not unique.
         repeated: list[str] = []
         unknown: list[str] = []
         for index in np.flatnonzero(cubes == ABSENT).tolist():

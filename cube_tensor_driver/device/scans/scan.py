@@ -179,7 +179,8 @@ class ScanBuilder:
         Returns:
             The rows; None if the skin has none of them.
         """
-        parts, self._deferred = _split_by_span(self._deferred or self._take_scans(max_scans))
+        taken = self._deferred or self._take_scans(max_scans)
+        parts, self._deferred = _split_by_span(taken)
         if not parts:
             return None
         n_rows = sum(len(part.cubes) for part in parts)
@@ -211,7 +212,8 @@ class ScanBuilder:
             self._holds_back = True
         n_scans = self._n_scans_to_build()
         if max_scans is not None and n_scans > max_scans:
-            n_scans, self._holds_back = max_scans, False
+            n_scans = max_scans
+            self._holds_back = False
 
         # They are removed before anything can fail, so that an error does not repeat for ever.
         scans = self._pending[:n_scans]
@@ -243,8 +245,8 @@ class ScanBuilder:
                 limits_ns.append((stamp_ns + last_ns) / 2)
             else:
                 limits_ns.append(0.0)  # another frame of the sample that was built last
-        oldest_ns = min(self._built_ns[link] for link in missing)
-        return oldest_ns > min(limits_ns)
+        built_ns = [self._built_ns[link] for link in missing]
+        return min(built_ns) > min(limits_ns)
 
     def _n_scans_to_build(self) -> int:
         """Return the number of scans that every live link has reached.
@@ -293,7 +295,9 @@ class ScanBuilder:
         return bisect_left(times, stamp_ns - tolerance)
 
 
-def _split_by_span(parts: list[_SampleRows]) -> tuple[list[_SampleRows], list[_SampleRows]]:
+def _split_by_span(
+    parts: list[_SampleRows],
+) -> tuple[list[_SampleRows], list[_SampleRows]]:
     """Return the samples within `MAX_SPAN_NS` of the earliest, and the others."""
     if not parts:
         return [], []
@@ -302,7 +306,8 @@ def _split_by_span(parts: list[_SampleRows]) -> tuple[list[_SampleRows], list[_S
     if max(stamps_ns) <= end_ns:
         return parts, []
     within = [part for part in parts if part.stamp_ns <= end_ns]
-    return within, [part for part in parts if part.stamp_ns > end_ns]
+    beyond = [part for part in parts if part.stamp_ns > end_ns]
+    return within, beyond
 
 
 def _fill(

@@ -170,8 +170,13 @@ class NativeDecoder:
 
 def unpack_all(raws: list[bytes]) -> list[Frame]:
     """Return the frames of the bytes that the decoder in C gives and has checked."""
-    unpacked = (UNPACK[raw[0]](raw, len(raw) - OVERHEAD) for raw in raws)
-    return [frame for frame in unpacked if frame is not None]
+    frames: list[Frame] = []
+    for raw in raws:
+        unpack = UNPACK[raw[0]]
+        frame = unpack(raw, len(raw) - OVERHEAD)
+        if frame is not None:
+            frames.append(frame)
+    return frames
 
 
 Decoder = PythonDecoder if wire is None else NativeDecoder
