@@ -213,7 +213,7 @@ class LiveLinks:
                 # All rows are counted first, so that an error in one frame hides no other.
                 for frame in frames:
                     if isinstance(frame, Sample):
-                        self._rows.received += frame.n_cubes
+                        self._rows.received += frame.shape[0]
                 try:
                     # A round trip during which the clock was set gives no bound.
                     self._handle_frames(link, arrival_ns, frames, 0 if step_ns else asked_ns)

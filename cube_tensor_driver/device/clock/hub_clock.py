@@ -194,12 +194,11 @@ class HubClock:
         # Of samples that arrive together the newest waited least; only it can touch the line.
         is_usable = self._learn(max(times), arrival_ns)
         offset, drift = self._line.bounded_offset, self._line.drift
-        first_ns, first_us = self._first_ns, self._first_us
         stamps = []
         for time_us in times:
-            device_ns = 1000 * (time_us - first_us)
-            stamp = first_ns + device_ns + round(offset + drift * device_ns)
-            if stamp > arrival_ns or not is_usable or stamp < arrival_ns - MAX_DELAY_NS:
+            device_ns = 1000 * (time_us - self._first_us)
+            stamp = self._first_ns + device_ns + round(offset + drift * device_ns)
+            if not is_usable or not 0 <= arrival_ns - stamp <= MAX_DELAY_NS:
                 stamp = arrival_ns
             # Along device time stamps do not go back, not even behind those that were in doubt.
             if device_ns <= self._newest and is_usable:

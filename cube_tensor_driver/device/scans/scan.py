@@ -183,8 +183,7 @@ class ScanBuilder:
         parts, self._deferred = _split_by_span(taken)
         if not parts:
             return None
-        n_rows = sum(len(part.cubes) for part in parts)
-        rows = make_rows(n_rows, self.cubes.n_pads)
+        rows = make_rows(sum(_n_rows(parts)), self.cubes.n_pads)
         # Usually all cubes have the same number of pads, and then nothing needs to be selected.
         if len({part.sample.n_pads for part in parts}) == 1:
             _fill(rows, parts, self._columns_of)
@@ -320,13 +319,13 @@ def _fill(
     Frequencies of pads that a cube does not have become NaN.
     """
     np.concatenate([part.cubes for part in parts], out=rows.cube)
-    counts = [len(part.cubes) for part in parts]
-    statuses = [part.status for part in parts]
-    rows.status[:] = np.repeat(statuses, counts) if any(statuses) else 0
+    rows.status[:] = 0
+    if any(part.status for part in parts):
+        rows.status[:] = np.repeat([part.status for part in parts], _n_rows(parts))
 
     raws = [part.sample.raw for part in parts]
     if wire is None or not all(raws):
-        _fill_in_python(rows, parts, counts)
+        _fill_in_python(rows, parts)
         return
     n_rows, n_pads = rows.frequency.shape
     columns = columns_of(n_rows, n_pads)
@@ -362,13 +361,15 @@ class _Columns:
         rows.frequency[:] = self._frequency
 
 
-def _fill_in_python(
-    rows: FrequencyRows,
-    parts: Sequence[_SampleRows],
-    counts: Sequence[int],
-) -> None:
+def _n_rows(parts: Sequence[_SampleRows]) -> list[int]:
+    """Return the number of rows of each sample."""
+    return [len(part.cubes) for part in parts]
+
+
+def _fill_in_python(rows: FrequencyRows, parts: Sequence[_SampleRows]) -> None:
     """Write the values of samples into rows, without the wire module in C."""
     samples = [part.sample for part in parts]
+    counts = _n_rows(parts)
     numbers = [sample.sequence for sample in samples]
     rows.sequence[:] = np.repeat(numbers, counts)
     stamps_ns = [part.stamp_ns for part in parts]
