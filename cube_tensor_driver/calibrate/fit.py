@@ -220,14 +220,21 @@ def fit(
 
     residuals = model.residuals(theta, design, y) / scale
     covariance = robust_covariance(jacobian, residuals, scale)
+    # The pseudo-inverse gives undetermined coefficients a small variance, which means nothing.
     covariance[:n_free][is_open] = np.nan
     covariance[:, :n_free][:, is_open] = np.nan
-    of_coefficients = np.zeros((structure.n_coefficients, structure.n_coefficients))
-    of_coefficients[np.ix_(model.free, model.free)] = covariance[:n_free, :n_free]
-    of_gains = model.gains @ covariance[n_free:, n_free:] @ model.gains.T
+    # Fixed coefficients have no error.
+    n = structure.n_coefficients
+    of_coefficients = np.zeros((n, n))
+    free = np.array(model.free, dtype=int)
+    of_coefficients[np.ix_(free, free)] = covariance[:n_free, :n_free]
+    of_coordinates = covariance[n_free:, n_free:]
+    of_gains = model.gains @ of_coordinates @ model.gains.T
     coefficients, gain = model.unpack(theta)
-    coefficients[np.array(model.free, dtype=int)[is_open]] = np.nan
+    coefficients[free[is_open]] = np.nan
     deviations = np.sqrt(np.diag(of_coefficients))
+    # Rounding can make the variance of a gain without error slightly negative.
+    gain_variance = np.diag(of_gains).clip(0)
 
     fitted = model.predict(theta, design)
     is_used = weights > 0
@@ -239,7 +246,7 @@ def fit(
         deviations=dict(zip(structure.names, deviations.tolist(), strict=True)),
         covariance=of_coefficients,
         gain=gain,
-        gain_deviation=np.sqrt(np.diag(of_gains).clip(0)),
+        gain_deviation=np.sqrt(gain_variance),
         scale=float(scale),
         chi2=float(np.sum(whitened[is_used] ** 2)),
         dof=int(is_used.sum()) - n_determined,
@@ -269,7 +276,8 @@ class _Model:
     ) -> None:
         self.structure, self.noise = structure, noise
         self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
-        self._fixed = np.array([fixed.get(name, 0.0) for name in structure.names], dtype=float)
+        values = [fixed.get(name, 0.0) for name in structure.names]
+        self._fixed = np.array(values, dtype=float)
         n_pads = structure.layout.n_pads
         columns = []
         for first, *others in structure.pad_orbits if gains else ():
@@ -277,13 +285,15 @@ class _Model:
                 column = np.zeros(n_pads)
                 column[pad], column[first] = 1, -1
                 columns.append(column)
+        # The reshape gives an empty matrix its width if there are no gains to fit.
         self.gains: Array = np.array(columns).reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
         """Return the coefficients (K,), including fixed ones, and the gains (P,) of parameters."""
         coefficients = self._fixed.copy()
         coefficients[self.free] = theta[: len(self.free)]
-        return coefficients, 1 + self.gains @ theta[len(self.free) :]
+        coordinates = theta[len(self.free) :]
+        return coefficients, 1 + self.gains @ coordinates
 
     def design(self, x: Array) -> Array:
         """Return what each coefficient adds to each reading (N, P, K) for loads (N, M), at gain
@@ -304,14 +314,16 @@ class _Model:
         y: Array,
     ) -> Array:
         """Return the whitened residuals (N P,)."""
-        residuals: Array = (y - self.predict(theta, design)) / self.noise
+        difference = y - self.predict(theta, design)
+        residuals: Array = difference / self.noise
         return residuals.ravel()
 
     def jacobian(self, theta: Array, design: Array) -> Array:
         """Return the derivatives (N P, parameters) of the whitened predictions."""
         coefficients, gain = self.unpack(theta)
         by_coefficient = design[:, :, self.free] * gain[:, None]
-        by_gain = (design @ coefficients)[:, :, None] * self.gains
+        at_gain_1 = design @ coefficients
+        by_gain = at_gain_1[:, :, None] * self.gains
         derivatives = np.concatenate([by_coefficient, by_gain], axis=2)
         whitened: Array = derivatives / self.noise[:, None]
         return whitened.reshape(-1, theta.size)
@@ -322,7 +334,8 @@ class _Model:
         Returns:
             Parameters, weights of the readings (N, P), and scatter in units of the noise.
         """
-        theta = np.zeros(len(self.free) + self.gains.shape[1])
+        n_parameters = len(self.free) + self.gains.shape[1]
+        theta = np.zeros(n_parameters)
         weights = np.ones(y.size)
         scale = 1.0
         for stage, tolerance in STAGES.items():
@@ -333,11 +346,14 @@ class _Model:
                     scale = estimate_scatter(r)
                 if stage != "plain":
                     weights = compute_weights(stage, r / scale)
+                # Rows times the roots of their weights make a weighted least squares problem.
                 root = np.sqrt(weights)
                 weighted = root[:, None] * self.jacobian(theta, design)
                 step = least_squares(weighted, root * r)
                 theta = theta + step
-                if np.linalg.norm(step) <= tolerance * (1 + np.linalg.norm(theta)):
+                # The 1 makes the tolerance absolute for parameters near 0.
+                limit = tolerance * (1 + np.linalg.norm(theta))
+                if np.linalg.norm(step) <= limit:
                     break
         return theta, weights.reshape(y.shape), scale
 
@@ -355,14 +371,16 @@ def _check_inputs(
         x, y, sigma = (np.array(values, dtype=float) for values in (loads, measured, noise))
     except (TypeError, ValueError):
         raise FitError("loads, measured stresses and noise must be numbers") from None
-    if x.ndim != 2 or x.shape[1] != n_modes or y.shape != (len(x), n_pads) or not len(x):
+    has_loads = x.ndim == 2 and len(x) > 0 and x.shape[1] == n_modes
+    if not has_loads or y.shape != (len(x), n_pads):
         raise FitError(
             f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} "
             f"needs (loads, {n_modes}) and (loads, {n_pads}) with at least one load"
         )
     _refuse_unknown("load", x, structure.modes.names)
     _refuse_unknown("reading", y, structure.layout.pads)
-    if sigma.shape not in ((), (n_pads,)) or not np.all(sigma > 0):
+    has_shape = sigma.shape in ((), (n_pads,))
+    if not has_shape or not np.all(sigma > 0):
         raise FitError(
             f"noise is {sigma.tolist()}; it must be one number or {n_pads}, each above 0 Pa"
         )
@@ -406,8 +424,10 @@ def _cross_validate(
         is_out = fold == k
         theta, _, _ = model.solve(design[~is_out], y[~is_out])
         errors[is_out] = y[is_out] - model.predict(theta, design[is_out])
+    # Outliers would dominate both means.
     mean_square_error = np.mean(errors[is_used] ** 2)
-    return float(np.sqrt(mean_square_error / np.mean(y[is_used] ** 2)))
+    mean_square_reading = np.mean(y[is_used] ** 2)
+    return float(np.sqrt(mean_square_error / mean_square_reading))
 
 
 def _advise(
@@ -430,22 +450,26 @@ def _advise(
         One sentence for each load to add.
     """
     advice = []
-    names = np.array(model.structure.names, dtype=object)[np.array(model.free, dtype=int)]
+    # As arrays of objects, names can be selected with masks.
+    free = np.array(model.free, dtype=int)
+    names = np.array(model.structure.names, dtype=object)[free]
     theta = theta.copy()
     # At the value 0 of a coefficient, the gains of the new load would seem undetermined.
     theta[: len(names)][is_open] = 0.5
+    # The advised loads are as large as those given, with which the fit was good.
     size = np.sqrt(np.mean(x[x != 0] ** 2))
+    single_modes = size * np.eye(x.shape[1])
     loads = x
     while is_open.any():
-        candidates = [np.vstack([loads, load]) for load in size * np.eye(x.shape[1])]
-        jacobians = [model.jacobian(theta, model.design(candidate)) for candidate in candidates]
-        null_spaces = [null_space(jacobian) for jacobian in jacobians]
+        candidates = [np.vstack([loads, load]) for load in single_modes]
+        designs = [model.design(candidate) for candidate in candidates]
+        null_spaces = [null_space(model.jacobian(theta, design)) for design in designs]
         opens = [find_undetermined(each, len(names)) for each in null_spaces]
         # The best load determines most coefficients, then most directions of the parameters.
         left = [
             (open_.sum(), each.shape[1]) for open_, each in zip(opens, null_spaces, strict=True)
         ]
-        best = min(range(len(left)), key=left.__getitem__)
+        best = left.index(min(left))
         if null_spaces[best].shape[1] >= null.shape[1]:
             advice.append(
                 f"no load determines {', '.join(names[is_open])}: "

@@ -77,7 +77,8 @@ def read_loads(
     modes = default_modes(layout)
     _check_columns(path, header, layout, modes)
     columns = dict(zip(header, cells.T, strict=True))
-    frequency = np.stack([columns[pad] for pad in layout.pads], axis=1)
+    by_pad = [columns[pad] for pad in layout.pads]
+    frequency = np.stack(by_pad, axis=1)
     state = _read_states(path, columns, modes, area)
     return Loads(state, frequency, columns.get(TEMPERATURE))
 
@@ -89,6 +90,7 @@ def _check_columns(
     modes: Modes,
 ) -> None:
     allowed = {*layout.pads, *modes.names, *FORCE, TEMPERATURE}
+    # All columns are checked before any is used, so that one message names all of them.
     mistakes = {
         "unknown": [name for name in header if name not in allowed],
         "twice": sorted({name for name in header if header.count(name) > 1}),
@@ -112,6 +114,7 @@ def _read_states(
     """Return amplitudes (N, M), in Pa, from the columns of modes or of forces."""
     forces = [name for name in FORCE if name in columns]
     amplitudes = [name for name in modes.names if name in columns]
+    # Both together could contradict each other.
     if bool(forces) == bool(amplitudes):
         found = "both" if amplitudes else "neither"
         raise FitError(
@@ -119,8 +122,9 @@ def _read_states(
             "give the load in one of the two ways"
         )
     if amplitudes:
-        zero = np.zeros(len(columns[amplitudes[0]]))
-        return np.stack([columns.get(name, zero) for name in modes.names], axis=1)
+        zero = np.zeros_like(columns[amplitudes[0]])
+        by_mode = [columns.get(name, zero) for name in modes.names]
+        return np.stack(by_mode, axis=1)
     if area is None:
         raise FitError(f"{path}: the loads are forces; give the area they act on in m² (--area)")
     if len(forces) < len(FORCE):
@@ -160,7 +164,9 @@ def _read_lines(path: Path) -> list[list[str]]:
     try:
         # Spreadsheet programs begin a file with a byte order mark, which this encoding removes.
         text = read_bounded(path, MAX_BYTES, "table of loads").decode("utf-8-sig")
-        lines = list(csv.reader(io.StringIO(text, newline="")))
+        # The csv module reads the ends of lines itself, also those within quotes.
+        file = io.StringIO(text, newline="")
+        lines = list(csv.reader(file))
     except ConfigError as error:
         raise FitError(str(error)) from None
     except OSError as error:

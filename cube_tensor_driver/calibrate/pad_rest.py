@@ -58,28 +58,37 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     is_measured = np.isfinite(frequency)
     counts = is_measured.sum(axis=0)
     # A count of at least 1 avoids a division by 0; pads without a sample are silent, see below.
-    mean = np.where(is_measured, frequency, 0).sum(axis=0) / np.maximum(counts, 1)
+    total = np.where(is_measured, frequency, 0).sum(axis=0)
+    mean = total / np.maximum(counts, 1)
     deviation = np.where(is_measured, frequency - mean, 0)
 
+    # Second differences remove drift, which would count as noise in a standard deviation.
     second = np.diff(frequency, n=2, axis=0)
-    n_second = np.maximum(np.isfinite(second).sum(axis=0), 1)
-    noise = np.sqrt(np.nansum(second**2, axis=0) / (6 * n_second))
-    time = np.where(is_measured, (seconds - seconds.mean())[:, None, None], 0)
-    sum_time_squares = np.maximum((time**2).sum(axis=0), 1e-12)
-    slope = (deviation * time).sum(axis=0) / sum_time_squares
+    n_second = np.isfinite(second).sum(axis=0)
+    sum_squares = np.nansum(second**2, axis=0)
+    noise = np.sqrt(sum_squares / (6 * np.maximum(n_second, 1)))
+    centred = seconds - seconds.mean()
+    time = np.where(is_measured, centred[:, None, None], 0)
+    sum_time_squares = (time**2).sum(axis=0)
+    covariance = (deviation * time).sum(axis=0)
+    slope = covariance / np.maximum(sum_time_squares, 1e-12)
 
     silent = counts < MIN_MEASURED_SHARE * len(frequency)
     highest = np.where(is_measured, deviation, -np.inf).max(axis=0)
     lowest = np.where(is_measured, deviation, np.inf).min(axis=0)
     span = highest - lowest
     varies = ~silent & (span > 0)
-    stuck = ~silent & (span == 0) & varies.any(axis=1, keepdims=True)
+    # If all pads of a cube show a single value, it may be a simulated cube without noise.
+    others_vary = varies.any(axis=1, keepdims=True)
+    stuck = ~silent & (span == 0) & others_vary
 
-    scale = np.where(silent | (mean <= 0), np.nan, mean)
+    has_frequency = ~silent & (mean > 0)
+    scale = np.where(has_frequency, mean, np.nan)
     relative_noise = noise / scale
     usual = np.full(len(relative_noise), np.inf)
     for cube in np.flatnonzero(varies.any(axis=1)):
-        usual[cube] = np.median(relative_noise[cube][varies[cube]])
+        of_varying = relative_noise[cube][varies[cube]]
+        usual[cube] = np.median(of_varying)
     noisy = varies & (relative_noise > NOISY_ENTER * usual[:, None])
     return PadsAtRest(
         frequency=scale,

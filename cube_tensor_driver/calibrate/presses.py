@@ -17,7 +17,7 @@ rotation is one change, and a swap of two pads is one change.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from ..mechanics.contact import disc, field
 MIN_PRESS_NOISE_RATIO = 30.0
 """Smallest frequency change of a press, as a multiple of the median noise of the pads.
 
-Noise, and vibration of the table, stay below it.
+Smaller changes may be noise.
 """
 
 MIN_PRESS_CHANGE = 2e-4
@@ -127,7 +127,8 @@ class PressDetector:
             A press when it has become steady, once; otherwise None.
         """
         with np.errstate(invalid="ignore"):  # NaN where nothing was measured
-            change = np.where(self._works, mean / self._rest - 1, np.nan)
+            relative = mean / self._rest - 1
+        change = np.where(self._works, relative, np.nan)
         before, self._before = self._before, change
         size = np.nan_to_num(np.abs(change))
         strongest = size.max()
@@ -137,7 +138,9 @@ class PressDetector:
             self.is_held = False
         if self.is_held or before is None or strongest < self._limit:
             return None
-        if np.nanmax(np.abs(change[cube] - before[cube])) > STEADY_SHARE * strongest:
+        # While the finger still moves, pads keep changing relative to each other.
+        movement = np.nanmax(np.abs(change[cube] - before[cube]))
+        if movement > STEADY_SHARE * strongest:
             return None
         self.is_held = True
         return SteadyPress(cube, change[cube])
@@ -178,12 +181,17 @@ def expected_presses(
     loaded = finger + places[:, :, None, :]
     stress, slope = field(cube_position, loaded, force, POISSONS_RATIO)
     # The slope is ordered (..., k, component); a gradient is (..., i, j, k).
-    gradient = np.moveaxis(to_matrix(np.moveaxis(slope, -1, -2)), -3, -1)
+    by_component = np.moveaxis(slope, -1, -2)
+    gradient = np.moveaxis(to_matrix(by_component), -3, -1)
 
-    to_cube = np.swapaxes(rotations, -1, -2)[:, None, None, None]
+    # The inverse of each rotation takes the field of the skin into the frame of the cube.
+    inverse = np.swapaxes(rotations, -1, -2)
+    to_cube = inverse[:, None, None, None]
+    rotated_stress = rotate_stress(stress, to_cube)
+    rotated_gradient = rotate_gradient(gradient, to_cube)
     state = calibration.modes.state(
-        rotate_stress(stress, to_cube).reshape(-1, 6),
-        rotate_gradient(gradient, to_cube).reshape(-1, 3, 3, 3) * calibration.half_side,
+        rotated_stress.reshape(-1, 6),
+        rotated_gradient.reshape(-1, 3, 3, 3) * calibration.half_side,
     )
     on_pads: Array = state @ calibration.response.T
     return on_pads.reshape(len(rotations), len(SIDES), len(distances), -1)
@@ -243,7 +251,7 @@ def explain_presses(measured: Array, expected: Array) -> Explanation:
     fewest = min(each.changes for each in similar)
     simplest = [each for each in similar if each.changes == fewest]
     best = min(simplest, key=lambda each: each.misfit)
-    return Explanation(best.rotation, best.places, best.misfit, is_certain=len(simplest) == 1)
+    return replace(best, is_certain=len(simplest) == 1)
 
 
 def _find_order(measured: Array, expected: Array) -> tuple[Index, float]:
@@ -282,7 +290,9 @@ def _misfit(
     # The force of a press is unknown but pushes, so only a positive scale is fitted.
     projection = np.maximum(0, np.einsum("kp,kgsp->kgs", m, e))
     total = (m**2).sum(axis=1)
-    unexplained = total[:, None, None] - projection**2 / (e * e).sum(axis=3)
-    best_distance = np.maximum(0, unexplained.min(axis=1))
-    misfit: Array = np.sqrt(best_distance.sum(axis=0) / total.sum())
+    explained = projection**2 / (e * e).sum(axis=3)
+    unexplained = total[:, None, None] - explained
+    # Rounding can leave a value just below 0.
+    at_best_distance = np.maximum(0, unexplained.min(axis=1))
+    misfit: Array = np.sqrt(at_best_distance.sum(axis=0) / total.sum())
     return misfit

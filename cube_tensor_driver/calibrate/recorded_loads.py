@@ -3,6 +3,7 @@ same time. They are the input of a fit."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,11 +79,15 @@ def read_recorded_loads(
         reference_ns, state = _read_reference(
             source.bag, reference, number, layout, area, calibration.half_side
         )
-    following = np.clip(np.searchsorted(reference_ns, stamp_ns), 1, len(reference_ns) - 1)
+    # Number of the message after each sample; the first and the last have no neighbour.
+    following = np.searchsorted(reference_ns, stamp_ns)
+    following = following.clip(1, len(reference_ns) - 1)
     steps = np.diff(reference_ns)
     is_close = steps[following - 1] <= MAX_STEP_RATIO * np.median(steps)
-    is_within = (stamp_ns >= reference_ns[0]) & (stamp_ns <= reference_ns[-1])
-    used = is_within & is_close & np.isfinite(frequency).all(axis=1)
+    is_after_start = stamp_ns >= reference_ns[0]
+    is_before_end = stamp_ns <= reference_ns[-1]
+    is_complete = np.isfinite(frequency).all(axis=1)
+    used = is_after_start & is_before_end & is_close & is_complete
     if not used.any():
         raise BagError(
             f"{path}: the frequencies of {source.skin.cubes[number].name} and {reference} have no "
@@ -92,13 +97,14 @@ def read_recorded_loads(
     # Seconds from the first message, because a float does not hold nanoseconds since 1970.
     seconds = (stamp_ns[used] - reference_ns[0]) / SECOND
     known = (reference_ns - reference_ns[0]) / SECOND
-    states = np.stack([np.interp(seconds, known, column) for column in state.T], axis=1)
-    size = -(-len(seconds) // MAX_LOADS)
+    by_mode = [np.interp(seconds, known, amplitude) for amplitude in state.T]
+    size = math.ceil(len(seconds) / MAX_LOADS)
     mean_temperature = _average_neighbours(temperature[used].astype(float), size)
+    has_temperature = np.isfinite(mean_temperature).all()
     loads = Loads(
-        state=_average_neighbours(states, size),
+        state=_average_neighbours(np.stack(by_mode, axis=1), size),
         frequency=_average_neighbours(frequency[used].astype(float), size),
-        temperature=mean_temperature if np.isfinite(mean_temperature).all() else None,
+        temperature=mean_temperature if has_temperature else None,
     )
     return loads, replace(calibration, rest_frequency=rest)
 
@@ -129,7 +135,8 @@ def _read_samples(
     """
     parts = []
     for rows in source:
-        chosen = rows.select((rows.cube == number) & (rows.pad_fault == 0))
+        is_good = (rows.cube == number) & (rows.pad_fault == 0)
+        chosen = rows.select(is_good)
         parts.append((chosen.stamp_ns, chosen.frequency[:, :n_pads], chosen.temperature))
     stamp_ns, frequency, temperature = (
         np.concatenate(column) for column in zip(*parts, strict=True)
@@ -154,7 +161,8 @@ def _read_reference(
         messages = [bag.decode(entry) for entry in bag.entries({topic})]
         stamps = [message.header.stamp for message in messages]
         read = _read_force if msgtype == WRENCH_TYPE else _read_components
-        stamp_ns = np.array([stamp.sec * SECOND + stamp.nanosec for stamp in stamps], np.int64)
+        times = [stamp.sec * SECOND + stamp.nanosec for stamp in stamps]
+        stamp_ns = np.array(times, np.int64)
         values = np.array([read(message) for message in messages])
     else:
         topics = ", ".join(sorted({one.topic for one in bag.connections}))
@@ -184,6 +192,7 @@ def _read_reference(
     for column, mode in zip(state.T, modes.names, strict=True):
         if mode in COMPONENTS:
             column[:] = values[:, COMPONENTS.index(mode)]
+    # Components that the reference does not observe are taken as 0, as missing modes are.
     return stamp_ns, np.nan_to_num(state)
 
 
@@ -212,8 +221,9 @@ def _read_components(message: Any) -> list[float]:
     """Return the 15 components of a StressTensorStamped."""
     tensor = message.tensor
     normal, shear = tensor.normal, tensor.shear
-    stress = [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z]
-    return [*stress, *tensor.normal_gradient]
+    normal_stress = [normal.x, normal.y, normal.z]
+    shear_stress = [shear.x, shear.y, shear.z]
+    return [*normal_stress, *shear_stress, *tensor.normal_gradient]
 
 
 def _average_neighbours(values: Array, size: int) -> Array:
@@ -222,6 +232,7 @@ def _average_neighbours(values: Array, size: int) -> Array:
     Values at the end that do not fill a group are left out.
     """
     n_groups = len(values) // size
-    groups = values[: n_groups * size].reshape(n_groups, size, *values.shape[1:])
+    complete = values[: n_groups * size]
+    groups = complete.reshape(n_groups, size, *values.shape[1:])
     means: Array = groups.mean(axis=1)
     return means

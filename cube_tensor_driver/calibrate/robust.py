@@ -44,16 +44,19 @@ def estimate_scatter(r: Array) -> float:
 
     The result is never 0, so that perfect data have a scale, too.
     """
-    return max(NORMAL_MEDIAN_RATIO * float(np.median(np.abs(r))), 1e-12)
+    median = float(np.median(np.abs(r)))
+    return max(NORMAL_MEDIAN_RATIO * median, 1e-12)
 
 
 def compute_weights(stage: str, r: Array) -> Array:
     """Compute the weights, by Huber or by Tukey, of residuals in units of their scatter."""
     size = np.abs(r)
     if stage == "huber":
+        # The smallest float above 0 avoids a division by 0 for a perfect fit.
         weights: Array = np.minimum(1, HUBER_LIMIT / np.maximum(size, 1e-300))
         return weights
-    return np.where(size < TUKEY_LIMIT, (1 - (r / TUKEY_LIMIT) ** 2) ** 2, 0)
+    u = (r / TUKEY_LIMIT) ** 2
+    return np.where(size < TUKEY_LIMIT, (1 - u) ** 2, 0)
 
 
 def least_squares(a: Array, b: Array) -> Array:
@@ -62,7 +65,8 @@ def least_squares(a: Array, b: Array) -> Array:
     Directions that a does not determine are 0.
     """
     scaled, size = _scale_columns(a)
-    solution: Array = np.linalg.lstsq(scaled, b, rcond=DIRECTION_TOLERANCE)[0] / size
+    x, *_ = np.linalg.lstsq(scaled, b, rcond=DIRECTION_TOLERANCE)
+    solution: Array = x / size
     return solution
 
 
@@ -70,14 +74,18 @@ def null_space(jacobian: Array) -> Array:
     """Return a basis (parameters, H) of the changes of scaled parameters that no reading shows."""
     scaled, _ = _scale_columns(jacobian)
     _, s, vt = np.linalg.svd(scaled, full_matrices=True)
-    rank = int(np.sum(s > DIRECTION_TOLERANCE * s[0])) if s[0] > 0 else 0
+    # If no parameter changes a reading, every direction belongs to the null space.
+    rank = 0
+    if s[0] > 0:
+        rank = int(np.sum(s > DIRECTION_TOLERANCE * s[0]))
     directions: Array = vt[rank:].T
     return directions
 
 
 def find_undetermined(null: Array, count: int) -> Mask:
     """Return which of the first parameters (count,) a direction of the null space changes."""
-    undetermined: Mask = np.linalg.norm(null[:count], axis=1) > DIRECTION_TOLERANCE
+    part = np.linalg.norm(null[:count], axis=1)
+    undetermined: Mask = part > DIRECTION_TOLERANCE
     return undetermined
 
 
@@ -98,7 +106,9 @@ def robust_covariance(
     Returns:
         Covariance (C, C).
     """
-    u = np.where(np.abs(r) < TUKEY_LIMIT, (r / TUKEY_LIMIT) ** 2, 1)
+    # u is 1 for outliers, for which psi and its slope are then 0.
+    is_inlier = np.abs(r) < TUKEY_LIMIT
+    u = np.where(is_inlier, (r / TUKEY_LIMIT) ** 2, 1)
     psi_squared = np.mean((r * (1 - u) ** 2) ** 2)
     psi_slope = np.mean((1 - u) * (1 - 5 * u))
     rank = jacobian.shape[1] - null_space(jacobian).shape[1]

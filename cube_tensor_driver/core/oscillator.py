@@ -38,7 +38,7 @@ def pad_stress(
     """Compute normal stresses in Pa, tension positive, from frequencies in Hz."""
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
-        # The small difference is formed first: 1 - r would lose digits in float32.
+        # The difference is formed first, because f / f0 - 1 would lose digits in float32.
         u = (f - f0) / f0
         # The foam is infinitely thick where this reaches zero.
         denominator = 1 - beta * u

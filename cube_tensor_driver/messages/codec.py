@@ -308,11 +308,14 @@ class MessageCodec(Generic[AnyRows]):
         """
         count = len(stamp_ns)
         pads = rows.frequency.shape[1] if isinstance(rows, FrequencyRows) else 0
-        layout = self._find_layout(_Shape(len(frame_id), len(rows) // count, pads))
+        shape = _Shape(len(frame_id), len(rows) // count, pads)
+        layout = self._find_layout(shape)
         record = np.zeros(count, layout.record)
         self.write_constants(record, layout, frame_id)
         record["sec"], record["nanosec"] = np.divmod(stamp_ns, SECOND)
-        record["time_offset"] = rows.stamp_ns.reshape(count, -1) - stamp_ns[:, None]
+        # 4 bytes hold the time of a row only as the distance from the stamp of its message.
+        times_ns = rows.stamp_ns.reshape(count, -1)
+        record["time_offset"] = times_ns - stamp_ns[:, None]
         for name in self._columns:
             if name != "stamp_ns":
                 record[name] = getattr(rows, name).reshape(record[name].shape)
@@ -346,6 +349,7 @@ class MessageCodec(Generic[AnyRows]):
         size, count = layout.record.itemsize, len(messages)
         data = messages[0]
         if count > 1:
+            # Bytes that middleware has added at the end are cut off.
             data = b"".join(message[:size] for message in messages)
             if len(data) != count * size:
                 raise MessageError(
@@ -372,10 +376,12 @@ class MessageCodec(Generic[AnyRows]):
             raise MessageError(
                 f"{self._name} of {len(data)} bytes says its frame id has {frame}: damaged"
             )
+        # The first sequence has one value per row.
         (rows,) = struct.unpack_from("<I", data, rows_at)
         pads = 0
         if self._n_fields_before_pads is not None:
             pads_at = self._find_end(_Shape(frame, rows, 0), self._n_fields_before_pads)
+            # Only as long as the message has that byte; a wrong length is refused below.
             pads = data[pads_at] if pads_at < len(data) else 0
         shape = _Shape(frame, rows, pads)
         # Middleware may add up to three bytes at the end. Before this check nothing is allocated,
@@ -442,14 +448,17 @@ class MessageCodec(Generic[AnyRows]):
             ("length of frame_id", "<u4", _FRAME_LENGTH_AT),
             ("frame_id", f"V{shape.frame}", _FRAME_AT),
         ]
-        sequences, counts, counts_at = ["frame_id"], [shape.frame], [_FRAME_LENGTH_AT]
+        sequences = ["frame_id"]
+        counts = [shape.frame]
+        counts_at = [_FRAME_LENGTH_AT]
         for field, count_at, at, values in places:
             if count_at is not None:
                 entries.append((f"length of {field.name}", "<u4", count_at))
                 sequences.append(field.name)
                 counts.append(values)
                 counts_at.append(count_at)
-            entries.append((field.name, (field.type, _dimensions(field.width, shape)), at))
+            form = (field.type, _dimensions(field.width, shape))
+            entries.append((field.name, form, at))
         names, formats, offsets = zip(*entries, strict=True)
         record = np.dtype(
             {
@@ -479,7 +488,8 @@ def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
 
 def _read_stamps(record: AnyArray) -> tuple[Times, Times]:
     """Return the time stamps of records (M,), and those of all their rows one after the other."""
-    stamp_ns: Times = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
+    seconds = record["sec"].astype(np.int64)
+    stamp_ns: Times = seconds * SECOND + record["nanosec"]
     times_ns: Times = stamp_ns[:, None] + record["time_offset"]
     return stamp_ns, times_ns.reshape(-1)
 
@@ -488,6 +498,7 @@ def _read_column(record: AnyArray, name: str) -> AnyArray:
     """Return a field of records (M,), with the rows of all of them one after the other."""
     values: AnyArray = record[name]
     if len(record) == 1:
+        # A single message is not copied, which matters in the nodes.
         view: AnyArray = values[0]
         return view
     return values.reshape(-1, *values.shape[2:])

@@ -42,6 +42,11 @@ _TRACKED_NUMBERS = (
     "area_uncertainty",
     "moment_uncertainty",
 )
+_VECTORS = {
+    "position": "Point",
+    "normal": "Vector3",
+    "force": "Vector3",
+}
 _FLOAT32 = 7  # sensor_msgs/msg/PointField.FLOAT32
 
 
@@ -59,13 +64,16 @@ def contacts_message(
         frame_id: Frame of the contacts.
         contacts: The contacts. Only tracked ones have an id, a moment and its uncertainties.
     """
+    # The numbers of tracked contacts stay empty if the contacts come without a tracker.
     tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
     fields: dict[str, Any] = {name: _collect(contacts, name) for name in _NUMBERS}
     fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
     fields["id"] = np.array([contact.id for contact in tracked], np.uint32)
-    for name, kind in (("position", "Point"), ("normal", "Vector3"), ("force", "Vector3")):
-        fields[name] = [_make_xyz(make, kind, getattr(contact, name)) for contact in contacts]
-    return make(CONTACTS, header=_make_header(make, stamp_ns, frame_id), **fields)
+    for name, kind in _VECTORS.items():
+        vectors = [getattr(contact, name) for contact in contacts]
+        fields[name] = [_make_xyz(make, kind, vector) for vector in vectors]
+    header = _make_header(make, stamp_ns, frame_id)
+    return make(CONTACTS, header=header, **fields)
 
 
 def traction_message(
@@ -102,6 +110,7 @@ def traction_message(
         is_bigendian=False,
         point_step=POINT_SIZE,
         row_step=POINT_SIZE * len(data),
+        # PointCloud2 wants the points as bytes.
         data=data.reshape(-1).view(np.uint8),
         is_dense=True,
     )
@@ -113,7 +122,7 @@ def decode_contacts(message: Any) -> list[Contact]:
     def read_xyz(vector: Any) -> Array:
         return np.array([vector.x, vector.y, vector.z])
 
-    columns = [getattr(message, name) for name in ("position", "normal", "force", *_NUMBERS)]
+    columns = [getattr(message, name) for name in (*_VECTORS, *_NUMBERS)]
     return [
         Contact(read_xyz(position), read_xyz(normal), read_xyz(force), *numbers)
         for position, normal, force, *numbers in zip(*columns, strict=True)
@@ -132,6 +141,7 @@ def decode_traction(message: Any) -> Array:
             f"a point cloud has the fields {', '.join(names)}; those of the topic traction are "
             f"{', '.join(CLOUD)}: listen to the topic of the node contacts"
         )
+    # rclpy gives an array of bytes, a bag a numpy array.
     points = np.frombuffer(bytes(message.data), "<f4")
     return points.reshape(-1, len(CLOUD)).astype(float)
 

@@ -24,15 +24,21 @@ def cube_poses(info: Any) -> CubePoses:
     """
     if not info.cubes:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
-    positions = [cube.pose.position for cube in info.cubes]
-    orientations = [cube.pose.orientation for cube in info.cubes]
+    positions, rotations, half_sides = [], [], []
+    for cube in info.cubes:
+        position, q = cube.pose.position, cube.pose.orientation
+        positions.append((position.x, position.y, position.z))
+        rotations.append(rotation_from_quaternion([q.x, q.y, q.z, q.w]))
+        half_sides.append(cube.half_side)
     poses = CubePoses(
-        position=np.array([(p.x, p.y, p.z) for p in positions]),
-        rotation=np.array([rotation_from_quaternion([q.x, q.y, q.z, q.w]) for q in orientations]),
-        half_side=np.array([cube.half_side for cube in info.cubes]),
+        position=np.array(positions),
+        rotation=np.array(rotations),
+        half_side=np.array(half_sides),
     )
+    # A wrong message must not reach the solvers, which would fail far from its cause.
     is_possible = np.isfinite(poses.position).all(axis=1)
-    is_possible &= np.isfinite(poses.half_side) & (poses.half_side > 0)
+    is_possible &= np.isfinite(poses.half_side)
+    is_possible &= poses.half_side > 0
     for number in np.flatnonzero(~is_possible).tolist():
         raise MessageError(
             f"info of the skin {info.name}: cube {info.cubes[number].name} is at "
@@ -52,6 +58,7 @@ def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
     used_ids = [cube.calibration_id for cube in info.cubes]
     calibrations: dict[str, Calibration] = {}
     try:
+        # Most skins have one calibration for all cubes, so each text is parsed only once.
         for used_id in set(used_ids):
             data = parse_yaml(texts[used_id], f"calibration {used_id}")
             calibrations[used_id] = Calibration.from_dict(data)
