@@ -16,7 +16,11 @@ from .tables import report_write_errors
 ROWS_PER_CHUNK = 1 << 16
 """Number of rows in one chunk of an array."""
 
-_UNITS = {"stamp_ns": "ns", "stress": "Pa", "gradient": "Pa/m"}
+_UNITS = {
+    "stamp_ns": "ns",
+    "stress": "Pa",
+    "gradient": "Pa/m",
+}
 _COMPONENTS = {
     "stress": COMPONENTS[: len(STRESS)],
     "gradient": COMPONENTS[len(STRESS) :],

@@ -103,6 +103,7 @@ class DataSet:
         self._tasks: list[str] = []
         self._calibrations: list[dict[str, Any]] = []
         self._writer: Any = None
+        # A file is created with its first frames, which determine the types of its columns.
         self._path = folder
         self._file_number = -1
 
@@ -173,6 +174,7 @@ class DataSet:
             **place,
             "dataset_from_index": self.frames - frames,
             "dataset_to_index": self.frames,
+            # All descriptions stand in one file: a row takes some kB.
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
             "bag": plan.path.name,
@@ -312,7 +314,11 @@ def _feature(
     names: list[str] | None,
 ) -> dict[str, Any]:
     """Describe a feature as info.json does."""
-    return {"dtype": dtype, "shape": list(shape), "names": names}
+    return {
+        "dtype": dtype,
+        "shape": list(shape),
+        "names": names,
+    }
 
 
 def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
@@ -342,8 +348,14 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
         numpy_type: str,
     ) -> dict[str, Any]:
         kinds = {"pandas_type": pandas_type, "numpy_type": numpy_type}
-        return {"name": name, "field_name": name, **kinds, "metadata": None}
+        return {
+            "name": name,
+            "field_name": name,
+            **kinds,
+            "metadata": None,
+        }
 
+    # The format of this description: https://pandas.pydata.org/docs/development/developer.html
     described = {
         "index_columns": ["task"],
         "column_indexes": [],

@@ -72,6 +72,7 @@ def export_lerobot(
     Raises:
         BagError: A bag is damaged, the choices do not fit, or the folder cannot be written.
     """
+    # Before the bags are read, which takes long.
     check_empty(folder)
     plans = [plan_bag(path, choices, report) for path in bags]
     skin = _check_same_skin(plans)
@@ -79,10 +80,14 @@ def export_lerobot(
     if not episodes:
         raise BagError(f"{bags[0]}: no sample lies between the marks; nothing to export")
     topics = find_topics(bags, choices)
-    depth = max(int(episode.counts.max()) for episode in episodes)
+    depths = [int(episode.counts.max()) for episode in episodes]
+    depth = max(depths)
     samples = sum(episode.rows for episode in episodes)
-    partial = folder.absolute().parent / f"{folder.absolute().name}.partial"
+    # Beside the folder, so that it can be renamed when it is complete.
+    partial = folder.absolute()
+    partial = partial.with_name(f"{partial.name}.partial")
     try:
+        # What an export that was killed left behind is of no use.
         shutil.rmtree(partial, ignore_errors=True)
         data_set = DataSet(
             partial,
@@ -103,12 +108,13 @@ def export_lerobot(
         ) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+    rate = max(plan.rate for plan in plans)
     return Exported(
         episodes=len(episodes),
         frames=data_set.frames,
         rows=samples,
         depth=depth,
-        usual=math.ceil(max(plan.rate for plan in plans) / choices.fps),
+        usual=math.ceil(rate / choices.fps),
         features=[topic.key for topic in topics.values()],
         outside=sum(plan.outside for plan in plans),
         unknown=sum(plan.unknown for plan in plans),
@@ -176,7 +182,12 @@ class EpisodeWriter:
             self._write_frames(windows)
         is_complete = self._windows.done == len(self._episode.counts)
         if is_complete:
-            self._data_set.end_episode(self._plan, self._episode, self._place, self._statistics)
+            self._data_set.end_episode(
+                self._plan,
+                self._episode,
+                self._place,
+                self._statistics,
+            )
         return is_complete
 
     def _write_frames(self, windows: dict[str, AnyArray]) -> None:

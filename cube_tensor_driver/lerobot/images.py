@@ -79,7 +79,8 @@ class ImageStream:
         Raises:
             BagError: The image cannot be read.
         """
-        self._bag, self._topic = bag, topic
+        self._bag = bag
+        self._topic = topic
         self._unread = self._read()
         self._next = next(self._unread, None)
         if shape is None:
@@ -114,6 +115,7 @@ class ImageStream:
             message = self._next[1]
             self._next = next(self._unread, None)
         if message is not None:
+            # A feature has one shape in the whole data set.
             self._latest = self._encode(message)
             if self._latest.shape != self.shape:
                 self._fail(f"an image of {self._latest.shape} after ones of {self.shape}")
@@ -171,6 +173,7 @@ def keep_encoded(message: Any) -> EncodedImage:
         OSError: Pillow does not know the format.
     """
     data = bytes(message.data)
+    # Opening reads the head of the file only: the pixels are not decoded here.
     with Image.open(io.BytesIO(data)) as image:
         return EncodedImage(data, _shape(image))
 

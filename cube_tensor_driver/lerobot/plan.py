@@ -135,9 +135,11 @@ class Episode:
             BagError: A stamp is too far from the first one.
         """
         inside = self.contains(stamp_ns)
-        cube, stamp_ns = cube[inside], stamp_ns[inside]
+        cube = cube[inside]
+        stamp_ns = stamp_ns[inside]
         if not len(cube):
             return
+        # The first rows decide where frame 0 begins; rows that come late are put into it.
         if not self.rows:
             self.begin_ns = int(stamp_ns.min())
         frame = self.sample_frame_of(stamp_ns)
@@ -200,6 +202,7 @@ def plan_bag(
             more frames than samples.
     """
     with open_bag(path, choices.frequencies) as source:
+        # Number of messages, for the report.
         total = sum(one.msgcount for one in source.bag.connections if one.topic == source.topic)
         spans = [(MIN_NS, MAX_NS, choices.task)]
         if choices.marks is not None:
@@ -233,6 +236,7 @@ def plan_bag(
         covered_s,
         choices.fps,
     )
+    # A mark at the end of a recording often has no sample behind it.
     used = [episode for episode in episodes if episode.rows]
     for episode in used:
         episode.finish()
@@ -264,6 +268,7 @@ def _check_rate(
         fps: Frames per second.
     """
     path = source.bag.path
+    # One sample tells no rate, and a hub that was unplugged would lower it.
     several = samples[samples > 1]
     if not len(several) or seconds <= 0:
         raise BagError(

@@ -78,6 +78,7 @@ class Statistics:
             "count": np.array([frames]),
         }
         sample = np.concatenate(self._sample)
+        # By chance no row may have been chosen; the mean stands for all quantiles then.
         if not len(sample):
             sample = self._mean[np.newaxis]
         columns = [column[np.isfinite(column)] for column in sample.T]

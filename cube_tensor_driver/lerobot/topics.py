@@ -6,9 +6,9 @@ Each frame gets the newest message that is stamped before the end of the frame.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -27,20 +27,21 @@ JOINT_FIELDS = ("position", "velocity", "effort")
 STATE, ACTION = "observation.state", "action"
 
 
-class Topic(NamedTuple):
+@dataclass
+class Topic:
     """A topic that is added to a data set.
 
     Attributes:
-        key: Name of its feature.
         msgtype: Type of its messages.
-        names: Names of its numbers; empty for images.
         shape: Shape of its images; zeros for numbers.
+        names: Names of its numbers; empty for images.
+        key: Name of its feature.
     """
 
-    key: str
     msgtype: str
-    names: list[str]
-    shape: Shape
+    shape: Shape = (0, 0, 0)
+    names: list[str] = field(default_factory=list)
+    key: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +94,13 @@ class TopicReader:
             topics: The topics by their names.
         """
         self._topics = topics
-        self._sources: dict[str, Signal | ImageStream] = {
-            name: ImageStream(bag, name, topic.shape)
-            if topic.msgtype in IMAGES
-            else read_signal(bag, name, topic.msgtype)
-            for name, topic in topics.items()
-        }
+        self._sources: dict[str, Signal | ImageStream] = {}
+        for name, topic in topics.items():
+            if topic.msgtype in IMAGES:
+                # Images stay in the bag until their frame comes; numbers fit the memory.
+                self._sources[name] = ImageStream(bag, name, topic.shape)
+            else:
+                self._sources[name] = read_signal(bag, name, topic.msgtype)
 
     def at(
         self,
@@ -128,9 +130,7 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
     Raises:
         BagError: A chosen topic is not there, or bags differ in its type.
     """
-    msgtypes: dict[str, str] = {}
-    names: dict[str, dict[str, None]] = {}
-    shapes: dict[str, Shape] = {}
+    found: dict[str, Topic] = {}
     existing: set[str] = set()
     wanted = set(choices.topics or ())
     wanted |= {topic for topic in (choices.state, choices.action) if topic}
@@ -140,45 +140,50 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
             prefix = frequencies.removesuffix("frequencies")
             for topic, msgtype in _stamped_topics(bag, prefix):
                 existing.add(topic)
-                if choices.topics is not None and topic not in wanted:
-                    continue
-                if msgtypes.setdefault(topic, msgtype) != msgtype:
-                    raise BagError(
-                        f"{path}: {topic} is {msgtype}, in other bags {msgtypes[topic]}; leave it "
-                        "out by naming the others with --topics"
-                    )
-                if msgtype in IMAGES:
-                    shapes.setdefault(topic, ImageStream(bag, topic).shape)
-                else:
-                    # Bags may be about different joints: the feature has the names of all.
-                    found = read_signal(bag, topic, msgtype).names
-                    known = names.setdefault(topic, {})
-                    known.update(dict.fromkeys(found))
-    missing = sorted(wanted - msgtypes.keys())
+                if choices.topics is None or topic in wanted:
+                    _describe_topic(bag, topic, msgtype, found)
+    missing = sorted(wanted - found.keys())
     if missing:
         raise BagError(
             f"{paths[0]}: no images and no stamped numbers on {', '.join(missing)}; there are "
             f"{', '.join(sorted(existing)) or 'none'}"
         )
-    used = {
-        topic: msgtype for topic, msgtype in msgtypes.items() if shapes.get(topic) or names[topic]
-    }
-    joints = [
-        topic for topic, msgtype in used.items() if msgtype == JOINTS and topic != choices.action
-    ]
-    # Of several robots nobody but the user can tell whose state is meant.
-    only_joints = joints[0] if len(joints) == 1 else None
-    state = choices.state or only_joints
-    keys = {state: STATE, choices.action: ACTION}
-    return {
-        topic: Topic(
-            keys.get(topic) or _feature_name(topic, msgtype),
-            msgtype,
-            list(names.get(topic, ())),
-            shapes.get(topic, (0, 0, 0)),
+    # Joint states may be without any joint.
+    used = {name: topic for name, topic in found.items() if topic.names or any(topic.shape)}
+    joints = [name for name, topic in used.items() if topic.msgtype == JOINTS]
+    # Of several robots only the user can tell whose state is meant.
+    others = [name for name in joints if name != choices.action]
+    state = choices.state or (others[0] if len(others) == 1 else None)
+    for name, described in used.items():
+        dotted = name.strip("/").replace("/", ".")
+        kind = "images" if described.msgtype in IMAGES else "topics"
+        described.key = f"observation.{kind}.{dotted}"
+        if name == choices.action:
+            described.key = ACTION
+        if name == state:
+            described.key = STATE
+    return used
+
+
+def _describe_topic(
+    bag: Bag,
+    name: str,
+    msgtype: str,
+    found: dict[str, Topic],
+) -> None:
+    """Add what a bag has on a topic to the description of the topic."""
+    topic = found.setdefault(name, Topic(msgtype))
+    if topic.msgtype != msgtype:
+        raise BagError(
+            f"{bag.path}: {name} is {msgtype}, in other bags {topic.msgtype}; leave it out by "
+            "naming the others with --topics"
         )
-        for topic, msgtype in used.items()
-    }
+    if msgtype not in IMAGES:
+        # Bags may be about different joints: the feature has the names of all.
+        names = read_signal(bag, name, msgtype).names
+        topic.names += [one for one in names if one not in topic.names]
+    elif not any(topic.shape):
+        topic.shape = ImageStream(bag, name).shape
 
 
 def read_signal(
@@ -264,15 +269,15 @@ def _numbers(
 def _joint_numbers(message: Any, where: str) -> dict[str, float]:
     """Return the numbers of a JointState, which may be about some of the joints only."""
     numbers = {}
-    for field in JOINT_FIELDS:
-        values = getattr(message, field)
+    for quantity in JOINT_FIELDS:
+        values = getattr(message, quantity)
         if len(values) and len(values) != len(message.name):
             raise BagError(
                 f"{where}: a message has {len(message.name)} joints and {len(values)} values of "
-                f"{field}; leave the topic out by naming the others with --topics"
+                f"{quantity}; leave the topic out by naming the others with --topics"
             )
         for name, value in zip(message.name, values, strict=False):
-            numbers[f"{name}.{field}"] = float(value)
+            numbers[f"{name}.{quantity}"] = float(value)
     return numbers
 
 
@@ -283,9 +288,3 @@ def _value(message: Any, name: str) -> float:
         is_place = part.isdigit()
         message = message[int(part)] if is_place else getattr(message, part)
     return float(message)
-
-
-def _feature_name(topic: str, msgtype: str) -> str:
-    """Return the name of a topic's feature."""
-    name = topic.strip("/").replace("/", ".")
-    return f"observation.images.{name}" if msgtype in IMAGES else f"observation.topics.{name}"

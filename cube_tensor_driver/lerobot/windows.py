@@ -96,6 +96,7 @@ class Windows:
             rows: N rows.
         """
         n_frames, n_cubes = counts.shape
+        # A cell is one cube in one frame. The stable order keeps its samples as they came.
         cell = frame * n_cubes + rows.cube
         order = np.argsort(cell, kind="stable")
         cell = cell[order]
