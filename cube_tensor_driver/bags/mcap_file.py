@@ -70,6 +70,7 @@ class McapReader:
             OSError, McapError, ValueError, struct.error: The file cannot be read, or is damaged.
         """
         self._stream = path.open("rb")
+        # The checksum comes first: it covers every offset and length that is used afterwards.
         try:
             _check_summary(self._stream)
             self._stream.seek(0)
@@ -78,6 +79,7 @@ class McapReader:
                 validate_crcs=True,
                 record_size_limit=MAX_CHUNK_BYTES,
             ).get_summary()
+            # Without statistics nobody knows how many messages there should be.
             if index is None or index.statistics is None:
                 raise McapError("the file has no summary")
             sizes = [chunk.uncompressed_size for chunk in index.chunk_indexes]
@@ -113,6 +115,7 @@ class McapReader:
         Yields:
             The topic, the time in ns and the serialised message.
         """
+        # A topic may have several channels, for example after a recorder was restarted.
         channels = {
             number: connection
             for number, connection in self._connections.items()
@@ -123,6 +126,7 @@ class McapReader:
             return
         stored = self._in_order(channels, start_ns, stop_ns)
         for time_ns, _, channel, data in stored:
+            # A chunk has messages of all topics, and its times reach beyond those wanted.
             if channel in channels and start_ns <= time_ns < stop_ns:
                 yield channels[channel], time_ns, data
 
@@ -174,6 +178,7 @@ class McapReader:
             for one in read_chunk_records(chunk)
             if isinstance(one, Message)
         ]
+        # Messages of several topics may stand a little out of order.
         messages.sort(key=itemgetter(0))
         return messages
 
@@ -204,6 +209,7 @@ class McapWriter:
         Raises:
             OSError: It exists, or cannot be created.
         """
+        # Chunks are not compressed: compression would take processor time from the nodes.
         self._stream = path.open("xb")
         self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.NONE)
         self._writer.start("ros2", library="cube_tensor_driver")

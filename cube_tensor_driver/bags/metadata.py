@@ -148,6 +148,7 @@ def typestore() -> Typestore:
 
 def type_hash(msgtype: str, definition: str) -> str:
     """Return ROS 2's hash (REP 2011) of a type; "" if its definition cannot be read."""
+    # A store of its own: the definition in a bag may differ from that of today.
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(get_types_from_msg(definition, msgtype))
@@ -168,6 +169,7 @@ def read_metadata(folder: Path) -> BagFiles:
             f"{folder}: no {FILE_NAME}: no bag, or a recording that was cut off; "
             f"./cube bag repair {folder} makes the latter readable"
         )
+    # Everything else that the file says about topics stands in the storage files, too.
     try:
         about = read_yaml(path)["rosbag2_bagfile_information"]
         names = about["relative_file_paths"]

@@ -181,6 +181,7 @@ class Bag:
         Raises:
             BagError: A file is missing or damaged, or has another version of the messages.
         """
+        # If one file cannot be opened, those before it are closed again.
         try:
             for path in self._unpacked_paths():
                 file = open_storage(path)
@@ -270,6 +271,7 @@ class Bag:
                 f"mean; record {topic} too"
             )
         for info in infos:
+            # The number also changes where a field has another meaning but the same type.
             if info.version != VERSION:
                 self._refuse_version(f"{topic} has version {info.version}")
         return infos
@@ -312,6 +314,7 @@ class Bag:
         end_ns = LAST_NS if stop_ns is None else stop_ns
         count = 0
         with report_damage(self.path):
+            # Files follow each other in time, so they need not be merged.
             for file in self._files:
                 for connection, time_ns, data in file.messages(wanted, begin_ns, end_ns):
                     count += 1
@@ -332,6 +335,7 @@ class Bag:
         decode: Callable[..., Any],
     ) -> Iterator[tuple[Any, Stamps]]:
         """Decode messages of one shape together, and say when they were recorded."""
+        # One call of numpy for many messages takes as long as for one.
         waiting: list[bytes] = []
         times_ns: list[int] = []
         size = limit = 0
@@ -364,6 +368,7 @@ class Bag:
         for path in self._bag_files.paths:
             unpacked.append(folder / path.name.removesuffix(".zstd"))
             with (
+                # In steps of some kB: a recording need not fit the memory.
                 report_damage(path),
                 path.open("rb") as source,
                 unpacked[-1].open("wb") as destination,

@@ -61,6 +61,7 @@ class Recording:
             raise BagError(f"{bag.path}: {error}") from None
         stamps = [stamp_ns(info) for info in self.infos]
         self._since_ns = np.array(stamps)
+        # It reads the bag only when it is asked.
         self._health = RecordedHealthReader(bag, topic)
 
     def __repr__(self) -> str:
@@ -143,6 +144,7 @@ def settings_of(info: Any) -> Settings:
         MessageError: They contradict each other.
     """
     calibrations = cube_calibrations(info)
+    # Without cubes nothing can be reconstructed, and the table below would have no columns.
     if not calibrations:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
     rest = []

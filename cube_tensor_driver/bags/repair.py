@@ -103,6 +103,7 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
 
 def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
     """Repair all files of a bag and describe them in metadata.yaml."""
+    # Also the files that metadata.yaml names: a disk may have lost their end later.
     cut = damaged = 0
     for path in _storage_files(folder):
         one_cut, one_damaged = _repair_file(path, keep_rest)
@@ -146,6 +147,7 @@ def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
     with report_damage(path):
         if path.suffix == SUFFIXES["mcap"]:
             return _repair_mcap(path, keep_rest)
+        # SQLite undoes an unfinished transaction at the first access with write permission.
         with closing(sqlite3.connect(path)) as database:
             database.execute("SELECT count(*) FROM messages")
         return 0, 0
@@ -156,6 +158,7 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
     size = path.stat().st_size
     is_complete = _has_summary(path)
     with path.open("r+b") as stream:
+        # Even with a good summary a chunk may be damaged, which only reading it shows.
         salvaged = _Salvaged(stream)
         if is_complete and not salvaged.damaged:
             return 0, 0
@@ -321,6 +324,7 @@ def _write_summary(
         (Opcode.METADATA_INDEX, [metadata_index]),
         (Opcode.STATISTICS, [statistics]),
     ]
+    # The offsets let a reader find one group without reading the others.
     summary = b""
     offsets: list[McapRecord] = []
     for opcode, records in groups:
@@ -345,7 +349,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     while size - start >= _RECORD_HEAD.size:
         opcode, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
         if length > size - start - _RECORD_HEAD.size:
-            return
+            return  # the record was cut off, or its length is damaged
         yield opcode, start, stream.read(length)
         start += _RECORD_HEAD.size + length
 

@@ -124,6 +124,7 @@ def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
     Raises:
         BagError: There is no bag, no such topic, no info for it, or several skins.
     """
+    # The source closes the bag; until there is one, an error must do so.
     bag = Bag(Path(path))
     bag.open()
     try:

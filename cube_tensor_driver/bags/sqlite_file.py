@@ -113,6 +113,7 @@ class SqliteReader:
                     " WHERE encoding = 'ros2msg'"
                 )
             )
+        # No table states the number of messages. Counting them is fast compared with reading them.
         counts = dict(
             self._database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id")
         )
@@ -146,6 +147,7 @@ class SqliteWriter:
         # A recorder adds topics in one thread and messages in another, one at a time.
         self._database = sqlite3.connect(path, check_same_thread=False)
         self._database.executescript(_TABLES)
+        # Numbers and types are kept here, so that nothing is read back while recording.
         self._types: set[str] = set()
         self._topics = 0
 

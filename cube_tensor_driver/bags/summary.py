@@ -62,6 +62,7 @@ def cube_summaries(
 
 def last_diagnostics(bag: Bag) -> list[Any]:
     """Return the last DiagnosticStatus of each name, sorted by name."""
+    # Later messages replace earlier ones of the same name.
     last = {}
     topics = set(bag.topics(DIAGNOSTICS))
     for entry in bag.entries(topics) if topics else ():
@@ -85,6 +86,7 @@ def _summarise(
     is_forward = (steps > 0) & (steps < SEQUENCE_RANGE // 2)
     lost = (steps[is_forward] - 1).sum()
     periods_ns = np.diff(stamp_ns)
+    # The median is not moved by a pause, as the mean would be.
     median_ns = float(np.median(periods_ns))
     return CubeSummary(
         name,
@@ -99,6 +101,7 @@ def _summarise(
 
 def _columns(bag: Bag, topic: str) -> tuple[AnyArray, AnyArray, Times]:
     """Return cube, sequence number and stamp of all rows."""
+    # An empty part keeps the type where there is no message.
     cube = [np.empty(0, np.uint16)]
     sequence = [np.empty(0, np.uint32)]
     stamp_ns = [np.empty(0, np.int64)]

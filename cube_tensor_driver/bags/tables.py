@@ -106,6 +106,7 @@ class TableWriter:
         ]
         batch = pyarrow.RecordBatch.from_arrays(columns, schema=self._schema)
         self._batches.append(batch)
+        # Groups of many rows compress better and are read faster.
         self._waiting_rows += len(rows)
         if self._waiting_rows >= ROWS_PER_GROUP:
             with report_write_errors(self._path):

@@ -116,6 +116,7 @@ class BagWriter:
         self._topics: list[Connection] = []
         self._complete: list[FileSummary] = []
         self._part: _Part | None = None
+        # Now, not with the first message, so that a folder that cannot be written is noticed early.
         self._attempt(lambda: folder.mkdir(parents=True))
         self._attempt(self._begin_part)
 
@@ -152,9 +153,10 @@ class BagWriter:
                 f"{topic}: the type {msgtype} is not known; known are those of ROS 2 Jazzy and "
                 "of this package"
             )
+        # The definition goes into the file, so that the bag can be read without this package.
         definition, _ = store.generate_msgdef(msgtype, ros_version=2)
         one = Connection(topic, msgtype, definition, list(qos))
-        self._topics.append(one)
+        self._topics.append(one)  # for the files that follow
         self._attempt(lambda: self._connect(self._open_part(), one))
 
     def write(
@@ -178,6 +180,7 @@ class BagWriter:
         duration_ns = time_ns - part.first_ns if part.messages else 0
         is_long = self._max_ns and duration_ns >= self._max_ns
         if is_large or is_long:
+            # metadata.yaml is complete at this point, so a reader sees all files before this one.
             self.close()
             self._attempt(self._begin_part)
             part = self._open_part()

@@ -85,6 +85,7 @@ class ZarrWriter:
         """Write the rows that wait."""
         if not self._waiting:
             return
+        # Whole chunks at a time: Zarr would read a chunk that is not full to append to it.
         rows = concatenate(self._waiting)
         columns = {name: getattr(rows, name) for name in self._arrays}
         columns["cube"] = np.minimum(rows.cube, self._last_cube)

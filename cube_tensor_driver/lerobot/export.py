@@ -208,7 +208,7 @@ class EpisodeWriter:
             columns[key] = values[:, np.newaxis]
         data_set.write(windows | columns)
 
-        # Reading every pixel would take longer than everything else.
+        # Some pixels of some images describe the colours well enough; decoding all would be slow.
         stride = -(-len(self._episode.counts) // MAX_SAMPLED_IMAGES)
         for key, values in columns.items():
             if isinstance(values, np.ndarray):

@@ -111,7 +111,7 @@ class ImageStream:
             stamp = np.array(self._next[0])
             if episode.frame_of(stamp) > frame:
                 break
-            # Only the last image of a frame is encoded, which takes most of the time.
+            # Only the last image of a frame is encoded, because encoding is slow.
             message = self._next[1]
             self._next = next(self._unread, None)
         if message is not None:
@@ -181,7 +181,7 @@ def keep_encoded(message: Any) -> EncodedImage:
 def _as_png(image: Image.Image) -> EncodedImage:
     """Encode pixels as PNG."""
     file = io.BytesIO()
-    # The lowest level takes a fifth of the time of the default, for files that are a little larger.
+    # The lowest level takes a fifth of the time of the default, for files that are a fifth larger.
     image.save(file, "PNG", compress_level=1)
     return EncodedImage(file.getvalue(), _shape(image))
 

@@ -48,6 +48,7 @@ def make_jobs(
     Raises:
         BagError: Two bags have the same name.
     """
+    # Results stand side by side in one folder, whatever folders the bags come from.
     names: dict[str, Path] = {}
     for bag in bags:
         path = bag.resolve()
@@ -87,6 +88,7 @@ def write_recipe(
         settings = asdict(contacts.settings)
         recipe["contacts"] = {**settings, "rate": contacts.rate}
     path = folder / RECIPE
+    # A recipe without results is of a run that failed at once: it may be replaced.
     if path.exists() and has_results(folder):
         if read_yaml(path) != recipe:
             raise BagError(

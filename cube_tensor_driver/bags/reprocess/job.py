@@ -113,6 +113,7 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
     # glibc's malloc keeps freed memory up to twice the largest block that it has given back. After
     # this block it keeps the arrays of the batches, which are requested again and again.
     np.empty(WORKING_BYTES, np.uint8)
+    # In the same file system as the output, so that it can be renamed when it is complete.
     partial = job.output.parent / PARTIAL / job.output.name
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
@@ -190,6 +191,7 @@ def _reprocess(
         raise BagError(
             f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
         )
+    # All infos are read before anything is written, so that a bad one leaves nothing behind.
     sources = [BagSource(bag, topic) for topic in topics]
     if job.form == "bag":
         with BagWriter(output) as writer:
@@ -266,6 +268,7 @@ def _reconstruct(
                 if ids != (ids := [one.id for one in current.calibrations]):
                     reconstructor = Reconstructor(current.calibrations)
                 reconstructor.rest_frequency = current.rest_frequency
+            # Where all is known, health need not be found again, which saves two fifths of the time.
             if health is not None and health.known.all():
                 stress = reconstructor.process_known(rows, health)
             else:
