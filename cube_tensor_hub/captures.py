@@ -53,6 +53,7 @@ def edges(
     found = np.zeros(len(millihertz), EDGES)
     hertz = 1e-3 * millihertz.astype(float)
     periods = np.ceil(hertz * window_us * 1e-6 - phase) - 1
+    # A pad without two edges in the window has no period to capture.
     runs = periods >= 1
     hertz, phase, periods = hertz[runs], phase[runs], periods[runs]
     found["first"][runs] = np.floor(phase / hertz * counter_hz)
@@ -110,5 +111,6 @@ class Oscillators:
 
     def _edges(self, middle_us: int) -> NDArray[np.void]:
         stress, gradient = self._memory.at(middle_us)
+        # Boards have no common clock with the pads, so that the first edge comes at any phase.
         millihertz = self.hub.frequency(stress, gradient, middle_us * 1e-6).ravel()
         return edges(millihertz, self._random.random(len(millihertz)))

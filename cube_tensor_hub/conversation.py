@@ -36,7 +36,7 @@ PERIOD_US = 40_000
 """Sample period, in µs, that every hub can do, on any line, and in an emulator."""
 
 SLOWER_US = 60_000
-"""Another such sample period, in µs."""
+"""A slower sample period, in µs, that every hub can do, too."""
 
 FAST_US = 1_000
 """Sample period, in µs, at which the line and all buffers are soon full when nobody reads."""
@@ -52,7 +52,7 @@ arrive, and 100 samples."""
 NEW_PERIOD_S = 0.8
 """Time, in seconds, for which samples with a new period are listened to."""
 
-SAMPLES_S = 1.2
+SECOND_S = 1.2
 """Time, in seconds, after which a frame that comes once a second must have arrived."""
 
 STOPPED_S = 0.3
@@ -147,7 +147,7 @@ def converse(wire: Wire, report: Report = lambda done, total, what: None) -> Tra
 
 
 class Conversation:
-    """One pass through the steps on a wire."""
+    """Goes once through all steps of a check."""
 
     def __init__(self, wire: Wire, report: Report) -> None:
         self._wire, self._report = wire, report
@@ -160,7 +160,8 @@ class Conversation:
     def run(self) -> Transcript:
         """Go through all steps; without an answer to the first ones the others are left out."""
         try:
-            self._ask("opened", seconds=SAMPLES_S)
+            # A hub that was running sends HELLO and STATS by itself.
+            self._ask("opened", seconds=SECOND_S)
             self._ask("hello", Request(Command.HELLO))
             if self._n_frames:
                 self._requests()
@@ -186,6 +187,7 @@ class Conversation:
         self._ask("stop", Request(Command.STOP))
         self._ask("quiet", seconds=QUIET_S)
         self._ask(
+            # A hub must keep order, and must read more than one request at a time.
             "three at once",
             Request(Command.IDENTIFY, 1),
             Request(Command.STOP, ANY_ARGUMENT),
@@ -196,6 +198,7 @@ class Conversation:
         self._send_bytes("damaged", _damaged_requests(), AFTER_DAMAGE)
         self._send_bytes("wrong way", b"".join(map(encode, _frames_of_hubs())), AFTER_WRONG_WAY)
         self._send_bytes("XOFF", XOFF, Command.STOP)
+        # A hub with flow control would stay silent for the rest of the check without an XON.
         self._send_bytes("XON", XON, Command.STOP)
 
     def _samples(self) -> None:
@@ -205,15 +208,17 @@ class Conversation:
         self._ask("after period", Request(Command.HELLO))
         self._ask("start", Request(Command.START, ANY_ARGUMENT), seconds=FLOW_S)
         self._ask_time("started")
+        # Each START comes at another place within a period.
         for number in range(3):
             self._ask(f"start again {number}", Request(Command.START), seconds=BETWEEN_START_S)
         self._ask("slower", Request(Command.SET_PERIOD, SLOWER_US), seconds=NEW_PERIOD_S)
         self._ask("stop samples", Request(Command.STOP), seconds=STOPPED_S)
         self._ask("stop again", Request(Command.STOP))
-        self._ask("start after stop", Request(Command.START), seconds=SAMPLES_S)
+        self._ask("start after stop", Request(Command.START), seconds=SECOND_S)
 
     def _host_that_does_not_read(self) -> None:
-        self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=SAMPLES_S)
+        self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=SECOND_S)
+        # At this rate the buffers overflow while nobody reads.
         self._begin("unread")
         self._wire.ignore(UNREAD_S)
         self._listen(GRACE_S)
@@ -221,11 +226,12 @@ class Conversation:
         self._begin("gone")
         self._wire.reopen(AWAY_S)
         self._listener.reopen()
-        self._ask("back", Request(Command.HELLO), seconds=SAMPLES_S)
+        self._ask("back", Request(Command.HELLO), seconds=SECOND_S)
 
     def _leave_as_found(self) -> None:
         self._ask("end", Request(Command.STOP))
         hello = next(iter(self._transcript.frames(Hello)), None)
+        # 0 means that no host had set a period yet.
         if hello is not None and hello.period_us:
             self._ask("first period", Request(Command.SET_PERIOD, hello.period_us))
 
@@ -234,6 +240,7 @@ class Conversation:
         step = self._begin(name, *requests)
         self._wire.send(b"".join(map(encode, requests)))
         hellos = sum(request.request == Command.HELLO for request in requests)
+        # HELLO is a second answer, behind the ACK of its request.
         if requests:
             self._listen(
                 ANSWER_S,
@@ -247,7 +254,12 @@ class Conversation:
             question = Request(Command.TIME, ANY_ARGUMENT + number)
             self._ask(f"time {state} {number}", question)
 
-    def _send_bytes(self, name: str, data: bytes, last: int) -> None:
+    def _send_bytes(
+        self,
+        name: str,
+        data: bytes,
+        last: int,
+    ) -> None:
         """Send bytes that a hub must ignore, and the valid request `last` behind them."""
         step = self._begin(name)
         self._wire.send(data + encode(Request(last)))
@@ -288,6 +300,7 @@ def _damaged_requests() -> bytes:
     """Return the requests of `DAMAGED`, behind noise that is longer than any request."""
     cut, wrong_crc, version = DAMAGED
     flipped = bytearray(encode(Request(wrong_crc)))
+    # One bit of the frame is wrong, which the CRC must detect.
     flipped[-3] ^= 0x40
     noise = bytes(range(1, 256)) * 4
     return b"".join(
@@ -309,5 +322,12 @@ def _frames_of_hubs() -> list[Frame]:
         Stats(1, 2, 3),
         Time(1, 2),
         Hello(1, 1, 1, PERIOD_US, np.array([1], "<u8")),
-        Sample(0, 0, 0, np.ones((1, 1), "<u4"), no_fault, unknown),
+        Sample(
+            0,
+            0,
+            0,
+            np.ones((1, 1), "<u4"),
+            no_fault,
+            unknown,
+        ),
     ]

@@ -73,7 +73,12 @@ def build(source: Path, out: Path, target: str) -> str:
     compiler = "cc" if target == "posix" else "arm-none-eabi-gcc"
     need(f"the build of {target}", "make", compiler)
     command = ["make", "--no-print-directory", "-C", str(source), f"OUT={out}", target]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         raise FirmwareError(f"make {target} failed:\n{done.stdout}{done.stderr}")
     return done.stdout
@@ -119,6 +124,7 @@ class Emulator:
                 start_new_session=True,
             )
             self.pads = socket.create_connection(pads.getsockname())
+        # Each question and answer is a small packet, which must not wait for more.
         self.pads.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return self
 

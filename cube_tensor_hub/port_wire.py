@@ -60,6 +60,7 @@ class PortWire:
         self._link.close()
         time.sleep(seconds)
         until = self.now() + MAX_REOPEN_S
+        # The port disappears while the board restarts.
         while not self._link.is_open:
             try:
                 self._open()

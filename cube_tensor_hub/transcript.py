@@ -10,7 +10,14 @@ from typing import TypeVar
 from cube_tensor_driver.device.wire.decoder import MAX_RUN, Decoder
 from cube_tensor_driver.device.wire.protocol import Ack, Frame, Hello, Request, Sample, Stats, Time
 
-FrameType = TypeVar("FrameType", Hello, Sample, Stats, Ack, Time)
+FrameType = TypeVar(
+    "FrameType",
+    Hello,
+    Sample,
+    Stats,
+    Ack,
+    Time,
+)
 
 REOPENING_STEP = "gone"
 """Name of the step in which the port is closed and opened again."""
@@ -108,7 +115,7 @@ class Transcript:
 
     @property
     def hello(self) -> Hello | None:
-        """The last HELLO."""
+        """Last HELLO of the hub; None: none came."""
         hellos = self.frames(Hello)
         return hellos[-1] if hellos else None
 
@@ -135,6 +142,7 @@ class FrameListener:
 
     def hear(self, data: bytes, at_s: float) -> list[Heard]:
         """Return the frames that are completed by bytes which came at a time, in seconds."""
+        # Zeros separate the frames on the wire; none occurs inside of one.
         runs = (self._tail + data).split(b"\0")
         self._tail = runs.pop()
         heard = []
@@ -152,6 +160,7 @@ class FrameListener:
     def _hear_run(self, run: bytes, at_s: float) -> list[Heard]:
         opened = self._opening_zeros > 0 if self._follows_frame else None
         frames = self.decoder.feed(run + b"\0")
+        # The first run may be the end of a frame that was sent before the port was opened.
         self.damaged += not frames and not self._is_first
         self._opening_zeros = 0
         self._is_first = False

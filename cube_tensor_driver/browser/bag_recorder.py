@@ -63,6 +63,7 @@ class BagRecorder:
         try:
             self._process.wait(MAX_END_S)
         except subprocess.TimeoutExpired:
+            # The bag can be repaired then: ./cube bag repair.
             self._process.kill()
             self._process.wait()
         self._process = None

@@ -21,7 +21,11 @@ from .history import History
 HISTORY_S = 10.0
 """Time, in seconds, that the plots cover."""
 
-TIME_SCALE = uplot.Scale(time=False, auto=False, range=(-HISTORY_S, 0.0))
+TIME_SCALE = uplot.Scale(
+    time=False,
+    auto=False,
+    range=(-HISTORY_S, 0.0),
+)
 
 NUDGE_PERIOD = 3
 """Number of pictures after which the charts are laid out again, see `Chart.draw`."""
@@ -79,8 +83,13 @@ class ChartLine(NamedTuple):
 class Charts:
     """The tab with the plots of the chosen cube, and of others that are named in a text field."""
 
-    def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, names: Sequence[str]) -> None:
-        """names: of the cubes."""
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        tab: viser.GuiTabHandle,
+        names: Sequence[str],
+    ) -> None:
+        """Add the contents of the tab; names: names of the cubes."""
         self._names = list(names)
         self._pictures = 0
         self._history: History | None = None
@@ -111,6 +120,7 @@ class Charts:
         indices = {name: number for number, name in enumerate(self._names)}
         words = str(self._text.value).replace(",", " ").split()
         named = [indices[word] for word in words if word in indices]
+        # A cube that is named twice is drawn once, and the chosen one first.
         self._cubes = list(dict.fromkeys([chosen, *named]))
         for chart in self._charts:
             chart.choose(self._lines(chart, history))
@@ -119,6 +129,7 @@ class Charts:
     def offer_observed(self, history: History) -> None:
         """Offer only what some cube observes."""
         observed = dict(zip(History.COLUMNS, history.observed, strict=True))
+        # Before the first tensors nothing is known of what the cubes observe.
         if not any(observed[name] for name in COMPONENTS):
             return
         groups = [
@@ -196,7 +207,13 @@ class Chart:
         grid: uplot.Axis_Grid = {"stroke": "#dee2e6", "width": 1}
         labels = ("time before now / s", self._label)
         axes = tuple(
-            uplot.Axis(stroke="#343a40", grid=grid, size=size, label=label, labelSize=18)
+            uplot.Axis(
+                stroke="#343a40",
+                grid=grid,
+                size=size,
+                label=label,
+                labelSize=18,
+            )
             for size, label in zip(AXIS_SIZES, labels, strict=True)
         )
         series = [
@@ -246,6 +263,7 @@ class Chart:
     def panel(self, history: History) -> tuple[str, Array, dict[str, Array]]:
         """Return label of the values, times, and values by name of the line, for a picture."""
         lines = zip(self._lines, self._values(history), strict=True)
+        # In a picture the component is set in mathematical type.
         label = self._label.replace("σzz", symbol("zz"))
         return label, history.times, {line.printed: values for line, values in lines}
 
@@ -289,7 +307,12 @@ def draw_lines(panels: Sequence[tuple[str, Array, dict[str, Array]]]) -> Figure:
         for number, (name, values) in enumerate(lines.items()):
             axis.plot(times, values, label=name, **curve_style(number) | {"marker": ""})
         axis.set_ylabel(label)
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, handlelength=3)
+        axis.legend(
+            loc="center left",
+            bbox_to_anchor=(1.0, 0.5),
+            fontsize=8,
+            handlelength=3,
+        )
     axes[-1].set_xlabel("time before now / s")
     return figure
 
@@ -301,6 +324,7 @@ def round_range(low: float, high: float) -> tuple[float, float]:
     seldom while values move.
     """
     size = max(-low, high, 1e-9)
+    # One noisy value on the other side of zero would take half of the room.
     low, high = (end if abs(end) > NOISE_SHARE * size else 0.0 for end in (low, high))
     power = 10.0 ** np.floor(np.log10(size))
     # The tolerance keeps a size of exactly 1, 2 or 5 from taking the next step.

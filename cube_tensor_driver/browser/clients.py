@@ -49,7 +49,12 @@ class ServiceCalls:
         self._say = say
         self._open: list[_Call] = []
 
-    def ask(self, what: str, client: Client, request: Any) -> None:
+    def ask(
+        self,
+        what: str,
+        client: Client,
+        request: Any,
+    ) -> None:
         """Call a service, unless nobody offers it.
 
         Args:
@@ -92,7 +97,12 @@ class ReplayClient:
         state: Where the replay is; None: there is none, or it has fallen silent.
     """
 
-    def __init__(self, node: Node, services: ServiceCalls, say: Say) -> None:
+    def __init__(
+        self,
+        node: Node,
+        services: ServiceCalls,
+        say: Say,
+    ) -> None:
         self.state: ReplayState | None = None
         self._services = services
         self._say = say
@@ -147,11 +157,13 @@ class ReplayClient:
                 self._say("No jump is possible", "jump: no replay is running", "red")
             return False
 
+        # The page may know the length of a bag that was replayed before.
         position = min(self._wanted_position, self.state.length)
         request = SteerReplay.Request(position=position, paused=self.state.paused)
         self._wanted_position = None
         self._jump = self._client.call_async(request)
         self._jump_asked_s = now_s
+        # The slider must not jump back until the replay has told its new position.
         self.state.position = position
         return True
 

@@ -48,6 +48,7 @@ class Colouring(NamedTuple):
         pressure, sigma = moment.field.pressure, moment.field.sigma
         above = None
         if sigma is not None:
+            # One point of the surface lies above the centre of each cube.
             above = np.stack([pressure, sigma], axis=1)[surface.middle]
         cubes = quantity.of(moment.values, moment.residual)
         if quantity is DEVIATION and above is not None:
@@ -65,7 +66,12 @@ class Colouring(NamedTuple):
         return f"pressure {surface}" if self.quantity is DEVIATION else f"{value}, {surface}"
 
 
-def _field_values(moment: Moment, surface: Surface, quantity: Quantity, cubes: Array) -> Array:
+def _field_values(
+    moment: Moment,
+    surface: Surface,
+    quantity: Quantity,
+    cubes: Array,
+) -> Array:
     """Return the values on the surface (M,); of the nearest cube where the field has none."""
     if quantity is QUANTITIES["pressure"]:
         return moment.field.pressure

@@ -20,7 +20,12 @@ class History:
         self._times = np.full(length, np.nan)
         self._count = 0
 
-    def add(self, now: float, values: Array, residual: Array) -> None:
+    def add(
+        self,
+        now: float,
+        values: Array,
+        residual: Array,
+    ) -> None:
         """Add values (cubes, 15) and residual (cubes,) as they are at the time `now`, in s."""
         slot = self._count % len(self._times)
         self._values[slot, :, :-1] = values
@@ -40,6 +45,7 @@ class History:
     def times(self) -> Array:
         """(M,) times relative to the last one, in s: zero or negative."""
         times = self._times[self._slots()]
+        # The newest value is at the right end of the plots, at zero.
         return times - times[-1] if len(times) else times
 
     @property
@@ -61,7 +67,12 @@ class RowRate:
         rate: (cubes,) Hz; NaN until the first period is over.
     """
 
-    def __init__(self, cubes: int, now: float, period: float = 1.0) -> None:
+    def __init__(
+        self,
+        cubes: int,
+        now: float,
+        period: float = 1.0,
+    ) -> None:
         """Start at the time `now`, in s; rows are counted over at least `period` s."""
         self.rate = np.full(cubes, np.nan)
         self._period = period

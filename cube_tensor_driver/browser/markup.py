@@ -64,7 +64,12 @@ class PageStatus:
     colour: NoteColour = "blue"
     recording: bool = False
 
-    def say(self, title: str, action: str, colour: NoteColour = "blue") -> None:
+    def say(
+        self,
+        title: str,
+        action: str,
+        colour: NoteColour = "blue",
+    ) -> None:
         """Show what became of an action, as a line and as a note."""
         self.title, self.action, self.colour = title, action, colour
 
@@ -184,7 +189,12 @@ def legend(quantity: scene.Quantity, top: float) -> str:
     return box(bar + _div(TICKS_STYLE, ticks) + _div("text-align:center", meaning))
 
 
-def explanation(bar: float, stress: float, gradient: float, sigma: Array | None) -> str:
+def explanation(
+    bar: float,
+    stress: float,
+    gradient: float,
+    sigma: Array | None,
+) -> str:
     """Return what is drawn, and what the lengths of arrows mean.
 
     Args:
@@ -213,6 +223,7 @@ def _field_source(sigma: Array | None) -> str:
     if sigma is None:
         return "field: interpolated between the cubes, at their depth"
     known = sigma[np.isfinite(sigma)]
+    # The deviation differs from point to point; the median stands for all.
     typical = f", ±&nbsp;{np.median(known) / 1e3:.2g}&nbsp;kPa" if len(known) else ""
     return f"field: on the surface, from the node <i>contacts</i>{typical}"
 

@@ -130,7 +130,12 @@ def ring(radius: float, thickness: float) -> Mesh:
     return rods(np.stack([circle[:-1], circle[1:]], axis=1), thickness)
 
 
-def hit(position: Array, pitch: float, start: Array, direction: Array) -> int | None:
+def hit(
+    position: Array,
+    pitch: float,
+    start: Array,
+    direction: Array,
+) -> int | None:
     """Return which cube a ray meets, None if it meets none.
 
     Cubes on the far side of a curved skin, behind another cube, do not count.
@@ -192,8 +197,14 @@ class SquareLayer:
     def hide(self) -> None:
         self._frame.visible = False
 
-    def paint(self, quantity: Quantity, values: Array, top: float) -> None:
+    def paint(
+        self,
+        quantity: Quantity,
+        values: Array,
+        top: float,
+    ) -> None:
         """Colour the squares by values (M,) of a quantity, on a range up to `top`, in SI units."""
+        # The colours of the steps depend on whether the quantity is signed.
         if quantity is not self._quantity:
             self._quantity = quantity
             for mesh, colour in zip(self._meshes, step_colours(quantity).tolist(), strict=True):

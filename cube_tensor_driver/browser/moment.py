@@ -72,12 +72,19 @@ class Moment(NamedTuple):
     contacts: list[Contact]
 
     @classmethod
-    def of(cls, newest: LatestStress, health: AnyArray, surface: Surface, found: Found) -> Moment:
+    def of(
+        cls,
+        newest: LatestStress,
+        health: AnyArray,
+        surface: Surface,
+        found: Found,
+    ) -> Moment:
         """Copy the newest rows, and compute what the node `contacts` did not give."""
         values = newest.usable_values(health)
         field, contacts = found.field, found.contacts
         if field is None:
             between = surface.field(values)
+            # A component that no cube observes counts as 0 here.
             shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)
             field = SurfaceField(between.pressure, shear)
         if contacts is None:

@@ -41,10 +41,10 @@ RIGHT_WIDTH = 320.0
 """Width of viser's main panel, in pixels."""
 
 CAMERA_POSITION = np.array([0.1, -1.0, 1.05]) * SPAN
-"""Position of the camera for a picture of normal proportions."""
+"""Position of the camera, in units of the scene, for a picture of normal proportions."""
 
 CAMERA_TARGET = np.array([0.0, -0.04, 0.0]) * SPAN
-"""Point that the camera looks at."""
+"""Point that the camera looks at, in units of the scene."""
 
 PHONE_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
 """Point that the camera looks at on a phone, whose panels cover the lower part of the picture."""
@@ -102,6 +102,7 @@ class ShownSkin:
         self, name: str, names: Sequence[str], poses: CubePoses, depth: float, history: History
     ) -> None:
         """depth: of the centres of the cubes below the surface, in metres."""
+        # A large skin gets fewer points per cube, so that the whole stays within the limit.
         points_per_side = np.sqrt(MAX_SURFACE_POINTS / len(names))
         points_per_side = np.clip(points_per_side, 2, MAX_POINTS_PER_SIDE)
         self.name, self.names, self.poses = name, list(names), poses
@@ -113,7 +114,12 @@ class ShownSkin:
 class Page:
     """The page of one skin in one browser."""
 
-    def __init__(self, client: viser.ClientHandle, skin: ShownSkin, buttons: Buttons) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        skin: ShownSkin,
+        buttons: Buttons,
+    ) -> None:
         self._client = client
         self._skin = skin
         self._moment: Moment | None = None
@@ -142,7 +148,13 @@ class Page:
         """Show where a replay is; None: there is none."""
         self._replay.show(replay)
 
-    def show(self, moment: Moment, rate: Array, status: PageStatus, with_numbers: bool) -> None:
+    def show(
+        self,
+        moment: Moment,
+        rate: Array,
+        status: PageStatus,
+        with_numbers: bool,
+    ) -> None:
         """Show a moment; while the page is paused it keeps the moment it has.
 
         Args:
@@ -151,6 +163,7 @@ class Page:
             status: Links, recording, and the last action of the user.
             with_numbers: Whether to show what changes less often, too: numbers and plots.
         """
+        # The browser shows all of it in one picture, or the field would be ahead of the cubes.
         with self._client.atomic():
             if not self._paused or self._moment is None:
                 self._moment = moment
@@ -172,14 +185,21 @@ class Page:
         self._top = self._colouring.top
         self._scene.draw(moment, self._colouring)
 
-    def _write_first_lines(self, moment: Moment, rate: Array, status: PageStatus) -> None:
+    def _write_first_lines(
+        self,
+        moment: Moment,
+        rate: Array,
+        status: PageStatus,
+    ) -> None:
         is_held = self._paused or self._replay.is_held
         hertz = float(np.fmax.reduce(rate, axis=None, initial=0.0))
         line = markup.headline(
             moment.health, hertz, moment.strongest_contact, is_held, status.recording
         )
+        # Each assignment is sent, even if nothing has changed.
         if line != self._headline.content:
             self._headline.content = line
+        # The button groups show what a press will do.
         view = (GO_ON if self._paused else PAUSE, STOP if status.recording else RECORD)
         if tuple(self._view.options) != view:
             self._view.options = view
@@ -190,7 +210,12 @@ class Page:
                 status.title, status.action, auto_close_seconds=NOTE_S, color=status.colour
             )
 
-    def _write(self, moment: Moment, rate: Array, status: PageStatus) -> None:
+    def _write(
+        self,
+        moment: Moment,
+        rate: Array,
+        status: PageStatus,
+    ) -> None:
         """Write plots and numbers in alternate calls, because each costs a browser as much time
         as a picture."""
         self._written += 1
@@ -202,7 +227,12 @@ class Page:
     def _write_plots(self) -> None:
         self._charts.draw(self._skin.history, self._scene.selected)
 
-    def _write_numbers(self, moment: Moment, rate: Array, status: PageStatus) -> None:
+    def _write_numbers(
+        self,
+        moment: Moment,
+        rate: Array,
+        status: PageStatus,
+    ) -> None:
         history, cube = self._skin.history, self._scene.selected
         self._charts.offer_observed(history)
         self._colours.offer_known(history, moment.field)
@@ -217,6 +247,7 @@ class Page:
 
     def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
         """Make the main panel, from top to bottom."""
+        # A style sheet can be anywhere on the page.
         gui.add_html(markup.PHONE_STYLE)
         self._headline = gui.add_html("")
         self._make_buttons(gui, buttons)

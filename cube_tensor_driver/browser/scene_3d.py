@@ -90,6 +90,7 @@ class Placement:
     @classmethod
     def of(cls, poses: CubePoses) -> Placement:
         """Scale cubes at `poses` in the parent frame, in metres, to `SPAN`."""
+        # The whole skin fits into the span, with half a pitch around it.
         low, high = poses.position.min(axis=0), poses.position.max(axis=0)
         centre = (low + high) / 2
         unit = SPAN / ((high - low).max() + poses.pitch)
@@ -130,6 +131,7 @@ class Scene3D:
         """
         placement = Placement.of(poses)
         self.shown = Shown()
+        # The cube in the middle is chosen at first.
         self.selected = int((placement.poses.position**2).sum(axis=1).argmin())
         self._unit = placement.unit
         _set_up_lights(api)
@@ -146,6 +148,7 @@ class Scene3D:
         @api.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            # viser reports a click as a ray from the camera.
             cube = hit(placement.poses.position, placement.pitch, start, direction)
             if cube is not None:
                 pick(cube)
@@ -179,7 +182,12 @@ class ScaleBar:
             the skin.
     """
 
-    def __init__(self, api: viser.SceneApi, placement: Placement, surface: Surface) -> None:
+    def __init__(
+        self,
+        api: viser.SceneApi,
+        placement: Placement,
+        surface: Surface,
+    ) -> None:
         span = SPAN / placement.unit
         self.length = round_down(span / 4)
         points = placement.point(surface.points)
@@ -222,8 +230,14 @@ def round_down(length: float) -> float:
 class Cubes:
     """The cubes and the field between them, in colours."""
 
-    def __init__(self, api: viser.SceneApi, placement: Placement, surface: Surface) -> None:
+    def __init__(
+        self,
+        api: viser.SceneApi,
+        placement: Placement,
+        surface: Surface,
+    ) -> None:
         poses, of_cube = placement.poses, surface.cube
+        # The field lies below the cubes, so that it does not hide them.
         down = poses.rotation[of_cube, :, 2] * poses.half_side[of_cube, None]
         self._field = SquareLayer(
             api,
@@ -248,9 +262,11 @@ class Cubes:
             batched_scales=poses.half_side,
             batched_colors=np.full((len(poses.position), 3), 200, np.uint8),
             flat_shading=True,
+            # viser would draw distant cubes with fewer triangles, which a cube does not have.
             lod="off",
             **NO_SHADOWS,
         )
+        # Without edges, cubes of one colour merge into a plane.
         edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
         lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
         api.add_line_segments(
@@ -274,7 +290,13 @@ class Cubes:
 class Names:
     """The names of the cubes above them, unless there are too many."""
 
-    def __init__(self, api: viser.SceneApi, placement: Placement, names: Sequence[str]) -> None:
+    def __init__(
+        self,
+        api: viser.SceneApi,
+        placement: Placement,
+        names: Sequence[str],
+    ) -> None:
+        # A hidden frame hides all names with one message.
         self._frame = api.add_frame("/names", show_axes=False, visible=False)
         if len(names) > MAX_NAMED_CUBES:
             return
@@ -345,7 +367,12 @@ class Arrows:
         longest: Value, in SI units, of an arrow of full length. It follows what is measured.
     """
 
-    def __init__(self, api: viser.SceneApi, placement: Placement, style: ArrowStyle) -> None:
+    def __init__(
+        self,
+        api: viser.SceneApi,
+        placement: Placement,
+        style: ArrowStyle,
+    ) -> None:
         self.longest = 0.0
         self._placement = placement
         self._style = style
@@ -356,11 +383,17 @@ class Arrows:
         """Value, in SI units, of an arrow with a length of 1 in the scene."""
         return self.longest / (self._style.full_length * self._placement.arrow)
 
-    def draw(self, values: Array, residual: Array, visible: bool) -> None:
+    def draw(
+        self,
+        values: Array,
+        residual: Array,
+        visible: bool,
+    ) -> None:
         """Follow the values, and draw the arrows if they are visible."""
         style, unit = self._style, self._placement.arrow
         measured = style.measured(values, residual)
         self.longest = scene.automatic(style.quantity, measured, self.longest)
+        # The range follows even while the arrows are hidden, so that it is right when they appear.
         self._mesh.visible = visible
         if visible:
             scale = style.full_length * unit / self.longest
@@ -373,11 +406,17 @@ class PrincipalCrosses:
     def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
         self._placement = placement
         self._frame = api.add_frame("/principal", show_axes=False, visible=False)
+        # The crosses begin on the upper faces and are lifted out of the cubes.
         self._lift = _above(placement, CROSS_HEIGHT, placement.pitch) - _above(placement, 1.0)
         self._tension = _add_mesh(api, "principal/pulls", TENSION_COLOUR)
         self._compression = _add_mesh(api, "principal/pushes", COMPRESSION_COLOUR)
 
-    def draw(self, values: Array, longest: float, visible: bool) -> None:
+    def draw(
+        self,
+        values: Array,
+        longest: float,
+        visible: bool,
+    ) -> None:
         """Draw the crosses; longest: stress, in Pa, whose line is as long as the pitch."""
         self._frame.visible = visible
         if not visible:
@@ -402,6 +441,7 @@ class FaultCrosses:
 
     def draw(self, health: AnyArray) -> None:
         """Draw the crosses again if the health (N,) of any cube has changed."""
+        # Health changes seldom, and a mesh is sent as a whole.
         if self._drawn is not None and np.array_equal(health, self._drawn):
             return
         self._drawn = health
@@ -415,7 +455,12 @@ class FaultCrosses:
 class ChosenCube:
     """A ring around the cube whose numbers the page shows, with its name and a text."""
 
-    def __init__(self, api: viser.SceneApi, placement: Placement, names: Sequence[str]) -> None:
+    def __init__(
+        self,
+        api: viser.SceneApi,
+        placement: Placement,
+        names: Sequence[str],
+    ) -> None:
         self._names = names
         self._upper_faces = _above(placement, 1.1)
         self._orientations = quaternions(placement.poses.rotation)
@@ -446,6 +491,7 @@ class ContactLabel:
     def show(self, contact: Contact | None) -> None:
         """Write the forces of a contact; None: there is none."""
         if contact is not None:
+            # Above the tip of the arrow of the cube below it.
             above = 1.1 * self._placement.arrow * contact.normal
             self._label.text = markup.newtons(contact)
             self._label.position = self._placement.point(contact.position) + above

@@ -45,7 +45,12 @@ class Raster:
             if none is near. The first row is at the largest y.
     """
 
-    def __init__(self, points: Array, pixel: float, reach: float) -> None:
+    def __init__(
+        self,
+        points: Array,
+        pixel: float,
+        reach: float,
+    ) -> None:
         """Assign the pixels to points.
 
         Args:
@@ -61,6 +66,7 @@ class Raster:
         x = self.low[0] + (np.arange(columns) + 0.5) * pixel
         y = self.high[1] - (np.arange(rows) + 0.5) * pixel
         distance, self.owner = cKDTree(flat).query(np.stack(np.meshgrid(x, y), axis=2))
+        # This index is that of the transparent entry in `image`.
         self.owner[distance > reach] = len(points)
 
     def image(self, colours: Array) -> NDArray[np.uint8]:
@@ -74,7 +80,12 @@ class Raster:
 class TopView:
     """Draws the skin in the x-y plane of its parent frame."""
 
-    def __init__(self, names: Sequence[str], poses: CubePoses, surface: Surface) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        poses: CubePoses,
+        surface: Surface,
+    ) -> None:
         self._names, self._poses = names, poses
         size = float(np.ptp(surface.points[:, :2], axis=0).max()) + surface.spacing
         pixel = max(size / MAX_PIXELS_PER_SIDE, surface.spacing / 4)
@@ -88,7 +99,12 @@ class TopView:
         # The axes do not change from picture to picture.
         self._axes = self._draw_axes()
 
-    def draw(self, colouring: Colouring, contacts: Sequence[Contact], chosen: int) -> str:
+    def draw(
+        self,
+        colouring: Colouring,
+        contacts: Sequence[Contact],
+        chosen: int,
+    ) -> str:
         """Return an SVG element; chosen: index of the cube with a thick outline."""
         parts = [
             self._heat_map(scene.colours(colouring.quantity, colouring.field, colouring.top)),
@@ -140,6 +156,7 @@ class TopView:
         parts = []
         for cube, (name, corners) in enumerate(zip(self._names, self._corners, strict=True)):
             points = " ".join("{:.1f},{:.1f}".format(*self._drawn(corner)) for corner in corners)
+            # The chosen cube has a thick outline.
             width = 2.5 if cube == chosen else 0.7
             title = escape(f"{name}: {colouring.text(cube)}")
             parts.append(
@@ -168,7 +185,12 @@ class TopView:
         return "".join(parts) + f"<g {halo}>{text}</g>"
 
 
-def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
+def _text(
+    x: float,
+    y: float,
+    text: str,
+    anchor: str = "middle",
+) -> str:
     return f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='{anchor}'>{text}</text>"
 
 

@@ -65,9 +65,16 @@ class Viewer:
     what they ask for waits in a queue.
     """
 
-    def __init__(self, host: str, port: int, depth: float, recordings: Path) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        depth: float,
+        recordings: Path,
+    ) -> None:
         """Start the server and the node; arguments as of `run_view`."""
         self._host = host
+        # Whoever can open a local address is a user of this machine already.
         self._token = "" if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
         self._server = _serve(host, port, self._token)
         self._depth = depth
@@ -93,6 +100,7 @@ class Viewer:
         self._shown: ShownSkin | None = None
         self._rows = RowRate(0, time.monotonic())
         self._pages: dict[int, Page | WaitingPage] = {}
+        # viser calls these in threads of its own.
         put = self._actions.put
         self._server.on_client_connect(lambda client: put(lambda: self._open_page(client)))
         self._server.on_client_disconnect(
@@ -114,6 +122,7 @@ class Viewer:
         next_picture_s = next_numbers_s = time.monotonic()
         waiting_note_s = next_picture_s + WAITING_NOTE_S
         while not stop.is_set():
+            # The executor returns earlier when a message comes.
             wait_s = min(next_picture_s - time.monotonic(), PICTURE_PERIOD_S)
             self._executor.spin_once(timeout_sec=max(0.0, wait_s))
             while not self._actions.empty():
@@ -157,6 +166,7 @@ class Viewer:
 
     def _open_page(self, client: viser.ClientHandle) -> None:
         """Make the page of a browser, unless it has one or has gone already."""
+        # The browser may be gone by the time its event is handled.
         if client.client_id in self._pages or client.client_id not in self._server.get_clients():
             return
         if self._shown is None:
@@ -185,8 +195,14 @@ class Viewer:
             jump=lambda position: put(lambda: self._replay.jump_to(position)),
         )
 
-    def _update(self, followed: FollowedSkin, shown: ShownSkin, with_numbers: bool) -> None:
+    def _update(
+        self,
+        followed: FollowedSkin,
+        shown: ShownSkin,
+        with_numbers: bool,
+    ) -> None:
         """Show one picture, and with `with_numbers` the numbers and plots beside it."""
+        # After a jump the plots would connect two different times.
         if self._replay.update():
             shown.history.clear()
         is_held = self._replay.is_held
@@ -234,6 +250,7 @@ class Viewer:
 
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
+            # Names of diagnostics are "NODE: link NAME".
             if ": link " in status.name:
                 name = status.name.rpartition(": ")[2]
                 self._links[status.name] = f"{name}: {status.message}"
@@ -250,6 +267,7 @@ def _serve(host: str, port: int, token: str) -> viser.ViserServer:
         ConfigError: The host is no address of this machine, or the port cannot be had.
     """
     check_host(host)
+    # A refused request is no error of the server.
     logging.getLogger("websockets").setLevel(logging.ERROR)
     # viser warns when a browser leaves while its picture is made, which is no fault.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
@@ -261,7 +279,12 @@ def _serve(host: str, port: int, token: str) -> viser.ViserServer:
         raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
 
 
-def run_view(host: str, port: int, depth: float, recordings: Path) -> int:
+def run_view(
+    host: str,
+    port: int,
+    depth: float,
+    recordings: Path,
+) -> int:
     """Serve the page until Ctrl-C; returns the exit code.
 
     Args:

@@ -113,6 +113,7 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
         markup=False,
     )
     for name, count in Counter(cube.calibration_id for cube in info.cubes).items():
+        # Cubes of one calibration have one layout, unless the file was edited.
         layouts = sorted({cube.layout for cube in info.cubes if cube.calibration_id == name})
         cubes = cubes_text(count)
         console.print(f"  calibration {name}, layout {', '.join(layouts)}: {cubes}")

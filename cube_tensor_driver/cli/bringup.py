@@ -83,6 +83,7 @@ def run(options: argparse.Namespace) -> int:
         rest = watch_rest(source, screen)
         explanations = press_cubes(source, rest)
 
+    # All findings are printed, even if no file is written in the end.
     for cube, explanation in explanations.items():
         data["cubes"][cube]["pose"]["rpy"] = rpy(explanation.rotation)
         show_explanation(names[cube], explanation, pads)
@@ -222,6 +223,7 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
         cube = presses[0].cube
         for side in other_sides:
             presses.append(wait_for_press({cube}, f"{cubes[cube].name} on its {side} side"))
+        # The pad law turns changes of frequency into pad stresses.
         ratio = 1 + np.array([each.change for each in presses])
         measured = pad_stress(ratio, 1.0, calibration.beta, calibration.modulus)
         explanations[cube] = explain_presses(measured, expected)

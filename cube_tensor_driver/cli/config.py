@@ -87,6 +87,7 @@ def write_grid(options: argparse.Namespace) -> int:
         rate=options.rate,
         port=options.port,
     )
+    # Checking all cubes of a large grid would take longer than writing them.
     _, mistakes = check_skin_data(ends_of_links(skin), options.output.parent)
     if mistakes:
         raise ConfigError(f"grid: {mistakes[0]}")
@@ -128,6 +129,7 @@ def check_file(path: Path) -> int:
         print(f"cube: {path}: {mistake}", file=sys.stderr)
     if skin is None or mistakes:
         return 1
+    # A skin may have cubes of several layouts.
     layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
     by_layout = ", ".join(f"{number} {name}" for name, number in layouts.items())
     cubes = f"{len(skin.cubes)} {'cube' if len(skin.cubes) == 1 else 'cubes'} ({by_layout})"

@@ -77,6 +77,7 @@ def run(options: argparse.Namespace) -> int:
 
     from ..demo.demo import DemoSettings, run_demo
 
+    # A demo that shows nothing must end by itself.
     measures = options.headless or options.json or options.figure
     if options.duration is None and measures:
         options.duration = DEFAULT_DURATION_S

@@ -52,6 +52,7 @@ def reading_line(reading: StressReading) -> str:
     stress = [f"{name} {value:9.1f}" for name, value in observed.items() if name in STRESS]
     gradient = [f"{name} {value:10.0f}" for name, value in observed.items() if name not in STRESS]
     parts = [f"{reading.stamp_ns * 1e-9:.3f} s", reading.cube]
+    # The unit stands once, behind the last value.
     if stress:
         parts += [*stress[:-1], f"{stress[-1]} Pa"]
     if gradient:

@@ -90,6 +90,7 @@ def run(options: argparse.Namespace) -> int:
             check_empty(options.output)
         return reprocess.run(options)
 
+    # All bags become one data set, so the choices hold for all of them.
     choices = Choices(
         fps=options.fps,
         task=options.task,

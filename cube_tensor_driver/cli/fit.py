@@ -77,6 +77,7 @@ def run(options: argparse.Namespace) -> int:
 
     layout = named_layout(options.layout)
     loads, base, rest, rest_source = read_inputs(options, layout)
+    # A calibration with a uid is used for that cube only.
     base = replace(base, rest_frequency=rest, uid=options.uid)
 
     # Rows without load say nothing about the response: they were averaged to the rest frequencies.
@@ -162,6 +163,7 @@ def show_fit(result: Fit, remark: str) -> None:
     console.print(f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {remark}")
     table = make_table(("coefficient",), ("value", "standard deviation"))
     for name, value in result.coefficients.items():
+        # Loads that do not excite a coefficient leave it undetermined.
         if math.isfinite(value):
             table.add_row(name, f"{value:+.5f}", f"{result.deviations[name]:.2g}")
         else:

@@ -58,6 +58,7 @@ def run(options: argparse.Namespace) -> int:
         symmetry = calibration.symmetry
     else:
         symmetry = largest_symmetry(layout)
+    # The symmetry decides how many coefficients the response has.
     structure = find_structure(layout, symmetry)
     if calibration is None:
         # Every response of this structure has the same ranks, but condition numbers and noise

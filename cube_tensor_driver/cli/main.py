@@ -124,8 +124,10 @@ def command_parser(name: str) -> Parser:
         close = nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
         Parser(prog=PROGRAM).error(f"unknown {kind} {name}; {close}")
 
+    # Commands for designers and developers are in packages of their own.
     package = PACKAGES.get(name, __package__.partition(".")[0])
     try:
+        # Only the module of this command is imported, to start quickly.
         module = importlib.import_module(f"{package}.cli.{name}")
     except ModuleNotFoundError as error:
         if error.name != package:

@@ -93,6 +93,7 @@ class Parser(argparse.ArgumentParser):
         if words[:1] in (["-h"], ["--help"]):
             self.print_help()
             self.exit()
+        # argparse accepts no words as an empty remainder.
         if self._missing and not words:
             self.exit(2, f"{self._prefix()}{self._missing}\n")
         namespace, _ = super().parse_known_args([], namespace)

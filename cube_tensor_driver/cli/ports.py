@@ -35,6 +35,7 @@ def run(options: argparse.Namespace) -> int:
                 f"{name}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} pads, "
                 f"{rate(hello.period_us)}, firmware 0x{hello.firmware:x}"
             )
+        # A port that a driver has open, or that this user must not open.
         elif port.problem:
             print(port.problem)
         else:

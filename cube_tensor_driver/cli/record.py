@@ -59,6 +59,7 @@ def run(options: argparse.Namespace) -> int:
             options.output,
             options.topics,
             storage=options.storage,
+            # 0 stands for no limit.
             max_bytes=round((options.split_size or 0) * 1e6),
             max_seconds=options.split_time or 0.0,
             duration=options.duration,

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as has_keys:
         length_s = (bag.end_ns - bag.start_ns) * 1e-9
         with ReplayBar(length_s, has_keys) as bar:
-
+            # It runs in the main thread, between two spins of the node.
             def each(player: Player) -> None:
                 children.check()
                 if has_keys:
@@ -73,6 +73,7 @@ def run(options: argparse.Namespace) -> int:
                 loop=options.loop,
                 start=options.start,
                 clock=options.clock,
+                # The view shows the recorded stress, not one that is computed again.
                 stress=options.stress or options.view,
                 hold=options.view,
                 each=each,
@@ -174,6 +175,7 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
                     f"{bag.path}: no stress to show; "
                     "./cube reprocess computes it from the frequencies"
                 )
+            # The page needs seconds to start; the replay begins when it can be opened.
             children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
             print(children.wait_for_line("view", "http://", MAX_START_S), file=sys.stderr)
         yield children

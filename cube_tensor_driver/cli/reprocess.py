@@ -93,6 +93,7 @@ def run(options: argparse.Namespace) -> int:
     overrides, contacts = overrides_of(options), contacts_of(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
     write_recipe(options.output, options.format, overrides, contacts)
+    # Results that are complete are kept, so that an interrupted run can be continued.
     waiting = [job for job in jobs if not job.output.exists()]
     processes = useful_workers(options.jobs, len(waiting))
     try:
@@ -176,6 +177,7 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
         raise ConfigError("found both --calibration and --skin; give one")
     calibration = skin = tare = None
     if options.tare_from is not None:
+        # The times are relative to the start of each bag.
         begin, end = tare = tuple(options.tare_from)
         if not 0 <= begin < end:
             raise ConfigError(f"--tare-from {begin:g} {end:g}: needed is 0 <= T0 < T1, in s")

@@ -24,6 +24,7 @@ def run(options: argparse.Namespace) -> int:
     from ..core.errors import TareError
     from ..ros.commands.services import request_tare
 
+    # The service that clears a tare takes no names.
     if options.clear and options.cubes:
         raise TareError(
             f"--clear with {' '.join(options.cubes)}: it clears the tare of all cubes; "

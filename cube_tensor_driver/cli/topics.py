@@ -18,6 +18,7 @@ def run(options: argparse.Namespace) -> int:
     from ..ros.commands.topics import list_topics
 
     topics = list_topics()
+    # The columns are aligned, so that rates can be compared.
     width = max(len(topic.name) for topic in topics)
     for topic in topics:
         rate = "not installed here" if topic.rate is None else f"{topic.rate:.0f} Hz"

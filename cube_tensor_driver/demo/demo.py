@@ -89,6 +89,7 @@ def run_demo(settings: DemoSettings) -> int:
     with tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
         folder = Path(name)
         skin_file = choose_skin_file(settings, folder)
+        # A hub that is told no rate by anybody sends no samples.
         rate = settings.rate or rate_of_file(skin_file) or DEFAULT_RATE
         hubs = SimulatedHubs(
             folder / "ports",
@@ -152,7 +153,13 @@ def write_grid(path: Path, cubes: int, rate: float) -> Path:
     nx = math.ceil(math.sqrt(cubes))
     ny = math.ceil(cubes / nx)
     links = math.ceil(cubes / CUBES_PER_HUB)
-    skin = grid(nx=nx, ny=ny, pitch=PITCH, links=links, rate=rate)
+    skin = grid(
+        nx=nx,
+        ny=ny,
+        pitch=PITCH,
+        links=links,
+        rate=rate,
+    )
     # The last row may be incomplete; a hub that loses all of its cubes goes as well.
     skin["cubes"] = skin["cubes"][:cubes]
     used = {cube["link"] for cube in skin["cubes"]}

@@ -100,6 +100,7 @@ class LoadVerification:
         """Add the rows of one message of stress, received at `received_ns` of the wall clock."""
         np.maximum.at(self._newest_ns, rows.cube, rows.stamp_ns)
         self._stress.add(rows, received_ns)
+        # The order is that of `Arrivals`, so that its indices fit.
         self._components.append(np.concatenate([rows.stress, rows.gradient], axis=1))
 
     @property
@@ -111,7 +112,12 @@ class LoadVerification:
         """Return whether each cube has a tensor whose stamp is after `end_ns`."""
         return bool(self._newest_ns.min() > end_ns)
 
-    def compare(self, log: SampleLog, start_ns: int, end_ns: int) -> None:
+    def compare(
+        self,
+        log: SampleLog,
+        start_ns: int,
+        end_ns: int,
+    ) -> None:
         """Set what is compared: samples taken from `start_ns` to before `end_ns` (wall clock)."""
         self._log, self._span_ns = log, (start_ns, end_ns)
 
@@ -147,12 +153,14 @@ class LoadVerification:
         """
         cube, components, taken_ns = self._received(self._comparison(self._stress))
         times_ns, counts = np.unique(taken_ns, return_counts=True)
+        # A force on the whole skin needs a tensor of every cube at the same time.
         times_ns = thin_out(times_ns[counts == len(self._skin.cubes)])
         if not len(times_ns):
             raise MessageError(
                 "no tensors of all cubes at one time have arrived: there are no forces to draw"
             )
 
+        # The load script runs in simulated time, which began with the simulator.
         seconds = (times_ns - self._log.start_time_ns) * 1e-9
         applied = [self._load.total(time) for time in seconds.tolist()]
         surface = Surface(self._load.poses, self._load.depth)
@@ -202,6 +210,7 @@ class LoadVerification:
         script = [self._truth(time) for time in np.linspace(0, self._load.period, RANGE_TIMES)]
         span = np.nanmax(script, axis=(0, 1)) - np.nanmin(script, axis=(0, 1))
         error = np.concatenate(errors)
+        # A component that the script never changes has no range to compare with.
         relative = error[:, span > 0] / span[span > 0]
         over_noise = error / np.concatenate(allowed)
         return {

@@ -41,5 +41,6 @@ class Usage:
         return {name: process.num_threads() for name, process in self._processes.items()}
 
     def _cpu_seconds(self) -> dict[str, float]:
+        # User and system time: sending and receiving happens in the kernel.
         times = {name: process.cpu_times() for name, process in self._processes.items()}
         return {name: float(time.user + time.system) for name, time in times.items()}

@@ -102,7 +102,12 @@ class Comparison:
         return self.sent - self.received
 
 
-def compare(taken: SampleTable, arrivals: Arrivals, start_ns: int, end_ns: int) -> Comparison:
+def compare(
+    taken: SampleTable,
+    arrivals: Arrivals,
+    start_ns: int,
+    end_ns: int,
+) -> Comparison:
     """Compare what arrived with what was taken from `start_ns` to before `end_ns` (wall clock)."""
     cube, sequence, stamp_ns, received_ns = arrivals.columns()
     sample = taken.match(SampleKeys(cube, sequence, stamp_ns))

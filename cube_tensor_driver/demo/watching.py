@@ -134,7 +134,14 @@ def watch(
         observer = stack.enter_context(
             observing("demo", children, interrupted=interrupted, on_step=table.refresh)
         )
-        watcher = SkinWatcher(skin, rate, children, table, observer, verification)
+        watcher = SkinWatcher(
+            skin,
+            rate,
+            children,
+            table,
+            observer,
+            verification,
+        )
         watcher.wait_for_tensors()
         if settings.view:
             watcher.note_address()
@@ -218,6 +225,7 @@ class SkinWatcher:
 
     def note_address(self) -> None:
         """Write the address of the browser view above the table."""
+        # The table is drawn while the view starts.
         self._observer.spin(MAX_START_S, lambda: "http://" in self._children.log("view"))
         address = self._children.wait_for_line("view", "http://", 0.0).split()[0]
         self._table.note = f"\n{address} shows it"
@@ -243,6 +251,7 @@ class SkinWatcher:
         # On a busy machine the simulator takes its samples late; its log must cover the span.
         spin(MAX_LATE_S, lambda: verification.is_beyond(end_ns))
         verification.compare(end_simulator(self._children, log), start_ns, end_ns)
+        # The last tensors are on their way when the simulator has ended.
         spin(MAX_LATE_S, verification.is_complete)
         self._check_alone()
         return {
@@ -254,6 +263,7 @@ class SkinWatcher:
 
     def _check_alone(self) -> None:
         """Raise CubeError if another skin publishes here: its tensors would be counted."""
+        # Messages of a smaller skin would pass as ours, so publishers are counted as well.
         if self._sees_other_skin or self._observer.node.count_publishers("stress") > 1:
             raise CubeError(
                 f"another skin publishes stress in DDS domain {os.environ.get('ROS_DOMAIN_ID', 0)}:"
@@ -267,6 +277,7 @@ class SkinWatcher:
         except MessageError as error:
             self._observer.log_error(str(error))
             return
+        # Our reconstruction sends no such cube.
         if int(rows.cube.max(initial=0)) >= self._n_cubes:
             self._sees_other_skin = True
             return

@@ -86,12 +86,36 @@ QUANTITIES = {
     "pressure": Quantity(
         "pressure −σzz", "kPa", 1e3, 500.0, False, lambda values, residual: -values[:, 2]
     ),
-    "shear": Quantity("shear |σzx, σyz|", "kPa", 1e3, 500.0, False, _length("zx", "yz")),
+    "shear": Quantity(
+        "shear |σzx, σyz|",
+        "kPa",
+        1e3,
+        500.0,
+        False,
+        _length("zx", "yz"),
+    ),
     "gradient": Quantity(
         "gradient |∂σzz/∂x, ∂σzz/∂y|", "kPa/mm", 1e6, 1e5, False, _length("zz_x", "zz_y")
     ),
-    **{name: Quantity(f"σ{name}", "kPa", 1e3, 500.0, True, _component(name)) for name in STRESS},
-    "residual": Quantity("residual", "σ", 1.0, 3.0, False, lambda values, residual: residual),
+    **{
+        name: Quantity(
+            f"σ{name}",
+            "kPa",
+            1e3,
+            500.0,
+            True,
+            _component(name),
+        )
+        for name in STRESS
+    },
+    "residual": Quantity(
+        "residual",
+        "σ",
+        1.0,
+        3.0,
+        False,
+        lambda values, residual: residual,
+    ),
 }
 """Name -> quantity, of all that markers and the page can show."""
 
@@ -117,6 +141,7 @@ def colours(quantity: Quantity, values: Array, top: float) -> Array:
     if quantity.signed:
         share = share / 2 + 0.5
     table = _colour_table(DIVERGING if quantity.signed else SEQUENTIAL)
+    # Colours between two entries of the table are interpolated linearly.
     place = np.clip(share, 0, 1) * (len(table) - 1)
     low = np.minimum(place.astype(int), len(table) - 2)
     part = (place - low)[:, None]
@@ -158,6 +183,7 @@ def gradient_arrows(poses: CubePoses, values: Array, length: float) -> Array:
         values: (N, 15); components that are not observed count as 0.
         length: Length in metres per Pa/m.
     """
+    # Pressure is −σzz, so that it grows against the gradient of σzz.
     columns = [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]
     gradient = -np.nan_to_num(values[:, columns]) * length
     arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], gradient)
@@ -179,6 +205,7 @@ def principal_crosses(poses: CubePoses, values: Array, length: float) -> tuple[A
     Returns:
         Lines (N, 3, 2, 3), and whether each is tension (N, 3).
     """
+    # Directions are rows in the frame of the cube.
     principal, directions = principal_stresses(np.nan_to_num(values[:, : len(STRESS)]))
     in_parent = np.einsum("nij,nkj->nki", poses.rotation, directions)
     half = in_parent * (0.5 * length * np.abs(principal))[..., None]
@@ -193,6 +220,7 @@ def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     The lines of a fine cube have a length of 0.
     """
     corner = np.array([[[-1, -1, 0.0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]) * 1.3
+    # The crosses float a little above the face, and have no size over a fine cube.
     corner = np.where((health != FINE)[:, None, None, None], corner, 0) + np.array([0, 0, 1.2])
     scaled = corner * poses.half_side[:, None, None, None]
     in_parent = np.einsum("nij,nabj->nabi", poses.rotation, scaled)

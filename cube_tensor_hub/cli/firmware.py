@@ -75,11 +75,17 @@ def run_emulated(options: argparse.Namespace) -> int:
     skin, hub = skin_of_hub(options.config)
     script = default_script() if options.load is None else read_script(options.load)
     build(SOURCE, OUT, "an386")
+    # The pads live in this process; the emulated hub measures them over a socket.
     pads = Oscillators(hub, Load(skin, script))
     with Emulator(OUT / "hub.elf", parse_url(hub.link.port)) as emulator:
         print(f"the hub is at {emulator.port}, under a load; Ctrl-C ends it", flush=True)
-        server = threading.Thread(target=pads.serve, args=(emulator.pads,), daemon=True)
+        server = threading.Thread(
+            target=pads.serve,
+            args=(emulator.pads,),
+            daemon=True,
+        )
         server.start()
+        # It ends when QEMU does, since that closes the line.
         server.join()
         emulator.check()
     return 0

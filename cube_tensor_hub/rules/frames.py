@@ -15,6 +15,7 @@ OVERFULL = ("unread", "gone")
 @rule("F1", "A sender puts a zero before and behind each frame.", needs=(ANY_FRAME,))
 def zeros_around(transcript: Transcript) -> RuleResult:
     """Between two frames there must be two zeros: one behind the first, one before the second."""
+    # A frame that follows a damaged run tells nothing about its zeros.
     opened = [heard.opened for heard in transcript.heard() if heard.opened is not None]
     if not opened:
         return not_tried("no two frames came one behind the other")
@@ -75,6 +76,7 @@ def nothing_but_frames(transcript: Transcript) -> RuleResult:
         kinds = ", ".join(f"{name} {count}" for name, count in transcript.damage.items())
         other = "" if transcript.other_version is None else f"; version {transcript.other_version}"
         return failed(f"{damaged} runs of bytes are no frame ({kinds}{other})")
+    # A REQUEST is a valid frame, but it goes from hosts to hubs only.
     wrong_way = [heard for step in steps for heard in step.heard if type(heard.frame) is Request]
     if wrong_way:
         return failed(f"the hub sent {len(wrong_way)} frames of type REQUEST")

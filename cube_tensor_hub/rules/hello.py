@@ -31,6 +31,7 @@ def once_a_second(heard: list[Heard], name: str, what: str) -> str:
         return f"{len(heard)} {name} {what} in a time in which 3 were due"
     gaps = [after.at_s - before.at_s for before, after in pairwise(heard)]
     mean = sum(gaps) / len(gaps)
+    # A busy host or emulator is late by some tenths of a second now and then.
     if not 0.9 < mean < 1.1 or max(gaps) > 1.6:
         return f"{name} {what} every {mean:.2f} s, at most {max(gaps):.2f} s apart"
     return ""
@@ -85,6 +86,7 @@ def uids_differ(transcript: Transcript) -> RuleResult:
     hubs = list(dict.fromkeys(hello.hub_uid for hello in hellos))
     if len(hubs) > 1:
         return failed(f"the hub's uid changed from 0x{hubs[0]:x} to 0x{hubs[1]:x}")
+    # A uid of 0 means that the cube has none.
     uids = [uid for uid in hellos[-1].cube_uids.tolist() if uid]
     twice = [uid for uid in set(uids) if uids.count(uid) > 1]
     if twice:
@@ -118,8 +120,10 @@ def cubes_stay(transcript: Transcript) -> RuleResult:
     hello, last = 0, None
     for heard in transcript.heard(*transcript.first_visit):
         if isinstance(heard.frame, Hello):
+            # From here on another number of cubes is right.
             if heard.frame.n_cubes != hello:
                 hello, last = heard.frame.n_cubes, None
+        # A frame of a split sample does not have all cubes.
         elif isinstance(heard.frame, Sample) and frames == 1:
             cubes = heard.frame.n_cubes
             if last is not None and cubes != last:

@@ -45,6 +45,7 @@ def nothing_but_the_bytes(transcript: Transcript) -> RuleResult:
     if not transcript.is_tcp:
         return not_tried("this is no TCP link")
     first = transcript.first_bytes
+    # 0xFF begins a command of Telnet.
     if len(first) > 1 and first[0] == 0xFF and first[1] in TELNET_COMMANDS:
         return failed(f"the bridge begins with a command of Telnet: {first[:3].hex(' ')}")
     if first[:2] == TLS_RECORD:
@@ -75,10 +76,12 @@ def host_goes_away(transcript: Transcript) -> RuleResult:
         return failed(f"no HELLO after the port was closed for {AWAY_S:g} s and opened again")
     if not after:
         return failed("no STATS after the port was closed and opened again")
+    # The uptime went back, so the hub has restarted; only a serial port may cause that.
     if after[-1].uptime_ms < before[-1].uptime_ms:
         if transcript.is_tcp:
             return failed("the hub restarted when the connection was closed and made again")
         return not_tried("this hub restarts when its port is opened, as L2 allows")
+    # The counter wraps at 2^32.
     taken = after[-1].taken - before[-1].taken & 0xFFFFFFFF
     seconds = 1e-3 * (after[-1].uptime_ms - before[-1].uptime_ms)
     # Samples that a busy host reads before the ACK were taken at the faster period.

@@ -49,6 +49,7 @@ def one_ack_each(transcript: Transcript) -> RuleResult:
     """
     n_requests = 0
     for step in transcript.steps.values():
+        # A hub that knows request 6 answers it with TIME: T2 checks that.
         asked = [ask.request for ask in step.requests if ask.request != Command.TIME]
         if not asked:
             continue
@@ -58,6 +59,7 @@ def one_ack_each(transcript: Transcript) -> RuleResult:
             return failed(
                 f"requests {words(asked)} got ACKs {words(answered)}, in the step '{step.name}'"
             )
+    # A STOP that was carried out before its ACK leaves no sample behind it.
     for name in ("stop", "stop samples"):
         late = behind_ack(transcript.steps[name], Command.STOP)
         if late:
@@ -103,6 +105,7 @@ def period_is_kept(transcript: Transcript) -> RuleResult:
         return not_tried(f"the hub did not take a period of {PERIOD_US} µs")
     if ack.result != Result.DONE:
         return failed(f"request 4 was answered with result {ack.result}")
+    # The HELLO was asked for after the ACK, so it must know the new period.
     hello = transcript.frames(Hello, "after period")
     if hello and hello[0].period_us != ack.argument:
         return failed(f"ACK says {ack.argument} µs, HELLO behind it {hello[0].period_us} µs")
@@ -111,6 +114,7 @@ def period_is_kept(transcript: Transcript) -> RuleResult:
         return not_tried(f"{len(gaps)} periods came in the step 'start', 3 are needed")
     middle = float(np.median(gaps))
     text = f"asked {PERIOD_US} µs, in force {ack.argument} µs, median {middle:.1f} µs"
+    # Device time has a resolution of 1 µs, hence the 2 µs.
     if abs(middle - ack.argument) > PERIOD_TOLERANCE * ack.argument + 2:
         return failed(text)
     return passed(f"{text}, mean {gaps.mean():.1f} µs, jitter {gaps.std():.1f} µs")
@@ -125,8 +129,10 @@ def impossible_period(transcript: Transcript) -> RuleResult:
     ack = transcript.steps["impossible period"].ack(Command.SET_PERIOD)
     if ack is None:
         return not_tried("request 4 was not answered: see R1")
+    # The last HELLO before the request tells the period that was in force.
     before = transcript.frames(Hello, "three at once")
     after = transcript.frames(Hello, "after impossible period")
+    # A hub may round any period to one that it can do.
     if ack.result == Result.DONE and ack.argument:
         return not_tried(f"the hub rounded a period of 0 µs to {ack.argument} µs, as R3 allows")
     if ack.result != Result.REFUSED:
@@ -152,6 +158,7 @@ def hosts_see_restarts(transcript: Transcript) -> RuleResult:
     needs=(Ack,),
 )
 def start_and_stop_again(transcript: Transcript) -> RuleResult:
+    # START is sent three times, at different places within a period.
     again = [name for name in transcript.steps if name.startswith("start again")]
     asked = [(Command.START, name) for name in again]
     asked += [(Command.STOP, name) for name in ("three at once", "stop again")]
@@ -160,6 +167,7 @@ def start_and_stop_again(transcript: Transcript) -> RuleResult:
         if ack is not None and ack.result != Result.DONE:
             return failed(f"a second {command.name} was answered with result {ack.result}")
     period_us = in_force(transcript.steps["period"])
+    # The last samples before the second START; earlier ones may have drifted.
     before = phases(transcript.frames(Sample, "start"), period_us)[-5:]
     if len(before) < 3:
         return not_tried("too few samples came to see it")
@@ -187,6 +195,7 @@ def new_period_at_once(transcript: Transcript) -> RuleResult:
     period_us = in_force(transcript.steps["slower"])
     if not period_us or period_us == in_force(transcript.steps["period"]):
         return not_tried("the hub did not take another period")
+    # The first gap behind the ACK may still have begun with the old period.
     gaps = periods_us(behind_ack(transcript.steps["slower"], Command.SET_PERIOD))[1:]
     if len(gaps) < MIN_PERIODS:
         return failed(f"{len(gaps) + 1} periods came after a new period of {period_us} µs")
@@ -206,6 +215,7 @@ def stopped_until_start(transcript: Transcript) -> RuleResult:
         return not_tried("no STATS came, so when the power came on is not known")
     opened = transcript.steps["opened"].sent_s
     first = next(heard for heard in transcript.heard() if isinstance(heard.frame, Stats))
+    # If the power came on before the port was opened, samples may be those of an earlier START.
     uptime_s = 1e-3 * stats[0].uptime_ms
     if early and uptime_s < first.at_s - opened + 0.5:
         return failed(f"{len(early)} samples came before START, {uptime_s:.1f} s after power-up")

@@ -38,6 +38,7 @@ MIN_DRIFT_SAMPLES = 20
 
 def forward(later: int, earlier: int) -> int:
     """Return by how much a number that wraps at 2^32 grew; negative if it went back."""
+    # The shift by half of the range makes a small step back negative instead of nearly 2^32.
     return (later - earlier + HALF) % (1 << 32) - HALF
 
 
@@ -77,6 +78,7 @@ def numbers_go_on(transcript: Transcript) -> RuleResult:
         if forward(sample.sequence, last.sequence) <= 0:
             return failed(f"number {sample.sequence} came after {last.sequence}, {where}")
     first, last = samples[0][1], samples[-1][1]
+    # A hub that has just been switched on says so: it has taken no sample yet.
     stats = transcript.frames(Stats, "opened", "hello", "stop", "quiet")
     if stats and stats[-1].taken == 0 and first.sequence != 0:
         return failed(f"the first sample since power-up has number {first.sequence}")
@@ -100,6 +102,7 @@ def device_time_runs(transcript: Transcript) -> RuleResult:
             )
     stats = transcript.frames(Stats, *transcript.first_visit)
     device_s = 1e-6 * samples[-1].device_us
+    # A hub that restarts its device time at START, for example, shows here.
     if stats and abs(device_s - 1e-3 * stats[-1].uptime_ms) > MAX_UPTIME_DIFFERENCE_S:
         uptime_s = 1e-3 * stats[-1].uptime_ms
         return failed(f"device time is {device_s:.3f} s, the uptime in STATS {uptime_s:.3f} s")
@@ -112,6 +115,7 @@ def device_time_runs(transcript: Transcript) -> RuleResult:
     device_us = np.array([float(sample.device_us) for sample in transcript.frames(Sample, "start")])
     drift, unsure, jitter = drift_of(host_us - host_us[0], device_us - device_us[0])
     text = f"{1e6 * drift:+.0f} ± {1e6 * unsure:.0f} ppm against the host, jitter {jitter:.0f} µs"
+    # The driver gives up a hub whose clock runs further off.
     if abs(drift) - unsure > MAX_DRIFT:
         return failed(f"device time runs {text}")
     return passed(f"never back, {text}")
@@ -131,6 +135,7 @@ def drift_of(host: NDArray[np.float64], device: NDArray[np.float64]) -> tuple[fl
         Relative drift, its uncertainty, and the median delay above the smallest one, in µs.
     """
     delay = host - device
+    # The drift moves the delays apart, and the more so the further apart the two samples are.
     half = len(delay) // 2
     early, late = int(np.argmin(delay[:half])), half + int(np.argmin(delay[half:]))
     apart = float(host[late] - host[early])
@@ -156,9 +161,11 @@ def frames_of_a_sample(transcript: Transcript) -> RuleResult:
         times = sorted({sample.device_us for sample in group})
         if len(times) > 1:
             return failed(f"frames of sample {group[0].sequence} have device times {times} µs")
+        # `groupby` begins a new group where another sample's frame lies in between.
         if group[0].sequence in seen and group[0].first_cube:
             return failed(f"between frames of sample {group[0].sequence} came one of another")
         seen.add(group[0].sequence)
+    # Samples that lost a frame are left out: that is for S4 and F5 to check.
     n_frames = max(map(len, groups))
     splits = sorted(
         {
@@ -195,10 +202,12 @@ def drops_are_counted(transcript: Transcript) -> RuleResult:
             step = 1 if previous is None else forward(number, previous)
             if step < 0:
                 return not_tried("the numbers go back: see S1")
+            # A sample that lacks a frame counts as dropped as a whole.
             missing += max(0, step - 1) + (frames[number] < n_frames)
             previous = number
         elif isinstance(heard.frame, Stats):
             before, counted = counted, heard.frame.dropped - base & 0xFFFFFFFF
+            # A count that stays while it exceeds what is missing was never right.
             if counted < missing or before == counted > missing:
                 return failed(f"{missing} numbers are missing, STATS counts {counted} as dropped")
     if counted:
@@ -279,19 +288,23 @@ def stats_come(transcript: Transcript) -> RuleResult:
 )
 def full_buffer(transcript: Transcript) -> RuleResult:
     step = transcript.steps["unread"]
+    # Damage in other steps comes from the line and says nothing about the buffer.
     if sum(other.damaged for other in transcript.steps.values()) > step.damaged:
         return not_tried("frames are damaged in any case: see F5")
     if step.damaged:
         return failed(f"{step.damaged} damaged frames after {UNREAD_S:g} s without reading")
+    # Only the steps before it, in which everything was read.
     read = transcript.first_visit[: transcript.first_visit.index("unread")]
     before = transcript.frames(Stats, *read)[-1]
     stats = [before, *transcript.frames(Stats, "unread", "period again")]
     dropped = forward(stats[-1].dropped, before.dropped)
     if dropped:
         return passed(f"{dropped} whole samples dropped in {UNREAD_S:g} s without reading")
+    # Nothing was dropped: either the line took everything, or the hub has waited for the host.
     due_ms = before.uptime_ms + 1e3 * UNREAD_S
     if stats[-1].uptime_ms < due_ms:
         return failed(f"no STATS any more after {UNREAD_S:g} s without reading")
+    # The period in force may be a rounded one, so it is measured.
     gaps = periods_us(transcript.frames(Sample, "fast"))
     rate = 1e6 / float(np.median(gaps)) if len(gaps) else 0.0
     for one, other in pairwise(stats):

@@ -72,6 +72,7 @@ def clock_is_read_between(transcript: Transcript) -> RuleResult:
     trips = time_exchanges(transcript)
     if not knows_time(transcript) or len(trips) < 2:
         return not_tried(NOT_KNOWN)
+    # The shortest time between request and answer is what the driver works with.
     shortest = min(trip.came_s - trip.sent_s for trip in trips)
     for first, trip in pairwise(trips):
         slack = MAX_RATE_DIFFERENCE * (trip.came_s - first.sent_s) + RESOLUTION_S
@@ -111,6 +112,7 @@ def clock_of_samples(transcript: Transcript) -> RuleResult:
         return not_tried(NOT_KNOWN)
     if not samples:
         return not_tried("no SAMPLE came")
+    # The answer with the shortest delay tells the hub's clock best.
     best = min(trips, key=lambda trip: trip.came_s - trip.sent_s)
     for heard, sample in zip(samples, transcript.frames(Sample, "start"), strict=True):
         age_s = heard.at_s - best.sent_s - (1e-6 * sample.device_us - best.device_s)

@@ -31,6 +31,7 @@ def draw_layout(layout: Layout) -> Figure:
     _draw_edges(axes)
     for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):
         _draw_pad(axes, name, centre, normal, layout.pad_size)
+    # matplotlib takes the view as two angles.
     elevation = np.degrees(np.arctan2(_VIEW[2], np.hypot(*_VIEW[:2])))
     azimuth = np.degrees(np.arctan2(_VIEW[1], _VIEW[0]))
     axes.view_init(elev=elevation, azim=azimuth)
@@ -48,6 +49,7 @@ def draw_layout(layout: Layout) -> Figure:
 
 def _draw_edges(axes: Any) -> None:
     """Draw the edges of the cube; those that end in its hidden corner are dotted."""
+    # Two corners are joined by an edge if they differ in one coordinate.
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     hidden = -np.sign(_VIEW)
     for i, a in enumerate(corners):
@@ -57,18 +59,42 @@ def _draw_edges(axes: Any) -> None:
                 continue
             is_hidden = np.array_equal(a, hidden) or np.array_equal(b, hidden)
             color, dash = ("0.6", ":") if is_hidden else ("0.2", "-")
-            axes.plot(*np.stack([a, b], axis=1), color=color, ls=dash, lw=1)
+            axes.plot(
+                *np.stack([a, b], axis=1),
+                color=color,
+                ls=dash,
+                lw=1,
+            )
 
 
-def _draw_pad(axes: Any, name: str, centre: Array, normal: Array, size: float) -> None:
+def _draw_pad(
+    axes: Any,
+    name: str,
+    centre: Array,
+    normal: Array,
+    size: float,
+) -> None:
     """Draw a square pad with its name; size: side, in units of the half side of the cube."""
     u, w = np.eye(3)[np.flatnonzero(normal == 0)] * size / 2
     outline = np.array([centre + a * u + b * w for a, b in _SQUARE])
     is_in_front = normal @ _VIEW > 0
     color, dash, order = ("C0", "-", 3) if is_in_front else ("0.55", "--", 1)
-    axes.plot(*outline.T, color=color, lw=1.2, ls=dash, zorder=order)
+    axes.plot(
+        *outline.T,
+        color=color,
+        lw=1.2,
+        ls=dash,
+        zorder=order,
+    )
     if is_in_front:
-        axes.add_collection3d(Poly3DCollection([outline], facecolor="C0", alpha=0.25, zorder=2))
+        axes.add_collection3d(
+            Poly3DCollection(
+                [outline],
+                facecolor="C0",
+                alpha=0.25,
+                zorder=2,
+            )
+        )
     axes.text(
         # A little above the face, so that the pad does not cover it.
         *(centre + 0.02 * normal),
@@ -108,9 +134,23 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
     outliers = fit.outliers
     if outliers.any():
         x, y = fit.fitted[outliers] * 1e-3, measured[outliers] * 1e-3
-        left.plot(x, y, "x", color="C3", ms=7, label="outlier")
+        left.plot(
+            x,
+            y,
+            "x",
+            color="C3",
+            ms=7,
+            label="outlier",
+        )
+    # Points of a perfect fit lie on this diagonal.
     ends = np.array([np.nanmin(fit.fitted), np.nanmax(fit.fitted)]) * 1e-3
-    left.plot(ends, ends, color="0.5", lw=0.8, zorder=0)
+    left.plot(
+        ends,
+        ends,
+        color="0.5",
+        lw=0.8,
+        zorder=0,
+    )
     left.set(xlabel="fitted pad stress / kPa", ylabel="measured pad stress / kPa")
     left.legend(fontsize=7, ncol=2 if len(pads) <= MAX_ONE_COLUMN_PADS else 3)
     right.axhline(0, color="0.5", lw=0.8)

@@ -62,15 +62,37 @@ def draw_forces(
     path.plot(MM * cubes[:, 1], MM * cubes[:, 0], "s", color="0.8", ms=3)
     path.plot(MM * centre[:, 1], MM * centre[:, 0], color="black", lw=1)
     measured = MM * measured_centre
-    path.plot(measured[:, 1], measured[:, 0], "o", color="C3", mfc="none", ms=3)
-    path.set(xlabel="$y$ / mm", ylabel="$x$ / mm", aspect="equal")
+    path.plot(
+        measured[:, 1],
+        measured[:, 0],
+        "o",
+        color="C3",
+        mfc="none",
+        ms=3,
+    )
+    path.set(
+        xlabel="$y$ / mm",
+        ylabel="$x$ / mm",
+        aspect="equal",
+    )
     path.set_title("path of the centre of pressure\n(grey: cubes; circles: measured)", fontsize=9)
     return figure
 
 
-def _draw_components(panel: Any, times: Array, applied: Array, measured: Array) -> None:
+def _draw_components(
+    panel: Any,
+    times: Array,
+    applied: Array,
+    measured: Array,
+) -> None:
     for axis, (letter, marker, color, dash) in enumerate(_AXIS_STYLES):
-        panel.plot(times, applied[:, axis], color=color, lw=1, ls=dash)
+        panel.plot(
+            times,
+            applied[:, axis],
+            color=color,
+            lw=1,
+            ls=dash,
+        )
         panel.plot(
             times, measured[:, axis], marker, color=color, mfc="none", ms=3, label=f"${letter}$"
         )

@@ -78,6 +78,7 @@ def symbol(component: str) -> str:
 def curve_style(number: int) -> dict[str, Any]:
     """Return colour, marker and dashes of the curve with this number in a panel."""
     count = len(_CURVE_COLOURS)
+    # The dashes move on by one each time the colours start again.
     dashes = (number + number // count) % len(_CURVE_DASHES)
     return {
         "color": _CURVE_COLOURS[number % count],
@@ -122,6 +123,7 @@ def png_of_pixels(pixels: NDArray[np.uint8]) -> bytes:
 
 def check_picture(path: Path) -> None:
     """Raise ConfigError if the suffix is no picture format that matplotlib can write."""
+    # The list depends on the installed version of matplotlib.
     formats = FigureCanvasAgg.get_supported_filetypes()
     if path.suffix and path.suffix[1:].lower() not in formats:
         raise ConfigError(

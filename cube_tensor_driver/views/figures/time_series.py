@@ -87,6 +87,7 @@ def cube_series(
     for segment, rows in reconstruct(source):
         seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
         chosen = (rows.cube == number) & (seconds >= start) & (seconds <= end)
+        # Cubes with fewer pads than others have unused columns behind theirs.
         frequency = segment.messages.rows.frequency[chosen, :n_pads]
         values = np.hstack([rows.stress, rows.gradient])[chosen]
         parts.append(
@@ -99,6 +100,7 @@ def cube_series(
             f"the bag is {length:.3f} s long"
         )
     joined = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    # Every n-th sample is kept, which cannot be seen on paper.
     every = math.ceil(len(joined[0]) / MAX_POINTS)
     seconds, frequency, values, residual, status = (column[::every] for column in joined)
     return TimeSeries(
@@ -133,12 +135,26 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
     _draw_columns(gradient_axes, seconds, gradient_kpa_per_mm, symbols[n_stress:])
     gradient_axes.set(ylabel="gradient / (kPa/mm)")
 
-    bottom.plot(seconds, series.residual, color="0.3", lw=0.8, label="residual")
+    bottom.plot(
+        seconds,
+        series.residual,
+        color="0.3",
+        lw=0.8,
+        label="residual",
+    )
     for bit, label, marker in ((RESIDUAL, "residual too large", "x"), (INVALID, "invalid", "v")):
         is_marked = series.status & bit > 0
         if is_marked.any():
+            # An invalid row has no residual and is marked at zero.
             residual = np.nan_to_num(series.residual[is_marked])
-            bottom.plot(seconds[is_marked], residual, marker, color="C3", ms=4, label=label)
+            bottom.plot(
+                seconds[is_marked],
+                residual,
+                marker,
+                color="C3",
+                ms=4,
+                label=label,
+            )
     bottom.set(ylabel="residual / expected noise", xlabel="time after the start of the bag / s")
     bottom.legend(loc="upper right", fontsize=7)
     return figure
@@ -160,7 +176,12 @@ def _with_breaks(series: TimeSeries) -> TimeSeries:
     )
 
 
-def _draw_columns(axes: Any, seconds: AnyArray, columns: AnyArray, names: list[str]) -> None:
+def _draw_columns(
+    axes: Any,
+    seconds: AnyArray,
+    columns: AnyArray,
+    names: list[str],
+) -> None:
     """Draw lines that differ in dashes, markers and lightness, so that grey is enough.
 
     Args:
@@ -190,4 +211,9 @@ def _draw_columns(axes: Any, seconds: AnyArray, columns: AnyArray, names: list[s
             label=name,
         )
     columns_of_legend = 1 if len(names) <= 12 else 2
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, ncol=columns_of_legend)
+    axes.legend(
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        fontsize=7,
+        ncol=columns_of_legend,
+    )

@@ -71,7 +71,12 @@ def _forms(components: Sequence[str]) -> Iterator[_Form]:
     for n in range(len(names), 0, -1):
         yield _Form(names[:n], has_bar=False, has_lines=False)
     yield _Form((), has_bar=False, has_lines=False)
-    yield _Form((), has_bar=False, has_residual=False, has_lines=False)
+    yield _Form(
+        (),
+        has_bar=False,
+        has_residual=False,
+        has_lines=False,
+    )
 
 
 class LiveTable:
@@ -129,6 +134,7 @@ class LiveTable:
         self._values[cube, : len(STRESS)] = rows.stress
         self._values[cube, len(STRESS) :] = rows.gradient
         self._residual[cube], self._status[cube] = rows.residual, rows.status
+        # `add.at` counts each row where a cube occurs several times in a message.
         np.add.at(self._count, cube, 1)
 
     def refresh(self) -> None:
@@ -154,6 +160,7 @@ class LiveTable:
         caption = None
         if len(shown) > max_rows:
             by_size = np.argsort(-np.abs(pressure), kind="stable")
+            # The rows stay in the order of the skin file.
             shown = np.sort(by_size[:max_rows])
             caption = f"the {max_rows} cubes under the greatest normal stress of {len(pressure)}"
 
@@ -161,13 +168,19 @@ class LiveTable:
         options = self._console.options.update(max_width=UNLIMITED_WIDTH)
         table = Table()
         for form in _forms(components):
+            # The width depends on the content, so each form is made and measured.
             table = self._table(form, shown, pressure)
             table.caption = caption
             if Measurement.get(self._console, options, table).maximum <= width:
                 break
         return table
 
-    def _table(self, form: _Form, shown: Index, pressure: Array) -> Table:
+    def _table(
+        self,
+        form: _Form,
+        shown: Index,
+        pressure: Array,
+    ) -> Table:
         """Make the table of some cubes.
 
         Args:

@@ -23,7 +23,12 @@ def say(text: str, style: str = "", *, stderr: bool = False) -> None:
         stderr: Whether the line goes to stderr instead of stdout.
     """
     console = Console(stderr=stderr, highlight=False)
-    console.print(text, style=style, markup=False, soft_wrap=True)
+    console.print(
+        text,
+        style=style,
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
@@ -49,7 +54,12 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
         return
 
     what_column = TextColumn(
-        "{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)
+        "{task.description}",
+        table_column=Column(
+            no_wrap=True,
+            overflow="ellipsis",
+            ratio=1,
+        ),
     )
     bar = Progress(
         what_column,
@@ -64,7 +74,12 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
         task = bar.add_task("starting", total=1.0)
 
         def report(done: float, total: float, what: str) -> None:
-            bar.update(task, completed=done, total=total, description=what)
+            bar.update(
+                task,
+                completed=done,
+                total=total,
+                description=what,
+            )
 
         yield report
         bar.update(task, completed=bar.tasks[0].total)
