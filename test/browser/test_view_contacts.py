@@ -32,7 +32,7 @@ class Node:
     def create_subscription(self, kind, topic, callback, depth) -> None:
         self.callbacks[topic] = callback
 
-    def wrap(self, callback):
+    def catch(self, callback):
         return callback
 
 
