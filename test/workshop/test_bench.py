@@ -44,12 +44,14 @@ def test_skin_counts_what_was_sent(domain, tmp_path):
 import functools, os, pathlib, sys
 from workshop.bench import skin as bench
 bench.SETTLE_S = bench.DRAIN_S = 0.2
-bench._echo = functools.cache(bench._echo)
+bench._measure_echo = functools.cache(bench._measure_echo)
 os.environ["ROS_DOMAIN_ID"] = "77"
-domains, queue = set(), bench.queue
-bench.queue = lambda rate: domains.add(os.environ["ROS_DOMAIN_ID"]) or queue(rate)
+domains, profile = set(), bench.batch_profile
+bench.batch_profile = lambda rate: domains.add(os.environ["ROS_DOMAIN_ID"]) or profile(rate)
 bench.bench_skin(
-    cubes=3, rate=100.0, duration=0.6, publish_period=0.02, json_path=pathlib.Path({str(path)!r})
+    cubes=3,
+    bench=bench.Bench(rate=100.0, duration=0.6, publish_period=0.02),
+    json_path=pathlib.Path({str(path)!r}),
 )
 if domains & {{"77"}} or not domains or os.environ["ROS_DOMAIN_ID"] != "77":
     sys.exit("the skins mix with those of domain 77")
@@ -70,15 +72,15 @@ def test_growth_of_memory_and_its_error():
     rng = np.random.default_rng(0)
     minutes = np.arange(1200) / 120
     line = 80 + 0.5 * minutes + rng.normal(0, 0.05, 1200)
-    found = bench._memory(
+    found = bench.summarise_memory(
         {"simulator": [999.0] * 1200, "driver": list(line), "reconstruction": [90.0] * 1200}
     )
     assert found["rss_mb"] == 90.0
     assert abs(found["rss_mb_per_minute"] - 0.5) < 4 * found["rss_mb_per_minute_error"] < 0.1
     steps = 80 + np.repeat(rng.normal(0, 0.3, 60), 20)
-    found = bench._memory({"driver": list(steps)})
+    found = bench.summarise_memory({"driver": list(steps)})
     assert abs(found["rss_mb_per_minute"]) < 4 * found["rss_mb_per_minute_error"]
-    assert "rss_mb_per_minute" not in bench._memory({"driver": [80.0] * 20})
+    assert "rss_mb_per_minute" not in bench.summarise_memory({"driver": [80.0] * 20})
 
 
 @pytest.mark.alone

@@ -1,4 +1,4 @@
-"""./cube bench decode: how fast bytes are decoded, clean frames and noise in the same run."""
+"""`./cube bench decode`: how fast bytes are decoded, clean frames and noise in the same run."""
 
 from __future__ import annotations
 
@@ -15,88 +15,90 @@ from cube_tensor_driver.device.wire.native import wire
 from cube_tensor_driver.device.wire.protocol import Sample, encode
 
 BYTES = 500_000
+"""Number of bytes of each kind."""
+
 READ = 4096
-"""Bytes that one call of the decoder is given, as a busy link gives them."""
+"""Number of bytes in one call of the decoder, as a busy link delivers them."""
+
 ROUNDS = 5
+"""Number of measurements, of which the fastest is given: other processes only slow one down."""
+
+DAMAGED_SHARE = 0.01
+"""Share of bytes that are replaced in damaged frames."""
 
 
 def clean_frames(size: int) -> bytes:
-    """At least `size` bytes of sound SAMPLE frames of 8 cubes with 8 pads."""
+    """Return at least `size` bytes of intact SAMPLE frames of 8 cubes with 8 pads."""
     random = np.random.default_rng(1)
-    frames: list[bytes] = []
-    length = 0
-    while length < size:
-        number = len(frames)
+    no_fault, no_temperature = np.zeros(8, "<u4"), np.zeros(8, "<i2")
+    frames = bytearray()
+    number = 0
+    while len(frames) < size:
         frequency = random.integers(90_000_000, 110_000_000, (8, 8)).astype("<u4")
-        no_fault, no_temperature = np.zeros(8, "<u4"), np.zeros(8, "<i2")
-        frame = encode(Sample(number, 0, 1000 * number, frequency, no_fault, no_temperature))
-        frames.append(frame)
-        length += len(frame)
-    return b"".join(frames)
+        sample = Sample(number, 0, 1000 * number, frequency, no_fault, no_temperature)
+        frames += encode(sample)
+        number += 1
+    return bytes(frames)
 
 
-def harmed_frames(size: int) -> bytes:
-    """Frames in which one byte in a hundred was replaced by a random one."""
+def damaged_frames(size: int) -> bytes:
+    """Return frames in which some bytes were replaced by random ones."""
     random = np.random.default_rng(2)
     data = np.frombuffer(clean_frames(size), np.uint8).copy()
-    where = random.integers(0, len(data), len(data) // 100)
+    where = random.integers(0, len(data), int(DAMAGED_SHARE * len(data)))
     data[where] = random.integers(0, 256, len(where))
-    return data.tobytes()
+    return bytes(data)
 
 
-def random_bytes(size: int) -> bytes:
-    return np.random.default_rng(3).bytes(size)
+LATE_FAILURE = b"\1" * 14 + b"\2\0"
+"""Shortest bytes that could be a frame and turn out to be none in the last byte."""
 
+INTACT_COBS = b"\2\7" * 7 + b"\1\0"
+"""Bytes of the same length that are correctly stuffed, and no frame."""
 
-def random_zeros_and_ones(size: int) -> bytes:
-    bits = np.random.default_rng(4).integers(0, 2, size)
-    return bytes(bits.tolist())
-
-
-# The shortest run that could be a frame, and fails in its last byte.
-FAILS_LATE = b"\1" * 14 + b"\2\0"
-SOUND_COBS = b"\2\7" * 7 + b"\1\0"
 NOISE: dict[str, Callable[[int], bytes]] = {
-    "random": random_bytes,
-    "mostly zeros and ones": random_zeros_and_ones,
-    "harmed frames": harmed_frames,
+    "random": lambda size: np.random.default_rng(3).bytes(size),
+    "mostly zeros and ones": lambda size: bytes(
+        np.random.default_rng(4).integers(0, 2, size).tolist()
+    ),
+    "harmed frames": damaged_frames,
     "no zero at all": lambda size: b"\x55" * size,
-    "late failures": lambda size: FAILS_LATE * (size // 16),
-    "late failures, sound ones between": lambda size: (FAILS_LATE + SOUND_COBS) * (size // 32),
+    "late failures": lambda size: LATE_FAILURE * (size // 16),
+    "late failures, sound ones between": lambda size: (LATE_FAILURE + INTACT_COBS) * (size // 32),
     "zeros and ones in turn": lambda size: b"\0\1" * (size // 2),
 }
-"""Bytes that are no frames, or few, each made for a size in bytes."""
+"""Functions that return a number of bytes with no frames, or few, by the name that is printed."""
 
 
 def bench_decode(*, json_path: Path | None = None) -> int:
     """Time clean frames and each noise in turn, in GB of wire bytes per second of one core.
 
-    `c`: the decoder in C, without objects of Python but the bytes of each frame; null if it was not
-    compiled. `frames`: the decoder that the driver has, with its frames. `python`: the one in
-    Python. The best of some rounds: other processes only ever add to a time.
+    The decoders are `c`, in C, which makes no Python objects except the bytes of each frame;
+    `frames`, the driver's decoder with its frames; and `python`, the one in Python.
     """
     decoders: dict[str, Callable[[], Any]] = {"frames": Decoder, "python": PythonDecoder}
+    # Without a compiler there is no decoder in C.
     if wire is not None:
         decoders = {"c": wire.Decoder, **decoders}
-    made = {"clean frames": clean_frames(BYTES)}
-    made |= {name: make(BYTES) for name, make in NOISE.items()}
-    best = {name: dict.fromkeys(decoders, 0.0) for name in made}
+    data = {"clean frames": clean_frames(BYTES)}
+    data |= {name: make(BYTES) for name, make in NOISE.items()}
+    fastest = {name: dict.fromkeys(decoders, 0.0) for name in data}
     for _ in range(ROUNDS):
-        for name, data in made.items():
+        for name, chunk in data.items():
             for kind, make_decoder in decoders.items():
-                speed = len(data) / _ns(make_decoder(), data)
-                best[name][kind] = max(best[name][kind], speed)
+                gb_per_s = len(chunk) / _time_decoding_ns(make_decoder(), chunk)
+                fastest[name][kind] = max(fastest[name][kind], gb_per_s)
     speeds = {
-        name: {kind: float(f"{speed:.3g}") for kind, speed in by_kind.items()}
-        for name, by_kind in best.items()
+        name: {kind: float(f"{gb_per_s:.3g}") for kind, gb_per_s in by_kind.items()}
+        for name, by_kind in fastest.items()
     }
     report({"bytes": BYTES, "gb_per_s": speeds}, json_path)
     return 0
 
 
-def _ns(decoder: Any, data: bytes) -> int:
-    """Processor time of decoding all of it."""
-    start = time.process_time_ns()
-    for at in range(0, len(data), READ):
-        decoder.feed(data[at : at + READ])
-    return time.process_time_ns() - start
+def _time_decoding_ns(decoder: Any, data: bytes) -> int:
+    """Return the processor time of decoding all of the data, in ns."""
+    start_ns = time.process_time_ns()
+    for begin in range(0, len(data), READ):
+        decoder.feed(data[begin : begin + READ])
+    return time.process_time_ns() - start_ns

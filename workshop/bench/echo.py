@@ -1,12 +1,13 @@
-"""What a benchmark compares with: bare rclpy that publishes and echoes messages of a skin's sizes.
+"""Floor of a benchmark: bare rclpy that publishes and echoes messages of a skin's sizes.
 
-`source` publishes SkinFrequencies at a rate, `echo` answers each with a SkinStress. They have the
-executor, the quality of service and the flat arrays of the real nodes, but compute nothing.
+`source` publishes SkinFrequencies at a rate, and `echo` answers each with a SkinStress. They have
+the executor, the quality of service and the flat arrays of the real nodes, but compute nothing.
 """
 
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 from std_msgs.msg import Header
@@ -17,23 +18,33 @@ from cube_tensor_driver.ros.messages import pack_array
 from cube_tensor_driver.ros.node import CubeNode, run
 from cube_tensor_driver.ros.qos import batch_profile
 
-PADS, STRESS, GRADIENT = 8, 6, 9
+PADS = 8
+"""Number of pads of each cube."""
+
+STRESSES = 6
+"""Number of stresses in a row of stress."""
+
+GRADIENTS = 9
+"""Number of gradients in a row of stress."""
+
 PARAMETERS = (
     AUTOSTART,
     Parameter("cubes", 64, "Rows of a message."),
     Parameter("rate", 1000.0, "Messages per second."),
 )
+"""Parameters of both nodes."""
 
 
 class BareSource(CubeNode):
-    """Publishes `frequencies` of so many cubes at a rate, with a timer."""
+    """Publishes `frequencies` at a rate, with a timer."""
 
     def __init__(self) -> None:
         super().__init__("source", PARAMETERS)
 
     def configure(self) -> None:
+        """Make the publisher and the arrays that every message has."""
         n, rate = int(self.value("cubes")), float(self.value("rate"))
-        self._publisher = self.create_lifecycle_publisher(
+        self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
             SkinFrequencies, "frequencies", batch_profile(rate)
         )
         self._cube = np.arange(n, dtype=np.uint16)
@@ -58,15 +69,18 @@ class BareSource(CubeNode):
 
 
 class BareEcho(CubeNode):
-    """Answers each `frequencies` with a `stress` of as many rows, which are all zero."""
+    """Answers each message of `frequencies` with one of `stress` whose rows are zero."""
 
     def __init__(self) -> None:
         super().__init__("echo", PARAMETERS)
 
     def configure(self) -> None:
+        """Subscribe, and make the arrays that every answer has."""
         n, quality = int(self.value("cubes")), batch_profile(float(self.value("rate")))
-        self._publisher = self.create_lifecycle_publisher(SkinStress, "stress", quality)
-        self._zeros = np.zeros((n, GRADIENT), np.float32)
+        self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
+            SkinStress, "stress", quality
+        )
+        self._zeros = np.zeros((n, GRADIENTS), np.float32)
         self._subscription = self.create_subscription(
             SkinFrequencies, "frequencies", self._answer, quality
         )
@@ -77,7 +91,7 @@ class BareEcho(CubeNode):
             cube=message.cube,
             sequence=message.sequence,
             time_offset=message.time_offset,
-            stress=pack_array("f", zeros[:, :STRESS]),
+            stress=pack_array("f", zeros[:, :STRESSES]),
             gradient=pack_array("f", zeros),
             residual=pack_array("f", zeros[:, 0]),
             status=pack_array("H", zeros[:, 0]),
@@ -88,6 +102,7 @@ class BareEcho(CubeNode):
 
 
 def main() -> None:
+    """Run the node that the arguments name."""
     run(lambda: [BareSource() if "source" in sys.argv else BareEcho()])
 
 

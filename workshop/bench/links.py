@@ -1,4 +1,4 @@
-"""./cube bench links: from the bytes of hubs to arrays, without DDS and without reconstruction."""
+"""`./cube bench links`: from the bytes of hubs to arrays, without DDS and reconstruction."""
 
 from __future__ import annotations
 
@@ -24,16 +24,34 @@ from cube_tensor_driver.device.scans.scan import empty_rows
 from .hubs_in_c import HubLoad
 
 PITCH = 0.012
-FIRST_S, SETTLE_S, END_S, STEP_S = 10.0, 2.0, 2.0, 0.05
-"""s: until the first rows at most; until it is measured; for the hubs to end; between two looks."""
+"""Distance of the cubes, in m."""
+
+MAX_START_S = 10.0
+"""Longest time, in seconds, until the first rows arrive."""
+
+SETTLE_S = 2.0
+"""Time, in seconds, from the first rows to the begin of the measurement."""
+
+MAX_END_S = 2.0
+"""Longest time, in seconds, until the hubs have ended."""
+
+POLL_S = 0.05
+"""Time, in seconds, between two looks at a condition."""
 
 
 def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | None = None) -> int:
-    """Measure what reading takes of a core, with hubs in C (firmware/) as the load.
+    """Measure the processor time of reading, with hubs in C (`firmware/`) as the load.
 
-    cubes: or a few more, because all hubs have as many. rate: samples per second. duration: s.
-    `lost`: rows that the hubs took and that did not become rows here. CubeError: the hubs cannot
-    be built, or no rows came.
+    The figure `lost` counts rows that the hubs took and that did not become rows here.
+
+    Args:
+        cubes: Number of cubes; a few more are measured if the hubs would differ.
+        rate: Samples per second of each cube.
+        duration: Duration of the measurement, in seconds.
+        json_path: File for the figures.
+
+    Raises:
+        CubeError: The hubs cannot be built, or no rows arrive.
     """
     load = HubLoad.of(cubes)
     cubes = load.cubes
@@ -55,7 +73,7 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
                 cube_addresses(skin),
                 on_rows,
                 rate=rate,
-                # As a node does, which fills the same messages again and again.
+                # A node fills the same messages again and again, too.
                 make_rows=lru_cache(maxsize=8)(empty_rows),
             )
             links.start()
@@ -84,7 +102,7 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
 
 @contextmanager
 def _hubs(program: str, folder: Path, load: HubLoad, rate: float) -> Iterator[None]:
-    """Hubs on pseudo-terminals in the folder, for the length of a block."""
+    """Run hubs on pseudo-terminals in the folder for the length of a block."""
     command = [program, *load.arguments(folder, rate)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
@@ -92,25 +110,25 @@ def _hubs(program: str, folder: Path, load: HubLoad, rate: float) -> Iterator[No
         yield
     finally:
         process.terminate()
-        process.wait(END_S)
+        process.wait(MAX_END_S)
 
 
 def _wait(done: Callable[[], bool]) -> None:
-    """CubeError: it does not happen within FIRST_S."""
-    until = time.monotonic() + FIRST_S
+    """Wait for a condition; CubeError if it is not met within `MAX_START_S`."""
+    until_s = time.monotonic() + MAX_START_S
     while not done():
-        if time.monotonic() > until:
-            raise CubeError(f"the hubs gave nothing within {FIRST_S:g} s")
-        time.sleep(STEP_S)
+        if time.monotonic() > until_s:
+            raise CubeError(f"the hubs gave nothing within {MAX_START_S:g} s")
+        time.sleep(POLL_S)
 
 
 def _lost(links: LiveLinks) -> int:
-    """Samples that the hubs took and that did not arrive, until now."""
+    """Return the number of samples that the hubs took and that did not arrive so far."""
     names = ("lost_on_the_way", "dropped_in_hub")
     return sum(int(str(report.values[name])) for report in links.report() for name in names)
 
 
 def _cpu_s() -> float:
-    """Processor time of this process."""
+    """Return the processor time of this process, in seconds."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime

@@ -197,8 +197,8 @@ class _Reference:
         key = made.cube.astype(np.int64) << 32 | made.left_out
         distinct, which = np.unique(key, return_inverse=True)
         rows = [self._deviation_of(value >> 32, value & 0xFFFFFFFF) for value in distinct.tolist()]
-        table: Array = np.array(rows).reshape(-1, len(self._range))
-        return table[which.ravel()]
+        deviations: Array = np.array(rows).reshape(-1, len(self._range))[which.ravel()]
+        return deviations
 
     def _deviation_of(self, cube: int, left_out: int) -> Array:
         if (cube, left_out) not in self._deviations:

@@ -7,32 +7,32 @@ from pathlib import Path
 
 from cube_tensor_driver.cli.parser import Parser, count, not_negative, positive, sample_rate
 
+DEFAULT_COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
+"""Numbers of cubes of `scale`."""
+
 
 def arguments(parser: Parser) -> None:
+    """Add a subcommand for each benchmark."""
     pipeline = parser.add_subcommand(
         "pipeline", "the core against the same equations and matrix product in bare numpy"
     )
     _add_cubes(pipeline, 1260)
-    pipeline.add_json()
 
     decode = parser.add_subcommand(
         "decode", "the decoder on clean frames and all kinds of noise, GB/s"
     )
-    decode.add_json()
 
     links = parser.add_subcommand(
         "links", "from the bytes of hubs in C to arrays, without DDS and reconstruction"
     )
     _add_cubes(links, 1280)
     _add_time(links)
-    links.add_json()
 
     echo = parser.add_subcommand(
         "echo", "bare rclpy: publish, echo and receive messages of a skin's sizes"
     )
     _add_cubes(echo, 64)
     _add_time(echo)
-    echo.add_json()
 
     skin = parser.add_subcommand(
         "skin", "from simulated hubs to received tensors, against the echo"
@@ -49,19 +49,20 @@ def arguments(parser: Parser) -> None:
         metavar="S",
         help="time that one message covers, s; 0: one message per scan (default: %(default)g)",
     )
-    skin.add_json()
 
     scale = parser.add_subcommand("scale", "skin for growing numbers of cubes, with a picture")
     scale.add_argument(
         "--counts",
         type=count,
         nargs="+",
-        default=[1, 4, 16, 64, 256, 1024, 4096],
+        default=DEFAULT_COUNTS,
         metavar="N",
-        help="numbers of cubes (default: 1 4 16 64 256 1024 4096)",
+        help=f"numbers of cubes (default: {' '.join(map(str, DEFAULT_COUNTS))})",
     )
     _add_time(scale)
-    scale.add_json()
+
+    for benchmark in (pipeline, decode, links, echo, skin, scale):
+        benchmark.add_json()
     scale.add_output(
         "--figure",
         kind="picture",
@@ -98,43 +99,29 @@ def _add_time(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run the benchmark. Only its own modules are imported, because two need no ROS."""
+    path = options.json
     if options.what == "decode":
         from ..bench.decode import bench_decode
 
-        return bench_decode(json_path=options.json)
+        return bench_decode(json_path=path)
+    if options.what == "pipeline":
+        from ..bench.pipeline import bench_pipeline
+
+        return bench_pipeline(cubes=options.cubes, json_path=path)
     if options.what == "links":
         from ..bench.links import bench_links
 
         return bench_links(
-            cubes=options.cubes,
-            rate=options.rate,
-            duration=options.duration,
-            json_path=options.json,
+            cubes=options.cubes, rate=options.rate, duration=options.duration, json_path=path
         )
-    from ..bench import skin as bench
 
-    if options.what == "pipeline":
-        return bench.bench_pipeline(cubes=options.cubes, json_path=options.json)
+    from ..bench.skin import Bench, bench_echo, bench_scale, bench_skin
+
+    if options.what == "skin":
+        bench = Bench(options.rate, options.duration, options.publish_period, options.composed)
+        return bench_skin(cubes=options.cubes, bench=bench, json_path=path)
+    bench = Bench(options.rate, options.duration)
     if options.what == "echo":
-        return bench.bench_echo(
-            cubes=options.cubes,
-            rate=options.rate,
-            duration=options.duration,
-            json_path=options.json,
-        )
-    if options.what == "scale":
-        return bench.bench_scale(
-            counts=options.counts,
-            rate=options.rate,
-            duration=options.duration,
-            json_path=options.json,
-            figure=options.figure,
-        )
-    return bench.bench_skin(
-        cubes=options.cubes,
-        rate=options.rate,
-        duration=options.duration,
-        publish_period=options.publish_period,
-        composed=options.composed,
-        json_path=options.json,
-    )
+        return bench_echo(cubes=options.cubes, bench=bench, json_path=path)
+    return bench_scale(counts=options.counts, bench=bench, figure=options.figure, json_path=path)

@@ -11,6 +11,7 @@ from cube_tensor_driver.cli.parser import Parser
 
 
 def arguments(parser: Parser) -> None:
+    """Add the folder of the pages."""
     parser.add_output(
         "-o",
         "--output",
@@ -21,6 +22,6 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Sphinx; a warning is an error."""
+    """Run Sphinx, with warnings as errors."""
     command = ["sphinx", "-W", "--keep-going", "-q", "docs", str(options.output.resolve())]
     return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode

@@ -13,11 +13,11 @@ TOOLS = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
 
 
 def arguments(parser: Parser) -> None:
-    """None."""
+    """Add no arguments."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """All tools, also if one of them finds something."""
+    """Run all tools, also if one of them finds something."""
     codes = [
         subprocess.run([sys.executable, "-m", *tool], cwd=ROOT, check=False).returncode
         for tool in TOOLS

@@ -9,6 +9,7 @@ from cube_tensor_driver.cli.parser import Parser
 
 
 def arguments(parser: Parser) -> None:
+    """Add the folder of the pictures."""
     parser.add_output(
         "-o",
         "--output",
@@ -19,6 +20,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Draw all pictures."""
     from ..pictures.draw import make_pictures
 
     make_pictures(options.output)

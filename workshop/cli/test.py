@@ -12,18 +12,19 @@ from cube_tensor_driver.cli.parser import Parser
 
 
 def arguments(parser: Parser) -> None:
+    """Add arguments that pytest gets."""
     parser.add_words(
         "words", "ARGUMENT", "arguments of pytest, as in -k name; ./cube exec pytest --help"
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """The whole suite on all processors, or what the words say, in one process."""
+    """Run the whole suite on all processors, or the given tests in one process."""
     words = options.words
     if not words:
         words = ["test"]
         if importlib.util.find_spec("xdist") is not None:
-            # Half of the time a test waits for processes it started.
+            # Half of the time, a test waits for processes that it started.
             workers = 2 * len(os.sched_getaffinity(0))
             words += ["-n", str(workers), "--dist", "loadgroup"]
     os.chdir(ROOT)

@@ -8,6 +8,7 @@ from cube_tensor_driver.cli.parser import Parser, positive, whole_number
 
 
 def arguments(parser: Parser) -> None:
+    """Add duration, seed and mutation."""
     parser.add_argument(
         "--duration",
         type=positive,
@@ -32,6 +33,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Torture a skin, or a mutated one."""
     from ..torture.torture import run_mutations, run_torture
 
     if options.mutate is not None:

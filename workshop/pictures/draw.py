@@ -32,7 +32,7 @@ from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, 
 from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
 from cube_tensor_driver.views.figures.style import save
 
-from ..bench.skin import bench_scale
+from ..bench.skin import Bench, bench_scale
 from .contact_tables import write_contact_tables
 from .cube_drawing import draw_cube
 from .fingers import draw_fingers
@@ -94,8 +94,7 @@ def make_pictures(folder: Path) -> None:
         print(f"no gripper.png: {error}", file=sys.stderr)
     bench_scale(
         counts=COUNTS,
-        rate=RATE,
-        duration=MEASURE_S,
+        bench=Bench(RATE, MEASURE_S),
         json_path=folder / "scale.json",
         figure=folder / "scale.png",
     )

@@ -160,4 +160,4 @@ def recording(
             steps.append(recorder.take)
             yield recorder
         finally:
-            node.destroy_node()
+            node.destroy_node()  # type: ignore[no-untyped-call]
