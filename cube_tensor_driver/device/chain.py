@@ -21,12 +21,12 @@ from .clock.hub_clock import HubClock
 from .clock.steps import HostClockWatch
 from .links.link import Link, LinkConfig, LinkState
 from .links.link_log import LinkLogger, Log
-from .links.reader import LinkFrames, Reader
+from .links.reader import LOGGED_ERRORS, LinkFrames, Reader
 from .scans.cube_table import CubeAddress
 from .scans.row_account import RowAccount, RowCounts
 from .scans.scan import MakeRows, ScanBuilder, empty_rows
 from .scans.sequence import Arrival, SampleAccount
-from .wire.native import SLOWER, wire
+from .wire.native import NOT_COMPILED, wire
 from .wire.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
 
 MAX_SCANS = 4
@@ -34,8 +34,6 @@ MAX_SCANS = 4
 pause, and the memory that is kept for rows need not hold all of them."""
 MAX_EVENTS = 100
 """Number of changes of state of one link that are kept until the next report."""
-LOGGED_ERRORS = (1, 10, 100, 1000, 10_000)
-"""Numbers of errors at which an error is logged. At 1 kHz all of them would fill the log."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ class LiveLinks:
         self._clock_watch = HostClockWatch(clock_ns)
         self._log: Log = log or logging.getLogger(__name__)
         if wire is None:
-            self._log.warning(SLOWER)
+            self._log.warning(NOT_COMPILED)
         self._loggers = [LinkLogger(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
         # Reports read accounts and clocks only while the reader's thread does not change them.
@@ -312,7 +310,7 @@ class LiveLinks:
             logger.error(problem)
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
-        """Handle a change of the state of a link, or of its reason."""
+        """Handle a change of the state of a link or of its reason, and log it."""
         record = self._records[link]
         record.was_open |= state is LinkState.OPEN
         if state is not LinkState.OPEN:

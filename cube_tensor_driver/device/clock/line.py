@@ -58,7 +58,7 @@ class ClockRoundTrip(NamedTuple):
     """Bounds of the offset from one question for the hub's time.
 
     Attributes:
-        device_ns: The hub's clock, as answered.
+        device_ns: Device time in the answer.
         low_ns: Host time minus device time when the question was sent.
         high_ns: Host time minus device time when the answer came.
     """
@@ -203,7 +203,7 @@ class ClockLine:
         return min(UNKNOWN_DRIFT, self.jitter_ns / (last - first))
 
     def _intersect_bounds(self) -> None:
-        """Find the offset that the newest consistent round trips allow."""
+        """Find the offset within the bounds of all recent round trips, and its largest error."""
         self._trip_offset, self.error_bound = math.inf, None
         low, high = -math.inf, math.inf
         drift_error = self._drift_error()

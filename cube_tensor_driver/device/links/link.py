@@ -36,7 +36,7 @@ READ_CHUNK = 1 << 16
 """Largest number of bytes read from one link at a time, so that a link that sends without pause
 does not hold up the others."""
 MAX_UNSENT = 4096
-"""Largest number of bytes that may wait to be sent."""
+"""Largest number of bytes that may wait to be sent. They only accumulate if a hub does not read."""
 MIN_PAUSE_S = 0.25
 """Pause after the first failed attempt to open a link. It doubles with each further attempt."""
 MAX_PAUSE_S = 5.0
@@ -202,8 +202,7 @@ class Link:
         return True
 
     def read(self) -> bytes:
-        """Return the bytes that one system call gives, at most `READ_CHUNK`; empty if there are
-        none.
+        """Return the bytes of one system call, at most `READ_CHUNK`; empty if there are none.
 
         A serial port gives 4 kB at a time. A second call at once would wait until the kernel has
         fetched the next 4 kB, which it does while the other links are read.
@@ -387,7 +386,7 @@ def _open_port(path: str, baud: int) -> serial.Serial:
 
 
 def _identify_file(path: str) -> tuple[object, ...] | None:
-    """Return what identifies the file at a path; None if there is none."""
+    """Return path, inode, device and permissions of a file; None if it does not exist."""
     try:
         status = Path(path).stat()
     except OSError:

@@ -32,13 +32,16 @@ callback."""
 MAX_WAIT_S = 1e-3
 """Longest wait for the hubs that have not delivered yet, in s."""
 WAIT_STEP_S = 2e-4
-"""Period at which the reader checks for data while it waits, in s, instead of waking up for each
-hub. Arrivals may be later than true by this time."""
+"""Period, in s, at which the reader checks for data while it waits for further hubs. Waking up for
+each hub would cost more. Arrivals may be later than true by this time."""
 MIN_SELECT_S = 5e-5
 """Duration of a wait for data, in s, below which the data were already there. Then this thread is
 late and does not wait for more."""
 DRAIN_S = 0.05
 """Time for which closing waits until the last requests have left the serial ports, in s."""
+LOGGED_ERRORS = (1, 10, 100, 1000, 10_000)
+"""Numbers of errors of a callback at which the error is logged. At 1 kHz all of them would fill the
+log."""
 CLOSE_S = 1.5
 """Time for which closing waits for the end of the thread, in s."""
 
@@ -220,7 +223,7 @@ class Reader:
             received, failed = self._handle_reads(reads)
             if received:
                 self._call(self._on_frames, received)
-            # A link is closed after its frames were delivered, because frames mark it as open.
+            # Links are closed only now, because delivering the frames of a link marks it as live.
             for i, error in failed.items():
                 self._drop(i, error)
             if self._requests:
@@ -359,8 +362,7 @@ class Reader:
             callback(*arguments)
         except Exception:  # noqa: BLE001  (whatever a callback raises, the links go on)
             self.callback_errors += 1
-            # Only a few are logged: at 1 kHz all of them would fill the log.
-            if self.callback_errors in (1, 10, 100, 1000, 10_000):
+            if self.callback_errors in LOGGED_ERRORS:
                 _log.exception("callback failed (%d so far); reading goes on", self.callback_errors)
 
     def _close_all(self, wake_read: int) -> None:

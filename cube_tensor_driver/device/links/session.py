@@ -21,7 +21,7 @@ SILENT_S = 0.2
 """Time without a sample, in s, after which a link is silent. Three sample periods count if they are
 longer."""
 TICK_S = 0.02
-"""Period at which the reader checks the timers, in s."""
+"""Period at which the reader checks the timers of all links (silence, retries, questions), in s."""
 HELLO_S = 1.0
 """Period at which a hub that does not answer is asked for HELLO again, in s."""
 ASK_TIME_S = 0.983
@@ -33,7 +33,8 @@ second."""
 CHECK_PORT_S = 0.25
 """Period at which a waiting link checks, in s, whether its port has come back."""
 PERIOD_TOLERANCE = 0.01
-"""Relative deviation of the sample period that a hub may round to without a note."""
+"""Relative deviation from the requested sample period, because of rounding in the hub, above which
+a note is given."""
 
 OnState = Callable[[LinkState, LinkError | None], None]
 

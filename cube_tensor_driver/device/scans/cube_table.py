@@ -24,7 +24,7 @@ _OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
 HubIndex = NDArray[np.int32]
 """Index in the skin of each cube of a hub (n_cubes,), or `ABSENT`."""
 RowIndex = NDArray[np.uint16]
-"""Index in the skin of each row of a sample (n_cubes,)."""
+"""Index in the skin of the cube of each row of a sample (n_cubes,)."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class CubeTable:
         return cubes[rows].astype(np.uint16), kept
 
     def _match(self, link: int, hello: Hello) -> tuple[HubIndex, list[str]]:
-        """Return the index in the skin of each cube of a hub, and what does not fit."""
+        """Return the index in the skin of each cube of a hub, and what does not fit, in words."""
         uids = hello.cube_uids.tolist()
         index_of_uid: dict[int, int] = {}
         for index, uid in enumerate(uids):

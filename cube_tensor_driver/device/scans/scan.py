@@ -23,13 +23,13 @@ MAX_SCANS_AHEAD = 4
 """Number of scans that one link may be ahead of another. Beyond it all scans are built as they
 are."""
 MAX_SPAN_NS = 2_000_000_000
-"""Longest time, in ns, between the first and the last row that are built together. The times of a
-message reach 2.1 s after its stamp."""
+"""Longest time, in ns, between the first and the last row that are built together. A message stores
+times that reach up to 2.1 s after its stamp."""
 CACHED_SHAPES = 4
-"""Number of shapes of rows whose memory is kept."""
+"""Number of shapes (rows, pads) whose memory is kept for the next rows."""
 MIN_PERIODS_EARLIER = 0.75
-"""Part of a period by which a scan must be earlier than a sample to be too early for it. Hubs
-sample at different phases, and stamps jitter."""
+"""Part of a sample period. A pending scan that is earlier than a sample by more is too early for
+it. Less than one period is needed because hubs sample at different phases and stamps jitter."""
 
 # Temperature, in °C, of each of the 65536 bit patterns of a SAMPLE.
 _PATTERNS = np.arange(1 << 16, dtype=np.uint16)

@@ -12,13 +12,13 @@ import zlib
 from dataclasses import dataclass
 
 from . import cobs
-from .native import SLOWER, wire
+from .native import NOT_COMPILED, wire
 from .protocol import HEADER, MAX_FRAME, OVERHEAD, UNPACK, VERSION, Frame
 
 MAX_RUN = MAX_FRAME + (MAX_FRAME + 253) // 254
 """Length of the longest run of bytes that can be a frame. COBS adds one byte to each 254."""
 MIN_PAYLOAD = 5
-"""Smallest payload in bytes of every protocol version, that of a REQUEST."""
+"""Smallest payload of a frame, in bytes. Later protocol versions keep this limit."""
 MIN_RUN = OVERHEAD + MIN_PAYLOAD + 1
 """Length of the shortest run of bytes that can be a frame of any protocol version."""
 _CRC_RESIDUE = 0x2144DF1C
@@ -146,7 +146,7 @@ class NativeDecoder:
 
     def __init__(self) -> None:
         if wire is None:
-            raise RuntimeError(SLOWER)
+            raise RuntimeError(NOT_COMPILED)
         self.wire = wire.Decoder()
 
     @property

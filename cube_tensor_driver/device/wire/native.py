@@ -10,10 +10,10 @@ try:
 except ImportError:
     wire = None  # type: ignore[assignment]
 
-__all__ = ["SLOWER", "wire"]
+__all__ = ["NOT_COMPILED", "wire"]
 
-SLOWER = (
+NOT_COMPILED = (
     "the wire is decoded in Python, which is slower, because no C compiler was there at the "
     "installation: install one (sudo apt install gcc python3-dev) and install again"
 )
-"""Warning to log when `wire` is None."""
+"""Warning that is logged where `wire` is None."""

@@ -53,11 +53,11 @@ _Arrays = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.int16]]
 
 
 class Command(IntEnum):
-    """What a `Request` asks for; each comment says what its argument is."""
+    """What a `Request` asks for. Each comment gives the argument."""
 
-    HELLO = 1  # 0
-    START = 2  # 0
-    STOP = 3  # 0
+    HELLO = 1  # none (0)
+    START = 2  # none (0)
+    STOP = 3  # none (0)
     SET_PERIOD = 4  # sample period, µs
     IDENTIFY = 5  # duration for which the hub shows itself, s
     TIME = 6  # any number, which the answer repeats; the answer is a `Time`
