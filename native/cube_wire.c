@@ -17,7 +17,7 @@ static uint64_t load_u64(const uint8_t *at) {
     return (uint64_t)load_u32(at) | (uint64_t)load_u32(at + 4) << 32;
 }
 
-/* Each returns where the next number goes. */
+/* Each function returns the place of the next number. */
 
 static uint8_t *store_u8(uint8_t *at, uint8_t value) {
     *at = value;
@@ -188,7 +188,7 @@ void cube_decoder_reset(cube_decoder *decoder) {
     decoder->discarding = false;
 }
 
-/* The fields of a frame with a right checksum. false: its length does not fit its contents. */
+/* Reads the fields of a frame with a right checksum. false: its length does not fit them. */
 static bool parse(cube_frame *frame) {
     const uint8_t *at = frame->raw + CUBE_HEADER;
     size_t size = load_u16(frame->raw + 2);
@@ -258,14 +258,14 @@ static bool is_known(uint8_t type) {
     return (type >= CUBE_HELLO && type <= CUBE_TIME) || type == CUBE_REQUEST || type == CUBE_ACK;
 }
 
-/* Where an unfinished run is kept: CUBE_GAP behind its decoded bytes. */
+/* Returns the place of an unfinished run: CUBE_GAP bytes after the place of its decoded bytes. */
 static uint8_t *kept(cube_decoder *decoder) {
     return decoder->buffer + CUBE_GAP;
 }
 
-/* What a run of CUBE_MIN_RUN to `limit` bytes is: a frame, or counted as what is wrong with it.
+/* Decodes a run of CUBE_MIN_RUN to `limit` bytes to a frame, or counts what is wrong with it.
  * run: in the caller's data, or `kept`. */
-static uint8_t judge(
+static uint8_t check_run(
     cube_decoder *decoder, const uint8_t *run, size_t length, cube_frame *frame) {
     cube_counters *counters = &decoder->counters;
     uint8_t *raw = decoder->buffer;
@@ -292,7 +292,7 @@ static uint8_t judge(
     return CUBE_NO_FRAME;
 }
 
-/* Adds bytes to the unfinished run, or throws the run away if it grows too long. */
+/* Adds bytes to the unfinished run, or discards the run if it becomes too long. */
 static void keep(cube_decoder *decoder, const uint8_t *data, size_t size) {
     if (decoder->discarding)
         return;
@@ -306,7 +306,7 @@ static void keep(cube_decoder *decoder, const uint8_t *data, size_t size) {
     decoder->length += size;
 }
 
-/* A zero closes the run that ends with these bytes. */
+/* Ends the run whose last bytes these are, because a zero follows. */
 static uint8_t close_run(
     cube_decoder *decoder, const uint8_t *data, size_t size, cube_frame *frame) {
     if (decoder->length > 0 || decoder->discarding || size > decoder->limit) {
@@ -317,7 +317,7 @@ static uint8_t close_run(
         decoder->discarding = false;
     }
     if (size >= CUBE_MIN_RUN)
-        return judge(decoder, data, size, frame);
+        return check_run(decoder, data, size, frame);
     decoder->counters.length += size > 0;
     return CUBE_NO_FRAME;
 }

@@ -36,13 +36,14 @@ extern "C" {
 #define CUBE_TEMPERATURE_UNKNOWN INT16_MIN
 #define CUBE_NOT_MEASURED 0
 
-/* Most bytes that `raw` bytes take in COBS, which adds one byte to each 254 and is never empty. */
+/* Largest number of bytes of the COBS encoding of `raw` bytes. COBS adds one byte to each 254, and
+ * is never empty. */
 #define CUBE_COBS_SIZE(raw) ((raw) + ((raw) + 253u) / 254u + ((raw) == 0u))
 
-/* Most bytes that a frame takes on the wire, with the zero before it and the zero behind it. */
+/* Largest number of bytes of a frame on the wire, with the zeros before and after it. */
 #define CUBE_WIRE_SIZE(payload) (2u + CUBE_COBS_SIZE(CUBE_HEADER + (payload) + CUBE_CRC))
 
-/* Bytes of payload. */
+/* Length of each payload, in bytes. */
 #define CUBE_HELLO_SIZE(n_cubes) (20u + 8u * (n_cubes))
 #define CUBE_SAMPLE_ROW(n_pads) (4u * (n_pads) + 6u)
 #define CUBE_SAMPLE_SIZE(n_cubes, n_pads) (20u + (n_cubes) * CUBE_SAMPLE_ROW(n_pads))
@@ -51,11 +52,11 @@ extern "C" {
 #define CUBE_REQUEST_SIZE 5u
 #define CUBE_ACK_SIZE 6u
 
-/* Bytes between two zeros: no frame of any version has more, or fewer. */
+/* Largest and smallest number of bytes between the two zeros of a frame, in any version. */
 #define CUBE_MAX_RUN CUBE_COBS_SIZE(CUBE_HEADER + CUBE_MAX_PAYLOAD + CUBE_CRC)
 #define CUBE_MIN_RUN CUBE_COBS_SIZE(CUBE_HEADER + CUBE_REQUEST_SIZE + CUBE_CRC)
 
-/* What a decoder needs to decode payloads of so many bytes. */
+/* Size of the buffer of a decoder for payloads up to `payload` bytes. */
 #define CUBE_DECODER_SIZE(payload) \
     (CUBE_COBS_SIZE(CUBE_HEADER + (payload) + CUBE_CRC) + CUBE_GAP)
 #define CUBE_GAP 8u
@@ -141,8 +142,8 @@ typedef struct {
     } as;
 } cube_frame;
 
-/* What became of the bytes: how many bytes and frames, and runs between zeros that are no frame,
- * each in exactly one counter. */
+/* Numbers of received bytes and frames, and of runs between zeros that are not a frame; each run is
+ * counted exactly once. */
 typedef struct {
     uint64_t bytes;
     uint64_t frames;
@@ -151,38 +152,38 @@ typedef struct {
     uint64_t length;       /* too short for a frame, or the length does not fit the contents */
     uint64_t version;      /* checksum right, but another protocol version: see other_version */
     uint64_t unknown_type; /* checksum right, but a type that version 1 does not have */
-    uint64_t overrun;      /* longer than any frame, or than the buffer; thrown away */
+    uint64_t overrun;      /* longer than any frame, or than the buffer; discarded */
 } cube_counters;
 
-/* From bytes to frames. Only `counters` and `other_version` are for reading. */
+/* Decodes bytes to frames. The caller may read only `counters` and `other_version`. */
 typedef struct {
     cube_counters counters;
-    int other_version; /* the last one other than ours in a sound frame; -1: none yet */
+    int other_version; /* last other version of a valid frame; -1: none yet */
     uint8_t *buffer; /* of limit + CUBE_GAP bytes */
     size_t limit;  /* longest run that fits the buffer and can be a frame */
     size_t length; /* bytes of an unfinished run in the buffer */
     bool discarding;
 } cube_decoder;
 
-/* Begins with no bytes. false: the buffer holds not even a REQUEST, and nothing was done.
+/* Initialises a decoder. false: the buffer is too small even for a REQUEST, and nothing was done.
  *
- * buffer: of `capacity` bytes; it belongs to the decoder for as long as that is used. A hub that
- *     takes requests needs CUBE_DECODER_SIZE(CUBE_REQUEST_SIZE) bytes, a host
- *     CUBE_DECODER_SIZE(CUBE_MAX_PAYLOAD). What is longer than fits is thrown away as overrun. */
+ * buffer: of `capacity` bytes; the decoder uses it until the end. A hub that receives
+ *     requests needs CUBE_DECODER_SIZE(CUBE_REQUEST_SIZE) bytes, a host
+ *     CUBE_DECODER_SIZE(CUBE_MAX_PAYLOAD). Longer runs are discarded and count as overrun. */
 bool cube_decoder_init(cube_decoder *decoder, uint8_t *buffer, size_t capacity);
 
-/* Takes bytes up to the end of the next frame, or all there are; returns how many it took.
+/* Decodes bytes up to the end of the next frame, or all of them. Returns the number of bytes used.
  *
  * frame: the frame that they complete, or CUBE_NO_FRAME. Its `raw` lies in the decoder's buffer,
  *     and is valid until the next call for this decoder.
  * The frames and counters do not depend on how a stream is cut into calls. */
 size_t cube_decode(cube_decoder *decoder, const uint8_t *data, size_t size, cube_frame *frame);
 
-/* The stream ended: an unfinished run is thrown away and counts as framing. */
+/* Discards an unfinished run, because the stream ended; it counts as framing. */
 void cube_decoder_reset(cube_decoder *decoder);
 
-/* Reads the fields of a frame again, from `raw` and `size` alone. false: they are no SAMPLE. The
- * checksum is not looked at. */
+/* Reads the fields of a frame again, from `raw` and `size` alone, without checking the checksum.
+ * false: they are not a SAMPLE. */
 bool cube_parse_sample(cube_frame *frame);
 
 /* Fields of a decoded frame. HELLO: uid of a cube, cube < n_cubes. SAMPLE: cube < n_cubes counts
@@ -197,7 +198,7 @@ const uint8_t *cube_frequency_bytes(const cube_frame *sample);
 const uint8_t *cube_pad_fault_bytes(const cube_frame *sample);
 const uint8_t *cube_temperature_bytes(const cube_frame *sample);
 
-/* Each of these writes one frame to `out`, between two zeros, and returns how many bytes it has.
+/* Each of these functions writes one frame to `out`, between two zeros, and returns its length.
  *
  * capacity: at least CUBE_WIRE_SIZE of the payload. If it is less, or the payload would have more
  *     than CUBE_MAX_PAYLOAD bytes, they write nothing and return 0. All of CUBE_WIRE_SIZE may be
@@ -214,19 +215,19 @@ size_t cube_build_time(uint8_t *out, size_t capacity, const cube_time *time);
 size_t cube_build_request(uint8_t *out, size_t capacity, const cube_request *request);
 size_t cube_build_ack(uint8_t *out, size_t capacity, const cube_ack *ack);
 
-/* How many cubes of n_pads fit one SAMPLE frame on `wire` bytes; the others need further frames.
- * 0: not even one does. */
+/* Returns the number of cubes of n_pads whose SAMPLE frame fits into `wire` bytes; 0 if not even
+ * one does. The other cubes need further frames. */
 size_t cube_cubes_per_frame(size_t wire, size_t n_pads);
 
-/* CRC-32 of IEEE 802.3. crc: 0, or the CRC of what comes before `data`. */
+/* Returns the CRC-32 of IEEE 802.3. crc: 0, or the CRC of the bytes before `data`. */
 uint32_t cube_crc32(uint32_t crc, const uint8_t *data, size_t size);
 
-/* COBS code of `size` bytes; returns its length, at most CUBE_COBS_SIZE(size).
+/* Encodes `size` bytes with COBS. Returns the length of the code, at most CUBE_COBS_SIZE(size).
  *
  * out: may overlap `data` where it begins at least CUBE_COBS_SIZE(size) - size bytes before it. */
 size_t cube_cobs_encode(const uint8_t *data, size_t size, uint8_t *out);
 
-/* The bytes of a COBS code; returns how many they are, fewer than `size`, or CUBE_NOT_COBS.
+/* Decodes a COBS code. Returns the number of bytes, less than `size`, or CUBE_NOT_COBS.
  *
  * code: `size` bytes, at least one, none of them 0.
  * out: of `size` bytes, all of which may be written. It may overlap `code` where it begins at least

@@ -58,7 +58,7 @@ static void decoder_dealloc(PyObject *object) {
     Py_DECREF(type);
 }
 
-/* Decodes bytes and adds their frames to `frames`; needs no lock. false: out of memory. */
+/* Decodes bytes and adds their frames to `frames`, without the lock. false: out of memory. */
 static bool decode(Decoder *self, const uint8_t *data, size_t size) {
     /* A frame and its length are shorter than twice the code, and one may have begun before. */
     size_t most = self->used + 2 * size + CUBE_MAX_RUN;
@@ -84,13 +84,13 @@ static bool decode(Decoder *self, const uint8_t *data, size_t size) {
     return true;
 }
 
-/* With the lock: what the decoder has counted. */
+/* Publishes the counters of the decoder; needs the lock. */
 static void publish_counters(Decoder *self) {
     self->counters = self->decoder.counters;
     self->other_version = self->decoder.other_version;
 }
 
-/* A list of the frames as bytes; they are forgotten here. */
+/* Returns the frames as a list of bytes, and removes them from the decoder. */
 static PyObject *take_frames(Decoder *self) {
     publish_counters(self);
     PyObject *list = PyList_New(0);
@@ -108,7 +108,7 @@ static PyObject *take_frames(Decoder *self) {
     return list;
 }
 
-/* The bytes of a bytes or bytearray object. false: it is neither, and an exception is set. */
+/* Gets the bytes of a bytes or bytearray object. false: it is neither, and an exception is set. */
 static bool get_bytes(PyObject *object, const uint8_t **data, size_t *size) {
     if (PyByteArray_Check(object)) {
         *data = (const uint8_t *)PyByteArray_AsString(object);
@@ -124,7 +124,7 @@ static bool get_bytes(PyObject *object, const uint8_t **data, size_t *size) {
     return true;
 }
 
-/* false: another thread reads this link just now, and an exception is set. */
+/* Returns whether no other thread reads this link now. false: an exception is set. */
 static bool is_free(const Decoder *self) {
     if (self->is_busy)
         PyErr_SetString(PyExc_RuntimeError, "a call of read_links has this decoder");
@@ -137,7 +137,7 @@ static PyObject *decoder_feed(PyObject *object, PyObject *argument) {
     size_t size;
     if (!is_free(self) || !get_bytes(argument, &data, &size))
         return NULL;
-    /* With the lock, because another thread might resize a bytearray. */
+    /* The lock is kept, because another thread might resize a bytearray. */
     if (!decode(self, data, size))
         return PyErr_NoMemory();
     return take_frames(self);
@@ -227,7 +227,7 @@ static PyObject *cobs_decode(PyObject *module, PyObject *argument) {
     return data;
 }
 
-/* One link to read: what read() gave, or minus the number of its error. */
+/* One link to read, with the result of read(), or minus the errno of its error. */
 typedef struct {
     Decoder *decoder;
     int fd;
@@ -248,8 +248,8 @@ static void decode_link(Link *link) {
         link->no_memory = !decode(link->decoder, link->decoder->input, (size_t)link->result);
 }
 
-/* Takes the decoders of a list of pairs (Decoder, file descriptor) for this call. Returns how many;
- * fewer than `count`: an exception is set. */
+/* Reserves the decoders of a list of pairs (Decoder, file descriptor) for this call. Returns their
+ * number; fewer than `count`: an exception is set. */
 static Py_ssize_t take_links(PyObject *pairs, Link *links, Py_ssize_t count) {
     for (Py_ssize_t i = 0; i < count; i++) {
         PyObject *pair = PyList_GetItem(pairs, i), *decoder;
@@ -268,7 +268,7 @@ static Py_ssize_t take_links(PyObject *pairs, Link *links, Py_ssize_t count) {
     return count;
 }
 
-/* The results of all links, and their decoders are free again. NULL: an exception is set. */
+/* Returns the results of all links, and releases their decoders. NULL: an exception is set. */
 static PyObject *give_links(Link *links, Py_ssize_t count, bool is_read) {
     PyObject *results = is_read ? PyList_New(count) : NULL;
     for (Py_ssize_t i = 0; i < count; i++) {
@@ -301,7 +301,7 @@ static PyObject *read_links(PyObject *module, PyObject *args) {
         for (Py_ssize_t i = 0; i < count; i++)
             read_link(&links[i]);
         Py_END_ALLOW_THREADS
-        /* Between reading and decoding, so that the time is that of the bytes. */
+        /* The clock is read between reading and decoding, so that the time is that of the bytes. */
         arrival = PyObject_CallNoArgs(clock);
     }
     if (arrival != NULL) {
@@ -321,7 +321,7 @@ static PyObject *read_links(PyObject *module, PyObject *args) {
 
 /* ------------------------------------------------------------------------------ rows ---------- */
 
-/* Where the columns of rows lie in one block of memory, each behind the one before. */
+/* Places of the columns of rows in one block of memory, one after the other. */
 typedef struct {
     float *frequency;
     uint32_t *sequence;
@@ -359,7 +359,7 @@ static void place(const cube_frame *frame, int64_t stamp_ns, Columns *columns, s
         float *to = columns->frequency + row * columns->n_pads;
         for (size_t pad = 0; pad < width; pad++, frequency += 4) {
             uint32_t millihertz = load_u32(frequency);
-            /* In double precision: 1 mHz of 100 kHz is below what float multiplies exactly. */
+            /* The product is computed in double precision: float cannot resolve 1 mHz of 100 kHz. */
             to[pad] = millihertz == CUBE_NOT_MEASURED ? NAN : (float)(1e-3 * (double)millihertz);
         }
         for (size_t pad = width; pad < columns->n_pads; pad++)
@@ -373,7 +373,7 @@ static void place(const cube_frame *frame, int64_t stamp_ns, Columns *columns, s
     }
 }
 
-/* The frame in the bytes of a decoded SAMPLE. false: it is none, and an exception is set. */
+/* Gets the frame in the bytes of a decoded SAMPLE. false: it is none, and an exception is set. */
 static bool get_sample(PyObject *raw, cube_frame *frame) {
     if (!get_bytes(raw, &frame->raw, &frame->size))
         return false;
@@ -399,7 +399,7 @@ static PyObject *place_rows(PyObject *module, PyObject *args) {
         return NULL;
     }
     for (Py_ssize_t i = 0; i < count; i++) {
-        /* Of an integer PyLong_AsLongLong calls no Python, which could change the lists. */
+        /* For an integer, PyLong_AsLongLong calls no Python code, which could change the lists. */
         if (!PyLong_Check(PyList_GetItem(stamps, i))) {
             PyErr_SetString(PyExc_TypeError, "a stamp is an integer");
             return NULL;

@@ -1,9 +1,9 @@
-"""Detection of clocks that were set: the host's, and that of a hub.
+"""Detection of steps of the host's clock and of a hub's clock.
 
-The host's clock is compared with the monotonic clock, which nobody sets. A hub counts its samples
+The host's clock is compared with the monotonic clock, which is never set. A hub numbers its samples
 and takes one in each period, so its device times follow the numbers. Where they do not, either the
-hub's clock was set, or the hub sampled late or early. The delays of the next samples tell which:
-they are the same as before, or different by the step.
+hub's clock was set, or the hub sampled late or early. The delays of the next samples distinguish
+the two: in the first case they differ from those before by the step, in the second they do not.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class HostClockWatch:
 
     Args:
         clock_ns: The clock that is watched.
-        steady_ns: A clock that nobody sets.
+        steady_ns: A clock that is never set.
     """
 
     def __init__(
