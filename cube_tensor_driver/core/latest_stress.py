@@ -16,7 +16,7 @@ FINE = 0
 DOUBTFUL = 1
 """Health of a cube: a status bit is set, or many rows have a high residual."""
 FAULTY = 2
-"""Health of a cube: its latest row has no component."""
+"""Health of a cube: all components of its latest row are unknown (NaN)."""
 STALE = 3
 """Health of a cube: no row of it has arrived for some time."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from .arrays import AnyArray
 
 MAX_SKINS = 4
-"""Number of rows in the cache, as a multiple of the number of cubes.
+"""Maximum number of rows in the cache, as a multiple of the number of cubes of the skin.
 
 This is enough for the pattern of the whole skin, of each hub, and of a few scans in one message.
 """
@@ -35,7 +35,7 @@ class PatternCache(Generic[Computed]):
         self._rows = 0
 
     def get(self, cube: AnyArray) -> Computed:
-        """Return the result for this column, and compute it if it is not in the cache."""
+        """Return the result for a column of cube numbers (N,); compute it if it is not cached."""
         # A short key finds the entry; its content decides, because other columns may share the key.
         key: tuple[int, ...] = (0,)
         if len(cube):

@@ -54,7 +54,8 @@ class _Table(NamedTuple):
     """An estimator in the form in which rows are computed.
 
     Attributes:
-        matrix: Map (15 + D, P) from v / stiffness to components and scaled residual rows.
+        matrix: Map (15 + D, P) from pad stresses divided by the stiffness to 15 components and D
+            whitened residuals divided by sqrt(dof).
         limit: Limit of the residual.
         observed: Bit mask of the observed components.
     """
@@ -277,7 +278,11 @@ class Pipeline:
         )
 
     def _multiply(self, pattern: _Pattern, v: Real) -> Real:
-        """Compute components and residual rows (B, N, 15 + D) of v (B, N, P)."""
+        """Multiply v (B, N, P) by the matrices of the rows' calibrations.
+
+        Returns:
+            Components and whitened residuals (B, N, 15 + D).
+        """
         first = pattern.blocks[0] if pattern.blocks else None
         if len(pattern.blocks) == 1 and first is not None and first.matrix.ndim == 2:
             # All cubes share one calibration: the product is the result, without a copy.
@@ -332,7 +337,10 @@ class Pipeline:
         observed.reshape(len(v), -1)[:, pattern.unknown] = 0
 
     def _residual(self, out: Real) -> Real:
-        """Compute the residuals (B, N) of components and residual rows (B, N, 15 + D)."""
+        """Compute the residual of each row (B, N) from its product (B, N, 15 + D).
+
+        The last D numbers of a product are the whitened residuals divided by sqrt(dof).
+        """
         rest = out[:, :, N_COMPONENTS:]
         if self._n_residual == 1:
             return np.abs(rest[:, :, 0])
@@ -436,7 +444,7 @@ class Pipeline:
         n = len(pattern.group)
         count = len(rows) // n if n else 1
         if count > 1:
-            # Only then, because numpy is faster with two axes than with three.
+            # Only for several scans, because numpy is faster with two axes than with three.
             f = f.reshape(count, n, self.n_pads)
         rest, highest = pattern.rest, pattern.highest
         no_temperature = None
@@ -474,7 +482,10 @@ class Pipeline:
         return _PadLaw(pattern, v, bad, no_temperature)
 
     def _make_pattern(self, cube: AnyArray) -> _Pattern:
-        """Compute the pattern of one scan; several scans of the same cubes share the first's."""
+        """Compute the pattern of a column of cube numbers.
+
+        A column of several scans of the same cubes gets the pattern of one scan.
+        """
         repeats = count_repeats(cube)
         if repeats > 1:
             return self._patterns.get(cube[: len(cube) // repeats])
@@ -559,7 +570,8 @@ class Pipeline:
         matrix[:N_COMPONENTS, :n_pads] = estimator.matrix * self._scale(group)[:, None]
         # Without redundancy the residual is unknown.
         matrix[N_COMPONENTS:, :n_pads] = np.nan
-        # A mask that lowers the rank by more than the pads it removes could have more null rows.
+        # If pads are missing and the rank falls by more than their number, there are more null rows
+        # than the table has room for. Then only the first of them are used.
         null = estimator.null[: self._n_residual]
         dof = len(null)
         limit = np.nan

@@ -16,9 +16,21 @@ from numpy.typing import NDArray
 
 from .arrays import AnyArray, PadMasks, Real, Single, StatusBits, Times
 
+COLUMN_TYPES: dict[str, type] = {
+    "sequence": np.uint32,
+    "stamp_ns": np.int64,
+    "temperature": np.float32,
+    "pad_fault": np.uint32,
+    "residual": np.float32,
+    "status": np.uint16,
+    "observed": np.uint16,
+    "left_out": np.uint32,
+}
+"""Type of each column with one number per row, as in the messages."""
+
 
 class _Rows:
-    """Number and selection of rows. All fields of a subclass are arrays (N, ...)."""
+    """Base class of rows, whose fields are all arrays (N, ...)."""
 
     __slots__ = ()
     cube: NDArray[np.uint16]
@@ -87,16 +99,15 @@ class FrequencyRows(_Rows):
             stamp_ns, sequence, temperature, pad_fault, status: The other attributes, as (N,) or
                 as one value for all rows.
         """
-        cube = np.asarray(cube)
-        return cls(
-            cube=cube,
-            sequence=_fill_column(cube, sequence, np.uint32),
-            stamp_ns=_fill_column(cube, stamp_ns, np.int64),
-            frequency=np.asarray(frequency),
-            temperature=_fill_column(cube, temperature, np.float32),
-            pad_fault=_fill_column(cube, pad_fault, np.uint32),
-            status=_fill_column(cube, status, np.uint16),
+        columns = _fill_columns(
+            cube,
+            stamp_ns=stamp_ns,
+            sequence=sequence,
+            temperature=temperature,
+            pad_fault=pad_fault,
+            status=status,
         )
+        return cls(frequency=np.asarray(frequency), **columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -149,18 +160,16 @@ class StressRows(_Rows):
             residual, status, observed, stamp_ns, sequence, left_out: The other attributes, as (N,)
                 or as one value for all rows.
         """
-        cube = np.asarray(cube)
-        return cls(
-            cube=cube,
-            sequence=_fill_column(cube, sequence, np.uint32),
-            stamp_ns=_fill_column(cube, stamp_ns, np.int64),
-            stress=np.asarray(stress),
-            gradient=np.asarray(gradient),
-            residual=_fill_column(cube, residual, np.float32),
-            status=_fill_column(cube, status, np.uint16),
-            observed=_fill_column(cube, observed, np.uint16),
-            left_out=_fill_column(cube, left_out, np.uint32),
+        columns = _fill_columns(
+            cube,
+            residual=residual,
+            status=status,
+            observed=observed,
+            stamp_ns=stamp_ns,
+            sequence=sequence,
+            left_out=left_out,
         )
+        return cls(stress=np.asarray(stress), gradient=np.asarray(gradient), **columns)
 
 
 def concatenate(parts: Sequence[_Kind]) -> _Kind:
@@ -173,13 +182,14 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
     return kind(*columns)
 
 
-def _fill_column(
-    cube: AnyArray,
-    values: Any,
-    dtype: type,
-) -> AnyArray:
-    """Return a column (N,) of values (N,), or of one value for all rows."""
-    return np.array(np.broadcast_to(values, cube.shape), dtype)
+def _fill_columns(cube: Any, **columns: Any) -> dict[str, AnyArray]:
+    """Return the columns (N,) of N rows, each from values (N,) or from one value for all rows."""
+    filled = {"cube": np.asarray(cube)}
+    shape = filled["cube"].shape
+    for name, values in columns.items():
+        # np.array copies, because a broadcast array is read-only.
+        filled[name] = np.array(np.broadcast_to(values, shape), COLUMN_TYPES[name])
+    return filled
 
 
 class Source(Protocol):

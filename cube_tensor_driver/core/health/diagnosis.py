@@ -44,7 +44,7 @@ single value is stuck."""
 STILL_MAX_SPAN = 8.0
 """Span (peak to peak) of a pad, as a multiple of its noise, below which the pad is still.
 
-Noise alone spans 6 in 1000 rows.
+In 1000 rows, noise alone spans 6 times its standard deviation.
 """
 
 RESIDUAL_ENTER = 0.5

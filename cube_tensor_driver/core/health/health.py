@@ -214,7 +214,7 @@ class Health:
         return self._conditions.collect(), had_high_residual, rows
 
     def _check(self, pattern: _Pattern, rows: FrequencyRows) -> tuple[PadMasks, StatusBits]:
-        """Check the rows of B scans of the same n cubes."""
+        """Check the rows of B scans of the same n cubes; `update` states what is returned."""
         scans = pattern.repeats, len(pattern.cube)
         frequency = rows.frequency.reshape(*scans, -1)
         pad_fault = rows.pad_fault.reshape(scans)

@@ -29,7 +29,7 @@ MAX_DURATION_S = HISTORY_WINDOWS * WINDOW_S
 MAX_SPAN = 12.0
 """Span (peak to peak) of a pad, as a multiple of the calibration's noise, above which it moves.
 
-Noise alone spans 9 in 10000 rows.
+In 10000 rows, noise alone spans 9 times its standard deviation.
 """
 
 MAX_NOISE = 4.0
@@ -52,7 +52,10 @@ MAX_GAP_S = 0.25
 """Longest gap in the data, in s, over which the load counts as unchanged."""
 
 MAX_GAP_ROWS = 4.0
-"""Longest gap, as a multiple of the mean interval of the rows, where this is above `MAX_GAP_S`."""
+"""Longest gap over which the load counts as unchanged, as a multiple of the rows' mean interval.
+
+It replaces `MAX_GAP_S` where rows come so slowly that it is the longer one.
+"""
 
 
 class _Means(NamedTuple):
