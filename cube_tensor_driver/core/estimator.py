@@ -111,7 +111,7 @@ class Estimator:
         chi2 = np.sum(z**2, axis=1)
         best = drop.max(axis=1)
         is_similar = drop > best[:, None] - SUSPECT_MARGIN
-        # One broken pad leaves noise in the others, which have one degree of freedom less.
+        # Without the broken pad only noise remains, with one degree of freedom less.
         limit_without = chi2_limit(self.dof - 1, FALSE_ALARM)
         is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
         is_specific = is_similar.sum(axis=1) < is_checked.sum()

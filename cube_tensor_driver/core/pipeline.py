@@ -424,7 +424,7 @@ class Pipeline:
     def _find_estimator(self, cube: int, left_out: int) -> tuple[Estimator, Array]:
         """Return the estimator of a cube, and the unit (15,) of its components."""
         group = int(self._group[cube])
-        # Bits of pads that the cube does not have would only fill the cache.
+        # Bits of pads that the cube does not have would fill the cache with equal estimators.
         mask = int(left_out) & int(_pack_bits(self._exists[group]))
         return self._estimator(group, mask), self._scale(group)
 

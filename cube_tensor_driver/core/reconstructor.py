@@ -36,7 +36,7 @@ class RecordedHealth(NamedTuple):
     status: StatusBits
 
     def select(self, chosen: Any) -> RecordedHealth:
-        """Return that of the rows that an index, a slice or a mask chooses."""
+        """Return the recorded health of the rows that an index, a slice or a mask chooses."""
         return RecordedHealth(self.known[chosen], self.left_out[chosen], self.status[chosen])
 
 

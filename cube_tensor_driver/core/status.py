@@ -9,7 +9,7 @@ is impossible."""
 RESIDUAL = 2
 """Status bit: chi-square is above its false-alarm limit.
 
-Either the load is outside the modes, or a pad is broken.
+Either the load causes a stress field that the modes do not express, or a pad is broken.
 """
 
 INVALID = 4

@@ -33,7 +33,7 @@ An older row is from another recording, or from a clock that was set, so a new w
 """
 
 HISTORY_WINDOWS = 20
-"""Number of closed windows that are kept for a tare, which is 10 s."""
+"""Number of closed windows that are kept for a tare: 10 s of data."""
 
 MIN_STRAIN = -0.8
 """Smallest strain d/d_rest - 1 of a pad's foam that is possible: a fifth of its thickness."""

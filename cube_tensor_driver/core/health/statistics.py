@@ -133,7 +133,7 @@ class WindowStatistics:
 
     @property
     def bound(self) -> Single:
-        """Largest term of the noise (cubes, P), in Hz²."""
+        """Upper limit of each term of the noise (cubes, P), in Hz²."""
         bound: Single = self._bound
         return bound
 
