@@ -1,5 +1,4 @@
-"""Circular components: combinations of stress and gradient that a rotation about z only
-phase-shifts.
+"""Circular components: combinations of stress and gradient that only change phase under rotation.
 
 A rotation of the frame about z by an angle multiplies a circular component c of order m (0 to 3) by
 exp(-i m angle). The field of a rotationally symmetric contact therefore depends on the direction
@@ -26,8 +25,12 @@ Orders = NDArray[np.int64]
 
 
 def _define_components() -> tuple[Complex, Orders]:
-    """Return the circular components (14, 24) as combinations of `FIELD`, and their orders
-    (14,)."""
+    """Define the circular components.
+
+    Returns:
+        Matrix (14, 24) of the components as combinations of `FIELD`, and their orders (14,).
+    """
+    # Unit vectors by name, from which the combinations are composed
     unit = dict(zip(FIELD, np.eye(len(FIELD)), strict=True))
 
     def combine_stresses(suffix: str) -> list[tuple[int, Complex]]:
@@ -79,7 +82,15 @@ def sum_rotated(
         Stress (N, 6) and gradient (N, 6, 3), each the sum over the L fields in the cube's frame.
     """
     # Multiplying is much faster than the exponential of m times the angle.
-    powers = np.stack([np.ones_like(rotation), rotation, rotation**2, rotation**3], axis=-1)
+    powers = np.stack(
+        [
+            np.ones_like(rotation),
+            rotation,
+            rotation**2,
+            rotation**3,
+        ],
+        axis=-1,
+    )
     phases = powers.astype(np.complex64)[..., ORDERS]
     total = (circular * phases).sum(axis=1)
 

@@ -70,8 +70,9 @@ def field(
     forces = np.asarray(forces, dtype=np.float64)
     _check(points, sources, forces, poisson)
 
-    d = points[..., :, np.newaxis, :] - sources[..., np.newaxis, :, :]
-    forces = forces[..., np.newaxis, :, :]
+    # One row per point, one column per force.
+    d = points[..., :, None, :] - sources[..., None, :, :]
+    forces = forces[..., None, :, :]
     distance = np.sqrt(np.einsum("...i,...i->...", d, d))
     if not np.all(distance > 0.0):
         raise ElasticError(
@@ -79,7 +80,7 @@ def field(
         )
 
     stress, gradient = _radial(d, forces, distance)
-    if poisson != 0.5:
+    if poisson != 0.5:  # an incompressible body has only the first term
         airy_stress, airy_gradient = _airy(d, forces, distance)
         scale = (1.0 - 2.0 * poisson) / (2.0 * np.pi)
         stress += scale * airy_stress
@@ -195,7 +196,11 @@ def _check(
     poisson: float,
 ) -> None:
     """Raise ElasticError for arguments that `field` cannot use."""
-    for name, array in (("points", points), ("sources", sources), ("forces", forces)):
+    for name, array in (
+        ("points", points),
+        ("sources", sources),
+        ("forces", forces),
+    ):
         if array.ndim < 2 or array.shape[-1] != 3 or not np.all(np.isfinite(array)):
             raise ElasticError(
                 f"{name} have shape {array.shape}; give finite numbers of shape (..., n, 3)"
@@ -226,12 +231,16 @@ def _radial(
     d_i d_j dw/dk + w (delta_ik d_j + delta_jk d_i).
     """
     constant = -3.0 / (2.0 * np.pi)
-    products = np.stack([d[..., i] * d[..., j] for i, j in _STRESS_AXES], axis=-2)
+    products = np.stack(
+        [d[..., i] * d[..., j] for i, j in _STRESS_AXES],
+        axis=-2,
+    )
     w = constant * np.einsum("...i,...i->...", d, forces) / distance**5
     stress = np.einsum("...cl,...l->...c", products, w)
 
-    by_force = constant * forces / distance[..., np.newaxis] ** 5
-    by_distance = 5.0 * (w / distance**2)[..., np.newaxis] * d
+    # dw/dk = constant F_k / R^5 - 5 w d_k / R^2
+    by_force = constant * forces / distance[..., None] ** 5
+    by_distance = 5.0 * (w / distance**2)[..., None] * d
     gradient = products @ (by_force - by_distance)
     weighted_d = np.einsum("...l,...li->...i", w, d)
     for component, (i, j) in enumerate(_STRESS_AXES):
@@ -257,6 +266,7 @@ def _airy(
     force = (fx, fy)
     f_dot_d = fx * x + fy * y
 
+    # Derivatives of the potentials as polynomials in u = 1/R and v = 1/(R + Z)
     u = 1.0 / distance
     v = 1.0 / (distance - z)  # 1 / (R + Z), finite because Z >= 0
     chi2 = u * v**2
@@ -276,7 +286,16 @@ def _airy(
         n1: Array,
         n2: Array,
     ) -> Array:
-        """Return g_ij from the derivatives t of its tangential and n of its normal potential."""
+        """Return g_ij of the module head, or its derivative by Z.
+
+        Args:
+            i: First axis, 0 or 1.
+            j: Second axis.
+            t2: h2 of the potential of the tangential force, chi or chi_Z.
+            t3: h3 of it.
+            n1: h1 of the potential of the normal force, chi_Z or chi_ZZ.
+            n2: h2 of it.
+        """
         mixed = force[i] * position[j] + force[j] * position[i]
         value = t2 * mixed + (f_dot_d * t3 - fz * n2) * position[i] * position[j]
         if i == j:
@@ -301,7 +320,13 @@ def _airy(
     # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy; d/dz = -d/dZ
     n_components = len(_STRESS_AXES)
     stress = np.zeros((*distance.shape[:-1], n_components))
-    gradient = np.zeros((*distance.shape[:-1], n_components, 3))
+    gradient = np.zeros(
+        (
+            *distance.shape[:-1],
+            n_components,
+            3,
+        )
+    )
     for component, i, j, sign in ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0)):
         stress[..., component] = sign * second(i, j, chi2, chi3, log1, log2)
         for axis in (0, 1):
@@ -315,6 +340,7 @@ def _gauss_points(order: int) -> tuple[Array, Array]:
     """Return Gauss-Legendre nodes (order,) and weights (order,) on the interval from 0 to 1."""
     if order < 1:
         raise ElasticError(f"quadrature order is {order}; it must be at least 1")
+    # numpy's nodes are those of the interval from -1 to 1.
     nodes, weights = np.polynomial.legendre.leggauss(order)
     return (nodes + 1.0) / 2.0, weights / 2.0
 
@@ -326,10 +352,18 @@ def _place_rings(
     force: ArrayLike,
     centre: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Return point forces on rings of radii (n,) relative to `radius`, each with its force
-    fraction."""
+    """Return point forces on n concentric rings.
+
+    Args:
+        radius: Radius of the contact in m.
+        rings: Radii (n,) of the rings, divided by that of the contact.
+        fractions: Fraction (n,) of the force on each ring.
+        force: Total force (3,) in N.
+        centre: Centre (2,) of the contact in m.
+    """
     if not radius > 0.0:
         raise ElasticError(f"patch radius is {radius} m; it must be positive")
+    # As many angles as resolve the outermost ring as finely as the radii.
     n = 4 * len(rings)
     angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
     x = radius * np.outer(rings, np.cos(angle))
@@ -350,9 +384,16 @@ def _place_forces(
     force: ArrayLike,
     centre: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Return point forces at (x, y) (L,) from the centre, with these fractions (L,) of the
-    force."""
+    """Return L point forces around a centre.
+
+    Args:
+        x: Positions (L,) relative to the centre, in m.
+        y: Positions (L,) relative to the centre, in m.
+        fractions: Fraction (L,) of the force at each position.
+        force: Total force (3,) in N.
+        centre: Centre (2,) in m.
+    """
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
     sources = np.stack([cx + x, cy + y, np.zeros_like(x)], axis=-1)
-    forces = fractions[:, np.newaxis] * np.asarray(force, dtype=np.float64)
+    forces = fractions[:, None] * np.asarray(force, dtype=np.float64)
     return sources, forces

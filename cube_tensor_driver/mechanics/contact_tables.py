@@ -49,11 +49,20 @@ MAX_LEG_RATIO = 50.0
 """Largest tabulated t / sqrt(1 + d**2), with d and t divided by the depth. Longer legs are cut
 there: beyond it hardly any stress reaches the cube."""
 
-_LAST_RADIUS = REACH_DEPTHS * POINTS_PER_DEPTH
+_LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
+"""Index of the largest tabulated distance."""
+
 _GRID_ROWS = int(np.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP)) + 2
+"""Number of tabulated values of d."""
+
 _CENTRE_COLUMN = int(np.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP))
+"""Index of t = 0 among the tabulated values of t."""
+
 _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
+"""Number of tabulated values of t."""
+
 _ORIGIN_TOLERANCE = 1e-12
+"""Length of an edge, divided by the depth, below which it counts as a point."""
 
 
 class _ContactTables:
@@ -68,7 +77,7 @@ class _ContactTables:
     """
 
     _kind: str
-    """Name of the cached file."""
+    """Kind of the tables, with which the name of the cached file begins."""
 
     def __init__(self, layer: Layer, depth: float) -> None:
         layer.check_depth(depth)
@@ -102,10 +111,10 @@ class _ContactTables:
             Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m.
         """
         neighbours = self._rows.take(rows, axis=0)
-        interpolated = (weights[..., np.newaxis, :] @ neighbours).view(np.complex64)
+        interpolated = (weights[..., None, :] @ neighbours).view(np.complex64)
         unit_fields = interpolated.reshape(*loads.shape, len(ORDERS))
 
-        amplitudes = loads[..., np.newaxis, :].astype(np.complex64)
+        amplitudes = loads[..., None, :].astype(np.complex64)
         circular = amplitudes @ unit_fields
         return sum_rotated(circular[..., 0, :], rotation)
 
@@ -123,10 +132,10 @@ class DiscTables(_ContactTables):
         radii = CONTACT_SIZES * self.depth
         disc_spectra = np.stack([disc_spectrum(spectra.k * radius) for radius in radii])
 
-        distance = np.arange(_LAST_RADIUS + 2) * self.depth / POINTS_PER_DEPTH
+        distance = np.arange(_LAST_DISTANCE + 2) * self.depth / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, distance)
         # (radii, distances, R Z T, 14); the tangential force F_t acts with the factor i.
-        table = spectra.radial(bessel, disc_spectra) * np.array([1, 1, 1j])[:, np.newaxis]
+        table = spectra.radial(bessel, disc_spectra) * np.array([1, 1, 1j])[:, None]
         return {"table": table.astype(np.complex64)}
 
     def field(
@@ -161,21 +170,29 @@ class DiscTables(_ContactTables):
         )
 
         polar_force = _to_complex(forces) * direction.conj()  # F_r + i F_t
-        loads = np.stack([polar_force.real, forces[..., 2], polar_force.imag], axis=-1)
+        loads = np.stack(
+            [
+                polar_force.real,
+                forces[..., 2],
+                polar_force.imag,
+            ],
+            axis=-1,
+        )
 
+        # Linear interpolation between two distances
         index = distance / self.depth * POINTS_PER_DEPTH
-        is_near = index < _LAST_RADIUS
-        below = np.minimum(index, _LAST_RADIUS - 1).astype(np.intp)
+        is_near = index < _LAST_DISTANCE
+        below = np.minimum(index, _LAST_DISTANCE - 1).astype(np.intp)
         fraction = index - below
         weights = np.stack(
             [1 - fraction, fraction],
             axis=-1,
             dtype=np.float32,
         )
-        weights *= is_near[..., np.newaxis]
+        weights *= is_near[..., None]
 
-        first_row = self._nearest_size(radius) * (_LAST_RADIUS + 2) + below
-        rows = first_row[..., np.newaxis] + np.array([0, 1])
+        first_row = self._nearest_size(radius) * (_LAST_DISTANCE + 2) + below
+        rows = first_row[..., None] + np.array([0, 1])
         return self._sum_loads(weights, rows, loads.astype(complex), direction)
 
     def _nearest_size(self, radius: ArrayLike) -> Index:
@@ -205,7 +222,7 @@ class PolygonTables(_ContactTables):
 
         # Grid of d (rows) and t (columns), divided by the depth.
         eta = np.arange(-_CENTRE_COLUMN, _CENTRE_COLUMN + 1) * GRID_STEP
-        d = np.sinh(np.arange(_GRID_ROWS) * GRID_STEP)[:, np.newaxis]
+        d = np.sinh(np.arange(_GRID_ROWS) * GRID_STEP)[:, None]
         t = np.hypot(1.0, d) * np.sinh(eta)
         r = np.hypot(d, t)
         is_origin = r == 0
@@ -214,31 +231,38 @@ class PolygonTables(_ContactTables):
 
         # The integral over alpha becomes one over eta: alpha = atan(t / d), t = t(eta).
         alpha_slope = d * np.hypot(1.0, d) * np.cosh(eta) / r_safe**2
-        exponents = np.stack([ORDERS - 1, ORDERS + 1, ORDERS, ORDERS])
+        exponents = np.stack(
+            [
+                ORDERS - 1,
+                ORDERS + 1,
+                ORDERS,
+                ORDERS,
+            ]
+        )
         integrand = over_distance(np.minimum(r, REACH_DEPTHS))
-        integrand = integrand * direction[..., np.newaxis, np.newaxis] ** exponents
-        integrand *= alpha_slope[..., np.newaxis, np.newaxis]
+        integrand = integrand * direction[..., None, None] ** exponents
+        integrand *= alpha_slope[..., None, None]
         table = CubicSpline(eta, integrand, axis=1).antiderivative()(eta)
         table -= table[:, _CENTRE_COLUMN : _CENTRE_COLUMN + 1]  # the integral begins at t = 0
 
-        sign = (-1.0) ** ORDERS * np.array([-1.0, -1.0, 1.0, -1j])[:, np.newaxis]
+        sign = (-1.0) ** ORDERS * np.array([-1.0, -1.0, 1.0, -1j])[:, None]
         # Lengths were divided by the depth: A, B and Z are areas, W is a volume.
-        unit = self.depth ** np.array([2.0, 2.0, 2.0, 3.0])[:, np.newaxis]
+        unit = self.depth ** np.array([2.0, 2.0, 2.0, 3.0])[:, None]
         return {"table": (table * sign * unit).astype(np.complex64)}
 
     def _integrate_distance(self) -> CubicSpline:
         """Return the inner integrals over r of A, B, Z and W, as functions (..., 4, 14) of r."""
         spectra = layer_spectra(self.layer, self.depth)
-        r = np.arange(_LAST_RADIUS + 2) / POINTS_PER_DEPTH
+        r = np.arange(_LAST_DISTANCE + 2) / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, r * self.depth)
         point_force = np.ones((1, len(spectra.k)))
         along, normal, across = spectra.radial(bessel, point_force)[0].swapaxes(0, 1)
 
-        distance = r[:, np.newaxis]
+        distance = r[:, None]
         a = (along + across) / 2
         b = (along - across) / 2
         w = across * distance
-        integrand = np.stack([a, b, normal, w], axis=1) * distance[..., np.newaxis]
+        integrand = np.stack([a, b, normal, w], axis=1) * distance[..., None]
         return CubicSpline(r, integrand).antiderivative()
 
     def field(
@@ -266,24 +290,33 @@ class PolygonTables(_ContactTables):
         """
         first = _to_complex(np.asarray(start, float)) / self.depth
         second = _to_complex(np.asarray(end, float)) / self.depth
+        # Unit vector along the edge, as a complex number
         edge = second - first
         edge /= np.maximum(np.abs(edge), _ORIGIN_TOLERANCE)
 
         # In axes along and across the edge, both ends have the coordinates t - i d.
-        local = np.stack([first, second], axis=-1) * edge.conj()[..., np.newaxis]
+        local = np.stack([first, second], axis=-1) * edge.conj()[..., None]
         signed_distance = -local[..., 0].imag
         side = np.where(signed_distance < 0, -1.0, 1.0)
         direction = -1j * edge * side  # exp(i beta)
         d = np.abs(signed_distance)
-        t = local.real * side[..., np.newaxis]
+        t = local.real * side[..., None]
 
         # Triangles that begin beyond the reach of the tables depend on their angle only.
         shrink = np.minimum(1.0, REACH_DEPTHS / np.maximum(d, REACH_DEPTHS))
-        weights, rows = _triangle_neighbours(d * shrink, t * shrink[..., np.newaxis])
+        weights, rows = _triangle_neighbours(d * shrink, t * shrink[..., None])
 
         tractions = np.asarray(traction, float)
         v = _to_complex(tractions) * direction.conj()
-        loads = np.stack([v, v.conj(), tractions[..., 2], np.asarray(twist, float)], axis=-1)
+        loads = np.stack(
+            [
+                v,
+                v.conj(),
+                tractions[..., 2],
+                np.asarray(twist, float),
+            ],
+            axis=-1,
+        )
         return self._sum_loads(weights, rows, loads, direction)
 
 
@@ -304,13 +337,13 @@ def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
         Weights of bilinear interpolation at four grid points for the start, which are negative, and
         at four for the end; rows of these grid points.
     """
-    column = np.arcsinh(t / np.hypot(1.0, d)[..., np.newaxis]) / GRID_STEP + _CENTRE_COLUMN
+    column = np.arcsinh(t / np.hypot(1.0, d)[..., None]) / GRID_STEP + _CENTRE_COLUMN
     column = np.clip(column, 0, _GRID_COLUMNS - 1 - 1e-6)
     row = np.arcsinh(d) / GRID_STEP
     above = row.astype(np.intp)
     left = column.astype(np.intp)
 
-    down = (row - above)[..., np.newaxis]
+    down = (row - above)[..., None]
     right = column - left
     upper = [(1 - down) * (1 - right), (1 - down) * right]
     lower = [down * (1 - right), down * right]
@@ -318,6 +351,6 @@ def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
     weights[..., 0, :] *= -1
 
     corners = np.array([0, 1, _GRID_COLUMNS, _GRID_COLUMNS + 1])
-    first = _GRID_COLUMNS * above[..., np.newaxis] + left
-    rows = first[..., np.newaxis] + corners
+    first = _GRID_COLUMNS * above[..., None] + left
+    rows = first[..., None] + corners
     return weights.reshape(*d.shape, 8), rows.reshape(*d.shape, 8)

@@ -45,6 +45,7 @@ class Influence:
         Returns:
             Pad stresses (P, m, dim); 0 outside of the grid.
         """
+        # The positions are all combinations of the coordinates, sorted by x, then by y.
         axes = [np.unique(column) for column in self.place.T]
         nodes = np.moveaxis(self.pads, 1, 0)
         grid = nodes.reshape(*map(len, axes), *nodes.shape[1:])

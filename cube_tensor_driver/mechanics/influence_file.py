@@ -45,6 +45,7 @@ def write_influence(
     Raises:
         ConfigError: The file cannot be written.
     """
+    # 16-bit integers instead of floats: the file is part of the package.
     step = np.abs(influence.pads).max() / MAX_INTEGER
     layout = influence.layout
     with atomic_write(path) as partial, partial.open("wb") as file:
@@ -81,6 +82,7 @@ def read_influence(path: Path) -> Influence:
             f"{path}: no such file; make it with ./cube fem MODEL --surface"
         ) from None
     except (CubeError, *_READ_ERRORS) as error:
+        # A KeyError contains only the name of the missing array.
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise ConfigError(
             f"{path}: {reason}; make the file again with ./cube fem MODEL --surface -o FILE.npz"
@@ -90,6 +92,7 @@ def read_influence(path: Path) -> Influence:
 
 def _load_arrays(data: bytes) -> Arrays:
     """Decompress the arrays of a file after checking their size."""
+    # A small archive may decompress to any size.
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(member.file_size for member in archive.infolist())
     if size > MAX_FILE_BYTES:
@@ -136,7 +139,10 @@ def _check(influence: Influence) -> None:
     if not (np.isfinite(place).all() and np.isfinite(influence.pads).all()):
         raise ConfigError("a position or a stress is not finite")
 
-    x, y = np.meshgrid(*(np.unique(column) for column in place.T), indexing="ij")
+    x, y = np.meshgrid(
+        *(np.unique(column) for column in place.T),
+        indexing="ij",
+    )
     grid = np.column_stack([x.ravel(), y.ravel()])
     is_grid = np.array_equal(place, grid)
     # Cubic interpolation needs four nodes per axis.

@@ -47,8 +47,8 @@ POINTS_PER_DEPTH = 32
 the peak."""
 
 REACH_DEPTHS = 20
-"""Largest tabulated distance, divided by the depth. Responses and covariances at larger distances
-count as zero."""
+"""Largest tabulated distance from a load to a cube, divided by the depth of the cube. Responses and
+covariances at larger distances count as zero."""
 
 _OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
 _IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
@@ -93,7 +93,7 @@ def model_points(
         ElasticError: The layer does not contain this depth.
     """
     spectra = layer_spectra(layer, depth)
-    components = FIELD_FROM_CIRCULAR[np.newaxis, :, _OBSERVED]
+    components = FIELD_FROM_CIRCULAR[None, :, _OBSERVED]
     return MeasurementModel(spectra, components, np.zeros(cubes, np.intp))
 
 
@@ -142,10 +142,21 @@ class Kernels:
         self.depth = depth
         self.scale = scale
         self.step = depth / POINTS_PER_DEPTH
-        self.variance = np.array([SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0])
+        self.variance = np.array(
+            [
+                SHEAR_RATIO**2,
+                SHEAR_RATIO**2,
+                1.0,
+            ]
+        )
         self.component_matrices = components * self._unit_factors
         self._order = spectra.order
-        table_inputs = [layer.thickness, layer.poisson, depth, *vars(spectra).values()]
+        table_inputs = [
+            layer.thickness,
+            layer.poisson,
+            depth,
+            *vars(spectra).values(),
+        ]
         self.inputs = [*table_inputs, self.component_matrices]
 
         # Cubic interpolation needs one more distance on the left, and two on the right.
@@ -179,11 +190,12 @@ class Kernels:
         Returns:
             The number of the variant.
         """
+        # Variants are few: cubes that lost the same pad share one.
         matrix = components * self._unit_factors
         equal = np.flatnonzero((self.component_matrices == matrix).all(axis=(1, 2)))
         if len(equal):
             return int(equal[0])
-        self.component_matrices = np.concatenate([self.component_matrices, matrix[np.newaxis]])
+        self.component_matrices = np.concatenate([self.component_matrices, matrix[None]])
         return len(self.component_matrices) - 1
 
     def _tabulate_discs(self, spectra: Spectra, bessel: BesselTable) -> Array:
@@ -213,8 +225,8 @@ class Kernels:
         """
         prior = _prior_spectrum(spectra.k * self.depth) * self.depth**2
         shear, normal = SHEAR_RATIO**2, 1.0
-        axis_variance = np.array([shear, normal, shear])[:, np.newaxis]
-        cross = spectra.radial(bessel, prior[np.newaxis])[0] * axis_variance
+        axis_variance = np.array([shear, normal, shear])[:, None]
+        cross = spectra.radial(bessel, prior[None])[0] * axis_variance
 
         real, imaginary = spectra.covariance(spectra, bessel, prior, SHEAR_RATIO)
         with_points, _ = spectra.covariance(points, bessel, prior, SHEAR_RATIO)
@@ -269,8 +281,16 @@ class Kernels:
         size: float,
         force: Array,
     ) -> Array:
-        """Compute the pressure (N,) at the depth of the cubes under a disc with a force (3,) in
-        N."""
+        """Compute the pressure at the depth of the cubes under a disc.
+
+        Args:
+            place: Positions (N, 2) from the centre of the disc.
+            size: Radius of the disc in m.
+            force: Force (3,) on the disc in N.
+
+        Returns:
+            Pressure (N,) in Pa.
+        """
         return -self.field(place, size)[:, _FIELD_ZZ] @ force
 
     def cross(
@@ -310,7 +330,13 @@ class Kernels:
         first = self._matrices_towards(direction - angle, variant)
         second = self._matrices_towards(direction - other_angle, other_variant)
 
-        total = np.zeros((len(place), len(COMPONENTS), len(COMPONENTS)))
+        total = np.zeros(
+            (
+                len(place),
+                len(COMPONENTS),
+                len(COMPONENTS),
+            )
+        )
         for left, table, right in zip(
             first,
             (self._real, self._imaginary),
@@ -333,7 +359,7 @@ class Kernels:
         distance, direction = _polar(place)
         covariance = self._interpolate(self._pressure, distance)
         real, _ = self._matrices_towards(direction - angle, variant)
-        return np.asarray((real @ covariance[:, :, np.newaxis])[:, :, 0])
+        return np.asarray((real @ covariance[:, :, None])[:, :, 0])
 
     def _rotate_loads(
         self,
@@ -360,13 +386,13 @@ class Kernels:
         across = 1j * parts[:, 2]
 
         # A force along x has the components F_r = cos(phi) and F_t = -sin(phi).
-        cosine = np.cos(direction)[:, np.newaxis]
-        sine = np.sin(direction)[:, np.newaxis]
+        cosine = np.cos(direction)[:, None]
+        sine = np.sin(direction)[:, None]
         along_x = cosine * radial - sine * across
         along_y = sine * radial + cosine * across
         loads = np.stack([along_x, along_y, normal], axis=1)
 
-        rotated = _phases(direction - angle, order)[:, np.newaxis] * loads
+        rotated = _phases(direction - angle, order)[:, None] * loads
         return np.concatenate([rotated.real, rotated.imag], axis=2)
 
     def _measure(self, circular: Array, variant: Index) -> Array:
@@ -386,12 +412,13 @@ class Kernels:
         Returns:
             Matrices (N, 15, n) of the real parts and of the imaginary parts.
         """
-        phases = _phases(angle, self._order)[:, np.newaxis]
+        phases = _phases(angle, self._order)[:, None]
         real, imaginary = np.split(
             self.component_matrices.swapaxes(1, 2),
             2,
             axis=2,
         )
+        # Rotating the frame multiplies a component by a phase, which acts on its coefficients.
         matrices = (real - 1j * imaginary)[variant] * phases
         return matrices.real, -matrices.imag
 
@@ -401,11 +428,20 @@ class Kernels:
         size: float,
         place: Array,
     ) -> Array:
-        """Return R, Z and T (distances, 3, n) of a disc of one radius, up to the farthest
-        position."""
+        """Interpolate a table between the radii of discs.
+
+        Args:
+            discs: R, Z and T (radii, distances, 3, n).
+            size: Radius of the disc in m.
+            place: Positions (N, 2) at which the table will be used.
+
+        Returns:
+            R, Z and T (distances, 3, n), up to the farthest position.
+        """
         farthest = np.hypot(*place.T).max(initial=0.0) / self.step
         n_distances = int(min(farthest, self._last)) + 4
 
+        # The radii are a geometric series: interpolation in the logarithm.
         log_step = np.log(DISC_SIZES[1] / DISC_SIZES[0])
         index = np.log(size / self.depth / DISC_SIZES[0]) / log_step
         first, weights = _cubic_weights(np.clip(index, 1.0, len(DISC_SIZES) - 2.001))
@@ -431,6 +467,7 @@ def hertz_pressure(distance: Array, size: float) -> Array:
         distance: Distances from the centre in m.
         size: Radius of the contact in m.
     """
+    # p = 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2), and 0 outside
     inside = np.clip(1 - (distance / size) ** 2, 0, None)
     peak = 3 / (2 * np.pi * size**2)
     return np.asarray(peak * np.sqrt(inside))
@@ -461,7 +498,7 @@ def _polar(place: Array) -> tuple[Array, Array]:
 
 def _phases(angle: Array, order: Orders) -> Complex:
     """Return exp(i m angle) (N, n) of angles (N,) and orders m (n,)."""
-    phases: Complex = np.exp(1j * angle[:, np.newaxis] * order)
+    phases: Complex = np.exp(1j * angle[:, None] * order)
     return phases
 
 

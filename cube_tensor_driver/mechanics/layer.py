@@ -35,8 +35,8 @@ FIELD = STRESS + tuple(f"{name}_{axis}" for name in STRESS for axis in "xyz")
 of each of them along x, y and z in Pa/m."""
 
 _WaveStress = dict[str, tuple[Any, Any]]
-"""Stress and its derivative along z; the key is the stress component and the load, in axes L, T,
-z."""
+"""Stress under a wave of traction, and its derivative along z. A key such as "LzT" names the stress
+component Lz and the load T, in the axes of the wave: L along it, T across it."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,7 @@ class Layer:
         """
         self.check_depth(depth)
         kx, ky = np.broadcast_arrays(np.asarray(kx, float), np.asarray(ky, float))
+        # L = (cosine, sine, 0); its direction does not matter where k is 0.
         k = np.hypot(kx, ky)
         is_zero = k == 0
         k_safe = np.where(is_zero, 1.0, k)
@@ -117,8 +118,8 @@ class Layer:
         slope[is_zero] = 0.0
 
         # d/dx exp(i k.x) = i kx exp(i k.x)
-        by_x = 1j * kx[..., np.newaxis, np.newaxis] * stress
-        by_y = 1j * ky[..., np.newaxis, np.newaxis] * stress
+        by_x = 1j * kx[..., None, None] * stress
+        by_y = 1j * ky[..., None, None] * stress
         gradient = np.stack([by_x, by_y, slope], axis=-2)
         gradient = gradient.reshape(*k.shape, 18, 3)
         return np.concatenate([stress, gradient], axis=-2)
@@ -157,7 +158,15 @@ class Layer:
             eta = zeta + h
             rise = np.exp(zeta)
             fall = (-1) ** n * np.exp(-eta)
-            return np.stack([rise, (n + zeta) * rise, fall, (eta - n) * fall], axis=-1)
+            return np.stack(
+                [
+                    rise,
+                    (n + zeta) * rise,
+                    fall,
+                    (eta - n) * fall,
+                ],
+                axis=-1,
+            )
 
         # Boundary conditions: psi(0), psi'(0), u_L and u_z at the bottom.
         nu = self.poisson
@@ -176,15 +185,15 @@ class Layer:
 
     @staticmethod
     def _airy_half_space(zeta: Array) -> Array:
-        """Return the same for a half space: psi = (A + B zeta) exp(zeta), C = D = 0."""
-        decay = np.exp(zeta)[..., np.newaxis]
+        """Return psi and its derivatives as `_airy`, for a half space: C = D = 0."""
+        decay = np.exp(zeta)[..., None]
         a = np.array([1.0, 0.0])
         b = np.array([-1.0, 1.0])  # psi'(0) = A + B
-        depth_factor = zeta[..., np.newaxis]
+        depth_factor = zeta[..., None]
         return np.stack([(a + (n + depth_factor) * b) * decay for n in range(4)])
 
     def _twist(self, k: Array, depth: float) -> _WaveStress:
-        """Return the stress under traction along T."""
+        """Return the stress under traction along T, the horizontal axis across the wave."""
         decay = np.exp(-k * depth)
         cosh = sinh = decay
         if np.isfinite(self.thickness):
@@ -233,7 +242,11 @@ def _add_rotated(
     stress_rows: dict[str, dict[int, Any]] = {
         "LL": {0: c * c, 1: s * s, 5: c * s},
         "TT": {0: s * s, 1: c * c, 5: -c * s},
-        "LT": {0: -2 * c * s, 1: 2 * c * s, 5: c * c - s * s},
+        "LT": {
+            0: -2 * c * s,
+            1: 2 * c * s,
+            5: c * c - s * s,
+        },
         "zz": {2: 1.0},
         "Lz": {4: c, 3: s},
         "Tz": {4: -s, 3: c},

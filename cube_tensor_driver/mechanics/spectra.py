@@ -36,8 +36,8 @@ from .circular import CIRCULAR_FROM_FIELD, ORDERS, Orders
 from .layer import Layer
 
 BesselTable = Callable[[int], Array]
-"""Function that returns the Bessel function of one order at fixed arguments (positions,
-wavenumbers)."""
+"""Function that returns J_m(kr) (positions, waves) of one order m, at fixed positions and
+wavenumbers."""
 
 MAX_WAVENUMBER_TIMES_DEPTH = 25.0
 """Upper limit of the integrals over k, multiplied by the depth. There, the field has decayed by the
@@ -83,17 +83,29 @@ class Spectra:
         minus = np.zeros(shape)
         normal = np.zeros(shape)
 
+        # Components of one order share their Bessel functions: one product for all of them.
         for order in np.unique(self.order):
             chosen = self.order == order
-            parts = ((plus, self.plus, -1), (minus, self.minus, 1), (normal, self.normal, 0))
+            parts = (
+                (plus, self.plus, -1),
+                (minus, self.minus, 1),
+                (normal, self.normal, 0),
+            )
             for total, spectrum, shift in parts:
                 wave = bessel(int(order) + shift) * self.weight
                 for load, load_spectrum in enumerate(load_spectra):
-                    weighted = spectrum[:, chosen] * load_spectrum[:, np.newaxis]
+                    weighted = spectrum[:, chosen] * load_spectrum[:, None]
                     total[load][:, chosen] = wave @ weighted
 
         # plus = R + T, minus = R - T
-        return np.stack([(plus + minus) / 2, normal, (plus - minus) / 2], axis=2)
+        return np.stack(
+            [
+                (plus + minus) / 2,
+                normal,
+                (plus - minus) / 2,
+            ],
+            axis=2,
+        )
 
     def covariance(
         self,
@@ -120,8 +132,8 @@ class Spectra:
         half = shear**2 / 2
 
         # <c d*> and <c d> of the module head at phi = 0
-        order_difference = self.order[:, np.newaxis] - other.order
-        order_sum = self.order[:, np.newaxis] + other.order
+        order_difference = self.order[:, None] - other.order
+        order_sum = self.order[:, None] + other.order
         sign = (-1.0) ** other.order
         conjugate = self._integrate(normal + half * same, order_difference, bessel, prior)
         direct = self._integrate(
@@ -141,8 +153,17 @@ class Spectra:
         bessel: BesselTable,
         prior: Array,
     ) -> Array:
-        """Integrate prior * spectrum (waves, n, n') * J_order(kr), with its own order (n, n')
-        each."""
+        """Integrate the products of spectra, Bessel functions and prior over k.
+
+        Args:
+            spectrum: Products (waves, n, n') of two spectra.
+            order: Order (n, n') of the Bessel function for each pair.
+            bessel: Bessel functions at the wanted distances.
+            prior: Spectrum S (waves,) of the pressure.
+
+        Returns:
+            Integrals (distances, n, n').
+        """
         result = np.zeros((len(bessel(0)), *order.shape))
         for one in np.unique(order):
             chosen = order == one
@@ -153,15 +174,19 @@ class Spectra:
 
 def _outer(first: Array, second: Array) -> Array:
     """Return the products (waves, n, n') of all pairs of two sets of spectra."""
-    return first[:, :, np.newaxis] * second[:, np.newaxis]
+    return first[:, :, None] * second[:, None]
 
 
 def tabulate_bessel(k: Array, r: Array) -> BesselTable:
-    """Prepare the Bessel functions J_m(kr) for wavenumbers (waves,) and distances (positions,) in
-    m.
+    """Tabulate Bessel functions.
+
+    Args:
+        k: Wavenumbers (waves,) in 1/m.
+        r: Distances (positions,) in m.
 
     Returns:
-        A function that returns J_m (positions, waves) of any order m and computes each order once.
+        Function that returns J_m(kr) (positions, waves) of any order m. It computes each order
+        once.
     """
     x = np.outer(r, k)
 
@@ -201,7 +226,7 @@ def layer_spectra(layer: Layer, depth: float) -> Spectra:
     circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
 
     # At phi = 0, i^m c = N F_z + (i/2) P (F_x + i F_y) - (i/2) M (F_x - i F_y).
-    x, y, z = np.moveaxis(1j ** ORDERS[:, np.newaxis] * circular, -1, 0)
+    x, y, z = np.moveaxis(1j ** ORDERS[:, None] * circular, -1, 0)
     plus = x.imag - y.real
     minus = -x.imag - y.real
     return Spectra(k, weight, ORDERS, plus, minus, z.real)

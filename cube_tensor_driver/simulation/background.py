@@ -70,8 +70,7 @@ class BackgroundHubs:
         self._thread.start()
 
     def set_load(self, stress: ArrayLike, gradient: ArrayLike) -> None:
-        """Set what acts on the cubes from now on, in their frames, as `MujocoSkin.field` returns
-        it.
+        """Set the fields that act on the cubes from now on, in the frames of the cubes.
 
         Args:
             stress: Stress (cubes, 6) in Pa, order xx yy zz yz zx xy.
@@ -115,7 +114,7 @@ class _SetLoad:
                 f"the load has a stress of shape {stress.shape} and a gradient of shape "
                 f"{gradient.shape}; a skin of {cubes} cubes takes ({cubes}, 6) and ({cubes}, 6, 3)"
             )
-        self._field = stress, gradient
+        self._field = stress, gradient  # one assignment is atomic
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         return self._field
@@ -130,7 +129,7 @@ class _StopRequest:
 
     def request(self) -> None:
         self.requested = True
-        os.write(self._write, b"\0")
+        os.write(self._write, b"\0")  # wakes the selector of the simulator
 
     def close(self) -> None:
         os.close(self.fd)

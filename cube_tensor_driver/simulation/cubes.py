@@ -88,6 +88,7 @@ class SimulatedCubes:
         for calibration, rows in self._groups:
             state = true_state(calibration, stress[rows], gradient[rows])
             pad_stress[rows] = state @ calibration.response.T
+        # Deviations of real pads act between the stress and the frequency.
         if self._behaviour is not None:
             pad_stress = self._behaviour.reported(pad_stress, seconds)
 
@@ -99,6 +100,7 @@ class SimulatedCubes:
             )
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
+        # The pad law returns NaN beyond its range.
         return np.nan_to_num(np.rint(hertz * 1e3), nan=NOT_MEASURED).astype("<u4")
 
 
@@ -142,10 +144,10 @@ class HubCubes:
 
 
 def frequency_noise(calibration: Calibration) -> Array:
-    """Return the relative standard deviation (pads,) of a frequency from the noise of a
-    calibration.
+    """Compute the noise of the frequencies that causes the noise in Pa of a calibration at rest.
 
-    At rest, it causes the noise in Pa that the calibration states.
+    Returns:
+        Standard deviation (pads,) of each frequency divided by the frequency.
     """
     rest = calibration.rest_frequency
     slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
@@ -178,6 +180,7 @@ def hub_cubes(
                 f"link {link.name}: its cubes have {sorted(n_pads)} pads; all cubes of a hub must "
                 "have the same number"
             )
+        # With the number as seed, hubs have different noise.
         cubes = SimulatedCubes(
             calibrations, noise=noise, drift=drift, imperfections=imperfections, seed=number
         )
@@ -203,6 +206,7 @@ def hub_members(skin: Skin, link: str) -> Index:
         if cube.index is None and (cube.link or first_link) == link
     ]
 
+    # A hub may have cubes that the skin does not use: their indices stay free.
     highest = max(by_index, default=-1)
     size = max(len(by_index) + len(by_uid), highest + 1)
     members = np.full(size, ABSENT)
@@ -238,6 +242,7 @@ def true_state(
     Returns:
         Amplitudes (N, modes) in Pa.
     """
+    # The gradient of the modes is that over one half side.
     by_axis = to_matrix(np.moveaxis(gradient, -1, -2))  # (N, axis, i, j)
     scaled = np.moveaxis(by_axis, -3, -1) * calibration.half_side
     return calibration.modes.state(stress, scaled)
@@ -252,6 +257,7 @@ def true_components(
 
     Arguments as in `true_state`.
     """
+    # The modes of gradients are in Pa; published gradients are in Pa/m.
     is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
     scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
     state = true_state(calibration, stress, gradient)

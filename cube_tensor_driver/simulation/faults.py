@@ -6,11 +6,11 @@ them. `injector.py` carries faults out.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from ..config.schema import Schema, integer, mapping, real
 from ..core.errors import ConfigError
 
 KINDS = {
@@ -42,6 +42,9 @@ KINDS = {
 }
 """What each kind of fault does, with the keys that it uses."""
 
+MAX_COUNT = (1 << 32) - 1
+"""Largest number of samples that a fault affects, and largest index of a cube or pad."""
+
 FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
 """Faults of the frames of single samples."""
 
@@ -65,6 +68,26 @@ CUT_FAULTS = (
 
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """Faults that end as soon as they have begun. All others last `seconds`."""
+
+
+# Only `value` may be negative: a clock may run slow, a temperature may fall.
+_AMOUNT = real("a number from 0 up", minimum=0)
+_COUNT = integer(0, MAX_COUNT, "a whole number from 0 up")
+_SCHEMA = Schema(
+    mapping(
+        ["kind"],
+        {
+            "kind": {"enum": list(KINDS), "description": ", ".join(KINDS)},
+            "at": _AMOUNT,
+            "link": {"type": "string", "description": "the name of a link"},
+            "seconds": _AMOUNT,
+            "count": _COUNT,
+            "cube": _COUNT,
+            "pad": _COUNT,
+            "value": real("a finite number"),
+        },
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -103,38 +126,12 @@ class Fault:
             ConfigError: A key or a value is wrong. The message names the key, the value and what is
                 allowed.
         """
-        if not isinstance(data, dict) or "kind" not in data:
-            raise ConfigError(
-                f"{place}: found {str(data)[:60]!r}, allowed: a table with the key kind, "
-                "{kind: drop}"
-            )
-        types: dict[str, type] = {field.name: type(field.default) for field in fields(cls)}
+        for _, mistake in _SCHEMA.mistakes(data):
+            raise ConfigError(f"{place}: {mistake}")
+        # YAML may contain 2 for 2.0 and the reverse.
+        types: dict[str, Any] = {field.name: type(field.default) for field in fields(cls)}
         types["kind"] = str
-        for key, value in data.items():
-            if key not in types:
-                raise ConfigError(f"{place}: unknown key {key!r}, allowed: {', '.join(types)}")
-            if not _is_valid(key, value, types[key]):
-                raise ConfigError(
-                    f"{place}: {key}: found {value!r}, allowed: a {types[key].__name__} from 0 up"
-                )
-        if data["kind"] not in KINDS:
-            raise ConfigError(f"{place}: kind: found {data['kind']!r}, allowed: {', '.join(KINDS)}")
         return cls(**{key: types[key](value) for key, value in data.items()})
-
-
-def _is_valid(
-    key: str,
-    value: Any,
-    wanted: type,
-) -> bool:
-    """Return whether a key of a fault may have this value; only `value` may be negative."""
-    if wanted is str:
-        return isinstance(value, str)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        return False
-    if wanted is int and value != int(value):
-        return False
-    return value >= 0 or key == "value"
 
 
 def parse_faults(data: Any, place: str) -> list[Fault]:

@@ -95,7 +95,10 @@ class SimulatedHub:
         uid = self.uid if self.false_uid is None else self.false_uid
         n_pads = self.n_pads + self.extra_pads
         uids = np.array(self.cube_uids, "<u8")
-        return encode(Hello(uid, FIRMWARE, n_pads, self.period_us, uids), self.version)
+        return encode(
+            Hello(uid, FIRMWARE, n_pads, self.period_us, uids),
+            self.version,
+        )
 
     def stats(self, now_us: int) -> bytes:
         """Return the STATS frame."""
@@ -120,6 +123,7 @@ class SimulatedHub:
         drift_ppm: float | None = None,
     ) -> None:
         """Set the clock forward, or change its rate from now on."""
+        # Time gained so far becomes part of the offset, so that only a step changes the clock.
         self.boot_us = self.device_us(now_us) - now_us + step_us
         self.drift_ppm = self.drift_ppm if drift_ppm is None else drift_ppm
         self._drift_since_us = now_us
@@ -165,6 +169,7 @@ class SimulatedHub:
         self.next_us += self.period_us
 
         _, prepared = self._prepared.get(id(frequency), (None, None))
+        # Prepared frames have no temperature and no reported faults.
         is_plain = self.celsius == TEMPERATURE_UNKNOWN and self.pad_fault is None
         if prepared is not None and is_plain and self.version == VERSION:
             return prepared.encode(sequence, device_us)
@@ -200,6 +205,7 @@ class SimulatedHub:
 
     def _log_sample(self) -> None:
         """Continue the run with the sample of `next_us`, or begin a new run."""
+        # A run ends where samples were skipped, the period changed or the hub restarted.
         if (self.next_us, self.period_us, self.boots) != self._expected:
             self._ended_runs = self.runs
             self._run = SampleRun(
@@ -230,6 +236,7 @@ class SimulatedHub:
                 device_us = self._positive_device_us(now_us)
                 return encode(Time(request.argument, device_us), self.version)
             case Command.START:
+                # A second START must not shift the samples.
                 if not self.started:
                     self.skip(now_us)
                 self.started = True
@@ -242,7 +249,7 @@ class SimulatedHub:
                     self.skip(now_us)
                 else:
                     result = Result.REFUSED
-                argument = self.period_us
+                argument = self.period_us  # the period that holds now
             case Command.IDENTIFY:
                 pass
             case _:

@@ -18,16 +18,46 @@ Theory of Viscoelasticity (1982), 2.2.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..config.schema import JsonSchema, Schema, integer, mapping, real
 from ..config.yaml import read_yaml
 from ..core.arrays import Array
 from ..core.errors import ConfigError
+
+MAX_SEED = (1 << 63) - 1
+"""Largest seed of the random deviations; it has to fit a 64-bit integer."""
+
+_CREEP_TERM: JsonSchema = {
+    "type": "array",
+    "items": [
+        real("a size from 0 up", minimum=0),
+        real("a time above 0 s", exclusiveMinimum=0),
+    ],
+    "minItems": 2,
+    "maxItems": 2,
+    "description": "[size, seconds]",
+}
+
+_SCHEMA = Schema(
+    mapping(
+        (),
+        {
+            "gain_spread": real("a number from 0 to below 1", minimum=0, exclusiveMaximum=1),
+            "dead": real("a fraction of the pads from 0 to 1", minimum=0, maximum=1),
+            "creep": {
+                "type": "array",
+                "items": _CREEP_TERM,
+                "description": "[[size, seconds], ...]",
+            },
+            "seed": integer(0, MAX_SEED, "a whole number from 0 up"),
+        },
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -50,18 +80,9 @@ class Imperfections:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.gain_spread < 1:
-            raise ConfigError(f"gain_spread is {self.gain_spread!r}, allowed: 0 to below 1")
-        if not 0 <= self.dead <= 1:
-            raise ConfigError(f"dead is {self.dead!r}, allowed: a part of the pads from 0 to 1")
-        if self.seed < 0:
-            raise ConfigError(f"seed is {self.seed!r}, allowed: a whole number from 0 up")
-        for size, time in self.creep:
-            if not (size >= 0 and time > 0):
-                raise ConfigError(
-                    f"a term of creep is {(size, time)!r}; give a size from 0 up and a time above "
-                    "0 s"
-                )
+        # The schema describes the values of a file, in which a term is a list.
+        values = asdict(self) | {"creep": [list(term) for term in self.creep]}
+        _raise_first_mistake(values)
 
 
 def read_imperfections(path: Path) -> Imperfections:
@@ -71,41 +92,19 @@ def read_imperfections(path: Path) -> Imperfections:
         ConfigError: A key is unknown, or a value is wrong.
     """
     data = read_yaml(path)
-    keys = [field.name for field in fields(Imperfections)]
-    if not isinstance(data, dict) or not set(data) <= set(keys):
-        found = [key for key in data if key not in keys] if isinstance(data, dict) else data
-        raise ConfigError(
-            f"{path}: found {str(found)[:60]!r}, allowed: a table of {', '.join(keys)}"
-        )
-
-    for key, value in data.items():
-        allowed = _describe_mismatch(key, value)
-        if allowed:
-            raise ConfigError(f"{path}: {key}: found {str(value)[:60]!r}, allowed: {allowed}")
-    if "creep" in data:
-        data["creep"] = tuple((size, time) for size, time in data["creep"])
     try:
-        return Imperfections(**data)
+        _raise_first_mistake(data)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+    # Tuples, because an instance is immutable.
+    creep = tuple((size, time) for size, time in data.pop("creep", ()))
+    return Imperfections(creep=creep, **data)
 
 
-def _describe_mismatch(key: str, value: Any) -> str:
-    """Return what is allowed for a key if the type of its value is wrong, else an empty text."""
-    if key == "creep":
-        is_valid = isinstance(value, list) and all(_is_pair(term) for term in value)
-        return "" if is_valid else "[[size, seconds], ...]"
-    if key == "seed":
-        return "" if isinstance(value, int) and _is_number(value) else "a whole number"
-    return "" if _is_number(value) else "a number"
-
-
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and type(value) is not bool and math.isfinite(value)
+def _raise_first_mistake(data: Any) -> None:
+    """Raise ConfigError for the first value that does not fit the schema."""
+    for _, mistake in _SCHEMA.mistakes(data):
+        raise ConfigError(mistake)
 
 
 class PadBehaviour:
@@ -124,6 +123,7 @@ class PadBehaviour:
             shape: Number of cubes and of pads per cube.
             seed: Seed that differs between the hubs of a skin.
         """
+        # With the same seeds, the same pads are dead, whatever the other deviations are.
         random = np.random.default_rng([imperfections.seed, seed])
         self._gain = 1 + imperfections.gain_spread * random.standard_normal(shape)
         self._dead = random.random(shape) < imperfections.dead
@@ -144,11 +144,12 @@ class PadBehaviour:
         Returns:
             Reported stress (cubes, pads) in Pa; NaN for a dead pad.
         """
+        # NaN as the frequency of an oscillator that does not run
         reported = np.where(self._dead, np.nan, stress * self._gain)
         if len(self._creep_time):
             elapsed = max(seconds - self._seconds, 0.0)
             # Solution of tau dq/dt = v - q for a constant v: 1 - exp(-t / tau)
-            approach = -np.expm1(-elapsed / self._creep_time)[:, np.newaxis, np.newaxis]
+            approach = -np.expm1(-elapsed / self._creep_time)[:, None, None]
             self._crept += approach * (np.nan_to_num(reported) - self._crept)
             reported += np.tensordot(self._creep_size, self._crept, axes=1)
             self._seconds = seconds

@@ -35,6 +35,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
             "seconds=2"
         )
     pairs = dict(word.split("=", 1) for word in words)
+    # Names are texts even if they look like numbers.
     fault = {
         key: value if key in ("kind", "link") else parse_yaml(value, "fault")
         for key, value in pairs.items()
@@ -43,6 +44,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
     folder = ports or _newest_demo()
 
     with os.fdopen(_open_pipe(folder / FAULT_PIPE), "w") as stream:
+        # The file exists before the pipe.
         sizes = read_yaml(folder / HUBS_FILE)
         hubs = {name: HubSize(**size) for name, size in sizes.items()}
         links = check_target(parsed, hubs)

@@ -34,7 +34,11 @@ DAMAGING_FAULTS = ("drop", "flip", "insert", "truncate")
 """Faults after which a frame may no longer be readable."""
 
 _MAX_INSERTED_BYTES = 20
+"""Number of inserted bytes, exclusive upper limit."""
+
 _FALSE_UID_BITS = 0xBAD
+"""Bits of the uid that are inverted in a false uid."""
+
 _LASTING_STATES = ("stall", "burst", "temperature")
 """Faults that need no action at their end: the line itself ends a stall and a burst, a temperature
 stays until the next one."""
@@ -137,6 +141,7 @@ class Injector:
             ConfigError: It names a link, cube or pad that does not exist.
         """
         sizes = {name: link.size for name, link in self._links.items()}
+        # A fault without a link becomes one fault per link.
         for name in check_target(fault, sizes):
             self._schedule(self._begins, at_us, replace(fault, link=name))
 
@@ -147,6 +152,7 @@ class Injector:
 
     def step(self, now_us: int) -> None:
         """Begin and end the faults that are due."""
+        # Ends first: a fault may begin in the instant in which another one on the same pad ends.
         while self._ends and self._ends[0][0] <= now_us:
             _, _, fault = heapq.heappop(self._ends)
             self._end(fault, now_us)
@@ -172,6 +178,7 @@ class Injector:
         if not state.pads and state.warming is None and not hub.extra_pads:
             return frequency  # the same array: the hub may have prepared its frame
 
+        # A copy, because the fields of a load may be kept for its next period.
         frequency = frequency.copy()
         if state.warming is not None:
             begin_us, fault = state.warming
@@ -248,11 +255,12 @@ class Injector:
                 line.burst_until_us = end_us
             case "unplug" | "rename":
                 state.held_back = b""
-                hub.off()
+                hub.off()  # the power comes from the port
                 line.unplug()
             case "reset":
                 self._restart(link, now_us, 0)
             case "wrap":
+                # Sample numbers reach 2**32 after `count` samples.
                 self._restart(link, now_us, -fault.count % 2**32)
             case "drift":
                 hub.set_clock(now_us, drift_ppm=fault.value)
@@ -357,6 +365,7 @@ def warming(
     time_us: Times | int,
 ) -> Any:
     """Return the °C above room temperature at simulated times while a temperature fault acts."""
+    # Linear over the duration of the fault, then constant.
     fraction = (np.asarray(time_us) - begin_us) * 1e-6 / max(fault.seconds, 1e-6)
     return fault.value * np.minimum(1.0, fraction)
 

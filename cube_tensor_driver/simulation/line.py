@@ -86,10 +86,12 @@ class SimulatedLine:
         if not self.plugged or now_us < self.held_until_us:
             return
         if now_us < self.burst_until_us:
+            # At most one write per period.
             burst = now_us // BURST_PERIOD_US
             if burst == self._newest_burst:
                 return
             self._newest_burst = burst
+        # The rest stays in the queue until the host reads.
         with contextlib.suppress(BlockingIOError):
             while self._queue:
                 del self._queue[: os.write(self.fd, self._queue)]
@@ -171,7 +173,7 @@ class TcpLine(SimulatedLine):
             data = super().read()
         except ConnectionError:
             data = b""
-        if not data:
+        if not data:  # the host has closed the connection
             self._hang_up()
         return data
 
@@ -182,6 +184,7 @@ class TcpLine(SimulatedLine):
         with contextlib.suppress(OSError):  # the host has closed it again
             self._connection, _ = self._listener.accept()
             self._connection.setblocking(False)
+            # Samples must not wait to be sent together.
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self.fd = self._connection.fileno()
 

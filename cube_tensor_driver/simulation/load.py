@@ -27,7 +27,7 @@ MAX_RADIUS_DEPTHS = 12
 needs so many points that it takes minutes."""
 
 MAX_CACHED_BYTES = 64 << 20
-"""Largest memory of the fields that `LoadMemory` keeps."""
+"""Maximum memory of the fields that `LoadMemory` keeps, in bytes."""
 
 _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
 """Quadrature orders in use. They are few, so that many cubes have the same order and are computed
@@ -129,8 +129,8 @@ class Load:
         self.poses = skin.poses
         self._pitch = self.poses.pitch
 
-        # Relative positions of a script range over the box around all cubes.
-        half = self.poses.half_side[:, np.newaxis]
+        # Relative positions of a script, from -1 to 1, range over the box around all cubes.
+        half = self.poses.half_side[:, None]
         low = (self.poses.position - half).min(axis=0)
         high = (self.poses.position + half).max(axis=0)
         self._centre = (low + high) / 2
@@ -145,6 +145,7 @@ class Load:
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         """Compute the fields at a time, as `Fields.at`."""
+        # In the frame of each cube, the surface is the plane z = 0 and the cube lies below it.
         position, rotation, _ = self.poses
         n = len(position)
         stress = np.zeros((n, 6))
@@ -154,16 +155,16 @@ class Load:
             local = np.einsum("nij,ni->nj", rotation, load.position - position)
             distance = np.hypot(local[:, 0], local[:, 1])
             facing = np.maximum(rotation[:, :, 2] @ load.normal, 0.0)
-            force = np.einsum("nij,i->nj", rotation, load.force) * facing[:, np.newaxis]
+            force = np.einsum("nij,i->nj", rotation, load.force) * facing[:, None]
             orders = _choose_orders(load.shape, load.radius, self.depth, distance)
 
             # Cubes with the same quadrature order are computed together.
             for order in np.unique(orders[facing > 0]).tolist():
                 rows = np.flatnonzero((orders == order) & (facing > 0))
                 points, weights = _unit_points(load.shape, order)
-                in_plane = local[rows, np.newaxis, :] * (1.0, 1.0, 0.0)
+                in_plane = local[rows, None, :] * (1.0, 1.0, 0.0)
                 sources = in_plane + load.radius * points
-                forces = force[rows, np.newaxis, :] * weights
+                forces = force[rows, None, :] * weights
                 part, slope = contact.field(below, sources, forces, self.script.poisson)
                 stress[rows] += part[:, 0]
                 gradient[rows] += slope[:, 0]
@@ -179,6 +180,7 @@ class Load:
             for action in indenter.actions
             if action.start <= seconds < action.end
         ]
+        # At the start and at the end of an action, the force is 0.
         return [load for load in loads if load.force.any()]
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
@@ -216,6 +218,7 @@ class Load:
         normal = surface_normal(self.poses, self._pitch, position)
         size = float(interpolate_knots(action.force, progress))
         if path and action.kind == "slide":
+            # Only the motion along the skin rubs.
             velocity = path.velocity(progress) / duration
             velocity -= normal * (velocity @ normal)
             speed = float(np.linalg.norm(velocity))
@@ -234,6 +237,7 @@ class Load:
         """Return the radius in m of a contact under a normal force in N."""
         if indenter.shape == "disc":
             return indenter.radius
+        # a³ = 3 F R / (4 E*), Johnson 4.2
         stiffness = self.script.young / (1 - self.script.poisson**2)
         return float(np.cbrt(3 * force * indenter.radius / (4 * stiffness)))
 
@@ -286,6 +290,7 @@ def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
     """
     if not loads:
         return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
+    # The centre of pressure is weighted with the normal forces.
     weight = np.array([-load.force @ load.normal for load in loads])
     force = np.sum([load.force for load in loads], axis=0)
     centre = weight @ np.array([load.position for load in loads]) / weight.sum()
@@ -313,6 +318,7 @@ class LoadMemory:
         field = self._fields.get(time_us)
         if field is None:
             field = self._load.at(time_us * 1e-6)
+            # All at once instead of the oldest one: a period that does not fit never repeats.
             field_bytes = sum(part.nbytes for part in field)
             if (len(self._fields) + 1) * field_bytes > MAX_CACHED_BYTES:
                 self._fields.clear()
@@ -339,6 +345,7 @@ def _choose_orders(
     """
     to_rim = np.maximum(distance - radius, 0.0)
     ratio = radius / np.hypot(depth, to_rim)
+    # Measured: the error decreases exponentially with order / ratio.
     wanted = 5 * ratio + 1 if shape == "sphere" else 3.3 * ratio + 0.5
     orders = _ORDERS[np.searchsorted(_ORDERS, wanted)]
     return np.where(ratio < _FAR_RATIO, 1, orders)
@@ -346,8 +353,15 @@ def _choose_orders(
 
 @lru_cache(maxsize=64)
 def _unit_points(shape: str, order: int) -> tuple[Array, Array]:
-    """Return points (L, 3) of a contact of radius 1, and the fraction (L, 1) of the force on
-    each."""
+    """Return the point forces that represent a contact of radius 1.
+
+    Args:
+        shape: Shape of the contact.
+        order: Quadrature order.
+
+    Returns:
+        Positions (L, 3) of the forces, and the fraction (L, 1) of the total force on each.
+    """
     unit_force = (0.0, 0.0, 1.0)
     if shape == "sphere" and order > 1:
         points, forces = contact.hertz(1.0, unit_force, order=order)

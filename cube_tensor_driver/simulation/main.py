@@ -25,6 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the simulator until a signal; return 0, or 1 after a mistake in its input."""
     options = _parser().parse_args(arguments)
     stop = StopSignal()
+    # Signals that arrive while the files are read end the simulator, too.
     try:
         simulator = _create_simulator(options)
         try:
@@ -127,7 +128,10 @@ def _read_load(skin: Skin, options: argparse.Namespace) -> AnyLoad:
         from .mujoco.scene import MujocoLoad
 
         return MujocoLoad(options.mujoco, skin)
-    return Load(skin, read_script(options.load) if options.load else default_script())
+    return Load(
+        skin,
+        read_script(options.load) if options.load else default_script(),
+    )
 
 
 if __name__ == "__main__":

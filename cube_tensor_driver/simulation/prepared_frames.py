@@ -47,7 +47,12 @@ class PreparedFrame:
             self._sample = sample
 
     def encode(self, sequence: int, device_us: int) -> bytes:
-        """Return the bytes that `protocol.encode` returns for the sample with these numbers."""
+        """Encode the sample with these numbers, with the result of `protocol.encode`.
+
+        Args:
+            sequence: Sequence number of the sample.
+            device_us: Time of the hub's clock in µs.
+        """
         if self._sample is not None:
             self._sample.sequence = sequence
             self._sample.device_us = device_us
@@ -55,6 +60,7 @@ class PreparedFrame:
 
         _SEQUENCE.pack_into(self._head, _SEQUENCE_OFFSET, sequence)
         _DEVICE_US.pack_into(self._head, _DEVICE_US_OFFSET, device_us)
+        # The checksum covers head and tail, and its four bytes may contain zeros.
         crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(_CRC_BYTES, "little")
         start = cobs.encode(bytes(self._head[:-1]))
         end = cobs.encode(self._rest + crc)

@@ -134,7 +134,7 @@ class SampleLog:
             raise ConfigError(
                 f"{path}: {error.strerror}; a simulator writes its sample log when it ends"
             ) from None
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError) as error:  # other JSON, or another version
             raise ConfigError(f"{path}: no sample log of this version ({error!r})") from None
 
     @classmethod
@@ -167,10 +167,12 @@ class SampleLog:
     @cached_property
     def table(self) -> SampleTable:
         """All samples of the log, link after link, in the order of time."""
+        # Runs become columns: one row per sample.
         runs = [(number, run) for number, link in enumerate(self.links) for run in link.runs]
         lengths = np.array([len(run) for _, run in runs], int)
         number = [np.arange(run.first, run.last + 1) for _, run in runs]
         time_us = [run.start_us + run.period_us * np.arange(len(run)) for _, run in runs]
+        # It gives the columns their type if there are no runs.
         no_samples = np.empty(0, np.int64)
 
         link_of_cube = np.full(CUBE_RANGE, NO_LINK, np.int64)
@@ -221,6 +223,7 @@ class SampleTable:
         """
         if among is None:
             among = np.arange(len(self))
+        # Cubes of one hub are sampled together: samples are identified by link instead of cube.
         number = self.number[among] % SEQUENCE_RANGE
         known = SampleKeys(self.link[among], number, self.time_ns[among])
         wanted = SampleKeys(self.link_of_cube[rows.cube], rows.sequence, rows.stamp_ns)

@@ -105,9 +105,8 @@ class Simulator:
             noise: Noise of the pads as in `SimulatedCubes`.
             drift: Drift of the pads as in `SimulatedCubes`.
             imperfections: Imperfections of the pads as in `SimulatedCubes`.
-            instants: Number of times at which the load is computed in advance, without noise
-                between them; they are repeated, one for each sample. 0: the load is computed as
-                time goes on.
+            instants: Number of times at which the load is computed in advance. They are repeated,
+                one for each sample. 0: the load is computed for each sample.
             faults: Faults to carry out.
             seed: Seed of what is random in the faults.
             tcp: Whether links whose port is socket://host:port are played there.
@@ -116,6 +115,7 @@ class Simulator:
             ConfigError: Cubes of one hub have different numbers of pads, the folder or a TCP
                 address cannot be used, or a fault names a link, cube or pad that does not exist.
         """
+        # Both clocks are read together: the log converts simulated time to wall clock.
         self._ports = ports
         self._load = LoadMemory(load)
         self._start_ns = time.monotonic_ns()
@@ -130,7 +130,10 @@ class Simulator:
                 imperfections=imperfections,
             ):
                 self._links.append(_connect(skin, carried, ports, tcp))
-            write_yaml(ports / HUBS_FILE, {link.name: asdict(link.size) for link in self._links})
+            write_yaml(
+                ports / HUBS_FILE,
+                {link.name: asdict(link.size) for link in self._links},
+            )
             self._fault_pipe = _open_pipe(ports / FAULT_PIPE)
         except OSError as error:
             raise ConfigError(
@@ -210,6 +213,7 @@ class Simulator:
         for link in self._links:
             link.line.unplug()
         os.close(self._fault_pipe)
+        # These files tell `inject` that a simulator runs.
         for name in (FAULT_PIPE, HUBS_FILE):
             (self._ports / name).unlink(missing_ok=True)
         # The folder stays if it contains other files.
@@ -225,8 +229,10 @@ class Simulator:
         return min(time for time in times if time is not None)
 
     def _skip_late(self, now_us: int) -> None:
-        """Leave samples out where a hub is too late; prepared ones take too little time for
-        that."""
+        """Leave samples out where a hub is late by more than `MAX_DELAY_US`.
+
+        Prepared samples are never left out: they take little time, and the hub catches up.
+        """
         for link in self._links:
             if link.computes_load and now_us - link.hub.next_us > MAX_DELAY_US:
                 link.hub.skip(now_us)
@@ -258,6 +264,7 @@ class Simulator:
             stress, gradient = self._load.at(load_us)
             frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
         frame = link.hub.sample(self._injector.measured(link, frequency, time_us))
+        # Without room on the line, a hub drops the sample and counts it.
         if not link.line.send(self._injector.transmitted(link, frame), now_us):
             link.hub.dropped += 1
             link.mark_damaged()
@@ -277,6 +284,7 @@ class Simulator:
         """
         fd = link.line.fd
         before = watched.get(link.name, -1)
+        # A line that was unplugged and plugged again has another descriptor.
         if fd == before:
             return
         if before >= 0:
@@ -295,8 +303,12 @@ class Simulator:
         text = os.read(self._fault_pipe, _PIPE_BYTES).decode(errors="replace")
         for line in text.splitlines():
             try:
-                self._injector.add(Fault.parse(parse_yaml(line, "fault"), "fault"), self.now_us())
+                self._injector.add(
+                    Fault.parse(parse_yaml(line, "fault"), "fault"),
+                    self.now_us(),
+                )
             except ConfigError as error:
+                # Anybody may write into the pipe: a mistake must not end the simulator.
                 print(f"simulator: {error}", file=sys.stderr, flush=True)
 
 
@@ -318,7 +330,7 @@ class StopSignal:
     def __init__(self) -> None:
         self.requested = False
         self.fd, write = os.pipe()
-        os.set_blocking(write, False)
+        os.set_blocking(write, False)  # Python requires it
         # Python writes a byte for each signal, which wakes a selector.
         signal.set_wakeup_fd(write)
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -1,5 +1,4 @@
-"""A simulated skin as a source of frequencies in this process, without ports, threads and
-waiting."""
+"""A simulated skin as a source of frequencies, without ports, threads and waiting."""
 
 from __future__ import annotations
 
@@ -57,6 +56,7 @@ def simulate(
         load = Load(skin, script)
     if rate is None:
         rate = skin.rate or 1e6 / SimulatedHub.period_us
+    # The longest period is the lowest rate.
     low, high = (1e6 / limit for limit in reversed(PERIOD_LIMITS_US))
     if not low <= rate <= high:
         raise ConfigError(f"rate is {rate!r}, allowed: {low:g} to {high:g} samples per second")
@@ -182,6 +182,7 @@ class SkinPads:
         """
         count = len(self._cube)
         millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
+        # Link by link, as the driver delivers the rows.
         start = 0
         for hub in self._hubs:
             cubes = hub.skin_cubes
@@ -190,6 +191,7 @@ class SkinPads:
             millihertz[start:end, : hub.cubes.n_pads] = own
             start = end
 
+        # Rounded to mHz and float32, as the values of a hub are.
         frequency = (millihertz * 1e-3).astype(np.float32)
         frequency[millihertz == NOT_MEASURED] = np.nan
         return FrequencyRows(

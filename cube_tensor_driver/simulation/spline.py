@@ -48,6 +48,7 @@ class CubicSpline:
 
     def position(self, time: float) -> Array:
         """Return the position (D,) at a time from 0 to 1."""
+        # Hermite's basis functions
         t, p, q, m, n = self._interval(time)
         value = (1 + 2 * t) * (1 - t) ** 2 * p
         value = value + t**2 * (3 - 2 * t) * q

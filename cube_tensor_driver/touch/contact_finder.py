@@ -33,8 +33,8 @@ class ContactSettings:
         method: One of `CONTACT_METHODS`.
         depth: Distance from the centres of the cubes to the surface, in m.
         least: Pressure at the depth of the cubes, in Pa, from which on something is a contact.
-        thickness: Thickness of the elastomer on rigid ground, in m; 0 for a half space. Used by the
-            method inverse.
+        thickness: Thickness of the elastomer on rigid ground in m, for the method inverse; 0 for a
+            half space.
         poisson: Poisson's ratio of the elastomer. Used by the method inverse.
         influence: Name of the influence functions of the pads (influence_file.py), which then
             determine depth, thickness and Poisson's ratio; empty: cubes are modelled as points.
@@ -141,6 +141,7 @@ class _InverseFinder:
         model = None
         if settings.influence:
             influence = read_influence(find_influence(settings.influence))
+            # The influence functions hold for one layer and depth only.
             layer = influence.layer
             depth = influence.depth
             model = model_pads(influence, calibrations)
@@ -152,6 +153,7 @@ class _InverseFinder:
         self._tracker = ContactTracker(self._inverse, settings.least)
 
     def update(self, values: Array, left_out: PadMasks) -> list[TrackedContact]:
+        # Noise matrices are computed again only for cubes whose pads in use have changed.
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
             by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])
@@ -163,4 +165,11 @@ class _InverseFinder:
         field = self._tracker.field
         shear = np.hypot(field.traction[:, 0], field.traction[:, 1])
         deviation = self._tracker.deviation(values).pressure
-        return np.column_stack([self._inverse.points, field.pressure, shear, deviation])
+        return np.column_stack(
+            [
+                self._inverse.points,
+                field.pressure,
+                shear,
+                deviation,
+            ]
+        )

@@ -68,6 +68,7 @@ class Interpolation:
             return np.full(n_cubes * n_points, np.nan)
 
         weights = self._solve_weights(known, columns)
+        # Lengths are divided by c, so derivatives are multiplied by it.
         scale = np.array([1.0, self._length, self._length])[: len(columns)]
         scaled = np.where(known, values, 0)[:, columns] * scale
         result: Array = weights.matrix @ scaled.ravel()
@@ -121,21 +122,21 @@ class Interpolation:
         # Directions (n, neighbours, 2 or 0, 3) of the derivatives: the cubes' x and y axes.
         axes = np.swapaxes(self._poses.rotation[:, :, : width - 1], 1, 2)[near]
 
-        offset = cubes[:, :, np.newaxis] - cubes[:, np.newaxis]
+        offset = cubes[:, :, None] - cubes[:, None]
         matrix = _covariance(
             offset,
-            axes[:, :, np.newaxis],
-            axes[:, np.newaxis],
+            axes[:, :, None],
+            axes[:, None],
         )
         matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
         # Unknown values become independent of all others and get the weight 0.
-        matrix *= is_known[:, :, np.newaxis] & is_known[:, np.newaxis]
+        matrix *= is_known[:, :, None] & is_known[:, None]
         matrix[:, np.arange(size), np.arange(size)] += np.where(is_known, RIDGE, 1.0)
 
-        offset = points[:, :, np.newaxis] - cubes[:, np.newaxis]
+        offset = points[:, :, None] - cubes[:, None]
         no_axes = np.zeros((n, points.shape[1], 1, 0, 3))
-        to_points = _covariance(offset, no_axes, axes[:, np.newaxis])
-        to_points = to_points.reshape(n, -1, size) * is_known[:, np.newaxis]
+        to_points = _covariance(offset, no_axes, axes[:, None])
+        to_points = to_points.reshape(n, -1, size) * is_known[:, None]
 
         weights = np.swapaxes(
             np.linalg.solve(matrix, np.swapaxes(to_points, 1, 2)),
@@ -165,7 +166,7 @@ class _Weights:
     ) -> None:
         """Create a matrix of zeros for neighbours (cubes, neighbours) and `points` per patch."""
         n, width = known.shape
-        columns = near[:, :, np.newaxis] * width + np.arange(width)
+        columns = near[:, :, None] * width + np.arange(width)
         columns = columns.reshape(n, -1)
         per_row = columns.shape[1]
         rows = n * points
@@ -175,9 +176,16 @@ class _Weights:
         self.uncertainty = np.zeros((n, points))
         self.data = np.zeros((n, points, per_row))
         indices = np.repeat(columns, points, axis=0).ravel()
+        # CSR format: every row has the same number of entries.
         starts = np.arange(rows + 1) * per_row
         self.matrix = csr_matrix(
-            (self.data.ravel(), indices, starts), shape=(rows, n * width), copy=False
+            (
+                self.data.ravel(),
+                indices,
+                starts,
+            ),
+            shape=(rows, n * width),
+            copy=False,
         )
 
 
@@ -220,13 +228,19 @@ def _covariance(
     along_u = np.einsum("...i,...ai->...a", d, u)
     along_v = np.einsum("...i,...ai->...a", d, v)
 
-    result = np.empty((*b.shape, 1 + u.shape[-2], 1 + v.shape[-2]))
+    result = np.empty(
+        (
+            *b.shape,
+            1 + u.shape[-2],
+            1 + v.shape[-2],
+        )
+    )
     result[..., 0, 0] = phi
-    result[..., 0, 1:] = -2 * phi1[..., np.newaxis] * along_v
-    result[..., 1:, 0] = 2 * phi1[..., np.newaxis] * along_u
+    result[..., 0, 1:] = -2 * phi1[..., None] * along_v
+    result[..., 1:, 0] = 2 * phi1[..., None] * along_u
     u_dot_v = np.einsum("...ai,...bi->...ab", u, v)
-    product = along_u[..., np.newaxis] * along_v[..., np.newaxis, :]
-    first = -2 * phi1[..., np.newaxis, np.newaxis] * u_dot_v
-    second = -4 * phi2[..., np.newaxis, np.newaxis] * product
+    product = along_u[..., None] * along_v[..., None, :]
+    first = -2 * phi1[..., None, None] * u_dot_v
+    second = -4 * phi2[..., None, None] * product
     result[..., 1:, 1:] = first + second
     return result

@@ -155,7 +155,7 @@ class SurfaceInverse:
 
         self.spacing = self.pitch / side
         self.area = self.spacing**2
-        above = depth * poses.rotation[:, np.newaxis, :, 2]
+        above = depth * poses.rotation[:, None, :, 2]
         self.points = (patches(poses, self.spacing, side) + above).reshape(-1, 3)
         self.cube = np.repeat(np.arange(n), side**2)
 
@@ -164,8 +164,9 @@ class SurfaceInverse:
         if not len(self.columns):
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
         self.observed = observed[:, self.columns]
+        # Gradients times the half side are in Pa, too, so that all components are comparable.
         self._unit_factors = np.where(self.columns < len(STRESS), 1.0, scale)
-        self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, np.newaxis]
+        self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
         self._all_pads = self.by_pad.copy()
 
         # Variants change when pads are left out; these are the ones with all pads.
@@ -204,7 +205,7 @@ class SurfaceInverse:
         place, angle = unroll(
             self.poses,
             np.array([centre]),
-            cubes[np.newaxis],
+            cubes[None],
         )
         return place[0], angle[0]
 
@@ -220,7 +221,7 @@ class SurfaceInverse:
             cubes: Indices (n,) of the cubes.
             by_pad: Noise matrices (n, 15, P) as from `noise_by_pad`, with the pads in use.
         """
-        self.by_pad[cubes] = by_pad[:, self.columns] * self._unit_factors[:, np.newaxis]
+        self.by_pad[cubes] = by_pad[:, self.columns] * self._unit_factors[:, None]
         if self._variant_pads is None:
             return
         for cube, own in zip(cubes.tolist(), by_pad, strict=True):
@@ -243,6 +244,7 @@ class SurfaceInverse:
 
     def field_of_scaled(self, scaled: Array) -> TractionField:
         """Compute the same from values (cubes, C) as from `scaled`."""
+        # Row by row: the patches follow the order of `points`.
         result = self._windows.product(self._fill(scaled))
         rows = result.reshape(len(self.points), -1).astype(np.float64)
         return TractionField(rows[:, :3], rows[:, 3])
@@ -260,13 +262,15 @@ class SurfaceInverse:
             scaled: All scaled values (cubes, C); errors of the gains are proportional to them.
         """
         y = self._fill(residual)
+        # Variance of each pad divided by that of its noise: 1 for the noise, and the gain error.
         stresses = pad_stresses(self.by_pad, self._known, scaled)
-        has_values = self._known.any(axis=1)[:, np.newaxis]
+        has_values = self._known.any(axis=1)[:, None]
         gain_variance = (GAIN_ERROR * stresses) ** 2
+        # A cube without values adds no noise.
         pad_variance = np.where(has_values, gain_variance + 1, 0).astype(np.float32)
 
         windows = self._windows
-        scale = windows.scale(y, pad_variance, self._known)[:, np.newaxis]
+        scale = windows.scale(y, pad_variance, self._known)[:, None]
         prior = windows.prior[windows.kind] + self._prediction.variance
         variance = scale * prior
         variance += windows.noise(pad_variance)
@@ -275,7 +279,8 @@ class SurfaceInverse:
 
     def _fill(self, scaled: Array) -> Single:
         """Return values (cubes, C) in which predictions replace those that are missing."""
-        usable = ~self._has_other_pads[:, np.newaxis]
+        usable = ~self._has_other_pads[:, None]
+        # Predictions depend on what is known only, which rarely changes.
         known = np.isfinite(scaled) & self.observed & usable
         if not np.array_equal(known, self._known):
             self._known = known

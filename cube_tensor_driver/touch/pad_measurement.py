@@ -59,20 +59,30 @@ def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Mea
     Raises:
         ElasticError: The influence functions belong to a cube of another size, or lack a pad.
     """
+    # Cubes with the same file share one calibration object.
     variants = list({id(one): one for one in calibrations}.values())
     variant_numbers = {id(one): number for number, one in enumerate(variants)}
     spectra, all_pads = _decompose(influence)
 
     pipeline = Pipeline(variants)
     components = []
-    pads = np.zeros((len(variants), len(all_pads), pipeline.n_pads))
+    pads = np.zeros(
+        (
+            len(variants),
+            len(all_pads),
+            pipeline.n_pads,
+        )
+    )
     for number, calibration in enumerate(variants):
         own = all_pads[:, _match_pads(influence, calibration)]
         matrix = np.nan_to_num(pipeline.matrix(number))
-        components.append(own @ matrix.T)
+        components.append(own @ matrix.T)  # circular components -> pads -> measured components
         pads[number, :, : own.shape[1]] = own / calibration.noise
 
-    variant = np.array([variant_numbers[id(one)] for one in calibrations], np.intp)
+    variant = np.array(
+        [variant_numbers[id(one)] for one in calibrations],
+        np.intp,
+    )
     return MeasurementModel(spectra, np.stack(components), variant, pads)
 
 
@@ -123,7 +133,10 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
     # With sqrt(r dr) as weight, the singular values measure the norm in the plane.
     root = np.sqrt(r * weight)
     decompositions = [
-        np.linalg.svd((series * root).reshape(len(series), -1), full_matrices=False)
+        np.linalg.svd(
+            (series * root).reshape(len(series), -1),
+            full_matrices=False,
+        )
         for series in _fourier_series(influence, r)
     ]
     largest = max(values[0] for _, values, _ in decompositions)
@@ -177,7 +190,7 @@ def _fourier_series(influence: Influence, r: Array) -> list[Array]:
     sine = np.sin(angle)
     direction = np.stack([cosine, sine], axis=1)
     # The direction runs from the force to the cube, so the force lies at minus r.
-    place = -(r[:, np.newaxis, np.newaxis] * direction).reshape(-1, 2)
+    place = -(r[:, None, None] * direction).reshape(-1, 2)
     responses = influence.at(place).reshape(-1, len(r), N_DIRECTIONS, 3)
 
     x, y, z = np.moveaxis(responses, -1, 0)
@@ -192,7 +205,14 @@ def _fourier_series(influence: Influence, r: Array) -> list[Array]:
         factor = 1.0 if order == 0 else 2.0
         even = factor * coefficients[..., order].real
         odd = -factor * coefficients[..., order].imag
-        real = np.stack([even[:, 0], even[:, 1], -odd[:, 2]], axis=1)
+        real = np.stack(
+            [
+                even[:, 0],
+                even[:, 1],
+                -odd[:, 2],
+            ],
+            axis=1,
+        )
         imaginary = np.stack([odd[:, 0], odd[:, 1], even[:, 2]], axis=1)
         series.append(np.concatenate([real, imaginary]))
     return series

@@ -41,7 +41,14 @@ def noise_by_pad(
         of each pad. It is NaN where a component is not observed, and 0 for a pad that is left out
         or that the cube does not have.
     """
-    by_pad = np.zeros((len(cubes), len(COMPONENTS), pipeline.n_pads))
+    by_pad = np.zeros(
+        (
+            len(cubes),
+            len(COMPONENTS),
+            pipeline.n_pads,
+        )
+    )
+    # Cubes may have different numbers of pads; the places beyond them stay 0.
     for row, (cube, mask) in enumerate(zip(cubes.tolist(), left_out.tolist(), strict=True)):
         own = pipeline.matrix(cube, mask) * pipeline.calibrations[cube].noise
         by_pad[row, :, : own.shape[1]] = own
@@ -70,11 +77,11 @@ def pad_stresses(
     Returns:
         Stresses u (n, P), in units of the noise of each pad.
     """
-    by_pad = np.where(known[:, :, np.newaxis], by_pad, 0.0)
+    by_pad = np.where(known[:, :, None], by_pad, 0.0)
     transposed = by_pad.swapaxes(1, 2)
 
     # Unknown components get a 1 on the diagonal, so that B B' stays regular.
-    unknown = np.eye(known.shape[1]) * ~known[:, np.newaxis, :]
-    right = np.where(known, values, 0.0)[..., np.newaxis]
+    unknown = np.eye(known.shape[1]) * ~known[:, None, :]
+    right = np.where(known, values, 0.0)[..., None]
     weights = np.linalg.solve(by_pad @ transposed + unknown, right)
     return np.asarray((transposed @ weights)[..., 0])

@@ -40,7 +40,8 @@ WINDOW_CUBES = 25
 
 INNER_CUBES = 13
 """Number of cubes at the centre of a window that determine the scale of the prior and predict
-missing values of the centre. P of all 25 cubes would take most of the memory."""
+missing values of the centre. The precision matrices P of all 25 cubes would take most of the
+memory."""
 
 MODEL_ERROR = 0.01
 """Standard deviation of a component divided by its prior standard deviation, for what response,
@@ -50,7 +51,8 @@ ROWS_PER_POINT = 4
 """Number of results per point: the traction along x, y, z, and the pressure at the cubes' depth."""
 
 _POSE_TOLERANCE = 1e-5
-"""Difference of positions (m) and of sines and cosines below which windows are of the same kind."""
+"""Difference of positions (m), and of sines and cosines of rotations, below which the poses of
+cubes in their windows count as equal."""
 
 
 class ObservationModel(NamedTuple):
@@ -79,17 +81,15 @@ class WindowPosteriors:
     """Matrices of the windows of all cubes; each kind of window is stored once.
 
     Attributes:
-        near: Indices (cubes, W) of the cubes of each window, inner ones first, the own one first of
-            all.
+        near: Indices (cubes, W) of the cubes of each window: its own cube, then the inner ones.
         inner: Number of inner cubes.
         kind: Index (cubes,) of the matrices of each window.
         gain: Matrix G (kinds, rows, W C), single precision.
         precision: Matrix P (kinds, inner C, inner C) of the inner cubes.
         prior: Posterior variance (kinds, points x 2) of the pressure on the surface and at the
             cubes' depth, at the scale s = 1 and without pad noise.
-        by_pad: Change (kinds, points x 2, W P) of these variances by the noise variance of each
-            pad.
-        trace: Contribution (kinds, inner P) of the noise variance of each pad to tr P M.
+        by_pad: Derivative (kinds, points x 2, W P) of these variances by the variance of each pad.
+        trace: Derivative (kinds, inner P) of tr P M by the variance of each pad.
         pads: Noise matrices (cubes, C, P) of all cubes, 0 where nothing is observed.
     """
 
@@ -120,14 +120,20 @@ class WindowPosteriors:
         # One window stands for all windows of its kind.
         kinds, first = np.unique(self.kind, return_index=True)
         example = model.select(self.near[first])
-        inputs: list[Any] = [*kernels.inputs, spacing, side, place[first], angle[first]]
+        inputs: list[Any] = [
+            *kernels.inputs,
+            spacing,
+            side,
+            place[first],
+            angle[first],
+        ]
         inputs += [example.columns, example.by_pad, example.variant]
         points = square_points(spacing, side)
 
         def solve_kinds() -> Arrays:
-            """Solve all kinds, each into its place in the result: copies would double the
-            memory."""
+            """Solve all kinds of windows."""
             solved: dict[str, AnyArray] = {}
+            # Each kind is written into its place in the result: copies would double the memory.
             for number, one in enumerate(first):
                 own = model.select(self.near[one])
                 window = _solve_window(kernels, own, place[one], angle[one], points)
@@ -157,24 +163,45 @@ class WindowPosteriors:
         place: Array,
         angle: Array,
     ) -> Index:
-        """Return the kind (cubes,) of each window from the relative poses and noise of its
-        cubes."""
+        """Find windows that are alike in the relative poses and the noise of their cubes.
+
+        Args:
+            model: What all cubes observe.
+            place: Positions (cubes, W, 2) of the cubes of each window, in m.
+            angle: Rotations (cubes, W) of these cubes, in rad.
+
+        Returns:
+            Number (cubes,) of the kind of each window.
+        """
         n = len(place)
+        # -1, because components that are not observed differ from those without noise.
         noise = np.nan_to_num(model.by_pad, nan=-1.0)
         noise_kind = _number_distinct(noise.reshape(n, -1))
-        poses = np.concatenate([place.reshape(n, -1), np.cos(angle), np.sin(angle)], axis=1)
+        poses = np.concatenate(
+            [
+                place.reshape(n, -1),
+                np.cos(angle),
+                np.sin(angle),
+            ],
+            axis=1,
+        )
         rounded = np.round(poses / _POSE_TOLERANCE)
-        features = [rounded, noise_kind[self.near], model.variant[self.near]]
+        features = [
+            rounded,
+            noise_kind[self.near],
+            model.variant[self.near],
+        ]
         return _number_distinct(np.concatenate(features, axis=1))
 
     def product(self, y: Single) -> Single:
         """Compute G y (cubes, rows) of values y (cubes, C), which are 0 where unknown."""
+        # The values of each window in one row, as the columns of G expect them.
         gathered = y[self.near].reshape(len(self.near), -1)
         result = np.empty((len(self.near), self.gain.shape[1]), np.float32)
         for kind, rows in self._shared_kinds:
             result[rows] = gathered[rows] @ self.gain[kind].T
         if len(self._single):
-            single = gathered[self._single][:, :, np.newaxis]
+            single = gathered[self._single][:, :, None]
             result[self._single] = (self._single_gain @ single)[:, :, 0]
         return result
 
@@ -280,6 +307,7 @@ def _solve_window(
     size = inner * width
     precision = _invert_known(total[:size, :size], known[:size])
     cubes = np.arange(inner)
+    # M is block diagonal, so tr P M needs only the diagonal blocks of P.
     diagonal = precision.reshape(inner, width, inner, width)[cubes, :, cubes]
     inner_pads = pads[:inner]
     trace = np.einsum("wcp,wcd,wdp->wp", inner_pads, diagonal, inner_pads, optimize=True)
@@ -303,7 +331,7 @@ def _cross_covariance(
     columns = model.columns
     n = len(place)
     n_points = len(points)
-    offset = (place[:, np.newaxis] - points).reshape(-1, 2)
+    offset = (place[:, None] - points).reshape(-1, 2)
     angles = np.repeat(angle, n_points)
     variants = np.repeat(model.variant, n_points)
 
@@ -342,12 +370,18 @@ def _nearest_cubes(poses: CubePoses) -> Index:
     candidates = min(3 * count, n)
     near = cKDTree(poses.position).query(poses.position, candidates)[1].reshape(n, -1)
 
-    offset = poses.position[near] - poses.position[:, np.newaxis]
+    offset = poses.position[near] - poses.position[:, None]
     local = np.einsum("nji,nkj->nki", poses.rotation, offset)
     # Rounding errors must not decide the order.
     local = np.round(local / poses.pitch, 4)
     distance = np.round(np.linalg.norm(local, axis=2), 4)
-    order = np.lexsort((local[..., 1], local[..., 0], distance))[:, :count]
+    order = np.lexsort(
+        (
+            local[..., 1],
+            local[..., 0],
+            distance,
+        )
+    )[:, :count]
     return np.asarray(np.take_along_axis(near, order, axis=1))
 
 

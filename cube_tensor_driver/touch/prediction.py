@@ -90,9 +90,10 @@ class MissingValuePrediction:
         weights = -covariance.T @ precision[is_missing]
         weights[:, is_missing] = 0.0
 
+        # All windows that contain the cube, and its place in each of them.
         rows, place = np.nonzero(windows.near == cube)
-        columns = place[:, np.newaxis] * width + own
-        kinds = windows.kind[rows][:, np.newaxis]
+        columns = place[:, None] * width + own
+        kinds = windows.kind[rows][:, None]
         gain = select_pressure(windows.gain[kinds, :, columns].astype(float))
         increase = np.einsum("ncr,cd,ndr->nr", gain, covariance[: len(own)], gain)
         self.variance[rows] += np.maximum(increase, 0)

@@ -52,8 +52,7 @@ class Contact(NamedTuple):
     """One contact in the skin's parent frame.
 
     Attributes:
-        position: Position (3,) on the surface, in m, where the line of action of the force meets
-            it.
+        position: Position (3,) in m, where the line of action of the force meets the surface.
         normal: Unit normal (3,) out of the skin.
         force: Force (3,) in N on the skin.
         normal_force: Normal force in N; pressing is positive.
@@ -143,10 +142,9 @@ class Surface:
 
         The layer above the cubes is in equilibrium: the integral of the pressure is the force. The
         first moment of the pressure is that of the load plus depth × shear force, which is
-        subtracted again. For this moment, pressure and shear are interpolated alike, from values:
-            below a point
-        force on an incompressible body, (σzx, σyz, σzz) points away from the force, so that each
-        cube by itself gives the position, and so does any weighted mean.
+        subtracted again. For this moment, pressure and shear are interpolated alike, from values.
+        Below a point force on an incompressible body, (σzx, σyz, σzz) points away from the force,
+        so that each cube by itself gives the position, and so does any weighted mean.
 
         What spreads beyond the edge of the skin is lost: hardly any pressure, but a fraction of the
         shear of about 1.5 depth / distance to the edge.
@@ -197,10 +195,12 @@ class Surface:
         first, second = self._pairs.T
         joined = inside[first] & inside[second]
         patch_pairs = (self.cube[first[joined]], self.cube[second[joined]])
+        # Patches are the nodes of a graph; neighbouring points in contact are its edges.
         links = coo_matrix((joined[joined], patch_pairs), shape=(n, n))
         component = connected_components(links, directed=False)[1]
 
         is_touched = inside.reshape(n, -1).any(axis=1)
+        # A patch without contact counts for the nearest one with contact.
         touched = cKDTree(self.poses.position[is_touched])
         nearest = touched.query(self.poses.position)[1]
         return np.asarray(component[is_touched][nearest], np.intp)
@@ -212,11 +212,13 @@ class Surface:
         pressure = loaded.pressure[chosen]
         weight = loaded.moment_pressure[chosen] * self.area
         normal_force = float(pressure.sum() * self.area)
+        # Mean of the cubes' normals, weighted with the pressure.
         normal = _weighted_sum(pressure.sum(axis=1), rotation[:, :, 2])
         normal /= np.linalg.norm(normal)
 
         shear = self._shear_force(loaded.shear[:, chosen], rotation)
         shear -= normal * (shear @ normal)
+        # Moments about the surface: depth × shear force is subtracted from the centre of pressure.
         centre = _weighted_sum(weight, points) / weight.sum()
         position = centre + self.depth * (normal - shear / weight.sum())
 
@@ -278,11 +280,19 @@ def patches(
     spacing: float,
     side: int,
 ) -> Array:
-    """Return a square grid of points (cubes, side^2, 3) around each cube, in its x-y plane, in
-    m."""
+    """Return the points on the patches of all cubes.
+
+    Args:
+        poses: Poses of the cubes.
+        spacing: Distance of neighbouring points in m.
+        side: Number of points along a side of a patch.
+
+    Returns:
+        Positions (cubes, side^2, 3) in m: a square grid in the x-y plane of each cube.
+    """
     in_plane = poses.rotation[:, :, :2]
     offset = np.einsum("nij,qj->nqi", in_plane, square_points(spacing, side))
-    return np.asarray(poses.position[:, np.newaxis] + offset)
+    return np.asarray(poses.position[:, None] + offset)
 
 
 def _weighted_sum(weights: Array, vectors: Array) -> Array:

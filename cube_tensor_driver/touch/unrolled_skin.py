@@ -1,5 +1,4 @@
-"""Unrolling of bent skins: a bent surface is laid flat around one cube, keeping distances from
-it."""
+"""Unrolling of bent skins: a surface is laid flat around one cube, distances from it are kept."""
 
 from __future__ import annotations
 
@@ -28,14 +27,14 @@ def unroll(
         Positions (n, W, 2) in m and rotations (n, W) about z in rad, in the frame of the centre.
     """
     to_centre = poses.rotation[centres]
-    offset = poses.position[near] - poses.position[centres][:, np.newaxis]
+    offset = poses.position[near] - poses.position[centres][:, None]
     local = np.einsum("nji,nkj->nki", to_centre, offset)
 
     # The direction in the plane stays, the length becomes the distance in space.
     distance = np.linalg.norm(local, axis=2)
     in_plane = np.hypot(local[..., 0], local[..., 1])
     stretch = distance / np.where(in_plane > 0, in_plane, 1.0)
-    place = local[..., :2] * stretch[..., np.newaxis]
+    place = local[..., :2] * stretch[..., None]
 
     # The rotation about z that is closest to the relative rotation.
     relative = np.einsum("nji,nkjl->nkil", to_centre, poses.rotation[near])

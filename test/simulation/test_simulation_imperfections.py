@@ -59,10 +59,10 @@ def test_a_simulated_skin_has_them():
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ({"gain_spread": -0.1}, "gain_spread is -0.1"),
-        ({"dead": 2.0}, "dead is 2.0"),
-        ({"dead": float("nan")}, "dead is nan"),
-        ({"creep": ((0.1, 0.0),)}, r"creep is \(0.1, 0.0\)"),
+        ({"gain_spread": -0.1}, "gain_spread: found -0.1"),
+        ({"dead": 2.0}, "dead: found 2.0"),
+        ({"dead": float("nan")}, "dead: found nan"),
+        ({"creep": ((0.1, 0.0),)}, r"creep\[0\]\[1\]: found 0.0, allowed: a time above 0 s"),
     ],
 )
 def test_values_out_of_range_are_named(asked, said):
@@ -79,13 +79,13 @@ def test_a_file_has_the_same_fields(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[1]", r"found '\[1\]', allowed: a table of gain_spread, dead, creep, seed"),
-        ("{gain: 0.1}", r"found \"\['gain'\]\", allowed: a table"),
-        ("{dead: many}", "dead: found 'many', allowed: a number"),
-        ("{dead: 2}", "dead is 2, allowed"),
-        ("{seed: -1}", "seed is -1, allowed"),
-        ("{seed: 0.5}", "seed: found '0.5', allowed: a whole number"),
-        ("{creep: [0.1, 0.5]}", r"creep: found '\[0.1, 0.5\]', allowed: \[\[size, seconds\]"),
+        ("[1]", r"top level: found \[1\], allowed: the keys gain_spread, dead, creep, seed"),
+        ("{gain: 0.1}", "top level: unknown key 'gain', allowed: gain_spread"),
+        ("{dead: many}", "dead: found 'many', allowed: a fraction"),
+        ("{dead: 2}", "dead: found 2, allowed"),
+        ("{seed: -1}", "seed: found -1, allowed"),
+        ("{seed: 0.5}", "seed: found 0.5, allowed: a whole number"),
+        ("{creep: [0.1, 0.5]}", r"creep\[0\]: found 0.1, allowed: \[size, seconds\]"),
     ],
 )
 def test_what_a_file_cannot_say_is_named(tmp_path: Path, text: str, said: str):

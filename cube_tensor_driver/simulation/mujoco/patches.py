@@ -77,6 +77,7 @@ def flat_contact(
     origin = points.mean(axis=0)
     flat = (points - origin) @ basis
     tangential = forces @ basis
+    # All forces press, so their components along the normal have the same sign.
     pressing = forces @ normal
     centre = pressing @ flat / pressing.sum()
     arm = flat - centre
@@ -87,11 +88,14 @@ def flat_contact(
     if area < min_width * np.abs(corners).max():
         # Points on a line: each of them becomes a square.
         square = min_width / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        corners = _convex_hull((flat[:, np.newaxis] + square).reshape(-1, 2))
+        corners = _convex_hull((flat[:, None] + square).reshape(-1, 2))
         area, centroid, polar = _area_moments(corners)
 
     ratios = _edge_distances(corners, centre) / _edge_distances(corners, centroid)
-    shrink = max(float(ratios.min()), min(1.0, min_width / np.sqrt(area)))
+    shrink = max(
+        float(ratios.min()),
+        min(1.0, min_width / np.sqrt(area)),
+    )
     return Polygon(
         corners=origin + (centre + shrink * (corners - centroid)) @ basis.T,
         centre=origin + centre @ basis.T,
@@ -101,8 +105,15 @@ def flat_contact(
 
 
 def _edge_distances(corners: Array, place: Array) -> Array:
-    """Return the distance (K,) of a position from the line of each edge, times the edge's
-    length."""
+    """Measure the distance of a position from all edges of a polygon.
+
+    Args:
+        corners: Corners (K, 2) of the polygon, counterclockwise.
+        place: Position (2,).
+
+    Returns:
+        Distance (K,) from the line of each edge, positive inside, multiplied by the edge's length.
+    """
     edges = _next_corners(corners) - corners
     offset = place - corners
     return np.asarray(edges[:, 0] * offset[:, 1] - edges[:, 1] * offset[:, 0])
@@ -119,6 +130,7 @@ def _area_moments(corners: Array) -> tuple[float, Array, float]:
 
     first = np.array([double_area @ (x + next_x), double_area @ (y + next_y)])
     centroid = first / (6 * area)
+    # Integral of x^2 + y^2 over the triangles between the origin and the edges
     squares = x * x + x * next_x + next_x * next_x
     squares = squares + y * y + y * next_y + next_y * next_y
     polar_about_origin = double_area @ squares / 12

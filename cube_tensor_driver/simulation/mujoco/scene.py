@@ -30,7 +30,8 @@ KEPT_S = 2.0
 for slightly different times."""
 
 UNBOUNDED_PERIOD_S = 10.0
-"""Time in s that counts as the whole of a scene that does not repeat."""
+"""Time in s that is taken as the period of a scene that does not repeat, wherever a period is
+needed."""
 
 CAMERA_ELEVATION = -12.0
 """Elevation of the camera in degrees; negative values look down."""
@@ -48,6 +49,7 @@ def read_scene(path: Path) -> MjModel:
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, RuntimeError, MemoryError) as error:
+        # MuJoCo's messages have several lines.
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: MuJoCo cannot read it: {reason}") from None
 
@@ -66,6 +68,7 @@ def scene_skin(path: Path) -> Path:
             f'{path}: names no skin; add <custom><text name="skin" data="skin.yaml"/></custom>, '
             "or name the skin file (--config)"
         )
+    # MuJoCo keeps all texts in one array, each with a zero at its end.
     start = model.text_adr[number]
     end = start + model.text_size[number]
     text = bytes(model.text_data[start:end])
@@ -73,7 +76,9 @@ def scene_skin(path: Path) -> Path:
 
 
 class MujocoLoad:
-    """A scene that plays by itself, as a `load.AnyLoad`. It is the same at the same time.
+    """A scene that plays by itself, as a `load.AnyLoad`.
+
+    The contacts depend on the time only, so that several processes compute the same load.
 
     Attributes:
         touch: The skin as a sensor, in the state that was computed last.
@@ -180,6 +185,7 @@ class MujocoLoad:
 
     def _touches_at(self, seconds: float) -> list[Touch]:
         """Return the contacts at a time, playing the scene up to it if necessary."""
+        # A scene can only be played forwards: earlier times are remembered or played again.
         number = self._step_number(seconds)
         if number not in self._touches:
             if number < self._step:
@@ -203,7 +209,7 @@ class MujocoLoad:
             self._mujoco.mj_resetDataKeyframe(model, data, 0)
         else:
             self._mujoco.mj_resetData(model, data)
-        self._mujoco.mj_forward(model, data)
+        self._mujoco.mj_forward(model, data)  # computes the contacts of the start
         self._step = 0
         self._touches[0] = self.touch.touches()
 
@@ -233,6 +239,7 @@ def _keyframe_controls(path: Path, model: MjModel) -> tuple[Array, Array]:
     times = np.array(model.key_time)
     if np.any(np.diff(times) < 0):
         raise ConfigError(f"{path}: keyframes go back in time; sort them by their time")
+    # Keyframes at time 0 are only named states.
     if not len(times) or times[-1] <= 0:
         return np.empty(0), np.empty((0, model.nu))
     return times, np.array(model.key_ctrl).reshape(len(times), model.nu)

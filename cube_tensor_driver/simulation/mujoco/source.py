@@ -208,6 +208,7 @@ class MujocoSkin:
         n = len(self.poses.position)
         stress = np.zeros((n, 6))
         gradient = np.zeros((n, 6, 3))
+        # Bodies are far apart: a contact acts only on the cubes of its own body.
         for part in self._parts:
             own = [touch for touch in touches if touch.body == part.body]
             loads = [touch.press for touch in own if touch.polygon is None]
@@ -235,6 +236,7 @@ class MujocoSkin:
             rows: Contact points of the pair in MuJoCo's list.
             side: 1 where the skin is the second of the two bodies, on which MuJoCo's forces act.
         """
+        # MuJoCo's normal points from the first body to the second one.
         data = self.data
         contact = data.contact
         sign = 2 * side - 1
@@ -248,14 +250,19 @@ class MujocoSkin:
         force = force[is_felt]
         total = force.sum(axis=0)
         if len(place) > 1:
+            # The round contact of the same area stands for it where one position is wanted.
             polygon = flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
             area = total @ normal / (polygon.traction @ normal)
             radius = float(np.sqrt(area / np.pi))
             load = ContactLoad("disc", polygon.centre, normal, total, radius)
             return Touch(part.body, load, polygon)
+        # The curvatures of both bodies add up (Johnson 4.2).
         curvature = self._curvature[contact.geom[rows[0]]].sum()
         radius = hertz_radius(-float(total @ normal), curvature, self._stiffness)
-        return Touch(part.body, ContactLoad("sphere", place[0], normal, total, radius))
+        return Touch(
+            part.body,
+            ContactLoad("sphere", place[0], normal, total, radius),
+        )
 
     def _contact_points(
         self,
@@ -263,15 +270,14 @@ class MujocoSkin:
         rows: Index,
         sign: int,
     ) -> tuple[Array, Array, Array]:
-        """Return positions in m, forces in N on the skin and outward normals (n, 3), parent
-        frame."""
+        """Return positions in m, forces in N and outward normals (n, 3) in the parent frame."""
         data = self.data
         frames = data.contact.frame[rows].reshape(-1, 3, 3)
         in_frames = np.empty((len(rows), 3))
         wrench = np.empty(6)
         for number, row in enumerate(rows.tolist()):
             self._mujoco.mj_contactForce(self.model, data, row, wrench)
-            in_frames[number] = wrench[:3]
+            in_frames[number] = wrench[:3]  # the moments of a point are left out
 
         body_rotation = data.xmat[part.body].reshape(3, 3)
         to_parent = part.rotation @ body_rotation.T
@@ -301,6 +307,7 @@ class MujocoSkin:
                 f"the MuJoCo model has no body {skin.parent_frame}, which is the parent_frame of "
                 f"skin {skin.name}; its bodies are {', '.join(filter(None, names))}"
             )
+        # Cubes whose link is no body sit on the body of the parent frame.
         bodies = np.array([self._body_number(cube.link) for cube in skin.cubes])
         bodies[bodies < 0] = base
 
@@ -313,6 +320,7 @@ class MujocoSkin:
             depth[number] = self._distance_to_surface(
                 reference, int(bodies[number]), place, outward, cube
             )
+        # One table serves all cubes, so their depths must be nearly equal.
         median = float(np.median(depth))
         deviation = np.abs(depth - median)
         farthest = int(np.argmax(deviation))
@@ -412,8 +420,9 @@ def _field_of_discs(
     radii = [load.radius for load in loads]
 
     facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
-    place = (position[:, np.newaxis] - centres) @ rotation
-    force = forces @ rotation * facing[..., np.newaxis]
+    # In the frame of each cube, relative to the centre of the contact
+    place = (position[:, None] - centres) @ rotation
+    force = forces @ rotation * facing[..., None]
     return tables.field(place[..., :2], force, radii)
 
 
@@ -439,7 +448,7 @@ def _field_of_polygons(
         next_corner += [*range(first + 1, first + size), first]
         number += [index] * size
 
-    origin = position[:, np.newaxis]
+    origin = position[:, None]
     places = np.concatenate([polygon.corners for polygon in polygons])
     corners = (places - origin) @ in_plane
     centre = (np.stack([polygon.centre for polygon in polygons]) - origin) @ in_plane
@@ -448,7 +457,7 @@ def _field_of_polygons(
     facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
     twist = facing * [polygon.twist for polygon in polygons]
     traction = np.stack([polygon.traction for polygon in polygons]) @ rotation
-    traction *= (facing > 0)[..., np.newaxis]
+    traction *= (facing > 0)[..., None]
     traction[..., 0] += twist * centre[..., 1]
     traction[..., 1] -= twist * centre[..., 0]
     return tables.field(

@@ -65,7 +65,7 @@ def estimate_contact(
     cross = np.zeros((len(offset), 3, observations.size))
     if fit.residual_scale > NEGLIGIBLE_RESIDUAL * AMPLITUDE:
         covariance = observations.cross(centre + offset)
-        cross = fit.residual_scale**2 * covariance * weight[:, np.newaxis, np.newaxis]
+        cross = fit.residual_scale**2 * covariance * weight[:, None, None]
 
     # Force and first moment; the position is where the moment of the pressure vanishes.
     total = cross.sum(axis=0)  # (3, D)
@@ -82,7 +82,7 @@ def estimate_contact(
     moment = contact_moment + twist @ fit.weighted_residual
 
     # Derivatives b (6, parameters) of force, position and moment.
-    functionals = np.concatenate([total, lever, twist[np.newaxis]])  # (6, D)
+    functionals = np.concatenate([total, lever, twist[None]])  # (6, D)
     first = 6 * j
     slopes = np.zeros((6, fit.jacobian.shape[1]))
     slopes[:3, first : first + 3] = np.eye(3)
@@ -118,7 +118,14 @@ def _functional_variance(
     radius: float,
     normal_force: float,
 ) -> Array:
-    """Return the prior variances k_LL (6,) of force, position and moment of the residual field."""
+    """Return the prior variances k_LL (6,) of force, position and moment of the residual field.
+
+    Args:
+        residual_scale: Standard deviation of the pressure of the residual field, in Pa.
+        depth: Depth of the cubes in m.
+        radius: Radius of the disc over which the residual field is integrated, in m.
+        normal_force: Normal force of the contact in N.
+    """
     # Variance per area of an integral of the pressure over an area wider than the prior's lengths.
     lengths = np.array(PRIOR_LENGTHS) * depth
     density = residual_scale**2 * np.mean(2 * np.pi * lengths**2)
@@ -127,7 +134,16 @@ def _functional_variance(
     mean_square_x = radius**2 / 4
     lever = mean_square_x / normal_force**2
     polar = radius**2 / 2
-    factors = np.array([shear, shear, 1.0, lever, lever, shear * polar])
+    factors = np.array(
+        [
+            shear,
+            shear,
+            1.0,
+            lever,
+            lever,
+            shear * polar,
+        ]
+    )
     return np.asarray(density * np.pi * radius**2 * factors)
 
 

@@ -58,7 +58,8 @@ SHAPE_SHIFT = 0.5
 """Shift, divided by the radius, of the contacts whose difference is a length shape."""
 
 SHAPE_WIDENING = 0.2
-"""Change of ln a between the contacts whose difference is the flatness shape."""
+"""Change of the logarithm of the radius between the contacts whose difference is the flatness
+shape."""
 
 STEPS_NEW = 16
 """Number of Gauss-Newton steps for a contact that has just begun."""
@@ -67,7 +68,7 @@ STEPS_TRACKED = 3
 """Number of Gauss-Newton steps for a contact that was fitted in the previous scan."""
 
 STEPS_EVALUATE = 0
-"""Number of steps to compute only the evidence of given centres and radii."""
+"""Number of Gauss-Newton steps, none, to compute only the evidence of given centres and radii."""
 
 MAX_SHIFT_PITCHES = 1.5
 """Largest distance, in cube pitches and along each axis, that one fit may move a contact.
@@ -78,17 +79,20 @@ accepted.
 """
 
 FINE_STEPS = 6
-"""Number of the last steps of a new contact that use the fine noise instead of the rough one."""
+"""Number of the last Gauss-Newton steps of a new contact, in which pads have their own gain errors
+instead of the larger `ROUGH_GAIN_ERROR`."""
 
 SETTLED_STEP = 0.02
-"""Step below which a contact has converged: its distance divided by the depth, and its change of
-ln a. One more step follows; what comes after it is of second order."""
+"""Size of a Gauss-Newton step below which a contact has converged: the distance divided by the
+depth, and the change of the logarithm of the radius. One more step follows; the error that then
+remains is of second order."""
 
 _MAX_STEP_DEPTHS = 0.5
-"""Largest distance of one step along each axis, divided by the depth."""
+"""Largest distance that one Gauss-Newton step moves a contact along each axis, divided by the
+depth."""
 
 _MAX_STEP_LOG_SIZE = 0.5
-"""Largest change of ln a in one step."""
+"""Largest change of the natural logarithm of a radius in one Gauss-Newton step."""
 
 _SCALE_FACTORS = {
     STEPS_NEW: np.array([0.1, 0.3, 1.0, 3.0, 10.0]),
@@ -98,12 +102,16 @@ _SCALE_FACTORS = {
 """Factors of the residual scale whose evidence is compared."""
 
 _DIFFERENCE_STEP = 1 / 50
-"""Step of the numerical derivatives by the centre, divided by the depth."""
+"""Step of the numerical derivatives with respect to the centre of a contact, divided by the
+depth."""
 
 _N_PARAMETERS = 6
 """Number of parameters of a contact: f_x, f_y, f_z, c_x, c_y, ln a."""
 
-_STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
+_STENCIL = np.array(
+    [[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]],
+    float,
+)
 _DIAGONALS = np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]]) / np.sqrt(2)
 _SHAPE_STENCIL = np.concatenate([_STENCIL[1:], _DIAGONALS])
 
@@ -158,12 +166,12 @@ class Observations:
         self.sees_all = self.size == len(values) * len(COMPONENTS)
 
         self._by_pad = np.where(
-            known[:, :, np.newaxis],
+            known[:, :, None],
             inverse.by_pad[cubes],
             0.0,
         )
         stresses = pad_stresses(self._by_pad, known, values)
-        self._squared_stresses = stresses[..., np.newaxis] ** 2
+        self._squared_stresses = stresses[..., None] ** 2
         self.noise = self._noise_covariance(GAIN_ERROR**2 * self._squared_stresses)
         self.prior = prior[np.ix_(self._known, self._known)]
 
@@ -181,6 +189,7 @@ class Observations:
         """
         own = self._by_pad @ ((1 + gain_variance) * self._by_pad.swapaxes(1, 2))
         n, width, _ = own.shape
+        # Pads of different cubes are independent: only the blocks on the diagonal are not 0.
         blocks = np.zeros((n, width, n, width))
         blocks[np.arange(n), :, np.arange(n), :] = own
         covariance: Array = blocks.reshape(n * width, -1)[np.ix_(self._known, self._known)]
@@ -189,7 +198,7 @@ class Observations:
     def responses(self, centres: Array, size: float) -> Array:
         """Compute the values (K, D, 3) under contacts with 1 N at K centres (K, 2) in m."""
         n = len(centres)
-        offset = (self.place - centres[:, np.newaxis]).reshape(-1, 2)
+        offset = (self.place - centres[:, None]).reshape(-1, 2)
         angle = np.tile(self._angle, n)
         variant = np.tile(self._variant, n)
         responses = self.kernels.response(offset, angle, variant, size)
@@ -198,7 +207,7 @@ class Observations:
     def cross(self, points: Array) -> Array:
         """Compute the prior covariance (points, 3, D) of the traction at points with the values."""
         n = len(points)
-        offset = (self.place - points[:, np.newaxis]).reshape(-1, 2)
+        offset = (self.place - points[:, None]).reshape(-1, 2)
         angle = np.tile(self._angle, n)
         variant = np.tile(self._variant, n)
         cross = self.kernels.cross(offset, angle, variant)[:, self._columns]
@@ -314,6 +323,7 @@ def fit_contacts(
 
         jacobian = _join_derivatives(responses, forces)
         residual = observations.y - response @ forces.ravel()
+        # Every second step, because each scale to compare needs its own Cholesky factor.
         if is_last or (steps == STEPS_NEW and not is_rough and step % 2 == 0):
             previous_scale = residual_scale
             candidates = residual_scale * _SCALE_FACTORS[steps]
@@ -328,11 +338,12 @@ def fit_contacts(
 
         weighted = cho_solve(factor, jacobian)
         normal_matrix = jacobian.T @ weighted + np.diag(precision)
+        # Without it, rounding could make the matrix of a vanishing contact singular.
         normal_matrix[np.diag_indices(len(normal_matrix))] *= 1 + 1e-9
         if is_last:
             break
 
-        # Gauss-Newton step, with the prior of ln a
+        # Gauss-Newton: (J' W J + prior) change = J' W r + prior (mean - parameters)
         right = weighted.T @ residual
         right[5::_N_PARAMETERS] -= (log_sizes - usual_log_size) * SIZE_DEVIATION**-2
         change = np.linalg.lstsq(normal_matrix, right, rcond=None)[0].reshape(count, _N_PARAMETERS)
@@ -340,6 +351,7 @@ def fit_contacts(
         growth = change[:, 5]
         largest = max(np.abs(shift).max() / depth, np.abs(growth).max())
 
+        # A step that takes back more than half of the previous one
         oscillates = growth * previous_growth < -(previous_growth**2) / 2
         growth[oscillates] /= 2
         previous_growth = growth.copy()
@@ -349,6 +361,7 @@ def fit_contacts(
         is_last = is_settled and not is_rough
         is_rough &= not is_settled and step < steps - FINE_STEPS
 
+        # Far from the solution, the linearised problem holds only for small steps.
         max_step = _MAX_STEP_DEPTHS * depth
         centres += np.clip(shift, -max_step, max_step)
         centres = np.clip(centres, start - max_shift, start + max_shift)
@@ -372,7 +385,14 @@ def _prior_precision(count: int, pitch: float) -> Array:
     """Return the prior precisions (6 contacts,) of the parameters of all contacts."""
     force = [FORCE_DEVIATION**-2] * 3
     centre = [pitch**-2] * 2
-    return np.tile([*force, *centre, SIZE_DEVIATION**-2], count)
+    return np.tile(
+        [
+            *force,
+            *centre,
+            SIZE_DEVIATION**-2,
+        ],
+        count,
+    )
 
 
 def _regress(
@@ -381,6 +401,7 @@ def _regress(
     y: Array,
 ) -> Array:
     """Return the weighted least squares solution (3 contacts,) of response @ forces = y."""
+    # R' W R f = R' W y. Contacts on the same place make it singular, so lstsq.
     weighted = cho_solve(factor, response)
     return np.asarray(
         np.linalg.lstsq(
@@ -423,14 +444,14 @@ class ContactResponse(NamedTuple):
         step = _DIFFERENCE_STEP * depth
         offsets = np.concatenate([step * _STENCIL, SHAPE_SHIFT * size * _SHAPE_STENCIL])
         moved = respond(centre + offsets, size)
-        narrower = respond(centre[np.newaxis], size * np.exp(-SHAPE_WIDENING))[0]
-        wider = respond(centre[np.newaxis], size * np.exp(SHAPE_WIDENING))[0]
+        narrower = respond(centre[None], size * np.exp(-SHAPE_WIDENING))[0]
+        wider = respond(centre[None], size * np.exp(SHAPE_WIDENING))[0]
 
         response = moved[0]
         sides = moved[1:5].reshape(2, 2, *response.shape)
         by_centre = (sides[:, 0] - sides[:, 1]) / (2 * step)
         by_log_size = (wider - narrower) / (2 * SHAPE_WIDENING)
-        slopes = np.concatenate([by_centre, by_log_size[np.newaxis]])
+        slopes = np.concatenate([by_centre, by_log_size[None]])
 
         # Length: contacts displaced along an axis, minus contacts displaced across it.
         axes = moved[5:].reshape(4, 2, *response.shape).sum(axis=1) / 4
@@ -440,21 +461,35 @@ class ContactResponse(NamedTuple):
         grow = np.exp(2 * SHAPE_WIDENING)
         share = (1 - shrink) / (grow - shrink)
         flatness = response - (share * wider + (1 - share) * narrower)
-        shapes = np.stack([axes[0] - axes[1], axes[2] - axes[3], flatness])
+        shapes = np.stack(
+            [
+                axes[0] - axes[1],
+                axes[2] - axes[3],
+                flatness,
+            ]
+        )
         return cls(
             response,
             slopes,
-            SHAPE_DEVIATIONS[:, np.newaxis, np.newaxis] * shapes,
+            SHAPE_DEVIATIONS[:, None, None] * shapes,
         )
 
     def by_parameters(self, force: Array) -> Array:
-        """Return the derivatives (D, 9) by f, c, ln a and the shapes at a force (3,) in N."""
+        """Compute the derivatives with respect to all parameters of a contact.
+
+        Args:
+            force: Force (3,) of the contact in N.
+
+        Returns:
+            Derivatives (D, 9) by force, centre, logarithm of the radius, and the shapes.
+        """
         moved = np.concatenate([self.slopes, self.shapes]) @ force
         return np.concatenate([self.response, moved.T], axis=1)
 
 
 def _join_derivatives(responses: list[ContactResponse], forces: Array) -> Array:
     """Return the Jacobian (D, 6 contacts)."""
+    # Columns per contact: f_x, f_y, f_z, c_x, c_y, ln a
     blocks = []
     for one, force in zip(responses, forces, strict=True):
         blocks += [one.response, (one.slopes @ force).T]
@@ -508,7 +543,11 @@ def _best_scale(
         The best scale, its score, and the Cholesky factor of W^-1.
     """
     columns = jacobian / np.sqrt(precision)
-    best = (AMPLITUDE, np.inf, (np.empty((0, 0)), True))
+    best = (
+        AMPLITUDE,
+        np.inf,
+        (np.empty((0, 0)), True),
+    )
     for scale in np.unique(np.clip(candidates, 1e-4 * AMPLITUDE, AMPLITUDE)).tolist():
         factor = _factorise(observations, noise, scale)
         weighted = cho_solve(factor, np.column_stack([columns, residual]))

@@ -15,8 +15,8 @@ from ..surface import square_points
 from .contact_fit import ContactResponse
 
 SUBPOINTS = 8
-"""Number of positions along each side of a point's square, over which the traction of a contact is
-averaged."""
+"""Number of positions along each side of the square that a point of the surface stands for. The
+traction of a contact is averaged over them, because it may be narrower than the square."""
 
 _PRESSURE_REACH_DEPTHS = 6.0
 """Distance, in depths, beyond which the pressure of a contact counts as zero."""
@@ -37,13 +37,12 @@ class HertzContact:
         size: Radius in m.
         force: Force (3,) in N on the skin.
         residual_scale: Standard deviation of the pressure of the residual field around it, in Pa.
-        place_doubt: Variance of the position in m^2 because fits from other starts ended elsewhere;
-            infinite before the first fit, 0 if they all agree.
-        force_doubt: Variance (3,) of the force in N^2 for the same reason.
+        place_ambiguity: Variance of the position in m^2 because fits from other starts ended
+            elsewhere; infinite before the first fit, 0 if they all agree.
+        force_ambiguity: Variance (3,) of the force in N^2 for the same reason.
         covariance: Covariance (9, 9) of force, position, ln(size) and shapes as from
-            `ContactFit.covariance`, plus these doubts.
-        split_tested_at: Residual scale in Pa at which it was last tested whether the contact is
-            two.
+            `ContactFit.covariance`, plus these ambiguities.
+        split_tested_at: Residual scale in Pa at the last test whether the contact is two; 0: none.
         was_split: Whether it came from a split (contact_split.py) and is told apart from its
             neighbour by the likelihood alone.
     """
@@ -54,8 +53,8 @@ class HertzContact:
     size: float
     force: Array
     residual_scale: float
-    place_doubt: float = np.inf
-    force_doubt: Array = field(default_factory=lambda: np.zeros(3))
+    place_ambiguity: float = np.inf
+    force_ambiguity: Array = field(default_factory=lambda: np.zeros(3))
     covariance: Array = field(default_factory=lambda: np.zeros((9, 9)))
     split_tested_at: float = 0.0
     was_split: bool = False
@@ -78,13 +77,15 @@ class ContactModel:
         """Return the centre (3,) of a contact on the surface, in m in the skin's parent frame."""
         poses = self.inverse.poses
         local = np.array([*contact.place, self.inverse.depth])
-        return np.asarray(poses.position[contact.home] + poses.rotation[contact.home] @ local)
+        offset = poses.rotation[contact.home] @ local
+        return np.asarray(poses.position[contact.home] + offset)
 
     def response(self, contacts: list[HertzContact]) -> Array:
         """Compute the response (cubes, C) of all cubes to contacts, in Pa."""
         inverse = self.inverse
         total = np.zeros((len(inverse.poses.position), len(inverse.columns)))
         for contact in contacts:
+            # The skin is unrolled around the home, in whose frame the position is given.
             cubes, place, angle = self._cubes_around(contact.home)
             offset = place - contact.place
             variant = inverse.variant[cubes]
@@ -122,9 +123,10 @@ class ContactModel:
         traction = residual.traction.copy()
         for contact in contacts:
             points, offset, rotation = self._points_around(contact)
-            distance = np.linalg.norm(offset[:, np.newaxis] + self._subpoints, axis=2)
+            subpoints = offset[:, None] + self._subpoints
+            distance = np.linalg.norm(subpoints, axis=2)
             share = hertz_pressure(distance, contact.size).mean(axis=1)
-            traction[points] += share[:, np.newaxis] * (rotation @ contact.force)
+            traction[points] += share[:, None] * (rotation @ contact.force)
         return TractionField(traction, depth_pressure)
 
     def pressure_variance(self, contacts: list[HertzContact]) -> Array:
@@ -145,25 +147,33 @@ class ContactModel:
         # The shapes of a contact do not extend beyond twice its radius.
         reach = 2 * contact.size + inverse.spacing
         touched = np.linalg.norm(offset, axis=1) < reach
-        subpoints = offset[touched][:, np.newaxis] + self._subpoints
+        subpoints = offset[touched][:, None] + self._subpoints
 
         def surface_pressure(centres: Array, size: float) -> Array:
             """Return the pressure (K, n, 3) at n touched points under 1 N at K centres (K, 2)."""
             x, y = np.moveaxis(
-                subpoints - centres[:, np.newaxis, np.newaxis],
+                subpoints - centres[:, None, None],
                 -1,
                 0,
             )
             share = hertz_pressure(np.hypot(x, y), size).mean(axis=2)
-            return np.asarray(-share[..., np.newaxis] * rotation[touched, 2])
+            return np.asarray(-share[..., None] * rotation[touched, 2])
 
         def pressure_at_depth(centres: Array, size: float) -> Array:
             """Return the pressure (K, n, 3) below n points under 1 N at K centres (K, 2)."""
-            from_centre = (offset - centres[:, np.newaxis]).reshape(-1, 2)
+            from_centre = (offset - centres[:, None]).reshape(-1, 2)
             pressure = -inverse.kernels.field(from_centre, size)[:, FIELD.index("zz")]
             return pressure.reshape(len(centres), -1, 3)
 
-        parts = ((0, points[touched], surface_pressure), (1, points, pressure_at_depth))
+        parts = (
+            (
+                0,
+                points[touched],
+                surface_pressure,
+            ),
+            (1, points, pressure_at_depth),
+        )
+        # var(p) = slopes cov slopes'
         for column, chosen, respond in parts:
             response = ContactResponse.linearise(
                 respond,
@@ -185,7 +195,10 @@ class ContactModel:
         inverse = self.inverse
         centre = self.centre(contact)
         reach = _PRESSURE_REACH_DEPTHS * inverse.depth
-        points = np.array(sorted(self._points.query_ball_point(centre, reach)), np.intp)
+        points = np.array(
+            sorted(self._points.query_ball_point(centre, reach)),
+            np.intp,
+        )
 
         rotation = inverse.poses.rotation
         home = rotation[contact.home]
@@ -205,6 +218,7 @@ class ContactModel:
         reach = REACH_DEPTHS * inverse.depth
         near = self._cubes.query_ball_point(poses.position[home], reach)
         cubes = np.array(sorted(near), np.intp)
+        # On a bent skin, cubes on the other side do not respond.
         facing = poses.rotation[cubes, :, 2] @ poses.rotation[home, :, 2]
         cubes = cubes[facing > _MIN_FACING]
         return cubes, *inverse.unroll(home, cubes)

@@ -34,11 +34,14 @@ MERGE_VALLEY = 0.92
 """The same ratio, above which two existing contacts become one."""
 
 SPLIT_OVERLAP = 0.6
-"""Distance of two contacts that came from a split, divided by the sum of their radii, below which
-they become one again."""
+"""Distance of two contacts that a split of one contact made (contact_split.py), divided by the sum
+of their radii, below which they become one again."""
 
 _VALLEY_SAMPLES = 9
+"""Number of positions along the line on which a valley is searched."""
+
 _MIN_PRESSURE = 1e-9
+"""Smallest pressure in Pa that is divided by."""
 
 
 def detect_contact(
@@ -63,7 +66,10 @@ def detect_contact(
         The index of the point with the highest residual that is separated from all contacts by
         distance and by a valley of the pressure; None if there is none.
     """
-    threshold = max(min_pressure, DETECTION_FRACTION * float(pressure.max(initial=0.0)))
+    threshold = max(
+        min_pressure,
+        DETECTION_FRACTION * float(pressure.max(initial=0.0)),
+    )
     is_candidate = residual > threshold
     points = model.inverse.points
     centres = [model.centre(contact) for contact in contacts]
@@ -71,6 +77,7 @@ def detect_contact(
         distance = np.linalg.norm(points - centre, axis=1)
         is_candidate &= distance > MIN_DISTANCE_PITCHES * model.inverse.pitch
 
+    # The highest residual may be the flank of a known contact: then the next one is tried.
     highest_first = np.argsort(-np.where(is_candidate, residual, -np.inf))
     for candidate in highest_first[: is_candidate.sum()].tolist():
         position = points[candidate]
@@ -121,11 +128,14 @@ def prune_contacts(
         for contact in contacts
     }
     strongest = max(peaks.values(), default=0.0)
+    # Half of the pressure at which a contact begins, so that it does not flicker.
     threshold = max(min_pressure / 2, PRUNING_FRACTION * strongest)
 
+    # In the order of their ids: an older contact is kept, a younger one beside it ends.
     kept: list[HertzContact] = []
     for contact in sorted(contacts, key=lambda one: one.id):
         centre = model.centre(contact)
+        # Contacts from a split may be close to each other; `find_pair_to_merge` checks these.
         others = [one for one in kept if not (contact.was_split and one.was_split)]
         distances = [float(np.linalg.norm(centre - model.centre(one))) for one in others]
         is_alone = min(distances, default=np.inf) >= MERGE_DISTANCE_PITCHES * model.inverse.pitch
@@ -140,9 +150,19 @@ def valley_ratio(
     second: Array,
     pressure: Array,
 ) -> float:
-    """Return the lowest pressure between two positions (3,), divided by the lower one at the
-    ends."""
-    path = first + np.linspace(0, 1, _VALLEY_SAMPLES)[:, np.newaxis] * (second - first)
+    """Measure how deep the pressure falls between two positions.
+
+    Args:
+        model: Model of the skin.
+        first: Position (3,) in m.
+        second: Position (3,) in m.
+        pressure: Pressure (M,) on all points.
+
+    Returns:
+        Lowest pressure along the line between them, divided by the lower one of the pressures at
+        its ends; 1 if the pressure does not fall at all.
+    """
+    path = first + np.linspace(0, 1, _VALLEY_SAMPLES)[:, None] * (second - first)
     along = pressure[model.nearest_points(path)]
     ends = max(min(along[0], along[-1]), _MIN_PRESSURE)
     return float(along.min() / ends)

@@ -62,6 +62,7 @@ def split_contact(
         _evaluate_pair(observations, one, j, pair, start_scale)
         for pair in _list_pairs(one.centres[j], size)
     ]
+    # A smaller score is more likely.
     likeliest = sorted(starts, key=lambda start: start.score)[:FITTED_PAIRS]
     fits = [
         fit_contacts(observations, start.centres, start.sizes, start_scale, STEPS_NEW)
@@ -72,6 +73,7 @@ def split_contact(
     distances = np.linalg.norm(two.centres[:-1] - two.centres[-1], axis=1)
     ratios = distances / (two.sizes[:-1] + two.sizes[-1])
     is_beside = ratios.min() > MIN_PAIR_DISTANCE and ratios[j] < MAX_PAIR_DISTANCE
+    # Both must press: a fit can explain a residual by a contact that pulls.
     smaller, larger = np.sort(-two.forces[[j, -1], 2])
     both_press = smaller > MIN_FORCE_RATIO * larger
     is_better = two.score < one.score and two.residual_scale < max_scale
@@ -80,9 +82,24 @@ def split_contact(
 
 def _list_pairs(centre: Array, size: float) -> list[tuple[Array, Array, float]]:
     """Return centres (2,) of two contacts and their radius: one beside the other, or two halves."""
-    beside = [(centre, centre + 2 * size * direction, size) for direction in _DIRECTIONS]
+    # Touching circles of equal size, and two circles with half the radius inside the fitted one.
+    beside = [
+        (
+            centre,
+            centre + 2 * size * direction,
+            size,
+        )
+        for direction in _DIRECTIONS
+    ]
     shifts = size / 2 * _DIRECTIONS[: len(_DIRECTIONS) // 2]
-    halves = [(centre - shift, centre + shift, size / 2) for shift in shifts]
+    halves = [
+        (
+            centre - shift,
+            centre + shift,
+            size / 2,
+        )
+        for shift in shifts
+    ]
     return beside + halves
 
 

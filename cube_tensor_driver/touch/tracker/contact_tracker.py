@@ -44,14 +44,16 @@ JOINT_FIT_PITCHES = 4.0
 """Distance, in cube pitches, below which contacts share cubes and are fitted together."""
 
 LARGE_RESIDUAL = 0.02
-"""Residual scale divided by `AMPLITUDE` above which a fit is doubted and other starts are tried."""
+"""Residual scale (standard deviation of the residual pressure) divided by `AMPLITUDE` above which a
+fit may be wrong, so that other starts are tried."""
 
 WIDE_SIZE = 2.5
-"""Radius divided by the depth of a wide contact, with which a doubted fit starts once more."""
+"""Radius divided by the depth with which a fit that leaves a large residual starts once more, since
+the true contact may be wide."""
 
 POSITION_TOLERANCE_PITCHES = 0.005
-"""Standard deviation of a position, in cube pitches, by which fits from different starts may differ
-without that other starts are tried again in the next scan."""
+"""Standard deviation of the positions that different starts lead to, in cube pitches, above which
+the position is ambiguous and the starts are tried again in the next scan."""
 
 RESTART_CUBES = 4
 """Number of nearest cubes around which a new contact with a large residual is searched."""
@@ -124,7 +126,10 @@ class ContactTracker:
         self._priors: dict[tuple[int, ...], Array] = {}
         n_points = len(inverse.points)
         self.field = TractionField(np.zeros((n_points, 3)), np.zeros(n_points))
-        self._residual = np.full((len(inverse.poses.position), len(inverse.columns)), np.nan)
+        self._residual = np.full(
+            (len(inverse.poses.position), len(inverse.columns)),
+            np.nan,
+        )
 
     def update(self, values: Array) -> list[TrackedContact]:
         """Fit the contacts to the newest values.
@@ -153,6 +158,7 @@ class ContactTracker:
 
             pair = find_pair_to_merge(model, self._contacts, pressure)
             if pair is not None:
+                # The older one keeps its id and is fitted to the values of both.
                 older, younger = pair
                 self._contacts.remove(younger)
                 self._fit(y, [older], STEPS_NEW)
@@ -169,6 +175,7 @@ class ContactTracker:
             if point is None or len(self._contacts) >= MAX_CONTACTS:
                 break
             tried.append(self._inverse.points[point])
+            # The neighbours are fitted again: so far, they had to explain the new contact, too.
             contact = self._start_contact(point)
             neighbours = self._neighbours(contact, self._contacts)
             self._contacts.append(contact)
@@ -281,9 +288,10 @@ class ContactTracker:
         for j, contact in enumerate(contacts):
             self._store_fit(contact, fit, j, cubes, place, angle)
             estimate = estimate_contact(observations, fit, j)
+            # Positions are known in the plane: each axis has half of the variance.
             estimate = estimate._replace(
-                place_variance=estimate.place_variance + contact.place_doubt / 2,
-                force_variance=estimate.force_variance + contact.force_doubt,
+                place_variance=estimate.place_variance + contact.place_ambiguity / 2,
+                force_variance=estimate.force_variance + contact.force_ambiguity,
             )
             result = self._to_parent_frame(contact.id, estimate, cubes, place, angle)
             self._results[contact.id] = result
@@ -297,20 +305,18 @@ class ContactTracker:
         origin: Array,
         rotation: Array,
     ) -> ContactFit:
-        """Restart the fit of one contact from other places and sizes and keep the most likely
-        result.
+        """Restart the fit of one contact from other positions and radii, keep the most likely fit.
 
         Gauss-Newton can end in a local optimum. A wide contact looks like a narrow one with a large
         residual. Beside a cube that does not observe all components, mirrored positions have almost
-        the same response. Both are tried for contacts that are new or were in doubt. If cubes are
-        far apart, the field may point at the wrong cube: a new contact with a large residual is
-            also
-        searched around other cubes.
+        the same response. Both are tried for contacts that are new or whose position was ambiguous.
+        If cubes are far apart, the field may point at the wrong cube. Therefore, a new contact with
+        a large residual is searched around other cubes, too.
 
         Args:
             observations: Values of the cubes.
             fit: Fit from the usual start.
-            contact: Contact, whose doubts are updated.
+            contact: Contact, whose ambiguities are updated.
             j: Index of the contact in the fit.
             origin: Position (2,) of the contact's home on the unrolled skin.
             rotation: Rotation (2, 2) from the frame of the home to the unrolled skin.
@@ -324,18 +330,20 @@ class ContactTracker:
             sizes[j] = size
             fits.append(fit_contacts(observations, centres, sizes, START_SCALE, STEPS_NEW))
 
+        # A contact that is known to leave a large residual is not tried again in every scan.
         limit = LARGE_RESIDUAL * AMPLITUDE
         depth = self._inverse.depth
-        was_in_doubt = contact.place_doubt > 0
-        if fit.residual_scale > limit and (was_in_doubt or contact.residual_scale <= limit):
+        was_ambiguous = contact.place_ambiguity > 0
+        if fit.residual_scale > limit and (was_ambiguous or contact.residual_scale <= limit):
             start_at(fit.centres[j], WIDE_SIZE * depth)
 
-        if was_in_doubt and not observations.sees_all:
+        if was_ambiguous and not observations.sees_all:
+            # Mirror images of the position about the axes of the cube, and about those of others.
             best = min(fits, key=lambda one: one.score)
             offset = np.abs(rotation.T @ (best.centres[j] - origin))
             offset = np.maximum(offset, self._inverse.pitch / 4)
             homes = [origin]
-            if best.residual_scale > limit and np.isinf(contact.place_doubt):
+            if best.residual_scale > limit and np.isinf(contact.place_ambiguity):
                 distance = np.linalg.norm(observations.place - best.centres[j], axis=1)
                 homes = list(observations.place[np.argsort(distance)[:RESTART_CUBES]])
             for home in homes:
@@ -344,14 +352,15 @@ class ContactTracker:
 
         # Variance over all fits, weighted with their evidence.
         best = min(fits, key=lambda one: one.score)
+        # The score is -2 ln of the evidence.
         weight = np.exp([(best.score - one.score) / 2 for one in fits])
         weight /= weight.sum()
         place_squares = [((one.centres[j] - best.centres[j]) ** 2).sum() for one in fits]
         force_squares = [(one.forces[j] - best.forces[j]) ** 2 for one in fits]
-        contact.force_doubt = weight @ force_squares
-        doubt = float(weight @ place_squares)
+        contact.force_ambiguity = weight @ force_squares
+        ambiguity = float(weight @ place_squares)
         tolerance = POSITION_TOLERANCE_PITCHES * self._inverse.pitch
-        contact.place_doubt = doubt if doubt > tolerance**2 else 0.0
+        contact.place_ambiguity = ambiguity if ambiguity > tolerance**2 else 0.0
         return best
 
     def _split_contacts(
@@ -413,9 +422,15 @@ class ContactTracker:
         # The two length shapes rotate by twice the angle, as an ellipse looks the same after 180°.
         double = (to_home @ to_home)[:2, :2]
         rotation = block_diag(to_home, in_plane, 1.0, double, 1.0)
-        place_doubts = [contact.place_doubt / 2] * 2
-        doubts = np.diag([*contact.force_doubt, *place_doubts, *np.zeros(4)])
-        contact.covariance = rotation @ (fit.covariance(j) + doubts) @ rotation.T
+        place_ambiguities = [contact.place_ambiguity / 2] * 2
+        ambiguities = np.diag(
+            [
+                *contact.force_ambiguity,
+                *place_ambiguities,
+                *np.zeros(4),
+            ]
+        )
+        contact.covariance = rotation @ (fit.covariance(j) + ambiguities) @ rotation.T
 
     def _to_parent_frame(
         self,
@@ -434,6 +449,7 @@ class ContactTracker:
         position = inverse.poses.position[home] + rotation @ np.array([*local, inverse.depth])
         force = to_home @ estimate.force
         shear = float(np.hypot(force[0], force[1]))
+        # Variance of the length of the shear force: that along its direction.
         direction = estimate.force[:2] / max(shear, 1e-300)
         shear_variance = direction**2 @ estimate.force_variance[:2]
         return TrackedContact(
@@ -460,6 +476,7 @@ class ContactTracker:
     ) -> Array:
         """Return the prior covariance (n C, n C) of cubes; the most recent ones are kept."""
         inverse = self._inverse
+        # Contacts rarely move to other cubes, and a covariance takes longer than a fit.
         variant = inverse.variant[cubes]
         key = (*cubes.tolist(), *variant.tolist())
         if key not in self._priors:
@@ -485,9 +502,18 @@ def _nearest_home(
     place: Array,
     angle: Array,
 ) -> tuple[int, Array]:
-    """Return the index of the cube nearest to a position, and the rotation (3, 3) into its
-    frame."""
+    """Find the cube nearest to a position on the unrolled skin.
+
+    Returns:
+        Index of the cube, and the rotation (3, 3) from the unrolled skin into its frame.
+    """
     nearest = int(np.argmin(np.linalg.norm(place - centre, axis=1)))
     c = np.cos(angle[nearest])
     s = np.sin(angle[nearest])
-    return nearest, np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    return nearest, np.array(
+        [
+            [c, s, 0],
+            [-s, c, 0],
+            [0, 0, 1.0],
+        ]
+    )
