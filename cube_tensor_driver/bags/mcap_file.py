@@ -7,6 +7,7 @@ instead of several per message. Source of the format: https://mcap.dev/spec.
 
 from __future__ import annotations
 
+import struct
 from bisect import bisect_left
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
@@ -19,9 +20,10 @@ from zlib import crc32
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Chunk, Footer, Message
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Chunk, Footer
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
@@ -31,8 +33,11 @@ from .metadata import Connection, FileSummary, QosProfile, bag_information
 MAGIC = b"\x89MCAP0\r\n"
 """The first and last bytes of a complete file."""
 
-RECORD_HEAD_BYTES = 9
-"""Size of what precedes each record: the opcode (1 byte) and the length of the record (8 bytes)."""
+RECORD_HEAD = struct.Struct("<BQ")
+"""What precedes each record: its opcode, and the length of the record."""
+
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""What precedes the content of a message: channel, sequence number, and two times in ns."""
 
 CHUNK_BYTES = 1 << 18
 """Size at which the writer closes a chunk. At 256 kB a chunk fits the processor's cache, and little
@@ -49,7 +54,7 @@ iterator of its own, from the same chunks."""
 ROSBAG2 = "rosbag2"
 """Name of the metadata record that rosbag2 reads."""
 
-_FOOTER_BYTES = RECORD_HEAD_BYTES + 20
+_FOOTER_BYTES = RECORD_HEAD.size + 20
 CHECKSUM_BYTES = 4
 
 StoredMessage = tuple[int, int, int, bytes]
@@ -169,14 +174,13 @@ class McapReader:
         Returns:
             Its messages in the order of their times.
         """
-        self._stream.seek(offset + RECORD_HEAD_BYTES)
+        self._stream.seek(offset + RECORD_HEAD.size)
         # A length inside the record may be damaged: then it ends with the record, not the memory.
-        record = BytesIO(self._stream.read(length - RECORD_HEAD_BYTES))
+        record = BytesIO(self._stream.read(length - RECORD_HEAD.size))
         chunk = Chunk.read(ReadDataStream(record))
         messages = [
-            (one.log_time, offset, one.channel_id, one.data)
-            for one in read_chunk_records(chunk)
-            if isinstance(one, Message)
+            (time_ns, offset, channel, data)
+            for channel, time_ns, data in _chunk_messages(unpack_chunk(chunk))
         ]
         # Messages of several topics may stand a little out of order.
         messages.sort(key=itemgetter(0))
@@ -268,16 +272,38 @@ class McapWriter:
             self._stream.close()
 
 
-def read_chunk_records(chunk: Chunk) -> list[object]:
-    """Decompress a chunk and read its records.
+def unpack_chunk(chunk: Chunk) -> bytes:
+    """Decompress a chunk and compare it with its checksum.
 
     Raises:
-        McapError, ValueError, struct.error: The chunk is damaged.
+        McapError, ValueError, zstandard.ZstdError: The chunk is damaged.
     """
     try:
-        return list(breakup_chunk(chunk, validate_crc=True))
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        return stream.read(size)
     except RuntimeError as error:  # lz4 reports damage so
         raise McapError(str(error)) from None
+
+
+def chunk_records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, begin and end of each record in a chunk."""
+    begin = 0
+    while begin < len(data):
+        opcode, length = RECORD_HEAD.unpack_from(data, begin)
+        begin += RECORD_HEAD.size
+        yield opcode, begin, begin + length
+        begin += length
+
+
+def _chunk_messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Yield channel, time and content of each message in a chunk.
+
+    The library's reader would take several times as long, as it reads field by field.
+    """
+    for opcode, begin, end in chunk_records(data):
+        if opcode == Opcode.MESSAGE:
+            channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(data, begin)
+            yield channel, time_ns, data[begin + _MESSAGE_HEAD.size : end]
 
 
 def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
@@ -326,7 +352,7 @@ def _check_summary(stream: BinaryIO) -> None:
     tail = stream.read()
     if tail_start < 0 or not tail.endswith(MAGIC):
         raise McapError("the file does not end as an MCAP file does")
-    footer = Footer.read(ReadDataStream(BytesIO(tail[RECORD_HEAD_BYTES:])))
+    footer = Footer.read(ReadDataStream(BytesIO(tail[RECORD_HEAD.size :])))
     if not footer.summary_crc:  # the program that wrote the file made none
         return
     # The checksum covers the summary and the footer up to the checksum itself.

@@ -31,7 +31,6 @@ from mcap.records import (
     DataEnd,
     Footer,
     McapRecord,
-    Message,
     MessageIndex,
     Metadata,
     MetadataIndex,
@@ -45,20 +44,19 @@ from ..core.errors import BagError
 from .mcap_file import (
     CHECKSUM_BYTES,
     MAGIC,
+    RECORD_HEAD,
     ROSBAG2,
     McapReader,
-    read_chunk_records,
+    chunk_records,
     rosbag2_metadata,
     summarise,
+    unpack_chunk,
 )
 from .metadata import FILE_NAME, SUFFIXES, FileSummary, write_metadata
 from .read import READ_ERRORS, open_storage, report_damage
 
 REST = ".rest"
 """Suffix of the file that keeps what was cut off."""
-
-_RECORD_HEAD = struct.Struct("<BQ")
-"""What precedes each record: its opcode, and the length of the record."""
 
 
 class Repaired(NamedTuple):
@@ -235,28 +233,28 @@ class _Salvaged:
         Raises:
             READ_ERRORS: It is damaged.
         """
-        if opcode == Opcode.SCHEMA:
-            self._learn(_parse(Schema.read, content))
-        elif opcode == Opcode.CHANNEL:
-            self._learn(_parse(Channel.read, content))
-        elif opcode == Opcode.CHUNK:
+        if opcode == Opcode.CHUNK:
             self._begin_chunk(start, content)
         elif opcode == Opcode.MESSAGE_INDEX and self._open_chunk is not None:
             self._add_message_index(start, content)
+        else:
+            self._learn(opcode, content)
 
     def _begin_chunk(self, start: int, content: bytes) -> None:
         """Read a chunk, which is complete only with the index of each of its channels."""
         self._open_chunk = None
         chunk: Chunk = _parse(Chunk.read, content)
         counts: Counter[int] = Counter()
-        for record in read_chunk_records(chunk):
-            if isinstance(record, Message):
-                counts[record.channel_id] += 1
+        data = unpack_chunk(chunk)
+        for opcode, begin, end in chunk_records(data):
+            record = data[begin:end]
+            if opcode == Opcode.MESSAGE:
+                counts[int.from_bytes(record[:2], "little")] += 1
             else:
-                self._learn(record)
+                self._learn(opcode, record)
         self._open_counts = counts
         self._open_chunk = ChunkIndex(
-            chunk_length=_RECORD_HEAD.size + len(content),
+            chunk_length=RECORD_HEAD.size + len(content),
             chunk_start_offset=start,
             compression=chunk.compression,
             compressed_size=len(chunk.data),
@@ -276,19 +274,21 @@ class _Salvaged:
         chunk.message_index_offsets[index.channel_id] = start
         # Readers need the indexes of all channels, so only the last one makes the chunk complete.
         if chunk.message_index_offsets.keys() == counts.keys():
-            self.end = start + _RECORD_HEAD.size + len(content)
+            self.end = start + RECORD_HEAD.size + len(content)
             chunk_end = chunk.chunk_start_offset + chunk.chunk_length
             chunk.message_index_length = self.end - chunk_end
             self.index.chunk_indexes.append(chunk)
             self.counts += counts
             self._open_chunk = None
 
-    def _learn(self, record: object) -> None:
+    def _learn(self, opcode: int, content: bytes) -> None:
         """Take in a schema or a channel; the first of each number counts."""
-        if isinstance(record, Schema):
-            self.index.schemas.setdefault(record.id, record)
-        elif isinstance(record, Channel):
-            self.index.channels.setdefault(record.id, record)
+        if opcode == Opcode.SCHEMA:
+            schema: Schema = _parse(Schema.read, content)
+            self.index.schemas.setdefault(schema.id, schema)
+        elif opcode == Opcode.CHANNEL:
+            channel: Channel = _parse(Channel.read, content)
+            self.index.channels.setdefault(channel.id, channel)
 
 
 def _write_summary(
@@ -346,12 +346,12 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     start = stream.tell()
     size = stream.seek(0, 2)
     stream.seek(start)
-    while size - start >= _RECORD_HEAD.size:
-        opcode, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD.size))
-        if length > size - start - _RECORD_HEAD.size:
+    while size - start >= RECORD_HEAD.size:
+        opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
+        if length > size - start - RECORD_HEAD.size:
             return  # the record was cut off, or its length is damaged
         yield opcode, start, stream.read(length)
-        start += _RECORD_HEAD.size + length
+        start += RECORD_HEAD.size + length
 
 
 def _parse(read: Callable[[ReadDataStream], Any], content: bytes) -> Any:

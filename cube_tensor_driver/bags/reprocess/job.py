@@ -268,7 +268,7 @@ def _reconstruct(
                 if ids != (ids := [one.id for one in current.calibrations]):
                     reconstructor = Reconstructor(current.calibrations)
                 reconstructor.rest_frequency = current.rest_frequency
-            # Where all is known, health need not be found again, which saves two fifths of the time.
+            # Health that is known need not be found again, which saves two fifths of the time.
             if health is not None and health.known.all():
                 stress = reconstructor.process_known(rows, health)
             else:
