@@ -143,11 +143,11 @@ class LiveLinks:
         """
         self._reader = Reader(
             self._configs,
-            self.receive,
-            self._on_state,
-            self._clock_ns,
-            _period_us(self._rate),
-            self._on_end,
+            on_frames=self.receive,
+            on_state=self._on_state,
+            clock_ns=self._clock_ns,
+            period_us=_period_us(self._rate),
+            on_end=self._on_end,
         )
         self._reader.start()
 
@@ -160,9 +160,11 @@ class LiveLinks:
         """Request another sample rate of the hubs, in Hz; None leaves it as it is."""
         self._rate = rate
         period_us = _period_us(rate)
-        if self._reader is not None and period_us is not None:
-            for link in range(len(self._configs)):
-                self._reader.send(link, Request(Command.SET_PERIOD, period_us))
+        if self._reader is None or period_us is None:
+            return
+        request = Request(Command.SET_PERIOD, period_us)
+        for link in range(len(self._configs)):
+            self._reader.send(link, request)
 
     @property
     def failure(self) -> Exception | None:

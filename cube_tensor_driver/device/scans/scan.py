@@ -216,7 +216,8 @@ class ScanBuilder:
 
         # They are removed before anything can fail, so that an error does not repeat for ever.
         scans = self._pending[:n_scans]
-        del self._pending[:n_scans], self._pending_ns[:n_scans]
+        del self._pending[:n_scans]
+        del self._pending_ns[:n_scans]
         self._n_pending = [max(0, count - n_scans) for count in self._n_pending]
 
         parts: list[_SampleRows] = []
@@ -321,7 +322,8 @@ def _fill(
     np.concatenate([part.cubes for part in parts], out=rows.cube)
     rows.status[:] = 0
     if any(part.status for part in parts):
-        rows.status[:] = np.repeat([part.status for part in parts], _n_rows(parts))
+        statuses = [part.status for part in parts]
+        rows.status[:] = np.repeat(statuses, _n_rows(parts))
 
     raws = [part.sample.raw for part in parts]
     if wire is None or not all(raws):
