@@ -83,8 +83,10 @@ def shipped_calibration(layout: Layout) -> Calibration | None:
 
     Other layouts have none, and give None.
     """
+    # A file may hold another layout under the name of a built-in one.
     built_in = LAYOUTS.get(layout.name)
     if built_in is None or not built_in.same_as(layout):
         return None
     path = package_data() / "config" / "calibration" / f"{layout.name}.yaml"
+    # What a user neglects is a decision about a calibration of his own.
     return replace(read_calibration(path), neglect=())

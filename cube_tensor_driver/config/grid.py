@@ -45,7 +45,13 @@ def grid(
             than `MAX_CUBES`, or all links would have one port.
     """
     n_cubes = nx * ny
-    _check_numbers(nx=nx, ny=ny, pitch=pitch, links=links, rate=rate)
+    _check_numbers(
+        nx=nx,
+        ny=ny,
+        pitch=pitch,
+        links=links,
+        rate=rate,
+    )
     if links > n_cubes:
         raise ConfigError(f"grid: {links} links for {n_cubes} cubes; use at most one link per cube")
     if n_cubes > MAX_CUBES:
@@ -53,15 +59,18 @@ def grid(
             f"grid: {nx} x {ny} are {n_cubes} cubes, a skin has at most {MAX_CUBES}: "
             "make several skins"
         )
+    # Two links on one port would take the bytes from each other.
     if links > 1 and LINK_NUMBER not in port:
         raise ConfigError(
             f"grid: the port {port!r} is that of all {links} links; write {LINK_NUMBER} where the "
             "number of the link belongs"
         )
 
+    # Names sort in the order of the cubes: c00, c01 and so on.
     digits = len(str(n_cubes - 1))
     cubes = []
     for number in range(n_cubes):
+        # Integer arithmetic deals the cubes evenly, whatever the numbers are.
         link = number * links // n_cubes
         first_of_link = -(-link * n_cubes // links)  # rounded up
         x = (number % nx - (nx - 1) / 2) * pitch

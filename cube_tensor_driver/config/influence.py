@@ -17,6 +17,7 @@ def find_influence(name: str) -> Path:
     Raises:
         ConfigError: There is neither. The message lists the shipped names.
     """
+    # A shipped name comes first, as for calibrations.
     shipped = package_data() / "config" / "influence"
     for path in (shipped / f"{name}.npz", Path(name)):
         if path.is_file():

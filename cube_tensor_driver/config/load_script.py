@@ -33,12 +33,23 @@ _PEAK_FORCE = real("a force in N greater than 0", exclusiveMinimum=0)
 _FORCE: JsonSchema = {
     "anyOf": [
         {"type": "number", "exclusiveMinimum": 0},
-        {"type": "array", "items": {"type": "number", "minimum": 0}, "minItems": 2},
+        {
+            "type": "array",
+            "items": {"type": "number", "minimum": 0},
+            "minItems": 2,
+        },
     ],
     "description": "a force in N greater than 0, or a list of at least two from 0 up",
 }
 _SHEAR: JsonSchema = {
-    "anyOf": [TRIPLE, {"type": "array", "items": TRIPLE, "minItems": 2}],
+    "anyOf": [
+        TRIPLE,
+        {
+            "type": "array",
+            "items": TRIPLE,
+            "minItems": 2,
+        },
+    ],
     "description": "a force [x, y, z] in N, or a list of at least two",
 }
 _TIMES = integer(1, MAX_TAPS, f"an integer from 1 to {MAX_TAPS}")
@@ -47,7 +58,11 @@ _PATH = list_of(TRIPLE, "places [x, y, z]", 2)
 
 def _action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSchema:
     """Return the schema of an action: its times, and these required and optional keys."""
-    needed: JsonSchema = {"from": _TIME, "to": _TIME, **required}
+    needed: JsonSchema = {
+        "from": _TIME,
+        "to": _TIME,
+        **required,
+    }
     return mapping(needed, needed | optional)
 
 
@@ -57,6 +72,7 @@ _ACTIONS: JsonSchema = {
     "roll": _action_schema({"shear": _SHEAR}, path=_PATH, force=_FORCE),
     "tap": _action_schema({"times": _TIMES}, at=TRIPLE, force=_PEAK_FORCE),
 }
+# An action is a mapping with one key, its kind.
 _ACTION = mapping((), _ACTIONS) | {
     "minProperties": 1,
     "maxProperties": 1,
@@ -195,6 +211,7 @@ def interpolate_knots(knots: Array, when: float | Array) -> Array:
     position = np.clip(when, 0.0, 1.0) * (len(knots) - 1)
     first = np.minimum(np.floor(position).astype(int), len(knots) - 2)
     part = 0.5 - 0.5 * np.cos(np.pi * (position - first))
+    # The values may be vectors: the share holds for each component.
     part = part.reshape(part.shape + (1,) * (knots.ndim - 1))
     value: Array = knots[first] + part * (knots[first + 1] - knots[first])
     return value
@@ -202,6 +219,7 @@ def interpolate_knots(knots: Array, when: float | Array) -> Array:
 
 def _make_indenter(item: dict[str, Any]) -> Indenter:
     actions = [_make_action(kind, keys) for does in item["does"] for kind, keys in does.items()]
+    # People may write the actions of an indenter in any order.
     actions.sort(key=lambda action: action.start)
     return Indenter(
         name=item["name"],
@@ -217,6 +235,7 @@ def _make_action(kind: str, item: dict[str, Any]) -> Action:
     force = np.array(item["force"], float)
     if kind == "tap":
         peak = float(item["force"])
+        # Each tap rises from 0 to the peak and falls to 0.
         force = np.array([0.0, *[peak, 0.0] * item.get("times", 1)])
     elif force.ndim == 0:
         # A single force rises in the first third of the time and falls in the last one.
@@ -227,6 +246,7 @@ def _make_action(kind: str, item: dict[str, Any]) -> Action:
 
 def _find_contradictions(script: Script) -> Iterator[str]:
     """Yield what a schema cannot say: values of several keys that do not fit together."""
+    # Errors and logs name indenters, so two of one name could not be told apart.
     names = [indenter.name for indenter in script.indenters]
     for number, indenter in enumerate(script.indenters):
         key = f"indenters[{number}] ({indenter.name})"
@@ -258,6 +278,7 @@ def _find_action_mistakes(action: Action, friction: float, period: float | None)
 
 def _max_shear_ratio(action: Action) -> float:
     """Return the maximum ratio of tangential to normal force during the action."""
+    # Without shear nothing can slip, also where the force is 0.
     if not action.shear.any():
         return 0.0
     if len(action.shear) == 1:
@@ -268,5 +289,11 @@ def _max_shear_ratio(action: Action) -> float:
     force = interpolate_knots(action.force, when)
     shear = np.linalg.norm(interpolate_knots(action.shear, when), axis=-1)
     without_force = np.where(shear > 0, np.inf, 0.0)
-    ratio = np.divide(shear, force, out=without_force, where=force > 0)
+    # Shear without a normal force would slip, however small it is: its ratio is infinite.
+    ratio = np.divide(
+        shear,
+        force,
+        out=without_force,
+        where=force > 0,
+    )
     return float(ratio.max())

@@ -50,6 +50,7 @@ def check_outputs(paths: dict[str, Path | None]) -> None:
     """
     given = {option: path for option, path in paths.items() if path is not None}
     for option, path in given.items():
+        # The file that is written last would replace the other one.
         for other, other_path in given.items():
             if other != option and other_path.resolve() == path.resolve():
                 raise ConfigError(f"{option} and {other} both name {path}; name two files")
@@ -63,6 +64,7 @@ def check_folder(option: str, path: Path | None) -> None:
     """Raise ConfigError if the folder cannot be made, or no file in it. Nothing is made yet."""
     if path is None:
         return
+    # The folder itself may still have to be made.
     existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
     problem = "is no folder"
     if existing.is_dir():
@@ -91,6 +93,7 @@ def write_json(path: Path, value: Any) -> None:
 def temporary_folder(prefix: str) -> Path:
     """Make a folder that is removed, with all that is in it, when this process ends."""
     folder = Path(tempfile.mkdtemp(prefix=prefix))
+    # Nodes of a launch use the folder as long as the launch lives.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
@@ -98,6 +101,7 @@ def temporary_folder(prefix: str) -> Path:
 @contextmanager
 def _temporary_file(path: Path) -> Iterator[Path]:
     """Name a file in the folder of `path`, which does not exist any more when the block ends."""
+    # In the same folder, because a file is renamed atomically only within a file system.
     temporary = path.parent / f"{path.name}.part"
     try:
         if path.exists() and not path.is_file():

@@ -18,6 +18,7 @@ def package_data() -> Path:
         ConfigError: There is neither, which means that the installation is broken.
     """
     for parent in Path(__file__).parents:
+        # config/ alone does not tell: this module lies in a folder of that name.
         for folder in (parent, parent / "share" / _NAME):
             if (folder / "package.xml").is_file() and (folder / "config").is_dir():
                 return folder

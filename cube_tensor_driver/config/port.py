@@ -21,6 +21,7 @@ def tcp_address(url: str) -> tuple[str, int] | None:
     except ValueError:
         return None
 
+    # A path or a user name shows that something else was meant.
     has_more = parts.path.strip("/") or parts.query or parts.fragment or "@" in parts.netloc
     if not url.startswith(TCP) or not host or not port or has_more:
         return None

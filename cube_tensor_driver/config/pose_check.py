@@ -47,7 +47,12 @@ def pose_doubts(skin: Skin) -> Iterator[str]:
 def _find_shared_positions(skin: Skin, positions: Array) -> Iterator[str]:
     """Yield a line for each position with several cubes, because at most one can be there."""
     rounded = np.round(positions / POSITION_RESOLUTION_M)
-    _, group, count = np.unique(rounded, axis=0, return_inverse=True, return_counts=True)
+    _, group, count = np.unique(
+        rounded,
+        axis=0,
+        return_inverse=True,
+        return_counts=True,
+    )
     group = group.reshape(-1)  # numpy 2.0 alone gives it a second axis
     for number in np.flatnonzero(count > 1).tolist():
         members = [skin.cubes[member] for member in np.flatnonzero(group == number)]
@@ -60,9 +65,11 @@ def _find_shared_positions(skin: Skin, positions: Array) -> Iterator[str]:
 def _seems_in_millimetres(positions: Array) -> bool:
     if np.abs(positions).max() > MAX_DISTANCE_M:
         return True
+    # A skin in mm near the origin betrays itself only by the distance of its cubes.
     if not MIN_SPACED_CUBES <= len(positions) <= MAX_SPACED_CUBES:
         return False
     distance = np.linalg.norm(positions[:, np.newaxis] - positions, axis=2)
+    # A cube is no neighbour of itself.
     np.fill_diagonal(distance, np.inf)
     return bool(distance.min() > MAX_SPACING_M)
 

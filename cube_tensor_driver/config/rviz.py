@@ -27,6 +27,7 @@ def rviz_view(skin: Skin) -> dict[str, Any]:
     """
     positions = np.array([cube.xyz for cube in skin.cubes])
     low, high = positions.min(axis=0), positions.max(axis=0)
+    # The wrench of one cube is shown; the central one is most likely touched.
     to_centre = np.linalg.norm(positions - (low + high) / 2, axis=1)
     central_cube = skin.cubes[int(to_centre.argmin())]
 

@@ -28,7 +28,11 @@ NAME: JsonSchema = {
     "description": "a name of at most 64 letters, digits and _, a letter first",
 }
 
-TEXT: JsonSchema = {"type": "string", "minLength": 1, "description": "a text that is not empty"}
+TEXT: JsonSchema = {
+    "type": "string",
+    "minLength": 1,
+    "description": "a text that is not empty",
+}
 
 TRIPLE: JsonSchema = {
     "type": "array",
@@ -70,13 +74,21 @@ def list_of(item: JsonSchema, what: str, minimum: int = 1) -> JsonSchema:
 
 def real(description: str, **limits: float) -> JsonSchema:
     """Return the schema of a number, with limits such as `minimum` and `exclusiveMinimum`."""
-    return {"type": "number", "description": description, **limits}
+    return {
+        "type": "number",
+        "description": description,
+        **limits,
+    }
 
 
 def integer(minimum: int, maximum: int, description: str) -> JsonSchema:
     """Return the schema of an integer from `minimum` to `maximum`."""
     limits = {"minimum": minimum, "maximum": maximum}
-    return {"type": "integer", "description": description, **limits}
+    return {
+        "type": "integer",
+        "description": description,
+        **limits,
+    }
 
 
 class Schema:

@@ -34,14 +34,26 @@ _FRAME: JsonSchema = {
 # Labels on cubes give uids in hexadecimal, so a text such as 0x1f is allowed.
 _UID: JsonSchema = {
     "anyOf": [
-        {"type": "integer", "minimum": 1, "maximum": 2**64 - 1},
+        {
+            "type": "integer",
+            "minimum": 1,
+            "maximum": 2**64 - 1,
+        },
         {"type": "string", "pattern": r"^0x(?!0+\Z)[0-9a-fA-F]{1,16}\Z"},
     ],
     "description": "a uid: 1 to 2^64 - 1, or hexadecimal as in 0x1f",
 }
 _INDEX = integer(0, 65535, "an integer from 0 to 65535")
 _BAUD = integer(1200, 20_000_000, "1200 to 20000000")
-_LINK = mapping(("name", "port"), {"name": NAME, "port": TEXT, "baud": _BAUD, "hub_uid": _UID})
+_LINK = mapping(
+    ("name", "port"),
+    {
+        "name": NAME,
+        "port": TEXT,
+        "baud": _BAUD,
+        "hub_uid": _UID,
+    },
+)
 _CUBE = mapping(
     ("name", "pose", "layout", "calibration"),
     {
@@ -210,6 +222,7 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     mistakes = [line for _, line in schema_mistakes]
     if not isinstance(data, dict):
         return None, mistakes
+    # Without both lists there is nothing more to check.
     if not isinstance(data.get("links"), list) or not isinstance(data.get("cubes"), list):
         return None, mistakes
     # ("cubes", 3) stands for a mistake anywhere in cubes[3].
@@ -225,6 +238,7 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     # Where a link is malformed its name is unknown, so no cube can be blamed for naming it.
     all_links_known = len({link.name for link in links}) == len(data["links"])
     reader = _CubeReader(folder, [link.name for link in links] if all_links_known else None)
+    # Entries beside a malformed one are checked, so that all mistakes show at once.
     for number, item in enumerate(data["cubes"]):
         if ("cubes", number) not in malformed:
             reader.read(number, item)
@@ -235,6 +249,7 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
 
     if mistakes:
         return None, mistakes
+    # YAML makes an integer of 100.
     rate = None if data.get("rate") is None else float(data["rate"])
     return Skin(data["name"], data["parent_frame"], rate, links, cubes), []
 
@@ -289,6 +304,7 @@ class _CubeReader:
     ) -> Iterator[str]:
         """Yield keys of one cube that contradict each other or the rest of the file."""
         link, index = item.get("link"), item.get("index")
+        # A cube without a link is looked for on all links, by its uid.
         if link is not None and self._links is not None and link not in self._links:
             allowed = ", ".join(sorted(self._links))
             yield f".link: found {link!r}, allowed: one of the links {allowed}"
@@ -297,6 +313,7 @@ class _CubeReader:
                 ": found neither uid nor both link and index, which say where the cube is; "
                 "add one of them"
             )
+        # Cubes are exchanged, and then the file would be wrong without a warning.
         if uid is not None and index is not None:
             yield ": found both uid and index; keep one, they might contradict each other"
         if item["layout"] != calibration.layout.name:
@@ -304,6 +321,7 @@ class _CubeReader:
                 f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
                 f"is for the layout {calibration.layout.name!r}"
             )
+        # A measured calibration belongs to one cube, a computed one to all of a layout.
         if calibration.uid is not None and uid != calibration.uid:
             found = "not given" if uid is None else hex(uid)
             yield (
@@ -318,6 +336,7 @@ def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
         if problem:
             yield f"links: port of {link.name}: {problem}"
     yield from _find_repeated("links", "name", [repr(link.name) for link in links])
+    # In hexadecimal, as labels on hubs have them.
     hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
     yield from _find_repeated("links", "hub_uid", hub_uids)
     # Each match of a pattern is tried, so two links may share a pattern.

@@ -58,6 +58,7 @@ def write_tare(
         ConfigError: The folder cannot be written.
     """
     try:
+        # The folder is below the home of ROS, and nobody makes it by hand.
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(
@@ -92,10 +93,12 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
     for _, mistake in _tare_schema(calibration.layout.n_pads).mistakes(data):
         raise ConfigError(f"{path}: {mistake}; tare again")
 
+    # Somebody has renamed or copied the file.
     if int(data["uid"], 16) != uid:
         raise ConfigError(
             f"{path}: uid is {data['uid']!r}, the file's name says {uid:#x}; tare again"
         )
+    # Rest frequencies contain what the calibration says about temperature.
     if data["calibration_id"] != calibration.id:
         raise ConfigError(
             f"{path}: measured under calibration {data['calibration_id']!r}, "
@@ -109,6 +112,7 @@ def remove_tare(folder: Path, uid: int) -> None:
     """Remove the tare of a cube if it has one. Raises ConfigError if it cannot be removed."""
     path = tare_path(folder, uid)
     try:
+        # Clearing a tare twice is no error.
         path.unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from None
@@ -117,7 +121,11 @@ def remove_tare(folder: Path, uid: int) -> None:
 def _tare_schema(n_pads: int) -> Schema:
     frequencies: JsonSchema = {
         "type": "array",
-        "items": {"type": "number", "exclusiveMinimum": 0, "description": "a number above 0"},
+        "items": {
+            "type": "number",
+            "exclusiveMinimum": 0,
+            "description": "a number above 0",
+        },
         "minItems": n_pads,
         "maxItems": n_pads,
         "description": f"{n_pads} numbers above 0",

@@ -73,6 +73,7 @@ def parse_yaml(text: str | bytes, origin: str) -> Any:
         where = f"{origin}, line {mark.line + 1}, column {mark.column + 1}" if mark else origin
         raise ConfigError(f"{where}: {error.problem or 'not YAML'}") from None
     except (yaml.YAMLError, *_INVALID_VALUE_ERRORS) as error:
+        # PyYAML explains itself in several lines, and an error here is one.
         first_line = (str(error) or type(error).__name__).splitlines()[0]
         raise ConfigError(f"{origin}: not YAML: {first_line}") from None
 

@@ -61,6 +61,7 @@ class Children:
         So Ctrl-C does not reach it directly: it is ended by `end`, after what depends on it.
         """
         program = [process.program] if process.program else [sys.executable, "-m", process.module]
+        # A demo that is killed must not leave a driver that holds the ports.
         command = [*end_with_parent(), *program, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]
@@ -123,6 +124,7 @@ class Children:
         """Raise ChildError, with the end of its log, if a process has ended."""
         for executable, process in self._processes.items():
             if process.poll() is not None:
+                # The last lines usually name the reason.
                 end_of_log = "\n".join(self.log(executable).splitlines()[-SHOWN_LINES:])
                 raise ChildError(
                     f"the {executable} ended with code {process.returncode}:\n{end_of_log}"
@@ -136,6 +138,7 @@ class Children:
         until = time.monotonic() + END_S
         for process in ending:
             with contextlib.suppress(subprocess.TimeoutExpired):
+                # All have the same time to end, as all were asked at once.
                 process.wait(timeout=max(0.0, until - time.monotonic()))
         for process in ending:
             if process.poll() is None:

@@ -58,6 +58,7 @@ def own_domain() -> Iterator[int]:
         ConfigError: All domains are in use.
     """
     domain, claim = _claim_domain()
+    # The domain holds for the block, so the variables are restored.
     before = {name: os.environ.get(name) for name in (VARIABLE, RANGE_VARIABLE)}
     os.environ.update({VARIABLE: str(domain), RANGE_VARIABLE: "LOCALHOST"})
     try:
@@ -74,6 +75,7 @@ def _claim_domain() -> tuple[int, socket.socket]:
     """Return a domain without nodes, and the socket that keeps others of us out of it."""
     for domain in range(MAX_OWN_DOMAIN, 0, -1):
         claim = _bind(domain, FREE_OFFSET)
+        # Another process of ours has claimed the domain.
         if claim is None:
             continue
         # Where a node runs, it has bound the port of the first participant.

@@ -76,10 +76,16 @@ class SimulatedHubs:
             "--noise": self.noise,
             "--imperfections": self.imperfections,
         }
+        # An option that is not given leaves the simulator its default.
         given = {name: str(value) for name, value in options.items() if value is not None}
         arguments = tuple(word for option in given.items() for word in option)
         module = "cube_tensor_driver.simulation.main"
-        return Process("simulator", module, node=False, arguments=arguments)
+        return Process(
+            "simulator",
+            module,
+            node=False,
+            arguments=arguments,
+        )
 
 
 def skin_processes(
@@ -105,14 +111,22 @@ def skin_processes(
         contacts: Whether the node `contacts` runs, too.
         simulated: Simulated hubs instead of real ones.
     """
+    # Queue depths of both nodes follow from the publish period.
     common: dict[str, Value] = {"config": str(config), "publish_period": publish_period}
     port_directory = str(simulated.ports) if simulated else ""
-    driver = {**common, "port": port, "rate": rate, "port_directory": port_directory}
+    driver = {
+        **common,
+        "port": port,
+        "rate": rate,
+        "port_directory": port_directory,
+    }
 
+    # The ports of simulated hubs must exist before the driver opens them.
     processes = [simulated.process(config)] if simulated else []
     if composed:
         processes.append(_node("composed", driver))
     else:
+        # The reconstruction subscribes first, so that it misses no rows of the driver.
         processes += [_node("reconstruction", common), _node("driver", driver)]
     if markers:
         processes.append(_node("markers", {}))

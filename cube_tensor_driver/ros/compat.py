@@ -66,6 +66,7 @@ def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., No
     does not tell it.
     """
     if not hasattr(Subscription, "CallbackType"):
+        # Without the info of a message there is no number.
         return lambda message: callback(message, None)
 
     def call(*arguments: Any) -> None:

@@ -53,12 +53,20 @@ NEEDED_PACKAGES = {
 """Launch argument -> the ROS packages that it needs beyond our own."""
 
 
-def declare_text(name: str, description: str, default: str = "") -> DeclareLaunchArgument:
+def declare_text(
+    name: str,
+    description: str,
+    default: str = "",
+) -> DeclareLaunchArgument:
     """Declare a launch argument that is a text."""
     return DeclareLaunchArgument(name, default_value=default, description=description)
 
 
-def declare_switch(name: str, description: str, default: str = "false") -> DeclareLaunchArgument:
+def declare_switch(
+    name: str,
+    description: str,
+    default: str = "false",
+) -> DeclareLaunchArgument:
     """Declare a launch argument that is true or false, or empty if that is the default."""
     choices = ["true", "false"] if default else ["", "true", "false"]
     return DeclareLaunchArgument(
@@ -135,7 +143,13 @@ def record_skin(context: LaunchContext) -> list[Action]:
     command += ["--qos-profile-overrides-path", str(overrides)]
     # The option --topics does not exist in Humble, --regex does everywhere.
     command += ["--regex", f"^({'|'.join(qualities)})$"]
-    return [ExecuteProcess(cmd=command, name="recorder", output="screen")]
+    return [
+        ExecuteProcess(
+            cmd=command,
+            name="recorder",
+            output="screen",
+        )
+    ]
 
 
 def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, dict[str, str]]:
@@ -152,6 +166,7 @@ def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, 
         name = remaps.get(name, name)
         prefix = f"/{namespace}" if namespace else ""
         full_name = name if name.startswith("/") else f"{prefix}/{name}"
+        # These two have the reliability that a parameter of the nodes gives them.
         is_batch = topic in ("/frequencies", "/stress")
         qualities[full_name] = quality | ({"reliability": reliability} if is_batch else {})
     return qualities
@@ -187,6 +202,7 @@ def check_arguments(context: LaunchContext) -> list[Action]:
         if _argument(context, name) == "true":
             _check_installed(name, packages)
 
+    # Two simulated skins on one host must not share their ports.
     ports = str(temporary_folder("cube_ports_")) if is_simulated else ""
     return [
         SetLaunchConfiguration("config", str(path)),

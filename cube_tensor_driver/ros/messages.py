@@ -13,7 +13,13 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, WrenchStamped
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    Quaternion,
+    Vector3,
+    WrenchStamped,
+)
 from rclpy.node import Node
 from std_msgs.msg import Header
 
@@ -25,7 +31,12 @@ from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
 from ..core.tensor import quaternion_from_rpy
 from ..messages.codec import SECOND
-from ..msg import CubeInfo, SkinInfo, StressTensor, StressTensorStamped
+from ..msg import (
+    CubeInfo,
+    SkinInfo,
+    StressTensor,
+    StressTensorStamped,
+)
 from .callbacks import LOG_PERIOD_S
 
 
@@ -56,6 +67,7 @@ def message_class(topic: str, type_name: str) -> Any:
 
 def make_message(type_name: str, **fields: Any) -> Any:
     """Return a message of rclpy. Fields may be numpy arrays."""
+    # The type code of numpy is that of the module array.
     arrays = {
         name: pack_array(value.dtype.char, value)
         for name, value in fields.items()
@@ -71,6 +83,7 @@ def pack_array(code: str, values: AnyArray) -> array[Any]:
         code: Type of the field, as a type code of the module `array`.
         values: The values, which are converted to this type.
     """
+    # rclpy takes an array of the field's type as it is; it looks at each item of a list.
     field = array(code)
     field.frombytes(np.ascontiguousarray(values, dtype=code).tobytes())
     return field
@@ -87,13 +100,24 @@ def to_ns(stamp: Time) -> int:
 
 
 def tensor_message(
-    header: Header, rows: StressRows, row: int, covariance: Array
+    header: Header,
+    rows: StressRows,
+    row: int,
+    covariance: Array,
 ) -> StressTensorStamped:
     """Return one row as a message of its own. The covariance is (15, 15)."""
     xx, yy, zz, yz, zx, xy = rows.stress[row].tolist()
     tensor = StressTensor(
-        normal=Vector3(x=xx, y=yy, z=zz),
-        shear=Vector3(x=yz, y=zx, z=xy),
+        normal=Vector3(
+            x=xx,
+            y=yy,
+            z=zz,
+        ),
+        shear=Vector3(
+            x=yz,
+            y=zx,
+            z=xy,
+        ),
         normal_gradient=rows.gradient[row].astype(float),
         covariance=covariance.ravel(),
         residual=float(rows.residual[row]),
@@ -103,7 +127,11 @@ def tensor_message(
     return StressTensorStamped(header=header, tensor=tensor)
 
 
-def wrench_message(header: Header, force_n: Array, torque_nm: Array) -> WrenchStamped:
+def wrench_message(
+    header: Header,
+    force_n: Array,
+    torque_nm: Array,
+) -> WrenchStamped:
     """Return a wrench of a force (3,) in N and a torque (3,) in N m."""
     message = WrenchStamped(header=header)
     force, torque = message.wrench.force, message.wrench.torque
@@ -129,16 +157,22 @@ def info_message(
             the skin file.
         sender: driver or reconstruction.
     """
-    message = SkinInfo(version=SkinInfo.VERSION, name=skin.name, sender=sender)
+    message = SkinInfo(
+        version=SkinInfo.VERSION,
+        name=skin.name,
+        sender=sender,
+    )
     message.header = Header(stamp=to_time(stamp_ns), frame_id=skin.parent_frame)
     rest_frequency = pipeline.rest_frequency
     covariances = []
     for number, cube in enumerate(skin.cubes):
         calibration = cube.calibration
+        n_pads = calibration.layout.n_pads
         info = _cube_info(cube, skin.frame(cube))
         info.uid = cube.uid or uids.get(number, 0)
-        info.rest_frequency = rest_frequency[number, : calibration.layout.n_pads].tolist()
+        info.rest_frequency = rest_frequency[number, :n_pads].tolist()
         message.cubes.append(info)
+        # Most skins have few calibrations, so that each is sent once and named by its id.
         if calibration.id not in message.calibration_ids:
             message.calibration_ids.append(calibration.id)
             message.calibrations.append(calibration_text(calibration))
@@ -150,12 +184,16 @@ def info_message(
 def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
     """Return what the skin file says of a cube."""
     calibration = cube.calibration
+    px, py, pz = cube.xyz
     x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
-    position = Point(x=cube.xyz[0], y=cube.xyz[1], z=cube.xyz[2])
+    # A message has no word for what the skin file leaves out: it says 0, or an empty text.
     return CubeInfo(
         name=cube.name,
         frame_id=frame_id,
-        pose=Pose(position=position, orientation=Quaternion(x=x, y=y, z=z, w=w)),
+        pose=Pose(
+            position=Point(x=px, y=py, z=pz),
+            orientation=Quaternion(x=x, y=y, z=z, w=w),
+        ),
         link=cube.link or "",
         index=cube.index or 0,
         layout=calibration.layout.name,

@@ -185,7 +185,11 @@ class CubeNode(LifecycleNode):
         )
         if parameter.span is not None:
             low, high = parameter.span
-            bounds = FloatingPointRange(from_value=low, to_value=high, step=0.0)
+            bounds = FloatingPointRange(
+                from_value=low,
+                to_value=high,
+                step=0.0,
+            )
             descriptor.floating_point_range = [bounds]
         self.declare_parameter(parameter.name, parameter.default, descriptor)
 
@@ -347,7 +351,12 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
                 stopping.set()
 
     with contextlib.suppress(ExternalShutdownException):
-        spin_until(executor, stopping.is_set, step_s=STEP_S, on_step=check_failures)
+        spin_until(
+            executor,
+            stopping.is_set,
+            step_s=STEP_S,
+            on_step=check_failures,
+        )
     for node in reversed(nodes):
         node.end()
         executor.remove_node(node)

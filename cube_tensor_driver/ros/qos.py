@@ -66,6 +66,7 @@ def batch_profile(
         allowed = ", ".join(_RELIABILITIES)
         raise ConfigError(f"parameter qos_reliability is {reliability!r}, allowed: {allowed}")
     wanted_depth = (rate_hz or DEFAULT_RATE_HZ) * MAX_PAUSE_S
+    # A large skin with a deep queue would fill the memory of a robot.
     affordable_depth = MAX_QUEUE_BYTES / (rows * ROW_BYTES)
     depth = max(MIN_BATCH_DEPTH, math.ceil(min(wanted_depth, affordable_depth)))
     return QoSProfile(depth=depth, reliability=_RELIABILITIES[reliability])
@@ -81,7 +82,12 @@ def scans_per_message(publish_period_s: float, rate_hz: float | None) -> int:
     return max(1, round(publish_period_s * (rate_hz or DEFAULT_RATE_HZ)))
 
 
-def make_profile(depth: int, *, is_latched: bool, is_best_effort: bool) -> QoSProfile:
+def make_profile(
+    depth: int,
+    *,
+    is_latched: bool,
+    is_best_effort: bool,
+) -> QoSProfile:
     """Return the profile of a topic with a queue of `depth` messages."""
     profile = QoSProfile(depth=depth)
     if is_latched:
@@ -102,7 +108,9 @@ def offered_profile(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfi
         depth: Depth of the queue, in messages.
     """
     profiles = [offer.qos_profile for offer in offers]
+    # A latched subscription does not match a publisher that is not.
     are_latched = [one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in profiles]
+    # A reliable subscription does not match a publisher of best effort.
     are_reliable = [one.reliability == ReliabilityPolicy.RELIABLE for one in profiles]
     return make_profile(
         depth,

@@ -82,6 +82,7 @@ def spin_until(
     """
     until = time.monotonic() + seconds
     while not is_done():
+        # Monotonic, because the clock of the system may be set meanwhile.
         left = until - time.monotonic()
         if left <= 0:
             return False

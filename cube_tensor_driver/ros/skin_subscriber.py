@@ -86,6 +86,7 @@ class SkinSubscriber:
         self.skin = skin
 
     def _receive_stress(self, data: bytes) -> None:
+        # Without the poses and the number of cubes, rows mean nothing.
         if self.skin is None:
             return
         try:
@@ -130,6 +131,7 @@ class SkinSubscriberNode(CubeNode):
     def configure(self) -> None:
         subscriber = SkinSubscriber(self, self.prepare)
         self.call_at_cleanup(subscriber.close)
+        # A node publishes one topic, which has its name.
         publisher = self.own(
             self.create_lifecycle_publisher(self._message_type, self.get_name(), self._depth)
         )
@@ -138,6 +140,7 @@ class SkinSubscriberNode(CubeNode):
             skin = subscriber.skin
             if skin is None or not self.is_active or not self.has_listeners(publisher):
                 return
+            # A cube that has become silent is shown as stale, so the time counts and not only rows.
             health = skin.newest.health(subscriber.now(), STALE_S)
             message = self.compute_message(skin, health)
             if message is not None:

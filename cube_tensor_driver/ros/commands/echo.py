@@ -77,6 +77,7 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
                 f"nobody publishes {name} in {domain_text()}; ./cube topics lists what there is"
             )
         spin_until(executor, lambda: stop.is_set() or listener.has_names, MAX_INFO_S)
+        # Somebody who watches a topic may wait for its first message as long as he likes.
         wait_s = MAX_MESSAGE_S if once else float("inf")
         while spin_until(executor, lambda: stop.is_set() or listener.waiting, wait_s):
             if stop.is_set():
@@ -152,6 +153,7 @@ class _Listener:
         if not offers:
             return False
         kinds = sorted({offer.topic_type for offer in offers})
+        # A subscription has one type, and the others would be dropped silently.
         if len(kinds) > 1:
             raise CubeError(
                 f"{self._topic} has publishers of {' and '.join(kinds)}; end those of the wrong one"
@@ -164,6 +166,7 @@ class _Listener:
 
         profile = offered_profile(offers, QUEUE_DEPTH)
         if kind is SkinStress:
+            # Rows number the cubes; their names are in the info.
             self._needs_names = True
             info = f"{self._topic.rpartition('/')[0]}/info"
             self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)

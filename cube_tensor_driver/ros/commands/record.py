@@ -65,7 +65,12 @@ class Recorder:
         error: Error that ended the writing thread; None: there is none.
     """
 
-    def __init__(self, node: Node, topics: Sequence[str], bag: BagWriter) -> None:
+    def __init__(
+        self,
+        node: Node,
+        topics: Sequence[str],
+        bag: BagWriter,
+    ) -> None:
         """Begin to record topics, which are full names."""
         self.received = self.dropped = 0
         self.counts: dict[str, int] = {}
@@ -124,6 +129,7 @@ class Recorder:
         def receive(data: bytes) -> None:
             self.received += 1
             self.counts[topic] += 1
+            # The deque is safe for two threads, but does not count bytes.
             waiting_bytes = self._received_bytes - self._written_bytes
             if waiting_bytes + len(data) > MAX_WAITING_BYTES or self.error is not None:
                 self.dropped += 1
@@ -189,7 +195,15 @@ def record(
     with node_session("recorder") as (node, executor):
         names = resolve_topics(node, list(topics))
         bag = BagWriter(folder, storage, max_bytes, max_seconds)
-        return fill(bag, node, executor, names, stop=stop, duration=duration, show=show)
+        return fill(
+            bag,
+            node,
+            executor,
+            names,
+            stop=stop,
+            duration=duration,
+            show=show,
+        )
 
 
 def fill(
@@ -231,6 +245,7 @@ def fill(
     finally:
         _close(recorder, bag.folder)
     if not bag.messages:
+        # An empty bag is of no use, and its name would be taken the next time.
         shutil.rmtree(bag.folder, ignore_errors=True)
         raise BagError(f"nothing recorded, no bag made: {_why_nothing(recorder)}")
     return recorder

@@ -71,7 +71,15 @@ class Player:
         stop: Set when `run` shall end.
     """
 
-    def __init__(self, node: Node, bag: Bag, *, rate: float, stress: bool, clock: bool) -> None:
+    def __init__(
+        self,
+        node: Node,
+        bag: Bag,
+        *,
+        rate: float,
+        stress: bool,
+        clock: bool,
+    ) -> None:
         """Announce the topics of the bag.
 
         Args:
@@ -95,6 +103,7 @@ class Player:
         self._node, self._bag, self._rate = node, bag, rate
         self._publishers: dict[str, Any] = {}
         self._latched: set[str] = set()
+        # A bag may hold several skins, each in its namespace.
         skins = [topic.removesuffix("frequencies") for topic in bag.topics(FREQUENCIES)]
         for connection in bag.connections:
             topic = connection.topic
@@ -184,6 +193,7 @@ class Player:
     def _await_subscribers(self) -> None:
         """Wait until subscribers have found the publishers."""
         everything = [*self._publishers.values(), *([self._clock] if self._clock else [])]
+        # Without a reconstruction nobody subscribes to frequencies, which must not delay for long.
         needed = [self._publishers[name] for name in self._publishers if _is_frequencies(name)]
         found, since, wait_s = 0, time.monotonic(), MAX_WAIT_S
         while time.monotonic() - since < wait_s and not self.stop.wait(LOOK_PERIOD_S):
@@ -211,9 +221,12 @@ class Player:
         for entry in self._bag.entries(set(self._publishers), start_ns):
             if not self._wait_until_due(entry.time_ns):
                 return
+            # Nodes with simulated time must know the time of a message before it comes.
             self._publish_clock(entry.time_ns)
             self._publish(entry)
+            # Read by other threads: one assignment needs no lock.
             self.position = (entry.time_ns - self._bag.start_ns) / SECOND
+            # One step is one scan: what belongs to it comes before.
             if self._steps and _is_frequencies(entry.topic):
                 with self._wake:
                     self._steps -= 1
@@ -279,7 +292,11 @@ class ReplayControl:
     def _publish_state(self) -> None:
         player = self._player
         self._state.publish(
-            ReplayState(position=player.position, length=player.length, paused=player.paused)
+            ReplayState(
+                position=player.position,
+                length=player.length,
+                paused=player.paused,
+            )
         )
 
     def _steer(
@@ -325,7 +342,13 @@ def replay(
     """
     errors: list[BagError] = []
     with node_session("player") as (node, executor):
-        player = Player(node, bag, rate=rate, stress=stress, clock=clock)
+        player = Player(
+            node,
+            bag,
+            rate=rate,
+            stress=stress,
+            clock=clock,
+        )
         ReplayControl(node, player)
         on_stop_signal(player.end)
 

@@ -35,7 +35,12 @@ REPEAT_S = 3.0
 
 LIST_SERVICE = "/list_parameters"
 
-EXPECTED = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+EXPECTED = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+}
 """Type of a parameter -> what a user has to write for it."""
 
 
@@ -72,6 +77,7 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
             )
         answers = []
         for service in services:
+            # The service is that of a node: /reconstruction/tare.
             name = service.rpartition("/")[0]
             if clear:
                 request = Trigger.Request()
@@ -159,6 +165,7 @@ class _NodeParameters:
         """Set a parameter to a text. ConfigError: the node refuses it."""
         value = get_parameter_value(text)
         kind = type(self.values([parameter])[parameter])
+        # A person writes 2 for 2.0, which rclpy would refuse.
         if kind is float and value.type == ParameterType.PARAMETER_INTEGER:
             value = ParameterValue(
                 type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value)
@@ -176,7 +183,11 @@ class _NodeParameters:
         return call_service(self._node, self._executor, service_type, name, request)
 
 
-def _find_nodes(node: Node, executor: Any, wanted_service: str = "") -> list[str]:
+def _find_nodes(
+    node: Node,
+    executor: Any,
+    wanted_service: str = "",
+) -> list[str]:
     """Return the full names of nodes with parameters. ConfigError: there is none."""
     kind = "rcl_interfaces/srv/ListParameters"
     services = find_services(node, executor, kind, wanted_service)
@@ -186,7 +197,12 @@ def _find_nodes(node: Node, executor: Any, wanted_service: str = "") -> list[str
     return nodes
 
 
-def find_services(node: Node, executor: Any, kind: str, wanted: str = "") -> list[str]:
+def find_services(
+    node: Node,
+    executor: Any,
+    kind: str,
+    wanted: str = "",
+) -> list[str]:
     """Return the full names of services of other nodes, sorted; there may be none.
 
     Args:
@@ -204,13 +220,20 @@ def find_services(node: Node, executor: Any, kind: str, wanted: str = "") -> lis
         )
 
     if wanted:
+        # One that is named may be found first: there is no need to wait for others.
         discover(executor, lambda: wanted in find())
     else:
         discover_all(executor, find)
     return find()
 
 
-def call_service(node: Node, executor: Any, service_type: type, name: str, request: Any) -> Any:
+def call_service(
+    node: Node,
+    executor: Any,
+    service_type: type,
+    name: str,
+    request: Any,
+) -> Any:
     """Return the answer of a service. The request must do no harm if it comes twice.
 
     Raises:
@@ -223,6 +246,7 @@ def call_service(node: Node, executor: Any, service_type: type, name: str, reque
         futures: list[Any] = []
         until = time.monotonic() + MAX_ANSWER_S
         while time.monotonic() < until:
+            # A request that the server has lost is never answered, so another one is sent.
             futures.append(client.call_async(request))
             spin_until(executor, lambda: any(future.done() for future in futures), REPEAT_S)
             for future in futures:
@@ -252,6 +276,7 @@ def discover_all(executor: Any, find: Callable[[], object]) -> bool:
     until = time.monotonic() + MAX_DISCOVERY_S
     if not spin_until(executor, find, MAX_DISCOVERY_S):
         return False
+    # Nodes are discovered one after the other, so it is looked again until nothing is new.
     before = None
     while before != (now := find()) and time.monotonic() < until:
         before = now

@@ -35,12 +35,17 @@ class LinkDiagnostics:
         return statuses
 
 
-def _rows_status(skin_name: str, counts: RowCounts, before: RowCounts) -> DiagnosticStatus:
+def _rows_status(
+    skin_name: str,
+    counts: RowCounts,
+    before: RowCounts,
+) -> DiagnosticStatus:
     """Return the status of all rows, with what happened since the counts `before`."""
     level, text = DiagnosticStatus.OK, ""
     if counts.unaccounted:
         level = DiagnosticStatus.ERROR
         text = f"{counts.unaccounted} rows are lost in the driver: please report it"
+    # Only new losses, so that the level falls again.
     elif counts.lost > before.lost:
         level = DiagnosticStatus.ERROR
         text = f"{counts.lost - before.lost} rows lost by an error: {counts.lost_reason}"
@@ -60,6 +65,7 @@ def _link_status(report: LinkReport) -> DiagnosticStatus:
     """Return the status of one link. Its level is that of the worst state since the last report."""
     levels = [LEVELS[state] for state in (report.state, *report.past_states)]
     if report.notes:
+        # A note, such as damaged frames, is worth a look although rows come.
         levels.append(DiagnosticStatus.WARN)
     uid = "" if report.hub_uid is None else f"{report.hub_uid:#x}"
     text = "; ".join(report.notes) or report.state.value

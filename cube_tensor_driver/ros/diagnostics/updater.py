@@ -74,7 +74,11 @@ class Diagnostics(Updater):  # type: ignore[misc]
 
 
 def make_status(
-    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]
+    name: str,
+    hardware_id: str,
+    level: bytes,
+    text: str,
+    values: Mapping[str, Any],
 ) -> DiagnosticStatus:
     """Return the status of one part of a node."""
     pairs = [_make_pair(name, key, str(value)) for key, value in values.items()]

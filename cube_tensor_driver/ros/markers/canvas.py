@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Quaternion, Vector3
+from geometry_msgs.msg import Point, Quaternion, Vector3
 from visualization_msgs.msg import Marker
 
 from ...core.arrays import Array, Index
@@ -23,7 +23,13 @@ from .legend import (
     four_characters,
     legend_markers,
 )
-from .serialised import Colour, SerialisedMarkers, allocate, make_marker, make_text
+from .serialised import (
+    Colour,
+    SerialisedMarkers,
+    allocate,
+    make_marker,
+    make_text,
+)
 
 PLATE_SIDE = 2.04
 """Side of the plate that has the colour of a cube, in half sides of the cube.
@@ -84,7 +90,14 @@ class Canvas:
         legend: The legend beside the skin.
     """
 
-    def __init__(self, frame_id: str, poses: CubePoses, *, crosses: bool, signed: bool) -> None:
+    def __init__(
+        self,
+        frame_id: str,
+        poses: CubePoses,
+        *,
+        crosses: bool,
+        signed: bool,
+    ) -> None:
         """Make the markers.
 
         Args:
@@ -107,12 +120,15 @@ class Canvas:
         self._markers = SerialisedMarkers(markers)
         heights = PLATE_HEIGHT * poses.half_side[:, None]
         plates = poses.position + heights * poses.rotation[:, :, 2]
-        for group, (members, rotation) in enumerate(zip(self._groups, rotations, strict=True)):
+        oriented = enumerate(zip(self._groups, rotations, strict=True))
+        for group, (members, rotation) in oriented:
             # The points of a marker are in the frame of its pose.
             self._markers[f"cubes {group}"].points[:] = plates[members] @ rotation
+        # The opacity stays, only red, green and blue are drawn later.
         for marker in markers:
             self._markers[marker.ns].colours[:, 3] = 1.0
         self.legend = Legend(self._markers, place)
+        # Until there is a contact, its placeholder text must not be seen.
         self.draw_contacts(None)
 
     @property
@@ -128,20 +144,34 @@ class Canvas:
     def draw_arrows(self, values: Array, ranges: Ranges) -> None:
         """Draw traction and gradient of each cube, from its stress and gradients (cubes, 15)."""
         normal = self._poses.rotation[:, :, 2]
-        metres_per_pa = TRACTION_LENGTH * self._pitch / ranges.traction
-        traction = scene.traction_arrows(self._poses, values, metres_per_pa)
-        metres_per_gradient = GRADIENT_LENGTH * self._pitch / ranges.gradient
-        gradient = scene.gradient_arrows(self._poses, values, metres_per_gradient)
-        for name, arrows in (("traction", traction), ("gradient", gradient)):
-            self._markers[name].points[:] = scene.heads(arrows, normal).reshape(-1, 3)
+        longest_traction = TRACTION_LENGTH * self._pitch
+        longest_gradient = GRADIENT_LENGTH * self._pitch
+        arrows = {
+            "traction": scene.traction_arrows(
+                self._poses,
+                values,
+                longest_traction / ranges.traction,
+            ),
+            "gradient": scene.gradient_arrows(
+                self._poses,
+                values,
+                longest_gradient / ranges.gradient,
+            ),
+        }
+        for name, tails_and_tips in arrows.items():
+            lines = scene.heads(tails_and_tips, normal)
+            self._markers[name].points[:] = lines.reshape(-1, 3)
 
     def draw_faults(self, health: Index) -> None:
         """Draw crosses over cubes that are not fine, if the health has changed."""
-        if self._health is not None and np.array_equal(health, self._health):
+        is_unchanged = self._health is not None and np.array_equal(health, self._health)
+        if is_unchanged:
             return
         self._health = health
         faults = self._markers["faults"]
-        faults.points[:] = scene.fault_crosses(self._poses, health).reshape(-1, 3)
+        crosses = scene.fault_crosses(self._poses, health)
+        faults.points[:] = crosses.reshape(-1, 3)
+        # Each of the four ends of a cross has the colour.
         faults.colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
 
     def draw_crosses(self, values: Array, longest_pa: float) -> None:
@@ -169,14 +199,16 @@ class Canvas:
             label.colour[3] = HIDDEN_OPACITY
             if contacts is None or number >= count:
                 continue
-            centre, n = contacts.position[number], contacts.normal[number]
-            position, normal = np.array([centre.x, centre.y, centre.z]), np.array([n.x, n.y, n.z])
-            radius = float(np.sqrt(max(0.0, contacts.area[number]) / np.pi))
+            position = _to_array(contacts.position[number])
+            normal = _to_array(contacts.normal[number])
+            # The ring has the area of the contact, whatever its shape.
+            area = max(0.0, contacts.area[number])
+            radius = float(np.sqrt(area / np.pi))
             rings[number] = _make_ring(position, normal, radius)
             label.colour[3] = 1.0
             label.position[:] = position + max(radius, MIN_TEXT_DISTANCE_M) * normal
-            text = _force_text(contacts.normal_force[number], contacts.shear_force[number])
-            self._markers.write_text(f"contact {number}", text)
+            normal_n, shear_n = contacts.normal_force[number], contacts.shear_force[number]
+            self._markers.write_text(f"contact {number}", _force_text(normal_n, shear_n))
         self._markers["contacts"].points[:] = rings.reshape(-1, 3)
 
     def _make_cubes(self, frame_id: str, rotations: Array) -> list[Marker]:
@@ -184,11 +216,22 @@ class Canvas:
         markers = []
         for group, (w, x, y, z) in enumerate(quaternions(rotations).tolist()):
             members = self._groups[group]
+            # All boxes of a marker have one size, so the largest cube decides.
             half_side = float(self._poses.half_side[members].max())
-            side, thickness = PLATE_SIDE * half_side, PLATE_THICKNESS * half_side
+            side = PLATE_SIDE * half_side
+            thickness = PLATE_THICKNESS * half_side
             marker = make_marker(frame_id, f"cubes {group}", Marker.CUBE_LIST)
-            marker.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
-            marker.scale = Vector3(x=side, y=side, z=thickness)
+            marker.pose.orientation = Quaternion(
+                x=x,
+                y=y,
+                z=z,
+                w=w,
+            )
+            marker.scale = Vector3(
+                x=side,
+                y=side,
+                z=thickness,
+            )
             allocate(marker, len(members), with_colours=True)
             markers.append(marker)
         return markers
@@ -212,10 +255,17 @@ class Canvas:
 
 def _group_by_orientation(rotation: Array) -> tuple[list[Index], Array]:
     """Return the cubes of each orientation, and the orientations upside down, (G, 3, 3)."""
+    # Rounded, because equal orientations may differ in their last bits.
     flat = rotation.round(6).reshape(len(rotation), 9)
     unique, group = np.unique(flat, axis=0, return_inverse=True)
-    members = [np.flatnonzero(group.ravel() == number) for number in range(len(unique))]
-    return members, unique.reshape(-1, 3, 3) * UPSIDE_DOWN
+    group = group.ravel()  # numpy 2.0 alone gives it a second axis
+    members = [np.flatnonzero(group == number) for number in range(len(unique))]
+    orientations = unique.reshape(-1, 3, 3)
+    return members, orientations * UPSIDE_DOWN
+
+
+def _to_array(vector: Point | Vector3) -> Array:
+    return np.array([vector.x, vector.y, vector.z])
 
 
 def _make_contacts(frame_id: str, pitch: float) -> list[Marker]:

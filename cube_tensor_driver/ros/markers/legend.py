@@ -12,7 +12,13 @@ from ...core.arrays import Array, Index
 from ...core.latest_stress import FINE, HEALTH_WORDS
 from ...core.poses import CubePoses
 from ...views import scene
-from .serialised import Colour, SerialisedMarkers, allocate, make_marker, make_text
+from .serialised import (
+    Colour,
+    SerialisedMarkers,
+    allocate,
+    make_marker,
+    make_text,
+)
 
 UPSIDE_DOWN = np.array([-1.0, 1.0, -1.0])
 """Half a turn about y, as factors of the axes of a frame.
@@ -112,6 +118,7 @@ class LegendPlace(NamedTuple):
         """Return a place beside the cubes with these poses."""
         low, high = poses.position.min(axis=0), poses.position.max(axis=0)
         pitch = poses.pitch
+        # A legend as narrow as a single cube could not be read.
         width = max(high[0] - low[0], 4 * pitch)
         centre_x = float(low[0] + high[0]) / 2
         return cls(pitch, float(width), centre_x, low[1] - 1.1 * pitch, low[2])
@@ -137,13 +144,20 @@ class Legend:
         bar = np.array([place.point(across, 0) for across in centres])
         bar[:, 1] += 0.15 * place.pitch
         markers["legend bar"].points[:] = bar * UPSIDE_DOWN
+        upwards = np.array([[0.0, 0.0, 1.0]])
         for number, scale in enumerate(SCALES):
             tail = place.point(0, FIRST_SCALE_LINE + SCALE_LINES * number)
             tip = tail + np.array([scale.length * place.pitch, 0, 0])
-            lines = scene.heads(np.stack([tail, tip])[None], np.array([[0.0, 0.0, 1.0]]))
+            arrow = np.stack([tail, tip])
+            lines = scene.heads(arrow[np.newaxis], upwards)
             markers[f"{scale.name} arrow"].points[:] = lines.reshape(-1, 3)
 
-    def draw(self, quantity: scene.Quantity, top: float, health: Index) -> None:
+    def draw(
+        self,
+        quantity: scene.Quantity,
+        top: float,
+        health: Index,
+    ) -> None:
         """Draw what colours mean and how the cubes are.
 
         Args:
@@ -156,11 +170,14 @@ class Legend:
         self._markers["legend bar"].colours[:, :3] = scene.colours(quantity, values, top)
         for number, position in enumerate(NUMBER_POSITIONS):
             value = (low + position * (top - low)) / quantity.size
+            # Always one character where the quantity has signs, so that the text keeps its length.
             sign = "-" if value < 0 else "+" if quantity.signed else ""
-            self._markers.write_text(f"legend number {number}", sign + four_characters(abs(value)))
-        width = TITLE_BYTES - 2
-        title = _title(quantity, top, health).encode()[:width].decode()
-        self._markers.write_text("legend", f".{title.center(width)}.")
+            text = sign + four_characters(abs(value))
+            self._markers.write_text(f"legend number {number}", text)
+
+        title = _title(quantity, top, health)
+        width = TITLE_BYTES - 2  # without the dots at both ends
+        self._markers.write_text("legend", f".{title[:width].center(width)}.")
 
     def draw_scale(self, traction_pa: float, gradient_pa_per_m: float) -> None:
         """Draw what the longest arrows stand for."""
@@ -168,17 +185,26 @@ class Legend:
             self._markers.write_text(f"{scale.name} scale", _scale_text(scale, value))
 
 
-def legend_markers(frame_id: str, place: LegendPlace, signed: bool) -> list[Marker]:
+def legend_markers(
+    frame_id: str,
+    place: LegendPlace,
+    signed: bool,
+) -> list[Marker]:
     """Return the markers of a legend; the numbers of the bar have signs if `signed`."""
     height = TEXT_HEIGHT * place.width
     bar = make_marker(frame_id, "legend bar", Marker.CUBE_LIST)
+    # Half a turn about y, see `UPSIDE_DOWN`.
     bar.pose.orientation.y, bar.pose.orientation.w = 1.0, 0.0
-    bar.scale = Vector3(x=place.width / BAR_BOXES, y=0.3 * place.pitch, z=0.05 * place.pitch)
+    bar.scale = Vector3(
+        x=place.width / BAR_BOXES,
+        y=0.3 * place.pitch,
+        z=0.05 * place.pitch,
+    )
     allocate(bar, BAR_BOXES, with_colours=True)
     markers = [bar]
 
     for number, across in enumerate(NUMBER_POSITIONS):
-        placeholder = "+" * signed + four_characters(0.0)
+        placeholder = ("+" if signed else "") + four_characters(0.0)
         text = make_text(frame_id, f"legend number {number}", height, placeholder)
         markers.append(_move(text, place.point(across, NUMBERS_LINE)))
 
@@ -203,6 +229,7 @@ def four_characters(value: float) -> str:
 
     Examples are 0.25, 18.7 and "250.". NaN and numbers that are too large become "----".
     """
+    # NaN compares false. From 9999.5 on a number would be rounded to five digits.
     if not value < 9999.5:
         return "----"
     texts = [f"{value:.{digits}f}" for digits in (2, 1, 0)]
@@ -213,7 +240,8 @@ def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
     """Return what colours mean up to the top of their range, in SI units, and how the cubes are."""
     high = top / quantity.size
     low = -high if quantity.signed else 0
-    label, unit = quantity.label.translate(PLAIN_LETTERS), quantity.unit.replace("σ", "sigma")
+    label = quantity.label.translate(PLAIN_LETTERS)
+    unit = quantity.unit.replace("σ", "sigma")
     states = []
     for state, word in enumerate(HEALTH_WORDS):
         count = np.count_nonzero(health == state)
@@ -229,5 +257,9 @@ def _scale_text(scale: ArrowScale, value: float) -> str:
 
 def _move(marker: Marker, position: Array) -> Marker:
     x, y, z = position.tolist()
-    marker.pose.position = Point(x=x, y=y, z=z)
+    marker.pose.position = Point(
+        x=x,
+        y=y,
+        z=z,
+    )
     return marker

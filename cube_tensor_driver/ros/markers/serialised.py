@@ -52,18 +52,38 @@ Colour = tuple[float, float, float]
 WHITE: Colour = (0.95, 0.95, 0.95)
 
 
-def make_marker(frame_id: str, name: str, shape: int, colour: Colour = WHITE) -> Marker:
+def make_marker(
+    frame_id: str,
+    name: str,
+    shape: int,
+    colour: Colour = WHITE,
+) -> Marker:
     """Return a marker without points. Its namespace is its name."""
-    marker = Marker(ns=name, type=shape, action=Marker.ADD, frame_locked=True)
+    marker = Marker(
+        ns=name,
+        type=shape,
+        action=Marker.ADD,
+        frame_locked=True,
+    )
     marker.header.frame_id = frame_id
     marker.lifetime.sec = LIFETIME_S
     marker.pose.orientation.w = 1.0
     red, green, blue = colour
-    marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+    marker.color = ColorRGBA(
+        r=red,
+        g=green,
+        b=blue,
+        a=1.0,
+    )
     return marker
 
 
-def make_text(frame_id: str, name: str, height: float, text: str) -> Marker:
+def make_text(
+    frame_id: str,
+    name: str,
+    height: float,
+    text: str,
+) -> Marker:
     """Return a text that faces the viewer, centred on its position.
 
     Args:
@@ -149,7 +169,12 @@ class SerialisedMarkers:
         """Write a text in ASCII that is as long as the one before."""
         self._arrays[namespace].text[:] = np.frombuffer(text.encode(), np.uint8)
 
-    def _view(self, dtype: str, start: int, shape: tuple[int, ...]) -> AnyArray:
+    def _view(
+        self,
+        dtype: str,
+        start: int,
+        shape: tuple[int, ...],
+    ) -> AnyArray:
         view: AnyArray = np.ndarray(shape, dtype, self.data, ENCAPSULATION_BYTES + start)
         return view
 

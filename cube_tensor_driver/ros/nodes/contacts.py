@@ -14,7 +14,12 @@ from ...core.errors import CubeError
 from ...messages.contacts import contacts_message, traction_message
 from ...messages.skin_info import cube_calibrations
 from ...msg import SkinContacts
-from ...touch.contact_finder import INVERSE, ContactFinder, ContactSettings, contact_finder
+from ...touch.contact_finder import (
+    INVERSE,
+    ContactFinder,
+    ContactSettings,
+    contact_finder,
+)
 from ..messages import make_message
 from ..node import run
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
@@ -42,6 +47,7 @@ class Contacts(SkinSubscriberNode):
         return self._has_traction_listeners() or super().has_listeners(publisher)
 
     def prepare(self, skin: FollowedSkin) -> None:
+        # Each setting is a parameter of the same name.
         names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
         calibrations = cube_calibrations(skin.info)
@@ -53,11 +59,13 @@ class Contacts(SkinSubscriberNode):
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
         finder = self._take_finder()
+        # The tracker follows contacts in time, so the same scan must not go in twice.
         if finder is None or skin.messages == self._processed_messages:
             return None
         self._processed_messages = skin.messages
         values, frame_id = skin.newest.usable_values(health), skin.info.header.frame_id
         contacts = finder.update(values, skin.newest.left_out)
+        # Only listeners are worth the time that the cloud takes.
         if self._traction is not None and self._has_traction_listeners():
             cloud = finder.cloud(values)
             if cloud is not None:

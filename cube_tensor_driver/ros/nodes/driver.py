@@ -20,7 +20,12 @@ from ..compat import on_matched
 from ..diagnostics.links import LinkDiagnostics
 from ..diagnostics.updater import Diagnostics
 from ..messages import info_message
-from ..node import MAX_BUFFERS, CubeNode, NodeClock, run
+from ..node import (
+    MAX_BUFFERS,
+    CubeNode,
+    NodeClock,
+    run,
+)
 from ..qos import LATCHED, scans_per_message
 
 COUNT_PERIOD_S = 0.2
@@ -43,6 +48,7 @@ class Driver(CubeNode):
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
         self._node_clock = NodeClock(self)
+        # None while the node is not configured.
         self._links: LiveLinks | None = None
         self._diagnostics = Diagnostics(self, self._statuses, self._count_errors)
 
@@ -66,6 +72,7 @@ class Driver(CubeNode):
             cube_addresses(skin),
             self._publish,
             rate=rate_hz,
+            # Several scans in a message save time per message where latency does not matter.
             scans_per_call=scans_per_message(self.value("publish_period"), rate_hz),
             make_rows=self._frequencies.make_rows,
             clock_ns=self._node_clock.now_ns,
@@ -105,6 +112,7 @@ class Driver(CubeNode):
 
     def _count_errors(self) -> int:
         """Return the number of errors of callbacks, in the main thread and in the reader's."""
+        # Errors there do not pass through `callback_errors`, which serves the main thread.
         in_reader = 0 if self._links is None else self._links.callback_errors
         return self.callback_errors.count + in_reader
 
@@ -118,6 +126,7 @@ class Driver(CubeNode):
         if self._links is None:
             return []
         self._node_clock.update()
+        # Hubs report uids some time after the start; the reconstruction restores tares by them.
         if self._links.cube_uids != self._published_uids:
             self._published_uids = self._links.cube_uids
             self._publish_info()
@@ -130,12 +139,19 @@ class FrequenciesPublisher:
     One thread makes and publishes the rows.
     """
 
-    def __init__(self, node: CubeNode, frame_id: str, profile: QoSProfile, always: bool) -> None:
+    def __init__(
+        self,
+        node: CubeNode,
+        frame_id: str,
+        profile: QoSProfile,
+        always: bool,
+    ) -> None:
         """Announce the topic; `always` publishes it whether or not anybody subscribes."""
         self._always = always
         self._has_subscribers = False
         self._frame_id = frame_id.encode() + b"\0"
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(self._make_buffer)
+        # The message that holds the rows which the reader is filling.
         self._next: MessageBuffer[FrequencyRows] | None = None
 
         # DDS tells how many subscribe; asking at each message would cost more.

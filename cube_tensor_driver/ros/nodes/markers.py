@@ -36,7 +36,12 @@ class Markers(SkinSubscriberNode):
     def prepare(self, skin: FollowedSkin) -> None:
         frame_id = skin.info.header.frame_id
         signed = self._quantity.signed
-        self._canvas = Canvas(frame_id, skin.poses, crosses=self.value("crosses"), signed=signed)
+        self._canvas = Canvas(
+            frame_id,
+            skin.poses,
+            crosses=self.value("crosses"),
+            signed=signed,
+        )
         self._ranges = Ranges()
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> bytes:
@@ -59,15 +64,22 @@ class Markers(SkinSubscriberNode):
         if contacts is None:
             return None
         age_ns = skin.stamp_ns - to_ns(contacts.header.stamp)
+        # A node `contacts` that has ended leaves its last message.
         return contacts if age_ns <= MAX_CONTACTS_AGE_NS else None
 
     def _on_contacts(self, message: SkinContacts) -> None:
         self._contacts = message
 
-    def _follow_ranges(self, values: Array, residual: Array, shown: Array) -> Ranges:
+    def _follow_ranges(
+        self,
+        values: Array,
+        residual: Array,
+        shown: Array,
+    ) -> Ranges:
         """Return ranges that follow the values, from the last ones on."""
         shear, gradient = scene.QUANTITIES["shear"], scene.QUANTITIES["gradient"]
         last, fixed = self._ranges, float(self.value("range"))
+        # The components that act on the upper face of a cube.
         traction = values[:, 2:5]  # zz, yz, zx
         return Ranges(
             colours=fixed or scene.automatic(self._quantity, shown, last.colours),

@@ -110,7 +110,12 @@ class Reconstruction(CubeNode):
             return
         self._process(message.rows, int(message.stamp_ns[0]), message.frame_id)
 
-    def _process(self, rows: FrequencyRows, stamp_ns: int, frame_id: bytes) -> None:
+    def _process(
+        self,
+        rows: FrequencyRows,
+        stamp_ns: int,
+        frame_id: bytes,
+    ) -> None:
         """Publish the stress of the rows of one message, with its stamp and frame."""
         if not self.is_active:
             return
@@ -119,6 +124,7 @@ class Reconstruction(CubeNode):
             with self._lock:
                 recorded = self._recorded
                 health = recorded.health_at(rows, self._reconstructor) if recorded else None
+                # A tare between two steps of this would mix old and new.
                 stress = self._reconstructor.process(rows, health)
                 if self._reconstructor.rest_changes != self._published_rest_changes:
                     self._publish_info()
@@ -134,6 +140,7 @@ class Reconstruction(CubeNode):
 
     def _check_scans(self, rows: FrequencyRows) -> None:
         """Raise MessageError if a message has too many rows of one cube."""
+        # Almost all messages end here: so few rows cannot be too many of one cube.
         if len(rows) <= self._max_scans:
             return
         counts = np.bincount(rows.cube)

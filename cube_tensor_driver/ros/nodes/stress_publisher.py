@@ -73,7 +73,12 @@ class StressPublisher:
         self._forces = ForceCloud(node, skin, profile, side) if with_forces else None
         node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
-    def publish(self, stress: StressRows, stamp_ns: int, frame_id: bytes) -> None:
+    def publish(
+        self,
+        stress: StressRows,
+        stamp_ns: int,
+        frame_id: bytes,
+    ) -> None:
         """Send rows as one message with this stamp and frame, and cubes that have listeners."""
         message = self._buffer(frame_id, len(stress))
         message.fill(stress)
@@ -89,10 +94,17 @@ class ForceCloud:
     It is a point cloud, which other tactile stacks take.
     """
 
-    def __init__(self, node: CubeNode, skin: Skin, profile: QoSProfile, side: float | None) -> None:
+    def __init__(
+        self,
+        node: CubeNode,
+        skin: Skin,
+        profile: QoSProfile,
+        side: float | None,
+    ) -> None:
         self._forces = Forces(skin, side)
-        self._publisher = node.own(node.create_lifecycle_publisher(PointCloud2, "forces", profile))
         self._n_cubes = len(skin.cubes)
+        self._publisher = node.own(node.create_lifecycle_publisher(PointCloud2, "forces", profile))
+        # One message is filled again and again: its fields are many Python objects.
         item = np.dtype("<f4").itemsize
         step = item * len(FORCE_FIELDS)
         self._message = PointCloud2(
@@ -100,7 +112,12 @@ class ForceCloud:
         )
         self._message.header.frame_id = skin.parent_frame
         self._message.fields = [
-            PointField(name=name, offset=item * k, datatype=PointField.FLOAT32, count=1)
+            PointField(
+                name=name,
+                offset=item * k,
+                datatype=PointField.FLOAT32,
+                count=1,
+            )
             for k, name in enumerate(FORCE_FIELDS)
         ]
 
@@ -108,8 +125,11 @@ class ForceCloud:
         """Send the last row of each cube; NaN for cubes without one."""
         if not self._publisher.get_subscription_count():
             return
-        force = self._forces.of_skin(rows.select(rows.cube < self._n_cubes))
+        # Frequencies of another skin may name cubes that this one does not have.
+        known = rows.select(rows.cube < self._n_cubes)
+        force = self._forces.of_skin(known)
         cloud = np.hstack([self._forces.position, force]).astype("<f4")
+        # An array of this type is what rclpy takes without looking at each byte.
         data = array.array("B")
         data.frombytes(cloud.tobytes())
         self._message.data = data
@@ -128,7 +148,8 @@ class CubeTopics:
         self, node: CubeNode, skin: Skin, reconstructor: Reconstructor, side: float | None
     ) -> None:
         self._node, self._skin, self._reconstructor = node, skin, reconstructor
-        self._sides = np.array([side or 2 * cube.calibration.half_side for cube in skin.cubes])
+        own_sides = [2 * cube.calibration.half_side for cube in skin.cubes]
+        self._sides = np.array([side or own_side for own_side in own_sides])
         self._covariances: dict[tuple[int, int], Array] = {}
         # Index of a cube -> its publisher.
         self._tensors: dict[int, Any] = {}
@@ -162,23 +183,31 @@ class CubeTopics:
         if wrenches:
             self._publish_wrenches(rows, wrenches)
         if tensors:
-            for row in np.flatnonzero(np.isin(rows.cube, tensors)).tolist():
-                cube = int(rows.cube[row])
-                covariance = self._covariance(cube, int(rows.left_out[row]))
-                header = self._header(rows, row, cube)
-                self._tensors[cube].publish(tensor_message(header, rows, row, covariance))
+            self._publish_tensors(rows, tensors)
+
+    def _publish_tensors(self, rows: StressRows, listened: list[int]) -> None:
+        is_chosen = np.isin(rows.cube, listened)
+        for row in np.flatnonzero(is_chosen).tolist():
+            cube = int(rows.cube[row])
+            left_out = int(rows.left_out[row])
+            covariance = self._covariance(cube, left_out)
+            header = self._header(rows, row, cube)
+            message = tensor_message(header, rows, row, covariance)
+            self._tensors[cube].publish(message)
 
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
+        # The wrench of an invalid row would be 0, which tools take for a measurement.
         is_chosen = np.isin(rows.cube, listened) & (rows.status & INVALID == 0)
         chosen = np.flatnonzero(is_chosen)
         cubes = rows.cube[chosen].tolist()
-        forces, torques = contact_wrench(
-            rows.stress[chosen], rows.gradient[chosen], self._sides[cubes][:, None]
-        )
+        stress, gradient = rows.stress[chosen], rows.gradient[chosen]
+        sides = self._sides[cubes][:, None]
+        forces, torques = contact_wrench(stress, gradient, sides)
         each = zip(chosen.tolist(), cubes, forces, torques, strict=True)
         for row, cube, force, torque in each:
             header = self._header(rows, row, cube)
-            self._wrenches[cube].publish(wrench_message(header, force, torque))
+            message = wrench_message(header, force, torque)
+            self._wrenches[cube].publish(message)
 
     def _announce(self, topics: set[str]) -> None:
         for topic in sorted(topics):
@@ -188,11 +217,13 @@ class CubeTopics:
 
     def _header(self, rows: StressRows, row: int, cube: int) -> Header:
         stamp = to_time(int(rows.stamp_ns[row]))
-        return Header(stamp=stamp, frame_id=self._skin.frame(self._skin.cubes[cube]))
+        frame_id = self._skin.frame(self._skin.cubes[cube])
+        return Header(stamp=stamp, frame_id=frame_id)
 
     def _covariance(self, cube: int, left_out: int) -> Array:
         key = cube, left_out
         if key not in self._covariances:
+            # Pads that come and go on a large skin would fill the memory otherwise.
             if len(self._covariances) >= MAX_COVARIANCES:
                 self._covariances.clear()
             self._covariances[key] = self._reconstructor.covariance(cube, left_out)

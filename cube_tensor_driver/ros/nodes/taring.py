@@ -79,8 +79,10 @@ class Taring:
 
     def on_info(self, message: SkinInfo) -> None:
         """Take over from the driver's info the uids that the skin file does not name."""
+        # The driver of another skin may be in the same namespace by mistake.
         if message.name != self._skin.name or len(message.cubes) != len(self._skin.cubes):
             return
+        # Reading files takes time, so the lock is taken only afterwards.
         uids_before = dict(self.uids)
         reported = {n: cube.uid for n, cube in enumerate(message.cubes) if cube.uid}
         restored = self._learn_uids(reported)
@@ -94,8 +96,11 @@ class Taring:
         """Return how many cubes are tared and since when, for diagnostics."""
         if not self.created:
             return {"cubes tared": "0"}
-        oldest = (datetime.now(timezone.utc) - min(self.created.values())).total_seconds()
-        return {"cubes tared": str(len(self.created)), "oldest tare s": f"{oldest:.0f}"}
+        oldest = datetime.now(timezone.utc) - min(self.created.values())
+        return {
+            "cubes tared": str(len(self.created)),
+            "oldest tare s": f"{oldest.total_seconds():.0f}",
+        }
 
     def _learn_uids(self, uids: Mapping[int, int]) -> Array | None:
         """Take over uids, and return the rest frequencies if that changes them.
@@ -108,41 +113,64 @@ class Taring:
         for number, uid in uids.items():
             if self.uids.get(number) == uid:
                 continue
+            # Another uid than before means that somebody has exchanged the cube.
             if number in self.uids:
                 self._forget_tare(number, rest)
             self.uids[number] = uid
+            # What was asked for in this run is newer than the file of an earlier one.
             if number in self._pending:
-                self._keep_pending(number, uid, rest)
+                self._keep_pending(number, rest)
             else:
                 self._restore_tare(number, uid, rest)
         return None if np.array_equal(before, rest, equal_nan=True) else rest
 
     def _restore_tare(self, number: int, uid: int, rest: Array) -> None:
         """Read the tare of one cube into its row of the rest frequencies."""
-        cube, log = self._skin.cubes[number], self._node.get_logger()
+        if self._folder is None:
+            return
+        cube = self._skin.cubes[number]
+        log = self._node.get_logger()
         try:
-            stored = read_tare(self._folder, uid, cube.calibration) if self._folder else None
+            stored = read_tare(self._folder, uid, cube.calibration)
         except ConfigError as error:
             log.warning(f"cube {cube.name}: tare not restored: {error}")
             return
         if stored is not None:
-            rest[number, : cube.calibration.layout.n_pads] = stored.rest_frequency
+            n_pads = cube.calibration.layout.n_pads
+            rest[number, :n_pads] = stored.rest_frequency
             self.created[number] = stored.created
             log.info(f"cube {cube.name}: tare of {stored.created} restored")
 
-    def _keep_pending(self, number: int, uid: int, rest: Array) -> None:
-        """Write or remove the file of a cube that was tared or cleared before its uid was known."""
-        created, cube = self._pending.pop(number), self._skin.cubes[number]
+    def _forget_tare(self, number: int, rest: Array) -> None:
+        """Give a cube that was exchanged the rest frequencies of its calibration."""
+        calibration = self._skin.cubes[number].calibration
+        rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
+        self.created.pop(number, None)
+
+    def _keep_pending(self, number: int, rest: Array) -> None:
+        """Keep what was decided about a cube before its uid was known."""
+        created = self._pending.pop(number)
+        try:
+            self._update_file(number, rest, created)
+        except ConfigError as error:
+            name = self._skin.names[number]
+            self._node.get_logger().warning(f"cube {name}: tare not kept: {error}")
+
+    def _update_file(self, number: int, rest: Array, created: datetime | None) -> None:
+        """Write the tare of a cube whose uid is known, or remove it if `created` is None.
+
+        Raises:
+            ConfigError: The file cannot be written or removed.
+        """
         if self._folder is None:
             return
-        try:
-            if created is None:
-                remove_tare(self._folder, uid)
-            else:
-                rest_of_cube = rest[number, : cube.calibration.layout.n_pads]
-                write_tare(self._folder, uid, cube.calibration, rest_of_cube, created)
-        except ConfigError as error:
-            self._node.get_logger().warning(f"cube {cube.name}: tare not kept: {error}")
+        uid = self.uids[number]
+        if created is None:
+            remove_tare(self._folder, uid)
+            return
+        calibration = self._skin.cubes[number].calibration
+        rest_of_cube = rest[number, : calibration.layout.n_pads]
+        write_tare(self._folder, uid, calibration, rest_of_cube, created)
 
     def _on_tare(self, request: Tare.Request, response: Tare.Response) -> Tare.Response:
         try:
@@ -164,12 +192,15 @@ class Taring:
         now_ns = self._node.get_clock().now().nanoseconds
         duration_s = duration_s or float(self._node.value("tare_duration"))
         with self._lock:
-            if now_ns - self._reconstructor.health.newest_ns > 1e9 * MAX_DATA_AGE_S:
+            # Data of before the links were lost would be tared without a complaint.
+            age_ns = now_ns - self._reconstructor.health.newest_ns
+            if age_ns > 1e9 * MAX_DATA_AGE_S:
                 raise TareError("no data now: see the diagnostics of the links")
             before = self._reconstructor.rest_frequency
             rest = self._reconstructor.tare(cubes, duration_s)
             self._on_change()
-        moved_ppm = 1e6 * np.nanmax(np.abs(rest / before - 1)[cubes])
+        moved = np.abs(rest / before - 1)[cubes]
+        moved_ppm = 1e6 * np.nanmax(moved)  # NaN stands for pads that a cube does not have
         kept = self._keep_tares(cubes, rest)
         return f"{len(cubes)} cubes, rest frequencies moved by up to {moved_ppm:.0f} ppm{kept}"
 
@@ -178,16 +209,27 @@ class Taring:
         with self._lock:
             self._reconstructor.clear_tare()
             self._on_change()
+            rest = self._reconstructor.rest_frequency
         self.created.clear()
-        self._pending = {n: None for n in range(len(self._skin.cubes)) if n not in self.uids}
+        self._pending.clear()
         try:
-            if self._folder is not None:
-                for uid in self.uids.values():
-                    remove_tare(self._folder, uid)
+            for number in range(len(self._skin.cubes)):
+                self._decide(number, rest, None)
         except ConfigError as error:
             response.success, response.message = False, str(error)
         self._node.get_logger().info(f"clear_tare: {response.message}")
         return response
+
+    def _decide(self, number: int, rest: Array, created: datetime | None) -> None:
+        """Keep the tare of a cube, or remove it, now or once its uid is known.
+
+        Raises:
+            ConfigError: The file cannot be written or removed.
+        """
+        if number in self.uids:
+            self._update_file(number, rest, created)
+        else:
+            self._pending[number] = created
 
     def _find_cubes(self, names: list[str]) -> list[int]:
         """Return the indices of cubes by name, or of all cubes if none is named."""
@@ -201,28 +243,18 @@ class Taring:
         return [index[name] for name in names] if names else list(index.values())
 
     def _keep_tares(self, cubes: list[int], rest: Array) -> str:
-        """Write files, and return what the answer should say about it."""
+        """Keep the tares of cubes, and return what the answer should say about it."""
         created = datetime.now(timezone.utc)
         self.created.update(dict.fromkeys(cubes, created))
         if self._folder is None:
             return "; not kept"
-        without_uid = [number for number in cubes if number not in self.uids]
-        self._pending.update(dict.fromkeys(without_uid, created))
-        for number in cubes:
-            if number in without_uid:
-                continue
-            calibration = self._skin.cubes[number].calibration
-            rest_of_cube = rest[number, : calibration.layout.n_pads]
+        # Cubes without a uid come first: an error of the disk does not concern them.
+        for number in sorted(cubes, key=lambda number: number in self.uids):
             try:
-                write_tare(self._folder, self.uids[number], calibration, rest_of_cube, created)
+                self._decide(number, rest, created)
             except ConfigError as error:
                 return f"; in force, but not kept: {error}"
+        without_uid = [self._skin.names[number] for number in cubes if number not in self.uids]
         if without_uid:
-            names = ", ".join(self._skin.names[number] for number in without_uid)
-            return f"; kept when their uid is known: {names}"
+            return f"; kept when their uid is known: {', '.join(without_uid)}"
         return "; kept on disk"
-
-    def _forget_tare(self, number: int, rest: Array) -> None:
-        calibration = self._skin.cubes[number].calibration
-        rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
-        self.created.pop(number, None)
