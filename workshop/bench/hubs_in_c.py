@@ -22,7 +22,13 @@ MAX_CUBES_PER_HUB = 80
 START_TIME_BYTES = 8
 """Length of the head of the hubs' log: the wall clock at device time 0, in ns."""
 
-SAMPLE_RECORD = np.dtype([("hub", "u4"), ("number", "u4"), ("device_us", "u8")])
+SAMPLE_RECORD = np.dtype(
+    [
+        ("hub", "u4"),
+        ("number", "u4"),
+        ("device_us", "u8"),
+    ]
+)
 """One sample in the hubs' log, as `firmware/posix/main.c` writes it."""
 
 
@@ -56,7 +62,12 @@ class HubLoad:
     def arguments(self, ports: Path, rate: float) -> tuple[str, ...]:
         """Return arguments of the program for pseudo-terminals hub0, hub1, … in a folder."""
         period = str(round(1e6 / rate))
-        numbers = ("--hubs", str(self.hubs), "--cubes", str(self.cubes_per_hub))
+        numbers = (
+            "--hubs",
+            str(self.hubs),
+            "--cubes",
+            str(self.cubes_per_hub),
+        )
         return ("--ports", str(ports), *numbers, "--period", period)
 
 

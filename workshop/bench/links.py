@@ -39,7 +39,13 @@ POLL_S = 0.05
 """Time, in seconds, between two looks at a condition."""
 
 
-def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | None = None) -> int:
+def bench_links(
+    *,
+    cubes: int,
+    rate: float,
+    duration: float,
+    json_path: Path | None = None,
+) -> int:
     """Measure the processor time of reading, with hubs in C (`firmware/`) as the load.
 
     The figure `lost` counts rows that the hubs took and that did not become rows here.
@@ -59,7 +65,16 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
         folder = Path(name)
         program = load.build(folder / "firmware")
         path = folder / "skin.yaml"
-        write_yaml(path, grid(nx=cubes, ny=1, pitch=PITCH, links=load.hubs, rate=rate))
+        write_yaml(
+            path,
+            grid(
+                nx=cubes,
+                ny=1,
+                pitch=PITCH,
+                links=load.hubs,
+                rate=rate,
+            ),
+        )
         skin = read_skin(path)
         delivered = 0
 
@@ -80,9 +95,23 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
             try:
                 _wait(lambda: delivered > 0)
                 time.sleep(SETTLE_S)
-                before, lost = (time.monotonic(), _cpu_s(), delivered), _lost(links)
+                before, lost = (
+                    (
+                        time.monotonic(),
+                        _cpu_s(),
+                        delivered,
+                    ),
+                    _lost(links),
+                )
                 time.sleep(duration)
-                after, lost = (time.monotonic(), _cpu_s(), delivered), _lost(links) - lost
+                after, lost = (
+                    (
+                        time.monotonic(),
+                        _cpu_s(),
+                        delivered,
+                    ),
+                    _lost(links) - lost,
+                )
             finally:
                 links.close()
     seconds, cpu_s, rows = (end - begin for begin, end in zip(before, after, strict=True))
@@ -101,7 +130,12 @@ def bench_links(*, cubes: int, rate: float, duration: float, json_path: Path | N
 
 
 @contextmanager
-def _hubs(program: str, folder: Path, load: HubLoad, rate: float) -> Iterator[None]:
+def _hubs(
+    program: str,
+    folder: Path,
+    load: HubLoad,
+    rate: float,
+) -> Iterator[None]:
     """Run hubs on pseudo-terminals in the folder for the length of a block."""
     command = [program, *load.arguments(folder, rate)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)

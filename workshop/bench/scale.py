@@ -37,14 +37,34 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
     for label, key, style, color in CPU_LINES:
         # One percent of a core is 10 ms per second.
         cpu_us = [1e4 * row[key] / row["rate_hz"] for row in rows]
-        left.plot(cubes, cpu_us, style, color=color, mfc="white", ms=5, label=label)
+        left.plot(
+            cubes,
+            cpu_us,
+            style,
+            color=color,
+            mfc="white",
+            ms=5,
+            label=label,
+        )
     for label, key, style in LATENCY_LINES:
         latency_ms = [row[key] for row in rows]
-        right.plot(cubes, latency_ms, style, color="black", mfc="white", ms=5, label=label)
+        right.plot(
+            cubes,
+            latency_ms,
+            style,
+            color="black",
+            mfc="white",
+            ms=5,
+            label=label,
+        )
     left.set(ylabel="CPU per scan / µs", title="cost of one scan of all cubes")
     right.set(ylabel="latency / ms", title="from reading the pads to receiving the tensor")
     for axes in (left, right):
-        axes.set(xscale="log", xlabel="number of cubes", ylim=(0, None))
+        axes.set(
+            xscale="log",
+            xlabel="number of cubes",
+            ylim=(0, None),
+        )
         axes.set_xticks(cubes, [str(count) for count in cubes])
         axes.xaxis.minorticks_off()
         axes.legend()

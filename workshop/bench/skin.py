@@ -107,17 +107,33 @@ class Measurement:
     first_tensor_s: float
 
 
-def bench_echo(*, cubes: int, bench: Bench, json_path: Path | None = None) -> int:
+def bench_echo(
+    *,
+    cubes: int,
+    bench: Bench,
+    json_path: Path | None = None,
+) -> int:
     """Measure the bare floor alone: a source of messages, an echo and a receiver."""
     with _prepared() as progress:
         result = _measure_echo(cubes, bench, progress)
     report(
-        {"cubes": cubes, "rate_hz": bench.rate, "duration_s": bench.duration, **result}, json_path
+        {
+            "cubes": cubes,
+            "rate_hz": bench.rate,
+            "duration_s": bench.duration,
+            **result,
+        },
+        json_path,
     )
     return 0
 
 
-def bench_skin(*, cubes: int, bench: Bench, json_path: Path | None = None) -> int:
+def bench_skin(
+    *,
+    cubes: int,
+    bench: Bench,
+    json_path: Path | None = None,
+) -> int:
     """Measure the whole chain, and the floor before and after it.
 
     The load are hubs in C (`firmware/`), or the simulator where they cannot be built.
@@ -134,12 +150,23 @@ def bench_skin(*, cubes: int, bench: Bench, json_path: Path | None = None) -> in
 
 
 def bench_scale(
-    *, counts: list[int], bench: Bench, figure: Path, json_path: Path | None = None
+    *,
+    counts: list[int],
+    bench: Bench,
+    figure: Path,
+    json_path: Path | None = None,
 ) -> int:
     """Measure the whole chain for several numbers of cubes, and draw a picture."""
     with _prepared() as progress:
         rows = [_measure_both(cubes, bench, progress) for cubes in counts]
-    report({"rate_hz": bench.rate, "duration_s": bench.duration, "skins": rows}, json_path)
+    report(
+        {
+            "rate_hz": bench.rate,
+            "duration_s": bench.duration,
+            "skins": rows,
+        },
+        json_path,
+    )
     save(draw_scale(rows), figure)
     return 0
 
@@ -155,7 +182,11 @@ def _prepared() -> Iterator[Progress]:
         yield progress
 
 
-def _measure_both(cubes: int, bench: Bench, progress: Progress) -> dict[str, Any]:
+def _measure_both(
+    cubes: int,
+    bench: Bench,
+    progress: Progress,
+) -> dict[str, Any]:
     """Measure the echo, the chain and the echo again, because the machine gets warm."""
     cubes = HubLoad.of(cubes).cubes
     before = _measure_echo(cubes, bench, progress)
@@ -174,12 +205,22 @@ def _measure_both(cubes: int, bench: Bench, progress: Progress) -> dict[str, Any
     }
 
 
-def _measure_skin(cubes: int, bench: Bench, progress: Progress) -> dict[str, Any]:
+def _measure_skin(
+    cubes: int,
+    bench: Bench,
+    progress: Progress,
+) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
         path, log = folder / "skin.yaml", folder / "log"
         load = HubLoad.of(cubes)
-        grid_of_cubes = grid(nx=load.cubes, ny=1, pitch=PITCH, links=load.hubs, rate=bench.rate)
+        grid_of_cubes = grid(
+            nx=load.cubes,
+            ny=1,
+            pitch=PITCH,
+            links=load.hubs,
+            rate=bench.rate,
+        )
         write_yaml(path, grid_of_cubes)
         processes = _make_processes(path, log, load, bench, progress)
         arrivals = Arrivals(read_skin(path), one_per_hub=True)
@@ -209,7 +250,11 @@ def _measure_skin(cubes: int, bench: Bench, progress: Progress) -> dict[str, Any
 
 
 def _make_processes(
-    path: Path, log: Path, load: HubLoad, bench: Bench, progress: Progress
+    path: Path,
+    log: Path,
+    load: HubLoad,
+    bench: Bench,
+    progress: Progress,
 ) -> list[Process]:
     """Return the load, followed by the nodes."""
     ports = path.parent / "ports"
@@ -225,13 +270,26 @@ def _make_processes(
         progress.console.print(f"The Python simulator is the load, which takes more: {error}")
         return processes
     ports.mkdir()
-    arguments = (*load.arguments(ports, bench.rate), "--log", str(log))
-    hubs = Process("hubs", "", node=False, program=program, arguments=arguments)
+    arguments = (
+        *load.arguments(ports, bench.rate),
+        "--log",
+        str(log),
+    )
+    hubs = Process(
+        "hubs",
+        "",
+        node=False,
+        program=program,
+        arguments=arguments,
+    )
     return [hubs, *processes[1:]]
 
 
 def _end_load(
-    executable: str, children: Children, log: Path, load: HubLoad
+    executable: str,
+    children: Children,
+    log: Path,
+    load: HubLoad,
 ) -> tuple[SampleTable, int]:
     """End the load and return its samples, and the number of samples it had no room for."""
     if executable == "simulator":
@@ -242,7 +300,11 @@ def _end_load(
     return read_samples(log, load), sum(map(int, dropped))
 
 
-def _measure_echo(cubes: int, bench: Bench, progress: Progress) -> dict[str, float]:
+def _measure_echo(
+    cubes: int,
+    bench: Bench,
+    progress: Progress,
+) -> dict[str, float]:
     parameters: dict[str, Any] = {"cubes": cubes, "rate": float(bench.rate)}
     processes = [
         Process(role, "workshop.bench.echo", parameters=parameters, arguments=(role,))
@@ -359,7 +421,12 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     for values in nodes:
         blocks = np.array_split(values[n_values // 5 :], GROWTH_BLOCKS)
         means = [block.mean() for block in blocks]
-        line, covariance = np.polyfit(block_minutes * np.arange(GROWTH_BLOCKS), means, 1, cov=True)
+        line, covariance = np.polyfit(
+            block_minutes * np.arange(GROWTH_BLOCKS),
+            means,
+            1,
+            cov=True,
+        )
         slopes.append((float(line[0]), float(np.sqrt(covariance[0, 0]))))
     slope, error = max(slopes)
     return result | {

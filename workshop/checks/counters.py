@@ -24,7 +24,11 @@ REPORT_PERIOD_S = 1.5
 shortly before it was killed may not have been reported."""
 
 
-def check_counters(run: Run, frequencies: FrequencyFindings, tensors: TensorFindings) -> Findings:
+def check_counters(
+    run: Run,
+    frequencies: FrequencyFindings,
+    tensors: TensorFindings,
+) -> Findings:
     """Compare the counters with the rows that are missing and the rows that arrived.
 
     Nobody can know the last samples of a hub before it lost its power or restarted, nor the samples
@@ -83,7 +87,11 @@ def _is_between_drivers(run: Run) -> Mask:
         arrived = arrived[samples.time_ns[arrived] > action.begin_ns]
         last_ns = action.begin_ns - round(NS_PER_S * REPORT_PERIOD_S)
         first_ns = np.full(len(samples.log.links), LATEST_NS)
-        np.minimum.at(first_ns, samples.link[arrived], samples.time_ns[arrived])
+        np.minimum.at(
+            first_ns,
+            samples.link[arrived],
+            samples.time_ns[arrived],
+        )
         between |= (samples.time_ns > last_ns) & (samples.time_ns < first_ns[samples.link])
     return between
 

@@ -79,7 +79,12 @@ class ExpectedReadings:
         truth: Components of the load (instants, cubes, 15), in Pa and Pa/m.
     """
 
-    def __init__(self, skin: Skin, samples: Samples, instants: int) -> None:
+    def __init__(
+        self,
+        skin: Skin,
+        samples: Samples,
+        instants: int,
+    ) -> None:
         """instants: number of instants of the load that the hubs repeat."""
         self._samples = samples
         self._millihertz, self.truth = load_tables(skin, instants)
@@ -116,7 +121,12 @@ class ExpectedReadings:
         """Compute the readings of cubes (N,) in samples (N,) without broken pads."""
         samples = self._samples
         link, time_ns, time_us = (
-            column[sample] for column in (samples.link, samples.time_ns, samples.time_us)
+            column[sample]
+            for column in (
+                samples.link,
+                samples.time_ns,
+                samples.time_us,
+            )
         )
         load_us = time_us.copy()
         certain = np.ones((len(cube), self._millihertz.shape[2]), bool)
@@ -140,7 +150,12 @@ class ExpectedReadings:
         millihertz[is_warm] = warmed(millihertz[is_warm], warmer[is_warm, np.newaxis])
         return _SoundReadings(millihertz, warmer, instant, certain)
 
-    def _break(self, fault: HubFault, millihertz: Any, time_us: Index) -> list[int]:
+    def _break(
+        self,
+        fault: HubFault,
+        millihertz: Any,
+        time_us: Index,
+    ) -> list[int]:
         """Return the readings of a broken pad (M,), given those of the sound pad, in mHz."""
         first = 0
         if fault.kind == "stuck":
@@ -151,7 +166,11 @@ class ExpectedReadings:
             first = int(sound.millihertz[0, fault.fault.pad])
         return [
             broken_reading(fault.fault, reading, first, at)
-            for reading, at in zip(millihertz.tolist(), time_us.tolist(), strict=True)
+            for reading, at in zip(
+                millihertz.tolist(),
+                time_us.tolist(),
+                strict=True,
+            )
         ]
 
     def find_held(self, cubes: list[int], span: Span) -> Array | None:
@@ -225,7 +244,14 @@ class _SkinKey:
 
     def __init__(self, skin: Skin) -> None:
         self.skin = skin
-        self._key = tuple((cube.calibration.id, cube.xyz, cube.rpy) for cube in skin.cubes)
+        self._key = tuple(
+            (
+                cube.calibration.id,
+                cube.xyz,
+                cube.rpy,
+            )
+            for cube in skin.cubes
+        )
 
     def __hash__(self) -> int:
         return hash(self._key)

@@ -63,7 +63,11 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     arrived = np.unique(sample[known] * n_cubes + rows.cube[known])
     received = np.bincount(arrived // n_cubes, minlength=len(samples))
     is_checked = record.contains(samples.time_ns)
-    missing = np.where(samples.time_ns >= record.begin_ns, samples.row_count - received, 0)
+    missing = np.where(
+        samples.time_ns >= record.begin_ns,
+        samples.row_count - received,
+        0,
+    )
     lost = np.flatnonzero(is_checked & (missing > 0) & ~_may_be_missing(run))
 
     figures = {

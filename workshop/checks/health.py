@@ -22,7 +22,13 @@ from .record import DRIVER_KILLS, NODE_STARTS, NS_PER_S, Span
 from .run import Findings, Run
 from .samples import HubFault
 
-STATUS_OF_FAULT = {"open": OPEN, "short": SHORT, "stuck": STUCK, "noisy": NOISY, "report": REPORTED}
+STATUS_OF_FAULT = {
+    "open": OPEN,
+    "short": SHORT,
+    "stuck": STUCK,
+    "noisy": NOISY,
+    "report": REPORTED,
+}
 """Status bit that names each fault of a pad."""
 
 PERMITTED_STATUS = NOISY | RANGE | DRIFT
@@ -89,7 +95,10 @@ def check_health(run: Run, sample: Index) -> Findings:
         permitted_status[may_be_flagged] |= np.uint16(bit | PERMITTED_STATUS)
 
         delay_ns = EDGE_NS if fault.kind in IMMEDIATE_FAULTS else DETECTION_NS
-        required = Span(begin_ns=fault.begin_ns + delay_ns, end_ns=fault.end_ns - EDGE_NS)
+        required = Span(
+            begin_ns=fault.begin_ns + delay_ns,
+            end_ns=fault.end_ns - EDGE_NS,
+        )
         must_be_flagged = mine[required.contains(time_ns[mine])]
         if not len(must_be_flagged) or not evidence.suffices(fault):
             continue
@@ -114,7 +123,11 @@ def check_health(run: Run, sample: Index) -> Findings:
     return Findings(figures, examples)
 
 
-def _is_flagged(rows: StressRows, pad: int, bit: int) -> Mask:
+def _is_flagged(
+    rows: StressRows,
+    pad: int,
+    bit: int,
+) -> Mask:
     """Find the rows (N,) that leave the pad out and name its condition."""
     is_left_out = rows.left_out >> np.uint32(pad) & 1 == 1
     is_flagged: Mask = is_left_out & (rows.status & bit != 0)

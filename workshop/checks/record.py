@@ -51,7 +51,10 @@ class Span:
     end_ns: int
 
     def contains(
-        self, time_ns: AnyArray | int, before_s: float = 0.0, after_s: float = 0.0
+        self,
+        time_ns: AnyArray | int,
+        before_s: float = 0.0,
+        after_s: float = 0.0,
     ) -> Mask:
         """Find the times (N,) that lie in the span, or less than a margin before or after it."""
         begin_ns = self.begin_ns - round(NS_PER_S * before_s)
@@ -174,7 +177,11 @@ class Record(Span):
         return [action for action in self.actions if action.kind in kinds]
 
     def is_during(
-        self, kinds: tuple[str, ...], time_ns: Times, before_s: float = 0.0, after_s: float = 0.0
+        self,
+        kinds: tuple[str, ...],
+        time_ns: Times,
+        before_s: float = 0.0,
+        after_s: float = 0.0,
     ) -> Mask:
         """Find the times (N,) within actions of some kinds, or less than a margin away."""
         during = np.zeros(len(time_ns), bool)

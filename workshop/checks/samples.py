@@ -58,7 +58,10 @@ class Samples:
         runs = [run for link in log.links for run in link.runs]
         lengths = np.array([len(run) for run in runs], int)
         self.boot = np.repeat(np.array([run.boot for run in runs], int), lengths)
-        self.period_us = np.repeat(np.array([run.period_us for run in runs], int), lengths)
+        self.period_us = np.repeat(
+            np.array([run.period_us for run in runs], int),
+            lengths,
+        )
 
         damaged = [
             (link, boot, number)
@@ -90,7 +93,12 @@ class Samples:
             if record.fault.kind in kinds
         ]
 
-    def is_near_fault(self, kinds: tuple[str, ...], before_s: float, after_s: float) -> Mask:
+    def is_near_fault(
+        self,
+        kinds: tuple[str, ...],
+        before_s: float,
+        after_s: float,
+    ) -> Mask:
         """Find the samples (S,) whose link had such a fault, or less than a margin away."""
         near = np.zeros(len(self), bool)
         for fault in self.faults(*kinds):
@@ -98,7 +106,11 @@ class Samples:
         return near
 
 
-def _join_keys(link: AnyArray, boot: AnyArray, number: AnyArray) -> AnyArray:
+def _join_keys(
+    link: AnyArray,
+    boot: AnyArray,
+    number: AnyArray,
+) -> AnyArray:
     """Join the columns that identify a sample in one integer each; numbers stay below 2**40."""
     key: AnyArray = (link << 52) | (boot << 40) | number
     return key

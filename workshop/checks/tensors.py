@@ -158,7 +158,12 @@ class _Reference:
         self._limits = np.array([np.sqrt(chi2_limit(n, FALSE_ALARM) / n) for n in degrees])
         self._deviations: dict[tuple[int, int], Array] = {}
 
-    def agrees(self, made: StressRows, measured: FrequencyRows, rest: RestFrequencies) -> Mask:
+    def agrees(
+        self,
+        made: StressRows,
+        measured: FrequencyRows,
+        rest: RestFrequencies,
+    ) -> Mask:
         """Return whether rows (N,) are what the pipeline computes with these rest frequencies."""
         self._pipeline.rest_frequency = rest.values
         wanted = self._pipeline.process(measured, made.left_out)
@@ -166,7 +171,11 @@ class _Reference:
         allowed = MAX_ERROR * self._range + MAX_NOISE_SHARE * self._deviation(made)
         allowed_residual = MAX_RESIDUAL_ERROR + MAX_RELATIVE_RESIDUAL_ERROR * wanted.residual
         agrees = _is_near(made.residual, wanted.residual, allowed_residual)
-        agrees &= _is_near(_components(made), _components(wanted), allowed).all(axis=1)
+        agrees &= _is_near(
+            _components(made),
+            _components(wanted),
+            allowed,
+        ).all(axis=1)
         agrees &= (made.observed == wanted.observed) & (made.left_out == wanted.left_out)
 
         # Rounding decides whether a residual that is close to its limit is above it.
@@ -176,7 +185,12 @@ class _Reference:
         agrees &= (difference == 0) | ((difference == RESIDUAL) & is_at_limit)
         return agrees
 
-    def agrees_with_load(self, made: StressRows, sample: Index, is_untared: Mask) -> Mask:
+    def agrees_with_load(
+        self,
+        made: StressRows,
+        sample: Index,
+        is_untared: Mask,
+    ) -> Mask:
         """Return whether rows (N,) of sound cubes are equal to the load; True for all others."""
         chosen = np.flatnonzero((sample != NO_MATCH) & is_untared & (made.left_out == 0))
         readings = self._expected.of(made.cube[chosen], sample[chosen])
@@ -212,7 +226,11 @@ def _components(rows: StressRows) -> Real:
     return np.concatenate([rows.stress, rows.gradient], axis=1)
 
 
-def _is_near(found: Real, wanted: Real, allowed: Real) -> Mask:
+def _is_near(
+    found: Real,
+    wanted: Real,
+    allowed: Real,
+) -> Mask:
     """Compare with a tolerance; what is not observed (NaN) must be so in both."""
     near: Mask = (np.abs(found - wanted) <= allowed) | (np.isnan(found) & np.isnan(wanted))
     return near

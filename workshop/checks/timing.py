@@ -74,7 +74,10 @@ def count_wrong_periods(run: Run) -> int:
     cuts = samples.faults(*CUT_FAULTS)
     wrong = 0
     for action in record.actions_of("rate"):
-        settled = Span(begin_ns=action.end_ns, end_ns=action.end_ns + round(1e9 * RATE_CHANGE_S))
+        settled = Span(
+            begin_ns=action.end_ns,
+            end_ns=action.end_ns + round(1e9 * RATE_CHANGE_S),
+        )
         if not action.succeeded or any(settled.contains(np.array(disturbances))):
             continue
         wanted_us = round(1e6 / float(action.answer))

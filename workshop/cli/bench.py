@@ -119,9 +119,19 @@ def run(options: argparse.Namespace) -> int:
     from ..bench.skin import Bench, bench_echo, bench_scale, bench_skin
 
     if options.what == "skin":
-        bench = Bench(options.rate, options.duration, options.publish_period, options.composed)
+        bench = Bench(
+            options.rate,
+            options.duration,
+            options.publish_period,
+            options.composed,
+        )
         return bench_skin(cubes=options.cubes, bench=bench, json_path=path)
     bench = Bench(options.rate, options.duration)
     if options.what == "echo":
         return bench_echo(cubes=options.cubes, bench=bench, json_path=path)
-    return bench_scale(counts=options.counts, bench=bench, figure=options.figure, json_path=path)
+    return bench_scale(
+        counts=options.counts,
+        bench=bench,
+        figure=options.figure,
+        json_path=path,
+    )

@@ -23,5 +23,16 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run Sphinx, with warnings as errors."""
-    command = ["sphinx", "-W", "--keep-going", "-q", "docs", str(options.output.resolve())]
-    return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode
+    command = [
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "docs",
+        str(options.output.resolve()),
+    ]
+    return subprocess.run(
+        [sys.executable, "-m", *command],
+        cwd=ROOT,
+        check=False,
+    ).returncode

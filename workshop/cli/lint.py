@@ -9,7 +9,11 @@ import sys
 from cube_tensor_driver.cli import ROOT
 from cube_tensor_driver.cli.parser import Parser
 
-TOOLS = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
+TOOLS = (
+    ["ruff", "check", "."],
+    ["ruff", "format", "--check", "."],
+    ["mypy"],
+)
 
 
 def arguments(parser: Parser) -> None:
@@ -19,7 +23,11 @@ def arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run all tools, also if one of them finds something."""
     codes = [
-        subprocess.run([sys.executable, "-m", *tool], cwd=ROOT, check=False).returncode
+        subprocess.run(
+            [sys.executable, "-m", *tool],
+            cwd=ROOT,
+            check=False,
+        ).returncode
         for tool in TOOLS
     ]
     return max(codes)

@@ -28,4 +28,12 @@ def run(options: argparse.Namespace) -> int:
             workers = 2 * len(os.sched_getaffinity(0))
             words += ["-n", str(workers), "--dist", "loadgroup"]
     os.chdir(ROOT)
-    os.execv(sys.executable, [sys.executable, "-m", "pytest", *words])
+    os.execv(
+        sys.executable,
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            *words,
+        ],
+    )

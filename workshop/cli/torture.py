@@ -38,4 +38,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.mutate is not None:
         return run_mutations(options.mutate, seed=options.seed, json_path=options.json)
-    return run_torture(duration=options.duration, seed=options.seed, json_path=options.json)
+    return run_torture(
+        duration=options.duration,
+        seed=options.seed,
+        json_path=options.json,
+    )

@@ -51,7 +51,13 @@ class Message(NamedTuple):
 class _RawSubscription:
     """Takes the serialised messages of a topic with their numbers."""
 
-    def __init__(self, node: Node, kind: type, topic: str, quality: QoSProfile) -> None:
+    def __init__(
+        self,
+        node: Node,
+        kind: type,
+        topic: str,
+        quality: QoSProfile,
+    ) -> None:
         self._node, self._kind = node, kind
         self._subscription: Any = node.create_subscription(
             kind, topic, lambda _: None, quality, raw=True
@@ -91,7 +97,13 @@ class TopicLog(Generic[AnyRows]):
         count: Number of messages so far.
     """
 
-    def __init__(self, node: Node, topic: Topic[AnyRows], quality: QoSProfile, skin: Skin) -> None:
+    def __init__(
+        self,
+        node: Node,
+        topic: Topic[AnyRows],
+        quality: QoSProfile,
+        skin: Skin,
+    ) -> None:
         self.count = 0
         self._codec: MessageCodec[AnyRows] = topic.codec
         self._frame_id = skin.parent_frame.encode() + b"\0"
@@ -142,7 +154,12 @@ class TopicLog(Generic[AnyRows]):
         if not self._decoded:
             raise MessageError("the driver or the reconstruction published nothing: see their logs")
         sent_ns = np.concatenate(self._sent_ns)
-        return Received(concatenate(self._decoded), sent_ns, tuple(self._gaps), self._unreadable)
+        return Received(
+            concatenate(self._decoded),
+            sent_ns,
+            tuple(self._gaps),
+            self._unreadable,
+        )
 
     def _decode(self) -> None:
         """Decode what waits: neighbours of one shape together."""
@@ -169,7 +186,13 @@ class TopicLog(Generic[AnyRows]):
 class CubeTopicLog:
     """Collects some messages of the topics of one cube."""
 
-    def __init__(self, node: Node, skin: Skin, cube: int, quality: QoSProfile) -> None:
+    def __init__(
+        self,
+        node: Node,
+        skin: Skin,
+        cube: int,
+        quality: QoSProfile,
+    ) -> None:
         self._cube = cube
         self._kinds = {"stress": StressTensorStamped, "wrench": WrenchStamped}
         self._subscriptions = {
@@ -207,7 +230,11 @@ class CubeTopicLog:
 
 def _read_tensor(message: StressTensorStamped) -> Tensor:
     tensor = message.tensor
-    values = [*_read_vector(tensor.normal), *_read_vector(tensor.shear), *tensor.normal_gradient]
+    values = [
+        *_read_vector(tensor.normal),
+        *_read_vector(tensor.shear),
+        *tensor.normal_gradient,
+    ]
     return (
         to_ns(message.header.stamp),
         np.array(values),

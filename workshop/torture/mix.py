@@ -139,13 +139,31 @@ class _Mix:
         random, at = self._random, 0.0
         while (at := at + random.exponential(0.15)) < self._duration:
             kind, hub = str(random.choice(FRAME_FAULTS)), int(random.integers(HUBS))
-            self._add(at, kind=kind, link=f"hub{hub}", count=int(random.integers(1, 6)))
+            self._add(
+                at,
+                kind=kind,
+                link=f"hub{hub}",
+                count=int(random.integers(1, 6)),
+            )
 
     def add_opening(self) -> None:
         for kind, cube in zip(PAD_FAULTS, OPENING_CUBES, strict=True):
             pad = int(self._random.integers(PADS))
-            self._add(0.5, kind=kind, link=f"hub{OPENING_HUB}", cube=cube, pad=pad, seconds=1.8)
-        self._add(1.5, kind="temperature", link="hub1", value=5.0, seconds=1.0)
+            self._add(
+                0.5,
+                kind=kind,
+                link=f"hub{OPENING_HUB}",
+                cube=cube,
+                pad=pad,
+                seconds=1.8,
+            )
+        self._add(
+            1.5,
+            kind="temperature",
+            link="hub1",
+            value=5.0,
+            seconds=1.0,
+        )
         self._add(4.5, kind="temperature", link="hub1", value=0.0)
         rounds = range(1 + int(self._duration))
         self._cuts = [
@@ -187,8 +205,19 @@ class _Mix:
         random, at = self._random, 0.0
         while (at := at + random.uniform(8.0, 25.0)) < self._end - 1:
             link, value = f"hub{random.integers(1, HUBS)}", round(random.uniform(1.0, 10.0), 2)
-            self._add(at, kind="temperature", link=link, value=value, seconds=2.0)
-            self._add(at + 3.0, kind="temperature", link=link, value=0.0)
+            self._add(
+                at,
+                kind="temperature",
+                link=link,
+                value=value,
+                seconds=2.0,
+            )
+            self._add(
+                at + 3.0,
+                kind="temperature",
+                link=link,
+                value=0.0,
+            )
 
 
 def _disturbs_tare(at: float, seconds: float) -> bool:

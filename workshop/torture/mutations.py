@@ -6,33 +6,23 @@ wraps or replaces one function. Most change the rows of a message just before it
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import fields, replace
 from itertools import count
+from pkgutil import resolve_name
+from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from cube_tensor_driver.core.health import health
-from cube_tensor_driver.core.health.diagnosis import Conditions, PadDiagnosis
-from cube_tensor_driver.core.health.health import Health
-from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import NOISY, OPEN, RESIDUAL, SHORT, STUCK
-from cube_tensor_driver.device.chain import LiveLinks
-from cube_tensor_driver.device.links import link
-from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
+from cube_tensor_driver.device.scans.sequence import Arrival
 from cube_tensor_driver.device.wire import decoder
 from cube_tensor_driver.processes.skin_processes import Process
-from cube_tensor_driver.ros import qos
-from cube_tensor_driver.ros.diagnostics.reconstruction import LostMessages
-from cube_tensor_driver.ros.nodes import stress_publisher
-from cube_tensor_driver.ros.nodes.driver import FrequenciesPublisher
-from cube_tensor_driver.ros.nodes.stress_publisher import CubeTopics, StressPublisher
-from cube_tensor_driver.ros.nodes.taring import Taring
 
 Patch = Callable[[], None]
 """Puts a mutation into this process."""
@@ -69,46 +59,65 @@ def mutated(process: Process, name: str) -> Process:
     """Return the process with a mutation, or as it is if the mutation is of another process."""
     if not name or MUTATIONS[name].node != process.executable:
         return process
-    module = "workshop.torture.mutated_node"
-    return Process(process.executable, module, True, process.parameters, (name,))
+    return Process(
+        process.executable,
+        __name__,
+        True,
+        process.parameters,
+        (name,),
+    )
 
 
-def _wrap(owner: Any, name: str, mutate: Callable[..., Any]) -> Patch:
-    """Call mutate(original, self, ...) where owner.name(self, ...) was called."""
+def _replace(
+    place: str,
+    name: str,
+    make: Callable[[Any], Any],
+) -> Patch:
+    """Replace an attribute of a class or module of the driver by one made from it.
+
+    Args:
+        place: Module below `cube_tensor_driver`, and the class in it behind a colon.
+        name: Name of the attribute.
+        make: Function of the attribute that returns its replacement.
+    """
 
     def patch() -> None:
-        original = getattr(owner, name)
-
-        def mutant(*arguments: Any, **options: Any) -> Any:
-            return mutate(original, *arguments, **options)
-
-        setattr(owner, name, mutant)
+        # The place is imported only in the process of the node that is patched.
+        owner = resolve_name(f"cube_tensor_driver.{place}")
+        setattr(owner, name, make(getattr(owner, name)))
 
     return patch
 
 
-def _skip(owner: Any, name: str) -> Patch:
+def _wrap(
+    place: str,
+    name: str,
+    mutate: Callable[..., Any],
+) -> Patch:
+    """Call mutate(original, self, ...) where the function (self, ...) was called."""
+
+    def make(original: Any) -> Any:
+        return lambda *arguments, **options: mutate(original, *arguments, **options)
+
+    return _replace(place, name, make)
+
+
+def _skip(place: str, name: str) -> Patch:
     """Do nothing where a function was called."""
-    return _wrap(owner, name, lambda *_, **__: None)
+    return _wrap(place, name, lambda *_, **__: None)
 
 
-def _change_result(owner: Any, name: str, change: Callable[[Any], Any]) -> Patch:
+def _change_result(
+    place: str,
+    name: str,
+    change: Callable[[Any], Any],
+) -> Patch:
     """Change what a function returns."""
 
     def mutate(original: Any, *arguments: Any, **options: Any) -> Any:
         return change(original(*arguments, **options))
 
-    return _wrap(owner, name, mutate)
-
-
-def _replace_value(owner: Any, name: str, value: Any) -> Patch:
-    """Give a constant or a function of a module another value."""
-
-    def patch() -> None:
-        getattr(owner, name)  # An error here tells that the module was changed.
-        setattr(owner, name, value)
-
-    return patch
+    return _wrap(place, name, mutate)
 
 
 def _change_frequencies(change: Callable[[FrequencyRows], FrequencyRows]) -> Patch:
@@ -123,7 +132,7 @@ def _change_frequencies(change: Callable[[FrequencyRows], FrequencyRows]) -> Pat
                 getattr(rows, field.name)[:] = getattr(changed, field.name)
         original(publisher)
 
-    return _wrap(FrequenciesPublisher, "publish", publish)
+    return _wrap("ros.nodes.driver:FrequenciesPublisher", "publish", publish)
 
 
 def _change_stress(change: Callable[[StressRows], StressRows]) -> Patch:
@@ -132,7 +141,7 @@ def _change_stress(change: Callable[[StressRows], StressRows]) -> Patch:
     def publish(original: Any, publisher: Any, rows: StressRows, *header: Any) -> None:
         original(publisher, change(rows), *header)
 
-    return _wrap(StressPublisher, "publish", publish)
+    return _wrap("ros.nodes.stress_publisher:StressPublisher", "publish", publish)
 
 
 def _columns(**changes: Callable[[Any], Any]) -> Callable[[Rows], Rows]:
@@ -170,7 +179,7 @@ def _stale(name: str) -> Callable[[Rows], Rows]:
     return change
 
 
-def _repeat(owner: Any, times: int) -> Patch:
+def _repeat(place: str, times: int) -> Patch:
     """Publish one of `MESSAGES_PER_CHANGE` messages several times, or not at all."""
     numbers = count(1)
 
@@ -178,7 +187,7 @@ def _repeat(owner: Any, times: int) -> Patch:
         for _ in range(1 if next(numbers) % MESSAGES_PER_CHANGE else times):
             original(*arguments)
 
-    return _wrap(owner, "publish", publish)
+    return _wrap(place, "publish", publish)
 
 
 def _drop_last_row() -> Patch:
@@ -194,7 +203,7 @@ def _drop_last_row() -> Patch:
             publisher._next.fill(part)
         original(publisher)
 
-    return _wrap(FrequenciesPublisher, "publish", publish)
+    return _wrap("ros.nodes.driver:FrequenciesPublisher", "publish", publish)
 
 
 def _swap_cubes(rows: FrequencyRows) -> FrequencyRows:
@@ -213,19 +222,18 @@ def _swap_hubs(cube: Any) -> Any:
 def _treat_as(found: Arrival, instead: Arrival) -> Patch:
     """Treat samples of one kind as another kind."""
     return _change_result(
-        SampleAccount, "sample", lambda arrival: instead if arrival is found else arrival
+        "device.scans.sequence:SampleAccount",
+        "sample",
+        lambda arrival: instead if arrival is found else arrival,
     )
 
 
 def _ignore_checksums() -> None:
-    class Zlib:
-        @staticmethod
-        def crc32(_: bytes) -> int:
-            return decoder._CRC_RESIDUE
-
-    decoder.zlib = Zlib  # type: ignore[assignment, attr-defined]
+    """Let every frame have the right checksum."""
+    checksum = SimpleNamespace(crc32=lambda _: decoder._CRC_RESIDUE)
+    _replace("device.wire.decoder", "zlib", lambda _: checksum)()
     # Only the decoder in Python has a checksum that can be replaced.
-    link.Decoder = decoder.PythonDecoder  # type: ignore[assignment, attr-defined]
+    _replace("device.links.link", "Decoder", lambda _: decoder.PythonDecoder)()
 
 
 def _leave_thread(original: Any, *arguments: Any) -> None:
@@ -239,19 +247,33 @@ def _swap_open_and_short(status: Any) -> Any:
     return swapped | np.where(status & SHORT, OPEN, 0).astype(np.uint16)
 
 
-def _flag_sound_pad(original: Any, health: Any, rows: FrequencyRows) -> tuple[Any, Any]:
+def _flag_sound_pad(
+    original: Any,
+    health: Any,
+    rows: FrequencyRows,
+) -> tuple[Any, Any]:
     left_out, status = original(health, rows)
     flagged = rows.cube == NOISY_CUBE
     return left_out | flagged.astype(np.uint32), status | (flagged * np.uint16(NOISY))
 
 
-def _never_release(original: Any, conditions: Any, found: Any, came: Any) -> None:
+def _never_release(
+    original: Any,
+    conditions: Any,
+    found: Any,
+    came: Any,
+) -> None:
     kept = conditions._recent[0] | found
     original(conditions, found, came)
     conditions._recent[0] |= kept
 
 
-def _use_bad_pads(original: Any, pipeline: Any, rows: FrequencyRows, left_out: Any = None) -> Any:
+def _use_bad_pads(
+    original: Any,
+    pipeline: Any,
+    rows: FrequencyRows,
+    left_out: Any = None,
+) -> Any:
     wrong = original(pipeline, rows, np.zeros(len(rows), np.uint32))
     right = original(pipeline, rows, left_out)
     return replace(right, stress=wrong.stress, gradient=wrong.gradient)
@@ -266,8 +288,8 @@ def _undo_tare(original: Any, reconstructor: Any, *arguments: Any) -> Any:
 
 def _lose_silently() -> None:
     """Make the queues short, and let nobody count what they drop."""
-    _replace_value(qos, "MAX_PAUSE_S", 0.1)()
-    _skip(LostMessages, "note_arrival")()
+    _replace("ros.qos", "MAX_PAUSE_S", lambda _: 0.1)()
+    _skip("ros.diagnostics.reconstruction:LostMessages", "note_arrival")()
 
 
 DRIVER: dict[str, tuple[str, Patch]] = {
@@ -275,8 +297,14 @@ DRIVER: dict[str, tuple[str, Patch]] = {
         "a row is dropped inside a message but counted as published",
         _drop_last_row(),
     ),
-    "lost scan": ("1 of 200 messages is not sent", _repeat(FrequenciesPublisher, 0)),
-    "scan twice": ("1 of 200 messages is sent twice", _repeat(FrequenciesPublisher, 2)),
+    "lost scan": (
+        "1 of 200 messages is not sent",
+        _repeat("ros.nodes.driver:FrequenciesPublisher", 0),
+    ),
+    "scan twice": (
+        "1 of 200 messages is sent twice",
+        _repeat("ros.nodes.driver:FrequenciesPublisher", 2),
+    ),
     "swapped pads": (
         "two pads of each cube are swapped",
         _frequencies(frequency=lambda f: np.hstack([f[:, [1, 0]], f[:, 2:]])),
@@ -337,34 +365,47 @@ DRIVER: dict[str, tuple[str, Patch]] = {
     "losses uncounted": (
         "samples lost on the way are not counted",
         _change_result(
-            SampleAccount, "counters", lambda counters: {**counters, "lost_on_the_way": 0}
+            "device.scans.sequence:SampleAccount",
+            "counters",
+            lambda counters: {**counters, "lost_on_the_way": 0},
         ),
     ),
     "checksum": ("checksums are not checked", _ignore_checksums),
-    "rate ignored": ("a new rate is not requested", _skip(LiveLinks, "set_rate")),
+    "rate ignored": ("a new rate is not requested", _skip("device.chain:LiveLinks", "set_rate")),
     "threads": (
         "each change of a link's state leaves a thread",
-        _wrap(LiveLinks, "_on_state", _leave_thread),
+        _wrap("device.chain:LiveLinks", "_on_state", _leave_thread),
     ),
 }
 """Errors of the driver: description and patch by name."""
 
 RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
-    "lost stress": ("1 of 200 messages of stress is not sent", _repeat(StressPublisher, 0)),
-    "stress twice": ("1 of 200 messages of stress is sent twice", _repeat(StressPublisher, 2)),
+    "lost stress": (
+        "1 of 200 messages of stress is not sent",
+        _repeat("ros.nodes.stress_publisher:StressPublisher", 0),
+    ),
+    "stress twice": (
+        "1 of 200 messages of stress is sent twice",
+        _repeat("ros.nodes.stress_publisher:StressPublisher", 2),
+    ),
     "losses unseen": ("queues hold 0.1 s, and nobody counts what they drop", _lose_silently),
     "blind": (
         "health finds and flags nothing",
-        _change_result(Health, "update", lambda flags: tuple(map(np.zeros_like, flags))),
+        _change_result(
+            "core.health.health:Health", "update", lambda flags: tuple(map(np.zeros_like, flags))
+        ),
     ),
-    "ghosts": ("health flags a sound pad", _wrap(Health, "update", _flag_sound_pad)),
+    "ghosts": (
+        "health flags a sound pad",
+        _wrap("core.health.health:Health", "update", _flag_sound_pad),
+    ),
     "never stuck": (
         "stuck pads are not found",
-        _change_result(PadDiagnosis, "_find_stuck", np.zeros_like),
+        _change_result("core.health.diagnosis:PadDiagnosis", "_find_stuck", np.zeros_like),
     ),
     "never noisy": (
         "noisy pads are not found",
-        _change_result(PadDiagnosis, "_find_noisy", np.zeros_like),
+        _change_result("core.health.diagnosis:PadDiagnosis", "_find_noisy", np.zeros_like),
     ),
     "no stuck bit": (
         "the status does not state that a pad is stuck",
@@ -376,18 +417,21 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
     ),
     "for ever": (
         "a pad is never used again",
-        _wrap(Conditions, "end_window", _never_release),
+        _wrap("core.health.diagnosis:Conditions", "end_window", _never_release),
     ),
     "slow": (
         "windows of statistics last 2 s",
-        _replace_value(health, "WINDOW_NS", 2_000_000_000),
+        _replace("core.health.health", "WINDOW_NS", lambda _: 2_000_000_000),
     ),
     "no mask": ("left_out is 0", _stress(left_out=np.zeros_like)),
     "other mask": (
         "left_out names the next pad",
         _stress(left_out=lambda mask: mask << np.uint32(1)),
     ),
-    "mask unused": ("left-out pads are used", _wrap(Pipeline, "process", _use_bad_pads)),
+    "mask unused": (
+        "left-out pads are used",
+        _wrap("core.pipeline:Pipeline", "process", _use_bad_pads),
+    ),
     "no residual": ("the residual is 0", _stress(residual=np.zeros_like)),
     "residual doubled": ("the residual is doubled", _stress(residual=lambda value: 2 * value)),
     "no residual bit": (
@@ -438,22 +482,38 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
     ),
     "wrong tare": (
         "a tare gives rest frequencies 100 ppm too high",
-        _change_result(Reconstructor, "measure_rest", lambda rest: (1 + 1e-4) * rest),
+        _change_result(
+            "core.reconstructor:Reconstructor", "measure_rest", lambda rest: (1 + 1e-4) * rest
+        ),
     ),
     "tare of others": (
         "a tare takes the frequencies of the next cube",
-        _change_result(Reconstructor, "measure_rest", lambda rest: np.roll(rest, 1, axis=0)),
+        _change_result(
+            "core.reconstructor:Reconstructor",
+            "measure_rest",
+            lambda rest: np.roll(rest, 1, axis=0),
+        ),
     ),
-    "no tare": ("a tare changes nothing", _wrap(Reconstructor, "tare", _undo_tare)),
-    "no clear": ("clearing the tare changes nothing", _skip(Reconstructor, "clear_tare")),
+    "no tare": (
+        "a tare changes nothing",
+        _wrap("core.reconstructor:Reconstructor", "tare", _undo_tare),
+    ),
+    "no clear": (
+        "clearing the tare changes nothing",
+        _skip("core.reconstructor:Reconstructor", "clear_tare"),
+    ),
     "covariance": (
         "the covariance of single cubes is doubled",
-        _change_result(CubeTopics, "_covariance", lambda covariance: 2 * covariance),
+        _change_result(
+            "ros.nodes.stress_publisher:CubeTopics",
+            "_covariance",
+            lambda covariance: 2 * covariance,
+        ),
     ),
     "other cube": (
         "the topic of a cube has the tensor of another one",
         _wrap(
-            stress_publisher,
+            "ros.nodes.stress_publisher",
             "tensor_message",
             lambda original, header, rows, row, *others: original(header, rows, row - 1, *others),
         ),
@@ -464,7 +524,7 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
 RESTARTED: dict[str, tuple[str, Patch]] = {
     "tare not restored": (
         "a tare is not restored at the start",
-        _skip(Taring, "_restore_tare"),
+        _skip("ros.nodes.taring:Taring", "_restore_tare"),
     ),
 }
 """Errors of the reconstruction that show only when it starts again."""
@@ -475,3 +535,14 @@ MUTATIONS: dict[str, Mutation] = {
     **{name: Mutation("reconstruction", *rest, True) for name, rest in RESTARTED.items()},
 }
 """All mutations by name."""
+
+
+def main() -> None:
+    """Run a node with a mutation: `python -m workshop.torture.mutations NAME --ros-args …`."""
+    mutation = MUTATIONS[sys.argv.pop(1)]
+    mutation.patch()
+    resolve_name(f"cube_tensor_driver.ros.nodes.{mutation.node}").main()
+
+
+if __name__ == "__main__":
+    main()

@@ -72,7 +72,11 @@ class Played:
 
 
 def play(
-    duration: float, seed: int, folder: Path, interrupted: Event, mutation: str = ""
+    duration: float,
+    seed: int,
+    folder: Path,
+    interrupted: Event,
+    mutation: str = "",
 ) -> Played:
     """Torture a skin.
 
@@ -104,7 +108,10 @@ def play(
             )
             actions.start_driver(ports / FAULT_PIPE)
             began_s, begin_ns = time.monotonic(), time.time_ns()
-            observer.spin(MAX_START_S, lambda: stress.count_cubes() == len(skin.cubes))
+            observer.spin(
+                MAX_START_S,
+                lambda: stress.count_cubes() == len(skin.cubes),
+            )
             if not stress.count:
                 logs = "\n".join(children.log(name)[-500:] for name in NODES)
                 raise CubeError(f"no tensor arrived within {MAX_START_S:g} s:\n{logs}")
@@ -156,12 +163,20 @@ def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
 
 
 def _make_processes(
-    skin_path: Path, ports: Path, log_path: Path, mutation: str
+    skin_path: Path,
+    ports: Path,
+    log_path: Path,
+    mutation: str,
 ) -> dict[str, Process]:
     """Return the processes by name; the node `markers` is the other subscriber of stress."""
     hubs = SimulatedHubs(ports, sample_log=log_path, instants=INSTANTS)
     processes = {}
-    for process in skin_processes(skin_path, rate=RATE, markers=True, simulated=hubs):
+    for process in skin_processes(
+        skin_path,
+        rate=RATE,
+        markers=True,
+        simulated=hubs,
+    ):
         if process.executable == "driver":
             process.parameters.update({"autostart": False, "port_directory": ""})
         if process.executable == "reconstruction":
@@ -178,7 +193,14 @@ def _write_skin(folder: Path, ports: Path) -> Path:
     The last hub is behind a TCP bridge and has the same faults there.
     """
     rows = HUBS * CUBES_PER_HUB // CUBES_PER_ROW
-    data = grid(nx=CUBES_PER_ROW, ny=rows, pitch=PITCH, links=HUBS, rate=RATE, port="{}")
+    data = grid(
+        nx=CUBES_PER_ROW,
+        ny=rows,
+        pitch=PITCH,
+        links=HUBS,
+        rate=RATE,
+        port="{}",
+    )
     for number, link in enumerate(data["links"]):
         link["port"], link["hub_uid"] = str(ports / "*"), number + 1
     with socket.create_server(("127.0.0.1", 0)) as free:

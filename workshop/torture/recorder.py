@@ -50,7 +50,12 @@ class Recorder:
         stress: Log of the topic `stress`.
     """
 
-    def __init__(self, observer: Observer, node: Node, skin: Skin) -> None:
+    def __init__(
+        self,
+        observer: Observer,
+        node: Node,
+        skin: Skin,
+    ) -> None:
         """node: gets the subscriptions without an executor, see `message_log`."""
         self.observer, self._skin = observer, skin
         quality = batch_profile(RATE)
@@ -144,7 +149,10 @@ class Recorder:
 
 @contextmanager
 def recording(
-    skin: Skin, children: Children, interrupted: Event, memory: MemoryMonitor
+    skin: Skin,
+    children: Children,
+    interrupted: Event,
+    memory: MemoryMonitor,
 ) -> Iterator[Recorder]:
     """Make a recorder for the length of a block, and measure the memory while it spins."""
     steps: list[Callable[[], None]] = [memory.measure]

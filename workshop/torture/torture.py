@@ -31,21 +31,26 @@ RESTARTED_S = 16.0
 """Duration, in seconds, of a torture with a mutation that shows when the reconstruction starts
 again."""
 
+FORBIDDEN = (
+    "unreadable",
+    "lost",
+    "wrong",
+    "repeated",
+    "miscounted",
+    "missing_tensors",
+    "wrong_tensors",
+    "unflagged",
+    "false_alarms",
+    "wrong_cube_messages",
+    "wrong_periods",
+    "deeds_failed",
+    "crashes",
+    "threads_leaked",
+)
+"""Figures that must be 0."""
+
 LIMITS = {
-    "unreadable": 0.0,
-    "lost": 0.0,
-    "wrong": 0.0,
-    "repeated": 0.0,
-    "miscounted": 0.0,
-    "missing_tensors": 0.0,
-    "wrong_tensors": 0.0,
-    "unflagged": 0.0,
-    "false_alarms": 0.0,
-    "wrong_cube_messages": 0.0,
-    "wrong_periods": 0.0,
-    "deeds_failed": 0.0,
-    "crashes": 0.0,
-    "threads_leaked": 0.0,
+    **dict.fromkeys(FORBIDDEN, 0.0),
     "rss_slope_mb_per_min": 5.0,
     "worst_reconnect_s": 3.0,
     "stamp_error_p50_ms": 0.3,
@@ -59,7 +64,12 @@ would be 6 MB per minute.
 """
 
 
-def run_torture(*, duration: float, seed: int = 0, json_path: Path | None = None) -> int:
+def run_torture(
+    *,
+    duration: float,
+    seed: int = 0,
+    json_path: Path | None = None,
+) -> int:
     """Torture a skin and print the figures.
 
     Args:
@@ -81,7 +91,12 @@ def run_torture(*, duration: float, seed: int = 0, json_path: Path | None = None
     return 1 if broken else 0
 
 
-def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) -> int:
+def run_mutations(
+    name: str,
+    *,
+    seed: int = 0,
+    json_path: Path | None = None,
+) -> int:
     """Torture a mutated skin and print which figures show the mutation.
 
     Args:
@@ -109,7 +124,11 @@ def run_mutations(name: str, *, seed: int = 0, json_path: Path | None = None) ->
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
                 figures = process.submit(_torture_mutated, name, seed).result()
             found_by, seconds = failures(figures), figures["seconds"]
-            results[name] = {"caught": bool(found_by), "by": found_by, "seconds": seconds}
+            results[name] = {
+                "caught": bool(found_by),
+                "by": found_by,
+                "seconds": seconds,
+            }
             outcome = f"caught by {', '.join(found_by)}" if found_by else "not caught"
             print(f"{name}: {outcome}, {seconds:g} s", flush=True)
     report({"mutations": results}, json_path)
@@ -131,7 +150,10 @@ def failures(result: dict[str, Any]) -> list[str]:
 
 
 def torture(
-    duration: float, seed: int, interrupted: threading.Event, mutation: str = ""
+    duration: float,
+    seed: int,
+    interrupted: threading.Event,
+    mutation: str = "",
 ) -> dict[str, Any]:
     """Play one torture and return all figures, see `play` for the arguments."""
     with own_domain(), tempfile.TemporaryDirectory(prefix="cube_torture_") as folder:
