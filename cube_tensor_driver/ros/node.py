@@ -36,7 +36,7 @@ from .qos import SERVICES, batch_profile, scans_per_message
 from .session import spin_until, start_ros
 
 MAX_BUFFERS = 4
-"""Number of message shapes whose memory is kept and filled again."""
+"""Number of message sizes for which a publisher keeps a buffer, to fill it again."""
 
 STEP_S = 0.2
 """Maximum time, in seconds, that the executor of nodes waits, and so how late it sees a signal."""

@@ -29,7 +29,7 @@ ROW_BYTES = 78
 """Size of a row of `stress` in a message, in bytes. A row of `frequencies` of 8 pads is smaller."""
 
 DEFAULT_RATE_HZ = 1000.0
-"""Rate of messages that is assumed where it is not known."""
+"""Rate of messages, in Hz, that is assumed where it is not known."""
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """For `info` topics: whoever subscribes late still gets the last message."""

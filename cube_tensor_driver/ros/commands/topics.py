@@ -20,7 +20,10 @@ COUNT_S = 1.0
 """Time, in seconds, for which messages are counted."""
 
 MAX_TRIES = 3
-"""Maximum number of counts. It is counted again where topics came or went meanwhile."""
+"""Maximum number of attempts to count messages.
+
+They are counted again if topics came or went meanwhile.
+"""
 
 HIDDEN_TOPICS = ("/rosout", "/parameter_events")
 """Topics that every node has, ours too."""

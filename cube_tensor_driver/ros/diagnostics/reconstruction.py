@@ -34,7 +34,7 @@ Hubs may start after the node.
 """
 
 MAX_KNOWN_PUBLISHERS = 8
-"""Number of earlier publishers of a topic whose last message number is kept."""
+"""Maximum number of publishers of a topic that are told apart by their message numbers."""
 
 LogChanges = list[tuple[str, bool]]
 """Lines for the log, and whether each is bad news."""

@@ -61,7 +61,7 @@ SCALES = (
 )
 
 TITLE_BYTES = 128
-"""Length of the title, in bytes: one line, with spaces on both sides, because viewers centre it.
+"""Length of the legend's title, in bytes: one line, with spaces on both sides to centre it.
 
 RViz sets a second line 1 cm lower, whatever the size of the text. A dot stands at either end,
 because RViz 2 takes a space for more than a metre at first. If a text began with spaces, it would
@@ -72,28 +72,28 @@ PLAIN_LETTERS = str.maketrans("−σ∂", "-sd")
 """Replacements of letters of two bytes. RViz 2 reads a text byte by byte, so one makes two gaps."""
 
 BAR_BOXES = 32
-"""Number of boxes that make up the bar."""
+"""Number of boxes that make up the bar of colours."""
 
 NUMBER_POSITIONS = (0.0, 0.5, 1.0)
-"""Positions of the numbers below the bar, in widths of the bar."""
+"""Positions of the numbers along the bar of colours, from 0 to 1."""
 
 TEXT_HEIGHT = 0.05
-"""Height of the texts, in widths of the bar."""
+"""Height of the texts of the legend, in widths of its bar of colours."""
 
 LINE_DISTANCE = 1.5
-"""Distance of lines of text, in heights of a text."""
+"""Distance between two lines of text in the legend, in heights of the text."""
 
 NUMBERS_LINE = 0.7
-"""Place of the numbers, in lines below the bar."""
+"""Place of the numbers of the legend, in lines of text below its bar of colours."""
 
 TITLE_LINE = 2.0
-"""Place of the title, in lines below the bar."""
+"""Place of the title of the legend, in lines of text below its bar of colours."""
 
 FIRST_SCALE_LINE = 3.5
-"""Place of the first arrow, in lines below the bar."""
+"""Place of the first arrow of the legend, in lines of text below its bar of colours."""
 
 SCALE_LINES = 1.2
-"""Distance of one arrow from the next, in lines."""
+"""Distance between two arrows of the legend, in lines of text."""
 
 
 class LegendPlace(NamedTuple):

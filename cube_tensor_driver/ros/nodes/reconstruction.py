@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from ...bags.reprocess.recorded_reconstruction import RecordedReconstruction
 
 MAX_SCANS = 1000
-"""Maximum number of rows of one cube in a message, if publish_period does not need more.
+"""Maximum number of rows of one cube in a message, unless publish_period needs more.
 
-A row of each of 1280 cubes may take 0.3 ms, and the node does nothing else meanwhile.
+One row for each of 1280 cubes takes up to 0.3 ms, and the node does nothing else meanwhile.
 """
 
 BAG_SUFFIXES = (".mcap", ".db3")

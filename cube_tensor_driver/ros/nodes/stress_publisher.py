@@ -35,7 +35,7 @@ the domain about every topic.
 """
 
 MAX_COVARIANCES = 4096
-"""Number of covariances that are kept. Each stands for a cube and the pads that it leaves out."""
+"""Maximum number of covariances that are cached, one for each cube and set of left-out pads."""
 
 CUBE_TOPIC_DEPTH = 10
 """Depth of the queues of single cubes' topics, in messages."""
