@@ -303,5 +303,5 @@ def run_view(
             print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
             viewer.spin(stop)
     finally:
-        rclpy.try_shutdown()  # type: ignore[attr-defined]
+        rclpy.try_shutdown()
     return 0

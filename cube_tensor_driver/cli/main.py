@@ -35,21 +35,11 @@ WHEELS = {
 }
 """Name of a module -> name of its package on PyPI, where they differ."""
 
-DEBIAN_PACKAGES = {
-    "PIL": "python3-pil",
-    "jsonschema": "python3-jsonschema",
-    "matplotlib": "python3-matplotlib",
-    "numpy": "python3-numpy",
-    "psutil": "python3-psutil",
-    "rich": "python3-rich",
-    "scipy": "python3-scipy",
-    "serial": "python3-serial",
-    "transforms3d": "python3-transforms3d",
-    "websockets": "python3-websockets",
-    "yaml": "python3-yaml",
-    "zstandard": "python3-zstandard",
+DEBIAN_MODULES = {
+    *("PIL", "jsonschema", "matplotlib", "numpy", "psutil", "rich", "scipy", "serial"),
+    *("transforms3d", "websockets", "yaml", "zstandard"),
 }
-"""Name of a module -> its package in Debian and Ubuntu, where there is one."""
+"""Modules that Debian and Ubuntu have as python3-MODULE, in small letters."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -86,8 +76,8 @@ def missing_module_text(name: str) -> str:
         needs = f"this command needs ROS 2, and {name} is not there: "
         return f"{needs}run it as ./cube, or source a workspace in which the package was built"
     text = f"{needs}pip install {WHEELS.get(module, module)}"
-    if module in DEBIAN_PACKAGES:
-        text += f", or sudo apt install {DEBIAN_PACKAGES[module]}"
+    if module in DEBIAN_MODULES:
+        text += f", or sudo apt install python3-{module.lower()}"
     return text
 
 

@@ -54,7 +54,8 @@ def run(options: argparse.Namespace) -> int:
     """Return 1 if messages were dropped, else 0."""
     from ..ros.commands.record import record
 
-    with RecordingStatus(options.output) as status:
+    status = RecordingStatus(options.output)
+    with status.line:
         recorder = record(
             options.output,
             options.topics,
@@ -70,10 +71,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 class RecordingStatus:
-    """Shows on stderr how a recording goes on; a context manager.
+    """Shows on stderr how a recording goes on.
 
     One line is updated; a red line is added for each topic that cannot be recorded, and whenever
     more messages were dropped.
+
+    Attributes:
+        line: Context manager during which the line is shown.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,22 +86,15 @@ class RecordingStatus:
 
         self._path = path
         self._console = Console(stderr=True, highlight=False)
-        self._status = self._console.status("")
+        self.line = self._console.status("")
         self._refused: set[str] = set()
         self._dropped = 0
-
-    def __enter__(self) -> RecordingStatus:
-        self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._status.stop()
 
     def show(self, recorder: Recorder, seconds: float) -> None:
         """Update the line; seconds: since the first message."""
         missing, refused = recorder.missing, recorder.refused
         waiting = f"; waiting for {', '.join(missing)}" if missing else ""
-        self._status.update(f"{self._path}: {seconds:.0f} s, {recorder.received} messages{waiting}")
+        self.line.update(f"{self._path}: {seconds:.0f} s, {recorder.received} messages{waiting}")
         for topic in refused.keys() - self._refused:
             self._console.print(f"not recorded: {refused[topic]}", style="red")
         self._refused |= refused.keys()

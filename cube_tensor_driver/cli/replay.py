@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 from .parser import Parser, not_negative, positive
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from ..bags.read import Bag
     from ..processes.children import Children
     from ..ros.commands.replay import Player
@@ -59,13 +61,16 @@ def run(options: argparse.Namespace) -> int:
 
     with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as has_keys:
         length_s = (bag.end_ns - bag.start_ns) * 1e-9
-        with ReplayBar(length_s, has_keys) as bar:
+        with replay_bar(has_keys) as bar:
+            task = bar.add_task("replaying", total=length_s)
+
             # It runs in the main thread, between two spins of the node.
             def each(player: Player) -> None:
                 children.check()
                 if has_keys:
                     obey(pressed_key(), player)
-                bar.show(player.position, player.paused)
+                text = "paused" if player.paused else "replaying"
+                bar.update(task, completed=player.position, description=text)
 
             replay(
                 bag,
@@ -121,34 +126,18 @@ def pressed_key() -> str:
     return os.read(sys.stdin.fileno(), 1).decode(errors="replace")
 
 
-class ReplayBar:
-    """Shows on stderr how far a replay is; a context manager."""
+def replay_bar(has_keys: bool) -> Progress:
+    """Return a bar on stderr for the time within the bag; has_keys: with the help for keys."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
 
-    def __init__(self, length_s: float, has_keys: bool) -> None:
-        """length_s: of the bag, in seconds. has_keys: whether to print the help for keys."""
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed:.1f} / {task.total:.1f} s"),
-            TextColumn(KEYS if has_keys else ""),
-            console=Console(stderr=True),
-        )
-        self._task = self._progress.add_task("replaying", total=length_s)
-
-    def __enter__(self) -> ReplayBar:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def show(self, position_s: float, paused: bool) -> None:
-        """position_s: time after the start of the bag, in seconds."""
-        text = "paused" if paused else "replaying"
-        self._progress.update(self._task, completed=position_s, description=text)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.1f} / {task.total:.1f} s"),
+        TextColumn(KEYS if has_keys else ""),
+        console=Console(stderr=True),
+    )
 
 
 @contextmanager

@@ -16,7 +16,6 @@ from .parser import Parser, count, number
 if TYPE_CHECKING:
     from ..bags.reprocess.contacts import ContactsOverTime
     from ..bags.reprocess.job import Overrides, ReprocessResult
-    from ..core.errors import CubeError
 
 
 def arguments(parser: Parser) -> None:
@@ -81,6 +80,9 @@ def run(options: argparse.Namespace) -> int:
     Raises:
         CubeError: The options cannot be used; nothing was begun.
     """
+    from rich.console import Console
+    from rich.progress import Progress
+
     from ..bags.reprocess.all_bags import (
         make_jobs,
         remove_without_results,
@@ -89,77 +91,41 @@ def run(options: argparse.Namespace) -> int:
         workers,
         write_recipe,
     )
+    from ..core.errors import CubeError
 
     overrides, contacts = overrides_of(options), contacts_of(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
     write_recipe(options.output, options.format, overrides, contacts)
     # Results that are complete are kept, so that an interrupted run can be continued.
     waiting = [job for job in jobs if not job.output.exists()]
+    console = Console(stderr=True, highlight=False)
+    if len(waiting) < len(jobs):
+        done = len(jobs) - len(waiting)
+        console.print(f"{done} of {len(jobs)} bags are there already in {options.output}")
+
     processes = useful_workers(options.jobs, len(waiting))
+    bar = Progress(console=console, disable=not waiting)
+    task = bar.add_task("reprocessing", total=len(waiting))
+    failed = 0
     try:
-        with (
-            workers(processes, options.scheduler) as executor,
-            ReprocessingReport(options.output, len(jobs), len(waiting)) as report,
-        ):
+        with workers(processes, options.scheduler) as executor, bar:
             for job, result in reprocess_all(waiting, executor):
-                report.add(job.output, result)
+                if isinstance(result, CubeError):
+                    failed += 1
+                    console.print(f"cube: {result}", style="red", markup=False)
+                else:
+                    console.print(result_line(job.output, result))
+                bar.advance(task)
     finally:
         remove_without_results(options.output)
-    report.print_summary()
-    return 1 if report.failed else 0
+    if failed:
+        console.print(f"{failed} of {len(jobs)} bags could not be reprocessed", style="red")
+    return 1 if failed else 0
 
 
-class ReprocessingReport:
-    """Shows on stderr a bar over the bags and a line for each; a context manager.
-
-    Attributes:
-        failed: Number of bags that could not be reprocessed.
-    """
-
-    def __init__(self, folder: Path, jobs: int, waiting: int) -> None:
-        """Start a report.
-
-        Args:
-            folder: Folder of the results.
-            jobs: Number of bags.
-            waiting: Number of bags without a result, which are reprocessed now.
-        """
-        from rich.console import Console
-        from rich.progress import Progress
-
-        self.failed = 0
-        self._jobs = jobs
-        self._console = Console(stderr=True, highlight=False)
-        self._progress = Progress(console=self._console, disable=not waiting)
-        self._task = self._progress.add_task("reprocessing", total=waiting)
-        if waiting < jobs:
-            self._console.print(f"{jobs - waiting} of {jobs} bags are there already in {folder}")
-
-    def __enter__(self) -> ReprocessingReport:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def add(self, output: Path, result: ReprocessResult | CubeError) -> None:
-        """Print the result of a bag, or the error that ended its reprocessing."""
-        from ..core.errors import CubeError
-
-        if isinstance(result, CubeError):
-            self.failed += 1
-            self._console.print(f"cube: {result}", style="red", markup=False)
-        else:
-            self._console.print(
-                f"{output}: {result.messages} messages, {result.rows} rows, {result.seconds:.1f} s"
-            )
-        self._progress.advance(self._task)
-
-    def print_summary(self) -> None:
-        """Print how many bags failed, if any did."""
-        if self.failed:
-            text = f"{self.failed} of {self._jobs} bags could not be reprocessed"
-            self._console.print(text, style="red")
+def result_line(output: Path, result: ReprocessResult) -> str:
+    """Return what was computed of one bag, and the time that the bag covers."""
+    return f"{output}: {result.messages} messages, {result.rows} rows, {result.seconds:.1f} s"
 
 
 def overrides_of(options: argparse.Namespace) -> Overrides:

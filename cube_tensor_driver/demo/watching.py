@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .demo import DemoSettings
     from .load_verification import LoadVerification
 
-__all__ = ["Interrupted", "Measurement", "watch"]
+__all__ = ["DemoResult", "Interrupted", "watch"]
 
 MAX_START_S = 20.0
 """Time, in seconds, within which every cube must have a tensor after the start."""
@@ -53,7 +53,7 @@ MEASURED_NODES = ("driver", "reconstruction")
 
 
 @dataclass(frozen=True)
-class Measurement:
+class DemoResult:
     """The result of a demo that measures.
 
     Attributes:
@@ -103,7 +103,7 @@ def watch(
     children: Children,
     interrupted: threading.Event,
     log: Path,
-) -> Measurement:
+) -> DemoResult:
     """Show a running skin until Ctrl-C, or measure it for a time.
 
     Args:
@@ -149,7 +149,7 @@ def watch(
             watcher.run()
         figures = watcher.measure(verification, settings.duration, log)
     head = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": settings.duration}
-    return Measurement(head | figures, verification, load)
+    return DemoResult(head | figures, verification, load)
 
 
 def make_load(skin: Skin, settings: DemoSettings) -> AnyLoad:

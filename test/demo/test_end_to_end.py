@@ -51,6 +51,18 @@ def demo(*arguments: str) -> subprocess.Popen:
     )
 
 
+def test_the_processes_of_a_demo_start_before_this_one_imports_anything_heavy():
+    """Else the first tensors come half a second later."""
+    script = (
+        "import sys, cube_tensor_driver.demo.demo\n"
+        "print({'numpy', 'rclpy', 'rich', 'jsonschema'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout == "set()\n"
+
+
 def test_demo_loses_nothing_and_is_right(domain, tmp_path):
     path = tmp_path / "demo.json"
     skin = "--cubes", "16", "--rate", "100", "--noise", "0"
