@@ -34,28 +34,33 @@ MAGIC = b"\x89MCAP0\r\n"
 """The first and last bytes of a complete file."""
 
 RECORD_HEAD = struct.Struct("<BQ")
-"""What precedes each record: its opcode, and the length of the record."""
+"""Bytes in front of each record of an MCAP file: its opcode, and the length of the record."""
 
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""What precedes the content of a message: channel, sequence number, and two times in ns."""
+"""Bytes in front of the content of a message record: channel, sequence number, and the times of
+recording and of publication in ns."""
 
 CHUNK_BYTES = 1 << 18
 """Size at which the writer closes a chunk. At 256 kB a chunk fits the processor's cache, and little
 is lost with the last one when the process is killed."""
 
 MAX_CHUNK_BYTES = 256 << 20
-"""Largest chunk, in bytes, that is read. rosbag2 closes a chunk after 0.8 MB, or after the message
-behind; a larger size is damage, and memory for it should not even be requested."""
+"""Largest size, in bytes, of a chunk that is read.
+
+rosbag2 closes a chunk when it has 0.8 MB, so only a single message can make it much larger. A size
+beyond this limit is damage, and no memory is requested for it.
+"""
 
 CACHED_CHUNKS = 4
 """Number of chunks kept in memory. Frequencies and stress are read side by side, each by an
 iterator of its own, from the same chunks."""
 
 ROSBAG2 = "rosbag2"
-"""Name of the metadata record that rosbag2 reads."""
+"""Name of the metadata record in which rosbag2 looks for the description of a file."""
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 CHECKSUM_BYTES = 4
+"""Size of the checksum (CRC-32) at the end of the footer record."""
 
 StoredMessage = tuple[int, int, int, bytes]
 """Time in ns, offset of the chunk in the file, channel, serialised message."""

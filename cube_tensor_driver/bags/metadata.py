@@ -34,7 +34,7 @@ _UNLIMITED = {"sec": 9223372036, "nsec": 854775807}
 """Largest duration that fits 64 bits of nanoseconds: DDS's value for "no limit"."""
 
 QosProfile = dict[str, Any]
-"""A quality of service profile with rosbag2's keys, so that a replay can offer the same."""
+"""A DDS quality of service profile with the keys of metadata.yaml, such as ``reliability``."""
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import zstandard
 from mcap.exceptions import McapError
-from numpy.typing import NDArray
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError, get_types_from_msg
 
-from ..core.arrays import AnyArray
+from ..core.arrays import AnyArray, Times
 from ..core.errors import BagError, ConfigError, MessageError
 from ..core.rows import FrequencyRows, StressRows
 from ..messages.codec import SHAPE_AT, Decoded, MessageCodec, frequency_codec, stress_codec
@@ -45,11 +44,8 @@ MAX_MESSAGE_BYTES = 64 << 20
 """Largest size of one message after decompression; an image of 4096 x 4096 pixels in colour has
 48 MB."""
 
-LAST_NS = (1 << 63) - 1
-"""Time, in ns since the epoch, that no message of a bag reaches."""
-
-Stamps = NDArray[np.int64]
-"""Times in ns since the epoch."""
+MAX_TIME_NS = (1 << 63) - 1
+"""Largest time that 64 bits can hold, in ns since the epoch: the end where no end is asked for."""
 
 READ_ERRORS = (
     McapError,
@@ -276,7 +272,7 @@ class Bag:
                 self._refuse_version(f"{topic} has version {info.version}")
         return infos
 
-    def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Stamps]]:
+    def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Times]]:
         """Read frequencies in the order of recording.
 
         Messages of the same shape that follow each other come together.
@@ -289,7 +285,7 @@ class Bag:
         """
         return self._decoded(topic, frequency_codec, frequency_codec.decode)
 
-    def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Stamps]]:
+    def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Times]]:
         """Read stress as `frequencies` reads frequencies."""
         return self._decoded(topic, stress_codec, stress_codec.decode)
 
@@ -311,7 +307,7 @@ class Bag:
             wanted &= topics
         is_packed = self._bag_files.compression == "message"
         begin_ns = 0 if start_ns is None else start_ns
-        end_ns = LAST_NS if stop_ns is None else stop_ns
+        end_ns = MAX_TIME_NS if stop_ns is None else stop_ns
         count = 0
         with report_damage(self.path):
             # Files follow each other in time, so they need not be merged.
@@ -333,7 +329,7 @@ class Bag:
         topic: str,
         codec: MessageCodec[Any],
         decode: Callable[..., Any],
-    ) -> Iterator[tuple[Any, Stamps]]:
+    ) -> Iterator[tuple[Any, Times]]:
         """Decode messages of one shape together, and say when they were recorded."""
         # One call of numpy for many messages takes as long as for one.
         waiting: list[bytes] = []

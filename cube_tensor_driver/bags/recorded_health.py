@@ -23,11 +23,13 @@ from ..messages.types import STRESS
 from .read import Bag
 
 MAX_DISORDER_NS = SECOND
-"""Largest time, in ns, by which the stress of a sample can be recorded before or after its
-frequencies."""
+"""Largest difference, in ns, between the order of messages in a bag and that of their samples.
+
+Stress is read this much further than the frequencies for which it is wanted.
+"""
 
 HEALTH_BITS = np.uint16(sum(WORDS))
-"""Status bits that `Health` sets."""
+"""The status bits of a row that state the health of its pads. The others are computed again."""
 
 
 class _StressBatch(NamedTuple):

@@ -40,10 +40,14 @@ PARTIAL = ".partial"
 """Folder beside the results for results that are not complete. A restart begins those again."""
 
 WORKING_BYTES = 30 << 20
-"""Size of the block that makes glibc's malloc keep the memory of a batch for the next one."""
+"""Size, in bytes, of the block that is allocated and freed once before reprocessing.
+
+The allocator of glibc keeps freed memory up to twice the size of the largest block freed so far;
+without this block it would return the arrays of every batch to the system.
+"""
 
 MAX_NAMED_CUBES = 5
-"""Largest number of cubes that a message names."""
+"""Largest number of cubes that one error message names."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class Overrides:
 
 
 AS_RECORDED = Overrides()
-"""Overrides of nothing."""
+"""Overrides that change nothing: calibrations and tare are those of the recording."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,7 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
     Raises:
         BagError: The bag is damaged, the overrides do not fit, or the output cannot be written.
     """
-    # glibc's malloc keeps freed memory up to twice the largest block that it has given back. After
-    # this block it keeps the arrays of the batches, which are requested again and again.
+    # From here on the allocator keeps the arrays of a batch for the next one.
     np.empty(WORKING_BYTES, np.uint8)
     # In the same file system as the output, so that it can be renamed when it is complete.
     partial = job.output.parent / PARTIAL / job.output.name
