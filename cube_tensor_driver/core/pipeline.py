@@ -187,8 +187,8 @@ class Pipeline:
 
     def __repr__(self) -> str:
         return (
-            f"Pipeline({len(self.calibrations)} cubes, {len(self._groups)} calibrations, "
-            f"{self.n_pads} pads, {self.dtype})"
+            f"Pipeline(cubes={len(self.calibrations)}, calibrations={len(self._groups)}, "
+            f"pads={self.n_pads}, dtype={self.dtype})"
         )
 
     @property
@@ -263,6 +263,7 @@ class Pipeline:
             status[observed == 0] |= INVALID
         if law.no_temperature is not None:
             status[law.no_temperature.ravel()] |= TEMPERATURE
+        # No other bit of the source is adopted, because a peer may write anything there.
         status |= rows.status & np.uint16(STAMP)
         components = out.reshape(-1, out.shape[2])
         return StressRows(
@@ -283,10 +284,10 @@ class Pipeline:
         Returns:
             Components and whitened residuals (B, N, 15 + D).
         """
-        first = pattern.blocks[0] if pattern.blocks else None
-        if len(pattern.blocks) == 1 and first is not None and first.matrix.ndim == 2:
+        if len(pattern.blocks) == 1 and pattern.blocks[0].matrix.ndim == 2:
             # All cubes share one calibration: the product is the result, without a copy.
-            product: Real = v[:, :, : first.pads] @ first.matrix
+            [block] = pattern.blocks
+            product: Real = v[:, :, : block.pads] @ block.matrix
             return product
         shape = (*v.shape[:2], N_COMPONENTS + self._n_residual)
         out = np.full(shape, np.nan, dtype=self.dtype)
@@ -296,8 +297,9 @@ class Pipeline:
             else:
                 part = out[:, rows]
                 # Pads come first, so that the inner loop of einsum runs over neighbours in memory.
-                by_pad = np.ascontiguousarray(v[:, rows, :pads].transpose(2, 0, 1))
-                part[:, :, self._recovered] = np.einsum("pin,pbn->bni", matrix, by_pad)
+                by_pad = v[:, rows, :pads].transpose(2, 0, 1)
+                product = np.einsum("pin,pbn->bni", matrix, np.ascontiguousarray(by_pad))
+                part[:, :, self._recovered] = product
                 out[:, rows] = part
         return out
 

@@ -88,8 +88,8 @@ class Reconstructor:
         self._drift = DriftTracker(self.pipeline, self.health)
 
     def __repr__(self) -> str:
-        drift = f"drift in {self.drift_time:g} s" if self.drift_time else "no drift"
-        return f"Reconstructor({self.pipeline!r}, {drift}, {self.rest_changes} changes of rest)"
+        settings = f"drift_time={self.drift_time:g}, rest_changes={self.rest_changes}"
+        return f"Reconstructor({self.pipeline!r}, {settings})"
 
     @property
     def calibrations(self) -> tuple[Calibration, ...]:

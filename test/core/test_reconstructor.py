@@ -53,7 +53,7 @@ def test_doubt_of_a_stamp_goes_with_the_row():
     assert reconstruct.process_known(rows, recorded).status.tolist()[0] == STAMP
 
 
-def test_recorded_verdicts_replace_those_made_now_where_they_are_known():
+def test_recorded_health_replaces_that_found_now_where_it_is_known():
     rows = stamped(np.arange(2), frequencies(), 0, 0)
     recorded = RecordedHealth(
         np.array([True, False]), np.array([1 << 5, 0], np.uint32), np.array([STUCK, 0], np.uint16)
@@ -61,3 +61,15 @@ def test_recorded_verdicts_replace_those_made_now_where_they_are_known():
     stress = Reconstructor([CALIBRATION] * 2).process(rows, recorded)
     assert stress.left_out.tolist() == [1 << 5, 1 << 3]
     assert stress.status.tolist() == [PAD_FAULT | STUCK, PAD_FAULT | SHORT]
+
+
+def test_what_a_notebook_shows_is_one_short_line():
+    rows = stamped(np.arange(2), frequencies(), 0, [0, 5_000_000])
+    reconstruct = Reconstructor([CALIBRATION] * 2)
+    assert repr(rows) == "FrequencyRows(2 rows of 2 cubes over 0.005 s)"
+    assert repr(rows.select(slice(0))) == "FrequencyRows(no rows)"
+    assert repr(reconstruct(rows)) == "StressRows(2 rows of 2 cubes over 0.005 s)"
+    pipeline = "Pipeline(cubes=2, calibrations=1, pads=8, dtype=float32)"
+    assert repr(reconstruct) == f"Reconstructor({pipeline}, drift_time=0, rest_changes=0)"
+    shown = f"Calibration({CALIBRATION.id}, layout 'planar', any cube, illustrative)"
+    assert repr(CALIBRATION) == shown
