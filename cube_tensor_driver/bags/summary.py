@@ -17,7 +17,7 @@ MIN_GAP_PERIODS = 1.5
 """Time between two samples of a cube, in median periods, from which on it counts as a gap."""
 
 SEQUENCE_RANGE = 1 << 32
-"""Number of different sequence numbers of samples, which have 32 bits: the last is followed by 0."""
+"""Number of different sequence numbers (32 bits); the largest one is followed by 0."""
 
 
 @dataclass(frozen=True)

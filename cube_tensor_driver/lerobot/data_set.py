@@ -23,16 +23,17 @@ from .topics import Topic
 from .windows import COLUMNS, TACTILE
 
 VERSION = "v3.0"
-"""Version of LeRobot's format."""
+"""Version of the format LeRobotDataset that is written."""
 
 MAX_FILES_PER_CHUNK = 1000
-"""Largest number of files in one folder."""
+"""Largest number of Parquet files in one folder ("chunk") of a data set."""
 
 MAX_FILE_MB = 100
-"""Size, in MB, from which on the next episode begins a new file; an episode is never divided."""
+"""Size of a Parquet file, in MB, after which the next episode begins a new file. An episode is
+never divided between files."""
 
 FILE_NAME = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-"""Name of the Parquet files in data/ and in meta/episodes/."""
+"""Path of a Parquet file below data/ or meta/episodes/, as a pattern for `str.format`."""
 
 COUNTED = {
     "timestamp": "float32",
@@ -41,7 +42,7 @@ COUNTED = {
     "index": "int64",
     "task_index": "int64",
 }
-"""Features that every data set has, with their types."""
+"""Features that count frames, episodes and tasks, with their types. LeRobot requires them."""
 
 _IMAGE = pyarrow.struct(
     [

@@ -25,9 +25,9 @@ from .topics import Topic, TopicReader, find_topics
 from .windows import TACTILE, Windows
 
 MAX_SAMPLED_IMAGES = 20
-"""Number of images of an episode from which statistics are taken."""
+"""Largest number of images of an episode whose pixels are used for statistics."""
 PIXEL_STRIDE = 4
-"""Distance of the pixels from which statistics are taken, along height and width."""
+"""Distance, in pixels along height and width, of the pixels that are used for statistics."""
 
 
 @dataclass(frozen=True)

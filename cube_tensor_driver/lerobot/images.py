@@ -17,7 +17,7 @@ from ..core.errors import BagError
 from .plan import Episode
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-"""Types of messages with an image."""
+"""ROS message types that contain one image."""
 
 MODES = {
     "rgb8": ("RGB", "RGB"),
@@ -28,10 +28,11 @@ MODES = {
     "mono8": ("L", "L"),
     "8UC1": ("L", "L"),
 }
-"""Pillow's mode of each encoding of sensor_msgs/Image, and the order of the bands in a message."""
+"""Mode of the image in Pillow, and order of the bands in the message, for each encoding of
+sensor_msgs/Image that can be exported."""
 
 MODE_OF_BANDS = {1: "L", 3: "RGB", 4: "RGBA"}
-"""Pillow's mode by the number of bands."""
+"""Mode of an image in Pillow, for each number of bands (colour channels)."""
 
 Shape = tuple[int, int, int]
 """Height, width and number of bands of an image."""
@@ -105,7 +106,7 @@ class ImageStream:
         return [self._newest_in(episode, frame) for frame in range(first, last)]
 
     def _newest_in(self, episode: Episode, frame: int) -> EncodedImage:
-        """Read on until the end of a frame."""
+        """Return the newest image before the end of a frame, reading the bag as far as needed."""
         message = None
         while self._next:
             stamp = np.array(self._next[0])
@@ -128,7 +129,7 @@ class ImageStream:
             yield stamp_ns(message), message
 
     def _encode(self, message: Any) -> EncodedImage:
-        """Return the image of a message."""
+        """Convert a message to an image in a file format."""
         try:
             return encode_raw(message) if hasattr(message, "encoding") else keep_encoded(message)
         except (UnidentifiedImageError, OSError, ValueError) as error:
@@ -167,7 +168,7 @@ def encode_raw(message: Any) -> EncodedImage:
 
 
 def keep_encoded(message: Any) -> EncodedImage:
-    """Take a sensor_msgs/CompressedImage as it is.
+    """Take the image of a sensor_msgs/CompressedImage without decoding it.
 
     Raises:
         OSError: Pillow does not know the format.

@@ -27,28 +27,35 @@ from ..core.errors import BagError
 from ..messages.codec import SECOND
 
 MARK = "std_msgs/msg/String"
-"""Type of the messages that divide a bag into episodes."""
+"""Message type of marks: texts that divide a bag into episodes and name their tasks."""
 
 MIN_NS, MAX_NS = -(1 << 63), (1 << 63) - 1
 """Smallest and largest time in 64 bits, in ns: the bounds of an episode without marks."""
 
 MAX_TIME_NS = 1 << 62
-"""Largest product of a time, in ns, and the frame rate. A stamp of a clock that was not set is
-limited to it, so that the product does not overflow."""
+"""Largest allowed product of a time, in ns, and the frame rate, so that it fits 64 bits. Times of
+clocks that were never set are reduced to it."""
 
 MAX_STAMP_RATIO = 10
-"""Largest ratio of the time that stamps cover to the time of recording. Stamps of a bag that is
-replayed faster cover more time than its recording takes."""
+"""Largest ratio of the time that the stamps of an episode cover to the duration of the recording.
+
+It can be above 1, because a bag may be replayed at several times its speed and recorded again.
+"""
 
 MAX_DEPTH_RATIO = 10
-"""Largest ratio of the samples in one frame to the usual number. Above it, one damaged stamp would
-make every window of the data set long."""
+"""Largest ratio of the number of samples in one frame to the usual number.
 
-TOLERANCE = 100
-"""Number of frames, or of samples, by which short recordings may exceed these two limits."""
+Every window of a data set is as long as the fullest frame, so a frame in which wrong stamps collect
+samples would multiply the size of the data set.
+"""
+
+ALWAYS_ALLOWED = 100
+"""Number of frames (or samples in a frame) that is always allowed, in addition to the two ratios:
+in a short recording a few late samples already exceed a ratio."""
 
 Report = Callable[[float, float, str], None]
-"""Function that is told what is done, the total, and what is being done."""
+"""Function that displays progress: it gets the amount done, the total amount, and a text that names
+the current step."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +166,7 @@ class Episode:
         np.add.at(self.counts, (frame, cube), 1)
 
     def finish(self) -> None:
-        """Remove the frames behind the last sample."""
+        """Remove the empty frames behind the last sample, once all samples are counted."""
         has_samples = self.counts.any(axis=1)
         last = np.flatnonzero(has_samples)[-1]
         self.counts = self.counts[: last + 1]
@@ -208,7 +215,7 @@ def plan_bag(
         episodes = [Episode(*span, choices.fps) for span in spans]
         n_cubes = len(source.skin.cubes)
         recorded_s = (source.bag.end_ns - source.bag.start_ns) / SECOND
-        max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + TOLERANCE
+        max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + ALWAYS_ALLOWED
 
         samples = np.zeros(n_cubes, np.int64)
         first_ns, last_ns = MAX_NS, MIN_NS
@@ -297,7 +304,7 @@ def _check_depth(
 ) -> None:
     """Check that no frame has far more samples than usual, which would lengthen every window."""
     depth = int(episode.counts.max())
-    if depth > MAX_DEPTH_RATIO * usual + TOLERANCE:
+    if depth > MAX_DEPTH_RATIO * usual + ALWAYS_ALLOWED:
         deepest = episode.counts.argmax()
         frame, cube = np.unravel_index(deepest, episode.counts.shape)
         raise BagError(

@@ -13,10 +13,11 @@ QUANTILES = {
     "q90": 0.90,
     "q99": 0.99,
 }
-"""Quantiles by LeRobot's names."""
+"""Quantiles of a feature that LeRobot expects, by the names that it gives them."""
 
 MAX_SAMPLE_ROWS = 10_000
-"""Expected number of rows, chosen at random, from which quantiles are taken."""
+"""Number of rows from which quantiles are computed. They are a random sample of all rows, because
+quantiles need the sampled rows in memory."""
 
 
 class Statistics:

@@ -84,7 +84,7 @@ class Signal:
 
 
 class TopicReader:
-    """The added topics of one bag."""
+    """Reads the values of the other topics of one bag, frame by frame."""
 
     def __init__(self, bag: Bag, topics: dict[str, Topic]) -> None:
         """Read the numbers, and prepare to read the images.
@@ -227,7 +227,8 @@ def read_signal(
 def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
     """Return name and type of the topics with images, joint states or other stamped numbers.
 
-    The topics of single cubes, below the prefix `skin`, repeat what the stress says.
+    Topics of single cubes (below ``cubes/`` of the skin with the prefix `skin`) are left out: their
+    content is in the stress, too.
     """
     found = []
     for one in bag.connections:

@@ -25,9 +25,9 @@ COLUMNS: dict[str, Any] = {
 """Columns of `StressRows` that a window has beside the stress, with their types."""
 
 MAX_BLOCK_BYTES = 32 << 20
-"""Largest size of the windows that are made at a time."""
+"""Largest size, in bytes, of the block of windows that is built and written at a time."""
 MAX_BLOCK_FRAMES = 128
-"""Largest number of frames that are made at a time: images may go with them."""
+"""Largest number of frames in such a block. Their images are in memory at the same time."""
 
 
 class Windows:
