@@ -60,7 +60,7 @@ class HubClock:
         self.problems: set[str] = set()
         self._line = ClockLine()
         self._timing = SampleTiming()
-        self._last_us = -1
+        self._last_us = -1  # device time of the last read
         self._moved_ns = 0
         self._n_still = 0
         self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)
@@ -130,7 +130,10 @@ class HubClock:
         device_ns = 1000.0 * (device_us - self._first_us)
         since_first = -self._first_ns - device_ns
         trip = ClockRoundTrip(device_ns, sent_ns + since_first, arrival_ns + since_first)
-        self._n_bad_answers = 0 if self._line.add_round_trip(trip) else self._n_bad_answers + 1
+        if self._line.add_round_trip(trip):
+            self._n_bad_answers = 0
+            return
+        self._n_bad_answers += 1
         if self._n_bad_answers >= MAX_BAD_ANSWERS:
             self.problems.add(BAD_ANSWERS)
 
@@ -167,7 +170,8 @@ class HubClock:
                 start = k
             if self._newest != _NEVER:
                 self._begin_decision(step_us, arrival_ns)
-        return stamps + self._convert(device_us[start:] if start else device_us, arrival_ns)
+        remaining = device_us[start:] if start else device_us
+        return stamps + self._convert(remaining, arrival_ns)
 
     @property
     def _is_fresh(self) -> bool:

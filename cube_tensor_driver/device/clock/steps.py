@@ -41,7 +41,7 @@ MAX_READ_NS = 100_000
 MAX_READS = 3
 """Number of attempts to read both clocks of the host within `MAX_READ_NS`."""
 _WRAP = 1 << 32
-_NO_NUMBER = -2  # not -1, which 0 would follow
+_NO_NUMBER = -2  # With -1, number 0 would be the next one.
 
 
 class HostClockWatch:
@@ -61,14 +61,14 @@ class HostClockWatch:
         self._offset: int | None = None
 
     def look(self) -> tuple[int, int]:
-        """Return the time and the step of the clock since the last call, both in ns."""
+        """Return the host's time, and by how much it was set since the last call, both in ns."""
         for _ in range(MAX_READS):
             before = self._steady_ns()
             now = self._clock_ns()
             if self._steady_ns() - before < MAX_READ_NS:
                 break
         else:
-            return now, 0
+            return now, 0  # The thread was interrupted each time, so nothing can be compared.
         offset = now - before
         step = 0 if self._offset is None else offset - self._offset
         if self._offset is not None and abs(step) < MIN_HOST_STEP_NS:
@@ -90,7 +90,7 @@ class SampleTiming:
         self._period_us = 0.0
 
     def forget_period(self) -> None:
-        """Discard the estimated sample period; the next two samples give a new one."""
+        """Discard the estimated sample period; the next sample gives a new one."""
         self._period_us = 0.0
 
     def find_step(self, number: int, device_us: int) -> int:
@@ -98,6 +98,7 @@ class SampleTiming:
         if number != self._number + 1 and not self._is_ahead(number, device_us):
             return 0
         self._number = number
+        # The reference is the newest sample before this one whose device time had changed.
         n_periods = (number - self._reference) % _WRAP
         interval = device_us - self._reference_us
         period = self._period_us

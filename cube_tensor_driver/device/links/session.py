@@ -203,7 +203,7 @@ class Session:
         if link.state is LinkState.SILENT or not self._has_hello:
             if now >= self._hello_at:
                 self._ask_hello(now)
-        # Not before the first sample, with which the answer is compared.
+        # The answer is compared with samples, so it is useless before the first one.
         elif self._knows_time and self._last_sample > self._opened_at and now >= self._ask_time_at:
             self._ask_time(now)
 

@@ -186,7 +186,7 @@ class SequenceTracker:
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
-        """Begin to count with a sample."""
+        """Begin a new count with this sample."""
         self._first = self._set_back = sequence
         self._next = sequence + 1
         self._newest_us = device_us
@@ -200,7 +200,7 @@ class SequenceTracker:
 
 
 def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -> bool:
-    """Return whether the device times grow with the numbers."""
+    """Return whether a sample fits those seen: device times must grow with the numbers."""
     for other, other_us in seen:
         is_wrong = other_us > device_us if other < number else other_us < device_us
         if is_wrong:
