@@ -241,10 +241,10 @@ def test_programs_of_a_page_run(name):
     from cube_tensor_driver.core.calibration import illustrative
     from cube_tensor_driver.core.poses import CubePoses
 
-    cube = types.SimpleNamespace(xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0))
+    poses = CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002))
     there = {
-        "skin": types.SimpleNamespace(cubes=[cube], calibrations=[illustrative("planar")]),
-        "poses": CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002)),
+        "skin": types.SimpleNamespace(poses=poses, calibrations=[illustrative("planar")]),
+        "poses": poses,
         "values": np.zeros((1, 15)),
     }
     programs = re.findall(
