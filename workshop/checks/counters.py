@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Mask
-from cube_tensor_driver.core.matching import NO_MATCH
 
 from .frequencies import FrequencyFindings
 from .record import DRIVER_KILLS, LATEST_NS, NS_PER_S
-from .run import Findings, Run
+from .run import Findings, Run, count, find_matched
 from .tensors import TensorFindings
 
 WRAPPED_NUMBER = 1 << 20
@@ -51,11 +50,12 @@ def check_counters(
     published, arrived = counters["rows published"], len(record.frequencies.rows)
     sent_ns = record.frequencies.sent_ns
     is_unreported = record.is_during(DRIVER_KILLS, sent_ns, REPORT_PERIOD_S)
-    reported = arrived - int(np.count_nonzero(is_unreported))
+    reported = arrived - count(is_unreported)
 
     wrong = counters["rows unaccounted"] + counters["rows lost by errors"]
     # A message that did not arrive here had an unknown number of rows.
     if not record.frequencies.missed:
+        # Each of these differences is at most 0 when all counters are right.
         excesses = (
             published - arrived,
             reported - published,
@@ -83,7 +83,9 @@ def _is_between_drivers(run: Run) -> Mask:
     samples, sent_ns = run.samples, run.record.frequencies.sent_ns
     between = np.zeros(len(samples), bool)
     for action in run.record.actions_of(*DRIVER_KILLS):
-        arrived = run.sample[(sent_ns > action.begin_ns) & (run.sample != NO_MATCH)]
+        later = find_matched(run.sample)
+        arrived = run.sample[later[sent_ns[later] > action.begin_ns]]
+        # A late row of the driver that was killed does not count for the next one.
         arrived = arrived[samples.time_ns[arrived] > action.begin_ns]
         last_ns = action.begin_ns - round(NS_PER_S * REPORT_PERIOD_S)
         first_ns = np.full(len(samples.log.links), LATEST_NS)
@@ -92,7 +94,8 @@ def _is_between_drivers(run: Run) -> Mask:
             samples.link[arrived],
             samples.time_ns[arrived],
         )
-        between |= (samples.time_ns > last_ns) & (samples.time_ns < first_ns[samples.link])
+        is_before_next = samples.time_ns < first_ns[samples.link]
+        between |= (samples.time_ns > last_ns) & is_before_next
     return between
 
 
@@ -104,7 +107,7 @@ def _is_lost_with_power(run: Run) -> Mask:
     """
     samples = run.samples
     arrived = np.zeros(len(samples), bool)
-    arrived[run.sample[run.sample != NO_MATCH]] = True
+    arrived[run.sample[find_matched(run.sample)]] = True
     lost = np.zeros(len(samples), bool)
     for link in range(len(samples.log.links)):
         of_link = samples.link == link
@@ -113,6 +116,7 @@ def _is_lost_with_power(run: Run) -> Mask:
             # Samples are in the order of time, so the order of indices is that of time.
             mine = np.flatnonzero(of_link & (samples.boot == boot))
             mine_arrived = mine[arrived[mine]]
+            # After the last restart, the driver hears of all losses from the counters of the hub.
             if boot != boots[-1]:
                 lost[mine[mine > mine_arrived.max(initial=-1)]] = True
             if len(mine_arrived) and samples.number[mine[0]] > WRAPPED_NUMBER:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -29,24 +32,29 @@ def check_cube_topics(run: Run) -> Findings:
         wanted = pipeline.covariance(messages.cube, int(rows.left_out[row]))
         has_bits = status == rows.status[row] and observed == rows.observed[row]
         components = np.concatenate([rows.stress[row], rows.gradient[row]])
-        is_near = _is_near(values, components) and _is_near(residual, rows.residual[row])
-        return has_bits and is_near and _is_near(covariance, wanted.ravel())
+        return (
+            has_bits
+            and _is_near(values, components)
+            and _is_near(residual, rows.residual[row])
+            and _is_near(covariance, wanted.ravel())
+        )
 
     def is_wrench_of(message: Wrench, row: int) -> bool:
         one = slice(row, row + 1)
         side = 2 * cube.calibration.half_side
-        wanted = contact_wrench(rows.stress[one], rows.gradient[one], side)
+        force, torque = contact_wrench(rows.stress[one], rows.gradient[one], side)
+        wanted = np.concatenate([force[0], torque[0]])
         # A row without components gives no wrench.
         is_valid = rows.status[row] & INVALID == 0
-        return bool(is_valid) and _is_near(message[1], np.concatenate(wanted, axis=1)[0])
+        return bool(is_valid) and _is_near(message[1], wanted)
 
-    def find(message: Tensor | Wrench) -> list[int]:
-        """Return the rows of a stamp; a row that comes late may have the stamp of another one."""
-        places: list[int] = np.flatnonzero(rows.stamp_ns == message[0]).tolist()
-        return places
+    def has_row(message: Any, is_of: Callable[[Any, int], bool]) -> bool:
+        # A row that comes late may have the stamp of another one.
+        candidates = np.flatnonzero(rows.stamp_ns == message[0])
+        return any(is_of(message, row) for row in candidates.tolist())
 
-    agrees = [any(is_tensor_of(one, row) for row in find(one)) for one in messages.tensors]
-    agrees += [any(is_wrench_of(one, row) for row in find(one)) for one in messages.wrenches]
+    agrees = [has_row(message, is_tensor_of) for message in messages.tensors]
+    agrees += [has_row(message, is_wrench_of) for message in messages.wrenches]
     wrong = len(messages.frame_ids - {skin.frame(cube)})
     # Where messages of `stress` are missing here, the row of a message may be missing, too.
     if not record.stress.gaps:
@@ -56,6 +64,8 @@ def check_cube_topics(run: Run) -> Findings:
 
 def _is_near(found: ArrayLike, wanted: ArrayLike) -> bool:
     """Compare numbers of different precision."""
-    scale = np.nan_to_num(np.abs(np.asarray(wanted, float))).max(initial=0.0)
+    # Components that are 0 have an error that is small against the largest one.
+    magnitude = np.abs(np.asarray(wanted, float))
+    scale = np.nan_to_num(magnitude).max(initial=0.0)
     tolerance = {"rtol": MAX_RELATIVE_ERROR, "atol": 1e-9 * scale}
     return bool(np.allclose(found, wanted, equal_nan=True, **tolerance))

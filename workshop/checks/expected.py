@@ -94,10 +94,12 @@ class ExpectedReadings:
         sound = self._compute_sound(cube, sample)
         millihertz, certain = sound.millihertz, sound.is_certain
         time_ns = self._samples.time_ns[sample]
-        is_sound, pad_fault = sound.warming == 0, np.zeros(len(cube), np.uint32)
+        is_sound = sound.warming == 0
+        pad_fault = np.zeros(len(cube), np.uint32)
 
         for fault in self._samples.faults(*PAD_FAULTS):
-            pad, mine = fault.fault.pad, cube == fault.cube
+            pad = fault.fault.pad
+            mine = cube == fault.cube
             is_edge = mine & _is_at_edge(fault, time_ns)
             certain[is_edge, pad] = False
             rows = np.flatnonzero(mine & fault.contains(time_ns))
@@ -107,9 +109,11 @@ class ExpectedReadings:
                 pad_fault[rows] |= np.uint32(1 << pad)
             elif len(rows):
                 time_us = self._samples.time_us[sample[rows]]
-                millihertz[rows, pad] = self._break(fault, millihertz[rows, pad], time_us)
+                readings = millihertz[rows, pad]
+                millihertz[rows, pad] = self._break(fault, readings, time_us)
 
         frequency = (millihertz * MILLIHERTZ).astype(np.float32)
+        # A hub sends 0 for a pad whose oscillator has stopped.
         frequency[millihertz == 0] = np.nan
         celsius = centi_celsius(sound.warming)
         # The float32 product is that of the decoder, so that it can be compared to the bit.
@@ -120,21 +124,17 @@ class ExpectedReadings:
     def _compute_sound(self, cube: AnyArray, sample: Index) -> _SoundReadings:
         """Compute the readings of cubes (N,) in samples (N,) without broken pads."""
         samples = self._samples
-        link, time_ns, time_us = (
-            column[sample]
-            for column in (
-                samples.link,
-                samples.time_ns,
-                samples.time_us,
-            )
-        )
+        link, time_ns = samples.link[sample], samples.time_ns[sample]
+        time_us = samples.time_us[sample]
         load_us = time_us.copy()
-        certain = np.ones((len(cube), self._millihertz.shape[2]), bool)
+        n_pads = self._millihertz.shape[2]
+        certain = np.ones((len(cube), n_pads), bool)
 
         for fault in samples.faults("hold"):
             mine = link == fault.link
             load_us[mine & fault.contains(time_ns)] = fault.start_us
             certain[mine & _is_at_edge(fault, time_ns)] = False
+        # A hub goes to the next instant with each sample.
         instant = load_us // samples.period_us[sample] % len(self._millihertz)
 
         warmer = np.zeros(len(cube))
@@ -162,7 +162,8 @@ class ExpectedReadings:
             # It repeats what it would have read in the first sample of the fault.
             is_later = self._samples.time_ns >= fault.begin_ns
             later = np.flatnonzero((self._samples.link == fault.link) & is_later)
-            sound = self._compute_sound(np.array([fault.cube]), later[:1])
+            cubes = np.array([fault.cube])
+            sound = self._compute_sound(cubes, later[:1])
             first = int(sound.millihertz[0, fault.fault.pad])
         return [
             broken_reading(fault.fault, reading, first, at)
@@ -186,7 +187,7 @@ class ExpectedReadings:
         instants = {
             fault.start_us // period_us % len(self._millihertz)
             for fault in samples.faults("hold")
-            if fault.link == link and fault.begin_ns <= span.begin_ns and span.end_ns < fault.end_ns
+            if fault.link == link and _covers(fault, span)
             for period_us in np.unique(samples.period_us[mine]).tolist()
         }
         if len(instants) != 1:
@@ -203,15 +204,18 @@ class ExpectedReadings:
         table, boot = self._samples.table, self._samples.boot
         sample = table.match(rows)
         known = np.flatnonzero(sample != NO_MATCH)
-        unlike = known[~self._resembles(rows.select(known), sample[known])]
+        is_alike = self._resembles(rows.select(known), sample[known])
+        unlike = known[~is_alike]
         others = rows.select(unlike)
 
         best_ns = np.full(len(unlike), LATEST_NS)
         for number in np.unique(boot):
+            # Within one life of a hub, each number occurs once.
             candidate = table.match(others, np.flatnonzero(boot == number))
             found = np.flatnonzero(candidate != NO_MATCH)
             found = found[self._resembles(others.select(found), candidate[found])]
-            distance_ns = np.abs(table.time_ns[candidate[found]] - others.stamp_ns[found])
+            taken_ns = table.time_ns[candidate[found]]
+            distance_ns = np.abs(taken_ns - others.stamp_ns[found])
             is_nearer = distance_ns < best_ns[found]
             nearer = found[is_nearer]
             best_ns[nearer] = distance_ns[is_nearer]
@@ -223,6 +227,7 @@ class ExpectedReadings:
         resembles = np.zeros(len(rows), bool)
         for part in split_in_chunks(np.arange(len(rows))):
             expected = self.of(rows.cube[part], sample[part]).frequency
+            # Pads that measure nothing do not tell samples apart.
             is_equal = (expected == rows.frequency[part]) | np.isnan(expected)
             resembles[part] = is_equal.mean(axis=1) >= MIN_EQUAL_SHARE
         return resembles
@@ -271,6 +276,10 @@ def _compute_tables(key: _SkinKey, instants: int) -> tuple[Any, Array]:
         readings.append(cubes.frequency(stress, gradient, 0.0))
         truth.append(skin_components(skin, stress, gradient))
     return np.array(readings), np.array(truth)
+
+
+def _covers(outer: Span, inner: Span) -> bool:
+    return outer.begin_ns <= inner.begin_ns and inner.end_ns < outer.end_ns
 
 
 def _is_at_edge(fault: HubFault, time_ns: Index) -> Mask:

@@ -14,7 +14,7 @@ from cube_tensor_driver.simulation.faults import CUT_FAULTS
 
 from .expected import Readings, split_in_chunks
 from .record import DRIVER_KILLS, DRIVER_STOPS, UNFLUSHED_S
-from .run import Findings, Run
+from .run import Findings, Run, count, find_matched
 
 RECOVERY_S = 6.0
 """Time, in seconds, after a cut in which a link delivers again: the driver tries a port at least
@@ -52,29 +52,28 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     """
     record, samples, sample = run.record, run.samples, run.sample
     rows = record.frequencies.rows
-    known = np.flatnonzero(sample != NO_MATCH)
+    known = find_matched(sample)
     is_wrong = np.zeros(len(rows), bool)
     for part in split_in_chunks(known):
         chosen = rows.select(part)
-        is_wrong[part] = _differs(chosen, run.expected.of(chosen.cube, sample[part]))
+        expected = run.expected.of(chosen.cube, sample[part])
+        is_wrong[part] = _differs(chosen, expected)
 
     # One number for sample and cube tells which rows arrived more than once.
     n_cubes = len(record.skin.cubes)
     arrived = np.unique(sample[known] * n_cubes + rows.cube[known])
     received = np.bincount(arrived // n_cubes, minlength=len(samples))
     is_checked = record.contains(samples.time_ns)
-    missing = np.where(
-        samples.time_ns >= record.begin_ns,
-        samples.row_count - received,
-        0,
-    )
+    # Before the record begins, the topics were not connected yet.
+    is_recorded = samples.time_ns >= record.begin_ns
+    missing = np.where(is_recorded, samples.row_count - received, 0)
     lost = np.flatnonzero(is_checked & (missing > 0) & ~_may_be_missing(run))
 
     figures = {
         "samples_sent": int(samples.row_count[is_checked].sum()),
         "delivered": int(received[is_checked].sum()),
         "lost": int(missing[lost].sum()),
-        "wrong": int(np.count_nonzero(is_wrong | (sample == NO_MATCH))),
+        "wrong": count(is_wrong | (sample == NO_MATCH)),
         "repeated": len(known) - len(arrived),
     }
     examples = [
@@ -98,13 +97,15 @@ def _differs(rows: FrequencyRows, readings: Readings) -> Mask:
     differs_in_temperature = ~_is_same(rows.temperature, readings.temperature)
     differs: Mask = (certain & differs_in_pad).any(axis=1)
     differs |= certain.all(axis=1) & differs_in_temperature
+    # Doubtful stamps are the only condition that a row of frequencies may have.
     differs |= rows.status & ~np.uint16(STAMP) != 0
     return differs
 
 
 def _is_same(one: Single, other: Single) -> Mask:
     """Compare to the bit; what was not measured (NaN) is equal to what was not measured."""
-    same: Mask = (one == other) | (np.isnan(one) & np.isnan(other))
+    same: Mask = one == other
+    same |= np.isnan(one) & np.isnan(other)
     return same
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array, Index, Mask
 from cube_tensor_driver.core.health.statistics import WINDOW_S
-from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.oscillator import stress_slope
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
@@ -19,7 +18,7 @@ from cube_tensor_driver.simulation.faults import CUT_FAULTS, PAD_FAULTS
 
 from .expected import EDGE_NS
 from .record import DRIVER_KILLS, NODE_STARTS, NS_PER_S, Span
-from .run import Findings, Run
+from .run import Findings, Run, count, find_matched
 from .samples import HubFault
 
 STATUS_OF_FAULT = {
@@ -80,8 +79,9 @@ def check_health(run: Run, sample: Index) -> Findings:
         run: The torture.
         sample: Index of the sample of each row of stress (M,), or `NO_MATCH`.
     """
-    known = np.flatnonzero(sample != NO_MATCH)
-    rows, time_ns = run.record.stress.rows.select(known), run.samples.time_ns[sample[known]]
+    known = find_matched(sample)
+    rows = run.record.stress.rows.select(known)
+    time_ns = run.samples.time_ns[sample[known]]
     permitted_pads = np.zeros(len(rows), np.uint32)
     permitted_status = np.zeros(len(rows), np.uint16)
     evidence = _Evidence(run)
@@ -100,6 +100,7 @@ def check_health(run: Run, sample: Index) -> Findings:
             end_ns=fault.end_ns - EDGE_NS,
         )
         must_be_flagged = mine[required.contains(time_ns[mine])]
+        # A short fault may be over before it must be flagged.
         if not len(must_be_flagged) or not evidence.suffices(fault):
             continue
         unflagged = must_be_flagged[~_is_flagged(rows.select(must_be_flagged), pad, bit)]
@@ -118,7 +119,7 @@ def check_health(run: Run, sample: Index) -> Findings:
     figures = {
         "faults_to_flag": n_faults,
         "unflagged": n_unflagged,
-        "false_alarms": int(np.count_nonzero(is_false)),
+        "false_alarms": count(is_false),
     }
     return Findings(figures, examples)
 
@@ -178,24 +179,28 @@ class _Evidence:
     def _is_complete(self, cube: int, span: Span) -> bool:
         """Return whether nearly all rows of a cube arrived in a span."""
         samples, rows = self._run.samples, self._run.record.stress.rows
-        arrived = np.count_nonzero((rows.cube == cube) & span.contains(rows.stamp_ns))
+        arrived = count((rows.cube == cube) & span.contains(rows.stamp_ns))
         begin = Span(begin_ns=span.begin_ns, end_ns=span.begin_ns)
         is_near = begin.contains(samples.time_ns, NOMINAL_PERIOD_S, NOMINAL_PERIOD_S)
+        # The rate may change meanwhile, so the longest period counts.
         period_us = int(samples.period_us[is_near].max(initial=1))
         expected = (span.end_ns - span.begin_ns) / (1000 * period_us)
-        return bool(arrived >= MIN_COMPLETENESS * expected)
+        return arrived >= MIN_COMPLETENESS * expected
 
     def _moves(self, fault: HubFault, span: Span) -> bool:
         """Return whether half of the pads of the cube move in every window of a span."""
         samples = self._run.samples
-        chosen = np.flatnonzero((samples.link == fault.link) & span.contains(samples.time_ns))
-        readings = self._run.expected.of(np.full(len(chosen), fault.cube), chosen)
+        is_chosen = (samples.link == fault.link) & span.contains(samples.time_ns)
+        chosen = np.flatnonzero(is_chosen)
+        cubes = np.full(len(chosen), fault.cube)
+        readings = self._run.expected.of(cubes, chosen)
         window_ns = round(NS_PER_S * WINDOW_S)
         for begin_ns in range(span.begin_ns, span.end_ns - window_ns, WINDOW_STEP_NS):
             window = Span(begin_ns=begin_ns, end_ns=begin_ns + window_ns)
             frequency = readings.frequency[window.contains(samples.time_ns[chosen])]
             if not len(frequency):
                 return False
+            # The lower median: half of the pads move at least that much.
             movement = np.sort(np.ptp(frequency, axis=0) / self._noise[fault.cube])
             if movement[(len(movement) - 1) // 2] < MIN_MOVEMENT:
                 return False

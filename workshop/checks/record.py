@@ -97,10 +97,14 @@ class Received(Generic[AnyRows]):
         stamps = self.rows.stamp_ns
         inside = np.zeros(len(stamp_ns), bool)
         for row, _ in self.gaps:
-            before = stamps[max(0, row - ROWS_AROUND_GAP) : row].min(initial=LATEST_NS)
+            # Late rows may be on the other side of the gap, so several rows are looked at.
+            first = max(0, row - ROWS_AROUND_GAP)
+            before = stamps[first:row].min(initial=LATEST_NS)
             after = stamps[row : row + ROWS_AROUND_GAP].max(initial=EARLIEST_NS)
+            begin_ns = min(int(before), int(after))
             # Everything before the first row that arrived belongs to a gap at the beginning.
-            begin_ns = min(int(before), int(after)) if row else EARLIEST_NS // 2
+            if not row:
+                begin_ns = EARLIEST_NS // 2  # half of it, because a margin is subtracted
             gap = Span(begin_ns=begin_ns, end_ns=int(after))
             inside |= gap.contains(stamp_ns, GAP_MARGIN_S, GAP_MARGIN_S)
         return inside

@@ -64,19 +64,26 @@ class RestHistory:
         calibrated = np.array([calibration.rest_frequency for calibration in calibrations])
         self._calibrated = RestFrequencies(calibrated, np.ones(len(calibrations), bool))
 
-        changes = [action for action in run.record.actions_of("tare", "clear") if action.succeeded]
         current = self._calibrated
         self._epochs = [(Span(begin_ns=0, end_ns=LATEST_NS), current)]
-        for action in changes:
+        for action in self._changes():
             current = self._apply(action, current)
+            # The change ends the span of the values before.
             last, rest = self._epochs[-1]
             self._epochs[-1] = (replace(last, end_ns=action.end_ns), rest)
-            self._epochs.append((Span(begin_ns=action.end_ns, end_ns=LATEST_NS), current))
+            following = Span(begin_ns=action.end_ns, end_ns=LATEST_NS)
+            self._epochs.append((following, current))
+
+    def _changes(self) -> list[Action]:
+        actions = self._run.record.actions_of("tare", "clear")
+        return [action for action in actions if action.succeeded]
 
     def _apply(self, action: Action, current: RestFrequencies) -> RestFrequencies:
         if action.kind == "clear":
             return self._calibrated
-        averaged = replace(action, begin_ns=action.begin_ns - round(NS_PER_S * AVERAGED_S))
+        # The load must have been held for all data that the tare averages.
+        first_ns = action.begin_ns - round(NS_PER_S * AVERAGED_S)
+        averaged = Span(begin_ns=first_ns, end_ns=action.end_ns)
         cubes = list(action.cubes)
         return current.tare(cubes, self._run.expected.find_held(cubes, averaged))
 
@@ -99,13 +106,13 @@ class RestHistory:
             is_tared = ~rest.is_known | differs
             applies |= is_candidate & ~is_tared[cube]
             ever_tared |= is_tared
+        # While two values may be in force, a cube that is ever tared is not certain.
         return applies & ~(self._is_unclear(sent_ns) & ever_tared[cube])
 
     def _is_unclear(self, sent_ns: Times) -> Mask:
         """Find the times (N,) at which the old or the new values may be in force."""
         record = self._run.record
         is_unclear = record.is_during(RECONSTRUCTION_STOPS, sent_ns, TRANSPORT_S, RESTORE_S)
-        for action in record.actions_of("tare", "clear"):
-            if action.succeeded:
-                is_unclear |= action.contains(sent_ns, TRANSPORT_S, TRANSPORT_S)
+        for action in self._changes():
+            is_unclear |= action.contains(sent_ns, TRANSPORT_S, TRANSPORT_S)
         return is_unclear

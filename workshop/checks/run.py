@@ -5,11 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
+from cube_tensor_driver.core.arrays import Index, Mask
+from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
 from .expected import ExpectedReadings
 from .record import NS_PER_S, Record
 from .samples import Samples
+
+
+def count(mask: Mask) -> int:
+    """Return the number of entries that are True."""
+    return int(np.count_nonzero(mask))
+
+
+def find_matched(index: Index) -> Index:
+    """Return the places of an index (N,) that are not `NO_MATCH`."""
+    return np.flatnonzero(index != NO_MATCH)
 
 
 class Run:
@@ -30,7 +44,8 @@ class Run:
 
     def describe(self, finding: str, time_ns: int) -> str:
         """Return a line about a finding, with its simulated time in seconds."""
-        return f"{finding}, {(int(time_ns) - self._start_ns) / NS_PER_S:.3f} s"
+        seconds = (int(time_ns) - self._start_ns) / NS_PER_S
+        return f"{finding}, {seconds:.3f} s"
 
 
 @dataclass(frozen=True)

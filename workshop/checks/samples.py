@@ -8,7 +8,7 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import AnyArray, Mask
 from cube_tensor_driver.simulation.faults import Fault
-from cube_tensor_driver.simulation.sample_log import SampleLog
+from cube_tensor_driver.simulation.sample_log import FaultRecord, SampleLog
 
 from .record import Span
 
@@ -55,13 +55,11 @@ class Samples:
         self.time_us = (self.time_ns - log.start_time_ns) // 1000
         self.row_count = self.table.rows_per_sample[self.link]
 
-        runs = [run for link in log.links for run in link.runs]
-        lengths = np.array([len(run) for run in runs], int)
-        self.boot = np.repeat(np.array([run.boot for run in runs], int), lengths)
-        self.period_us = np.repeat(
-            np.array([run.period_us for run in runs], int),
-            lengths,
-        )
+        runs = [(len(run), run.boot, run.period_us) for link in log.links for run in link.runs]
+        # One column each; the shape is stated because there may be no runs.
+        lengths, boots, periods_us = np.array(runs, int).reshape(-1, 3).T
+        self.boot = np.repeat(boots, lengths)
+        self.period_us = np.repeat(periods_us, lengths)
 
         damaged = [
             (link, boot, number)
@@ -78,20 +76,22 @@ class Samples:
 
     def faults(self, *kinds: str) -> list[HubFault]:
         """Return the faults of some kinds, in order."""
-        links = {link.name: index for index, link in enumerate(self.log.links)}
-        start_ns = self.log.start_time_ns
-        return [
-            HubFault(
-                begin_ns=start_ns + 1000 * record.start_us,
-                end_ns=start_ns + 1000 * record.end_us,
-                fault=record.fault,
-                start_us=record.start_us,
-                link=links[record.fault.link],
-                cube=self.log.links[links[record.fault.link]].cubes[record.fault.cube],
-            )
-            for record in self.log.faults
-            if record.fault.kind in kinds
-        ]
+        records = [record for record in self.log.faults if record.fault.kind in kinds]
+        return [self._convert(record) for record in records]
+
+    def _convert(self, record: FaultRecord) -> HubFault:
+        """Convert a fault of the log to times of the wall clock and indices of the skin."""
+        fault, start_ns = record.fault, self.log.start_time_ns
+        names = [link.name for link in self.log.links]
+        link = names.index(fault.link)
+        return HubFault(
+            begin_ns=start_ns + 1000 * record.start_us,
+            end_ns=start_ns + 1000 * record.end_us,
+            fault=fault,
+            start_us=record.start_us,
+            link=link,
+            cube=self.log.links[link].cubes[fault.cube],
+        )
 
     def is_near_fault(
         self,
@@ -102,7 +102,8 @@ class Samples:
         """Find the samples (S,) whose link had such a fault, or less than a margin away."""
         near = np.zeros(len(self), bool)
         for fault in self.faults(*kinds):
-            near |= (self.link == fault.link) & fault.contains(self.time_ns, before_s, after_s)
+            is_close = fault.contains(self.time_ns, before_s, after_s)
+            near |= (self.link == fault.link) & is_close
         return near
 
 

@@ -21,7 +21,7 @@ from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL, STAMP, 
 from .expected import split_in_chunks
 from .record import DRIVER_KILLS, NODE_STARTS, UNFLUSHED_S
 from .rest import RestFrequencies, RestHistory
-from .run import Findings, Run
+from .run import Findings, Run, count, find_matched
 
 MAX_ERROR = 1e-4
 """Largest error of a component against the reference, as a share of the component's range.
@@ -74,20 +74,24 @@ def check_tensors(run: Run) -> TensorFindings:
     record = run.record
     frequencies, stress = record.frequencies.rows, record.stress.rows
     source = _find_sources(frequencies, stress)
-    known = np.flatnonzero(source != NO_MATCH)
-    count = np.bincount(source[known], minlength=len(frequencies))
-    is_missing = _find_missing(run, has_tensor=count > 0)
+    known = find_matched(source)
+    # A row of frequencies should be the source of exactly one row of stress.
+    n_tensors = np.bincount(source[known], minlength=len(frequencies))
+    is_missing = _find_missing(run, has_tensor=n_tensors > 0)
 
-    is_invented = (source == NO_MATCH) & ~record.frequencies.is_in_gap(stress.stamp_ns)
+    is_invented = source == NO_MATCH
+    is_invented &= ~record.frequencies.is_in_gap(stress.stamp_ns)
     # The last messages of a driver that was killed may have reached the reconstruction alone.
     is_invented &= ~record.is_during(DRIVER_KILLS, record.stress.sent_ns, UNFLUSHED_S)
 
-    history, reference = RestHistory(run), _Reference(run)
+    history = RestHistory(run)
+    reference = _Reference(run)
     is_wrong, is_unknown = np.zeros((2, len(stress)), bool)
     for part in split_in_chunks(known):
         made, measured = stress.select(part), frequencies.select(source[part])
         sent_ns = record.stress.sent_ns[part]
         agrees = np.zeros(len(part), bool)
+        # Where two changes are close, a row may agree with any of several rest frequencies.
         for is_candidate, rest in history.candidates(sent_ns):
             has_no_reference = ~rest.is_known[made.cube]
             agrees |= is_candidate & (has_no_reference | reference.agrees(made, measured, rest))
@@ -99,10 +103,10 @@ def check_tensors(run: Run) -> TensorFindings:
     sent_ns = record.frequencies.sent_ns
     figures = {
         "tensors": len(stress),
-        "tensors_not_judged": int(np.count_nonzero(is_unknown)),
-        "missing_tensors": int(np.count_nonzero(is_missing)),
-        "wrong_tensors": int(np.count_nonzero(is_wrong | is_invented)),
-        "repeated": int(np.maximum(count - 1, 0).sum()),
+        "tensors_not_judged": count(is_unknown),
+        "missing_tensors": count(is_missing),
+        "wrong_tensors": count(is_wrong | is_invented),
+        "repeated": int(np.maximum(n_tensors - 1, 0).sum()),
     }
     found: list[tuple[str, FrequencyRows | StressRows, Mask]] = [
         ("wrong tensor", stress, is_wrong),
@@ -114,14 +118,14 @@ def check_tensors(run: Run) -> TensorFindings:
         for what, rows, is_found in found
         for row in np.flatnonzero(is_found)[:3]
     ]
-    without = np.setdiff1d(sent_ns, sent_ns[count > 0])
+    without = np.setdiff1d(sent_ns, sent_ns[n_tensors > 0])
     return TensorFindings(figures, examples, source, len(without))
 
 
 def _find_sources(frequencies: FrequencyRows, stress: StressRows) -> Index:
     """Find the row of frequencies with the cube, number and stamp of each row of stress (M,)."""
     source = match_rows(frequencies, stress)
-    found = np.flatnonzero(source != NO_MATCH)
+    found = find_matched(source)
     has_other_stamp = frequencies.stamp_ns[source[found]] != stress.stamp_ns[found]
     source[found[has_other_stamp]] = NO_MATCH
     return source
@@ -136,9 +140,11 @@ def _find_missing(run: Run, has_tensor: Mask) -> Mask:
     """
     record = run.record
     stamp_ns, sent_ns = record.frequencies.rows.stamp_ns, record.frequencies.sent_ns
-    is_missing = ~has_tensor & record.contains(stamp_ns) & ~record.stress.is_in_gap(stamp_ns)
+    is_missing = ~has_tensor & record.contains(stamp_ns)
+    is_missing &= ~record.stress.is_in_gap(stamp_ns)
     for action in record.actions_of(*NODE_STARTS):
-        before_ns = sent_ns[has_tensor & (sent_ns <= action.begin_ns)].max(initial=0)
+        was_up = has_tensor & (sent_ns <= action.begin_ns)
+        before_ns = sent_ns[was_up].max(initial=0)
         is_missing &= (sent_ns <= before_ns) | (sent_ns > action.end_ns)
     # The rows of one message were sent at one time.
     if len(np.unique(sent_ns[is_missing])) <= record.messages_lost:
@@ -154,8 +160,10 @@ class _Reference:
         self._pipeline = Pipeline(calibrations, np.float64)
         self._expected = run.expected
         self._range = np.ptp(run.expected.truth, axis=(0, 1))
+        # One limit for each possible number of degrees of freedom.
         degrees = range(1, self._pipeline.n_pads + 1)
-        self._limits = np.array([np.sqrt(chi2_limit(n, FALSE_ALARM) / n) for n in degrees])
+        limits = [np.sqrt(chi2_limit(degree, FALSE_ALARM) / degree) for degree in degrees]
+        self._limits = np.array(limits)
         self._deviations: dict[tuple[int, int], Array] = {}
 
     def agrees(
@@ -176,7 +184,8 @@ class _Reference:
             _components(wanted),
             allowed,
         ).all(axis=1)
-        agrees &= (made.observed == wanted.observed) & (made.left_out == wanted.left_out)
+        agrees &= made.observed == wanted.observed
+        agrees &= made.left_out == wanted.left_out
 
         # Rounding decides whether a residual that is close to its limit is above it.
         relative = wanted.residual[:, np.newaxis] / self._limits
@@ -192,7 +201,8 @@ class _Reference:
         is_untared: Mask,
     ) -> Mask:
         """Return whether rows (N,) of sound cubes are equal to the load; True for all others."""
-        chosen = np.flatnonzero((sample != NO_MATCH) & is_untared & (made.left_out == 0))
+        uses_all_pads = made.left_out == 0
+        chosen = np.flatnonzero((sample != NO_MATCH) & is_untared & uses_all_pads)
         readings = self._expected.of(made.cube[chosen], sample[chosen])
         is_usable = readings.is_sound & readings.is_certain.all(axis=1)
         chosen, instant = chosen[is_usable], readings.instant[is_usable]
@@ -200,7 +210,9 @@ class _Reference:
         part = made.select(chosen)
         truth = self._expected.truth[instant, part.cube]
         is_near = _is_near(_components(part), truth, MAX_ERROR_OF_LOAD * self._range)
-        is_hidden = part.observed[:, np.newaxis] >> np.arange(is_near.shape[1]) & 1 == 0
+        # Planar cubes do not observe all components of the load.
+        bit = np.arange(is_near.shape[1])
+        is_hidden = part.observed[:, np.newaxis] >> bit & 1 == 0
         agrees = np.ones(len(made), bool)
         agrees[chosen] = (is_near | is_hidden).all(axis=1)
         return agrees
@@ -210,8 +222,13 @@ class _Reference:
         # One integer for cube and mask is sorted much faster than pairs are.
         key = made.cube.astype(np.int64) << 32 | made.left_out
         distinct, which = np.unique(key, return_inverse=True)
-        rows = [self._deviation_of(value >> 32, value & 0xFFFFFFFF) for value in distinct.tolist()]
-        deviations: Array = np.array(rows).reshape(-1, len(self._range))[which.ravel()]
+        rows = [
+            self._deviation_of(cube=value >> 32, left_out=value & 0xFFFFFFFF)
+            for value in distinct.tolist()
+        ]
+        # The shape is stated because there may be no rows.
+        table = np.array(rows).reshape(-1, len(self._range))
+        deviations: Array = table[which.ravel()]
         return deviations
 
     def _deviation_of(self, cube: int, left_out: int) -> Array:
@@ -232,5 +249,6 @@ def _is_near(
     allowed: Real,
 ) -> Mask:
     """Compare with a tolerance; what is not observed (NaN) must be so in both."""
-    near: Mask = (np.abs(found - wanted) <= allowed) | (np.isnan(found) & np.isnan(wanted))
+    near: Mask = np.abs(found - wanted) <= allowed
+    near |= np.isnan(found) & np.isnan(wanted)
     return near

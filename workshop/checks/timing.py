@@ -13,6 +13,8 @@ from .frequencies import RECOVERY_S, FrequencyFindings
 from .record import DRIVER_KILLS, DRIVER_STOPS, NS_PER_S, Span
 from .run import Run
 
+MS_PER_NS = 1e-6
+
 CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "drift")
 """Faults after which the driver fits the clock of the hub from the start."""
 
@@ -45,22 +47,26 @@ def measure_stamp_errors(run: Run) -> Array:
     # All cubes of a hub have the same stamp, so one of each is enough.
     rows = record.frequencies.rows
     first_cubes = [link.members[0] for link in samples.log.links]
-    is_certain = (rows.status & np.uint16(STAMP) == 0) & (run.sample != NO_MATCH)
+    is_certain = rows.status & np.uint16(STAMP) == 0
     chosen = np.flatnonzero(np.isin(rows.cube, first_cubes) & is_certain)
+    chosen = chosen[run.sample[chosen] != NO_MATCH]
     chosen = chosen[settled[run.sample[chosen]]]
-    error_ms = 1e-6 * (rows.stamp_ns[chosen] - samples.time_ns[run.sample[chosen]])
-    return np.asarray(error_ms, np.float64)
+    taken_ns = samples.time_ns[run.sample[chosen]]
+    error_ms: Array = (rows.stamp_ns[chosen] - taken_ns) * MS_PER_NS
+    return error_ms
 
 
 def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
     """Compute the time, in seconds, from the end of each unplugging to the first sample after it
     that arrived."""
     samples = run.samples
-    arrived = (frequencies.missing < samples.row_count) & (samples.time_ns < run.record.end_ns)
+    # One row of a sample is enough to know that the link delivers.
+    arrived = frequencies.missing < samples.row_count
+    arrived &= samples.time_ns < run.record.end_ns
     gaps_s = []
     for fault in samples.faults("unplug", "rename"):
-        is_later = (samples.link == fault.link) & (samples.time_ns >= fault.end_ns)
-        times_ns = samples.time_ns[arrived & is_later]
+        is_after = samples.time_ns >= fault.end_ns
+        times_ns = samples.time_ns[arrived & is_after & (samples.link == fault.link)]
         if len(times_ns):
             gaps_s.append(float(times_ns.min() - fault.end_ns) / NS_PER_S)
     return gaps_s
@@ -76,17 +82,23 @@ def count_wrong_periods(run: Run) -> int:
     for action in record.actions_of("rate"):
         settled = Span(
             begin_ns=action.end_ns,
-            end_ns=action.end_ns + round(1e9 * RATE_CHANGE_S),
+            end_ns=action.end_ns + round(NS_PER_S * RATE_CHANGE_S),
         )
-        if not action.succeeded or any(settled.contains(np.array(disturbances))):
+        # A later change within this time would have changed the period again.
+        is_disturbed = settled.contains(np.array(disturbances)).any()
+        if not action.succeeded or is_disturbed:
             continue
         wanted_us = round(1e6 / float(action.answer))
+        time_us = (settled.end_ns - samples.log.start_time_ns) // 1000
         for link, log in enumerate(samples.log.links):
             is_cut = any(
                 cut.link == link and cut.contains(settled.end_ns, BEFORE_CUT_S, RECOVERY_S)
                 for cut in cuts
             )
-            time_us = (settled.end_ns - samples.log.start_time_ns) // 1000
-            periods = {run.period_us for run in log.runs if run.start_us <= time_us < run.end_us}
+            periods = {
+                sample_run.period_us
+                for sample_run in log.runs
+                if sample_run.start_us <= time_us < sample_run.end_us
+            }
             wrong += not is_cut and periods != {wanted_us}
     return wrong
