@@ -12,6 +12,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = main()
+        # Here a closed pipe is noticed while it can still be handled.
         sys.stdout.flush()
     except KeyboardInterrupt:
         # It came while the arguments were parsed.

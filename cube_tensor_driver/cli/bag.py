@@ -67,6 +67,7 @@ def show_bag(path: Path) -> None:
         # The start and end time of a bag without messages are undefined.
         if any(connection.msgcount for connection in bag.connections):
             duration_s = (bag.end_ns - bag.start_ns) * 1e-9
+            # Milliseconds are enough for people.
             start = np.datetime64(bag.start_ns, "ns").astype("datetime64[ms]")
             console.print(f"{path}: {duration_s:.3f} s from {start} UTC")
         else:
@@ -89,6 +90,7 @@ def topic_table(bag: Bag, duration_s: float) -> Table:
         table.add_column(heading, justify="right")
     for connection in sorted(bag.connections, key=lambda connection: connection.topic):
         count = connection.msgcount
+        # One message has no rate.
         rate = f"{count / duration_s:.1f}" if duration_s and count > 1 else ""
         table.add_row(connection.topic, connection.msgtype, str(count), rate)
     return table
@@ -120,6 +122,7 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
 
     table = make_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"))
     for cube in cube_summaries(bag, topic, info):
+        # A cube with fewer than two samples has no rate and no gaps.
         cells = ["", "", "", ""]
         if cube.rate is not None and cube.longest_gap is not None:
             gap_ms = f"{1e3 * cube.longest_gap:.1f}"

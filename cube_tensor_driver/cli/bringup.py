@@ -90,6 +90,7 @@ def run(options: argparse.Namespace) -> int:
     if any(each.swapped or not each.is_clear for each in explanations.values()):
         say("no file written: swap the wires, or press again, and run this command again", "red")
         return 1
+    # The header of the file says where it comes from.
     header = f"./cube bringup {options.port}. Write the positions of the cubes into xyz."
     write_yaml(options.output, data, header)
     say(f"wrote {options.output}: write the positions of the cubes into it")
@@ -122,6 +123,7 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
             port.problem or f"{port.path}: no answer within 1 s; not a hub, or no power"
         )
 
+    # Built-in layouts differ in their number of pads, which HELLO states.
     shipped = {layout.n_pads: name for name, layout in LAYOUTS.items()}
     name = options.calibration or shipped.get(hello.n_pads)
     if name is None:
@@ -134,6 +136,7 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
         # A relative path would be searched from the folder of the skin file.
         name = str(file.resolve())
     calibration = read_calibration(file)
+    # A row of cubes: the hub does not know how they are arranged.
     data = grid(
         options.name,
         nx=hello.n_cubes,
@@ -167,6 +170,7 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
     for rows in source:
         parts.append(split_into_scans(rows, len(source.skin.cubes)))
         now_s = float(parts[-1][1][-1] - parts[0][1][0])
+        # The time is that of the samples, so that a slow computer measures as long as a fast one.
         is_over = now_s >= REST_S
         has_enough = sum(len(each) for each, _ in parts) >= MIN_SAMPLES
         if not has_enough or not (is_over or now_s >= next_shown_s):
@@ -269,6 +273,7 @@ class PadScreen:
         table = make_table(("cube", "pad"), ("f / Hz", "noise / ppm", "drift / (ppm/min)"))
         table.add_column("state")
         for cube, pad in np.ndindex(rest.frequency.shape):
+            # A silent pad has no numbers.
             numbers = ("", "", "")
             if np.isfinite(rest.frequency[cube, pad]):
                 numbers = (

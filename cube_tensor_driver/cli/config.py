@@ -92,6 +92,7 @@ def write_grid(options: argparse.Namespace) -> int:
     if mistakes:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
+    # The same text stands at the top of the file.
     text = f"{size}, on {options.links} {'link' if options.links == 1 else 'links'}"
     with working(f"writing {len(skin['cubes'])} cubes"):
         write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
@@ -120,6 +121,7 @@ def check_file(path: Path) -> int:
     from ..device.links.line_load import line_doubts
     from ..views.terminal.output import working
 
+    # A skin of thousands of cubes takes seconds to check.
     with working(f"checking {path}"):
         skin, mistakes = check_skin(path)
         # Doubts about poses and lines make sense only for a file without mistakes.

@@ -36,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
                     print(message_json(item))
                 else:
                     print(f"{to_yaml(item)}---")
+            # A reader of a pipe sees each message at once.
             sys.stdout.flush()
     except BrokenPipeError:
         # Python flushes stdout once more when it ends, which must not fail again.

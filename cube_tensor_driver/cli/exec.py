@@ -28,6 +28,7 @@ def run(options: argparse.Namespace) -> int:
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     name = options.words[0]
     try:
+        # The command takes the place of this process, with its signals and its exit code.
         os.execvp(name, options.words)
     except OSError as error:
         print(f"cube: exec: {name}: {error.strerror}", file=sys.stderr)

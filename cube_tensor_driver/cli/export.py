@@ -57,6 +57,7 @@ def arguments(parser: Parser) -> None:
     for name, text in TABLES.items():
         table = parser.add_subcommand(name, text)
         _add_common(table)
+        # Tables are made by `reprocess`, whose other options have their defaults here.
         table.set_defaults(format=name, contacts=None, scheduler=None)
         table.add_argument(
             "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"

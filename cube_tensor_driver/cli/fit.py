@@ -91,6 +91,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json is not None:
         write_json(options.json, figures(result))
     save(draw_fit(result, measured), options.figure)
+    # The time and the source are part of the file, so that it can be traced back.
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     table = options.loads.name
     calibration = result.calibration(base, created, f"fit of {table}, {len(measured)} loads")
@@ -126,6 +127,7 @@ def read_inputs(
         # A reference sensor never reads exactly 0, so that only the tare of the recorded skin
         # tells when there was no load.
         rest, rest_source = base.rest_frequency, "of the bag, after tare"
+    # A bag without --reference does not say what the loads were.
     elif is_bag(options.loads):
         raise ConfigError(
             f"{options.loads} is a bag: name the topic to fit to with --reference; "
@@ -138,6 +140,7 @@ def read_inputs(
     if options.base is not None:
         base = read_calibration(find_calibration(options.base, Path()))
         base.check(layout, options.uid)
+    # A layout of the user's own has no shipped calibration to start from.
     if base is None:
         raise ConfigError(
             f"layout {layout.name!r} is not a built-in one: name a calibration for it with --base"

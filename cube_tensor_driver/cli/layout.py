@@ -51,6 +51,7 @@ def run(options: argparse.Namespace) -> int:
     calibration = shipped_calibration(layout)
     if options.calibration is not None:
         calibration = read_calibration(find_calibration(options.calibration, Path()))
+        # A calibration of another layout has another number of pads.
         calibration.check(layout)
     if options.symmetry is not None:
         symmetry = options.symmetry

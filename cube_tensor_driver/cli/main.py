@@ -90,6 +90,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         SystemExit: Help or the version was printed, or the usage is wrong.
     """
     words = list(arguments)
+    # ./cube help demo is the same as ./cube demo --help.
     if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
     if not words or words[0] in ("-h", "--help"):
@@ -107,6 +108,7 @@ def command_parser(name: str) -> Parser:
     Raises:
         SystemExit: There is no such command.
     """
+    # ./cube handles --distro before Python starts; without the checkout nobody does.
     if name.startswith("--distro"):
         Parser(prog=PROGRAM).error("--distro is an option of ./cube in a checkout")
     if name not in COMMANDS:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import math
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
+
+Number = TypeVar("Number", int, float)
 
 MAX_WIDTH = 100
 """Width of a help text in columns, however wide the terminal is: longer lines are hard to read."""
@@ -152,6 +155,7 @@ def sentence(text: str) -> str:
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return a question that suggests close words, or the list of all known words."""
     # The words are compared without dashes, which all options have in common.
+    # Short options such as -o are close to everything.
     names = {one.lstrip("-"): one for one in known if len(one) > 2}
     close = difflib.get_close_matches(word.lstrip("-"), names, n=2)
     if close:
@@ -171,6 +175,7 @@ def check_outputs(options: argparse.Namespace) -> None:
     pictures: list[Path] = []
     for output in getattr(options, "outputs", ()):
         value = getattr(options, output.name)
+        # A default such as the name of a picture depends on other options.
         if callable(value):
             value = value(options)
             setattr(options, output.name, value)
@@ -191,61 +196,44 @@ def check_outputs(options: argparse.Namespace) -> None:
             check_picture(picture)
 
 
-def _number(kind: Callable[[str], Any], text: str, what: str, fits: Callable[[Any], bool]) -> Any:
-    """Convert a text into a number.
+def _number_type(
+    kind: Callable[[str], Number],
+    what: str,
+    is_allowed: Callable[[Number], bool],
+) -> Callable[[str], Number]:
+    """Return a function that converts the text of an argument into a number.
 
     Args:
-        kind: Function that converts it.
-        text: The text.
+        kind: Function that converts any number.
         what: What is expected, for the error message.
-        fits: Function that tells whether the number is allowed.
+        is_allowed: Whether the option takes a number.
     """
-    try:
-        value = kind(text)
-    except ValueError:
-        value = None
-    if value is None or not fits(value):
+
+    def convert(text: str) -> Number:
+        with contextlib.suppress(ValueError):
+            value = kind(text)
+            if is_allowed(value):
+                return value
         raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
-    return value
+
+    return convert
 
 
-def number(text: str) -> float:
-    """Convert the text of a finite number."""
-    return float(_number(float, text, "a finite number", math.isfinite))
-
-
-def positive(text: str) -> float:
-    """Convert the text of a number above 0."""
-    return float(_number(float, text, "a number above 0", lambda x: 0 < x < math.inf))
-
-
-def sample_rate(text: str) -> float:
-    """Convert the text of a sample rate in Hz, with the limits of hubs and skin files."""
-    what = "a rate from 0.1 to 10000 samples per second"
-    return float(_number(float, text, what, lambda x: 0.1 <= x <= 10_000))
-
-
-def not_negative(text: str) -> float:
-    """Convert the text of a number of at least 0."""
-    return float(_number(float, text, "a number of at least 0", lambda x: 0 <= x < math.inf))
-
-
-def count(text: str) -> int:
-    """Convert the text of a whole number of at least 1."""
-    return int(_number(int, text, "a whole number of at least 1", lambda n: n >= 1))
-
-
-def whole_number(text: str) -> int:
-    """Convert the text of a whole number of at least 0."""
-    return int(_number(int, text, "a whole number of at least 0", lambda n: n >= 0))
-
-
-def tcp_port(text: str) -> int:
-    """Convert the text of a TCP port."""
-    return int(_number(int, text, "a TCP port, 1 to 65535", lambda n: 1 <= n <= 65535))
-
-
-def uid(text: str) -> int:
-    """Convert the text of a uid: decimal, or hexadecimal with 0x in front."""
-    what = "a uid, 0 to 2^64 - 1"
-    return int(_number(lambda word: int(word, 0), text, what, lambda n: 0 <= n <= MAX_UID))
+number = _number_type(float, "a finite number", math.isfinite)
+positive = _number_type(float, "a number above 0", lambda x: 0 < x < math.inf)
+not_negative = _number_type(float, "a number of at least 0", lambda x: 0 <= x < math.inf)
+sample_rate = _number_type(
+    float,
+    "a rate from 0.1 to 10000 samples per second",
+    # These are the limits of hubs and skin files.
+    lambda rate: 0.1 <= rate <= 10_000,
+)
+count = _number_type(int, "a whole number of at least 1", lambda n: n >= 1)
+whole_number = _number_type(int, "a whole number of at least 0", lambda n: n >= 0)
+tcp_port = _number_type(int, "a TCP port, 1 to 65535", lambda n: 1 <= n <= 65535)
+uid = _number_type(
+    # Base 0 takes decimal numbers, and hexadecimal ones with 0x in front.
+    lambda text: int(text, 0),
+    "a uid, 0 to 2^64 - 1",
+    lambda n: 0 <= n <= MAX_UID,
+)

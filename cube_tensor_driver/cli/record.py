@@ -95,6 +95,7 @@ class RecordingStatus:
         missing, refused = recorder.missing, recorder.refused
         waiting = f"; waiting for {', '.join(missing)}" if missing else ""
         self.line.update(f"{self._path}: {seconds:.0f} s, {recorder.received} messages{waiting}")
+        # Each refusal is printed once.
         for topic in refused.keys() - self._refused:
             self._console.print(f"not recorded: {refused[topic]}", style="red")
         self._refused |= refused.keys()

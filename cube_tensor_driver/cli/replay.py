@@ -109,6 +109,7 @@ def single_keys() -> Iterator[bool]:
     if not sys.stdin.isatty():
         yield False
         return
+    # `cbreak` leaves Ctrl-C as it is.
     number = sys.stdin.fileno()
     before = termios.tcgetattr(number)
     try:
@@ -159,6 +160,7 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
         Children(Path(name)) as children,
     ):
         if wanted:
+            # The view does not compute stress.
             if not bag.topics(f"{PACKAGE}/msg/SkinStress"):
                 raise BagError(
                     f"{bag.path}: no stress to show; "

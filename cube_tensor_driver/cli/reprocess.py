@@ -103,6 +103,7 @@ def run(options: argparse.Namespace) -> int:
         done = len(jobs) - len(waiting)
         console.print(f"{done} of {len(jobs)} bags are there already in {options.output}")
 
+    # More processes than bags would only cost memory.
     processes = useful_workers(options.jobs, len(waiting))
     bar = Progress(console=console, disable=not waiting)
     task = bar.add_task("reprocessing", total=len(waiting))
@@ -117,6 +118,7 @@ def run(options: argparse.Namespace) -> int:
                     console.print(result_line(job.output, result))
                 bar.advance(task)
     finally:
+        # An interrupted bag must not look like a result.
         remove_without_results(options.output)
     if failed:
         console.print(f"{failed} of {len(jobs)} bags could not be reprocessed", style="red")

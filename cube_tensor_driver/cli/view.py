@@ -44,6 +44,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    # viser is imported only by this command.
     from ..browser.viewer import run_view
 
     return run_view(options.host, options.port, options.depth, options.recordings.expanduser())

@@ -163,6 +163,7 @@ class LoadVerification:
         # The load script runs in simulated time, which began with the simulator.
         seconds = (times_ns - self._log.start_time_ns) * 1e-9
         applied = [self._load.total(time) for time in seconds.tolist()]
+        # The contacts are computed as the page and the node `contacts` do without the inverse.
         surface = Surface(self._load.poses, self._load.depth)
         measured = []
         for time_ns in times_ns:
@@ -197,31 +198,38 @@ class LoadVerification:
         """Return rms and largest error relative to the range of each component in the script, and
         the rms relative to the standard deviation that the noise of the pads causes."""
         cube, components, taken_ns = self._received(comparison)
+        if not len(cube):
+            return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
         errors, allowed = [], []
         noise = component_noise(self._skin)
         for time_ns in thin_out(np.unique(taken_ns)):
             rows = np.flatnonzero(taken_ns == time_ns)
-            truth = self._truth((time_ns - self._log.start_time_ns) * 1e-9)
+            seconds = (time_ns - self._log.start_time_ns) * 1e-9
+            truth = self._truth(seconds)
             errors.append(components[rows] - truth[cube[rows]])
             allowed.append(noise[cube[rows]])
-        if not errors:
-            return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
 
-        script = [self._truth(time) for time in np.linspace(0, self._load.period, RANGE_TIMES)]
+        times = np.linspace(0, self._load.period, RANGE_TIMES)
+        script = [self._truth(time) for time in times]
         span = np.nanmax(script, axis=(0, 1)) - np.nanmin(script, axis=(0, 1))
         error = np.concatenate(errors)
         # A component that the script never changes has no range to compare with.
         relative = error[:, span > 0] / span[span > 0]
         over_noise = error / np.concatenate(allowed)
         return {
-            "error_rel_rms": float(np.sqrt(np.nanmean(relative**2))),
+            "error_rel_rms": rms(relative),
             "error_rel_worst": float(np.nanmax(np.abs(relative))),
-            "error_over_noise": float(np.sqrt(np.nanmean(over_noise**2))),
+            "error_over_noise": rms(over_noise),
         }
 
     def _truth(self, seconds: float) -> Array:
         """Return the components (cubes, 15) that the load causes at a simulated time."""
         return skin_components(self._skin, *self._load.at(seconds))
+
+
+def rms(values: AnyArray) -> float:
+    """Return the root mean square, without values that are NaN."""
+    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def component_noise(skin: Skin) -> Array:
@@ -254,6 +262,7 @@ def total_force(contacts: list[Contact]) -> tuple[Array, Array]:
     """Return force (3,) in N and centre of pressure (3,) in metres of all contacts together."""
     if not contacts:
         return np.zeros(3), np.full(3, np.nan)
+    # The centre of pressure is weighted by the normal force.
     weight = np.array([contact.normal_force for contact in contacts])
     positions = np.array([contact.position for contact in contacts])
     force = np.sum([contact.force for contact in contacts], axis=0)

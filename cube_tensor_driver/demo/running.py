@@ -64,6 +64,7 @@ class Observer:
         """
 
         def check() -> None:
+            # A signal sets an event only, so that it is handled at this place.
             if self._interrupted is not None and self._interrupted.is_set():
                 raise Interrupted("interrupted")
             # Once per message would cost more than the message.

@@ -58,6 +58,7 @@ class Arrivals:
             rows: The rows of one message.
             received_ns: Time of arrival; 0 where the latency is not asked for.
         """
+        # All rows count, kept or not, because callers ask whether anything has arrived.
         self.rows += len(rows)
         cube, sequence, stamp_ns = rows.cube, rows.sequence, rows.stamp_ns
         if not self._keeps_all:

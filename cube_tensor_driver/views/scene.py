@@ -75,46 +75,45 @@ def _length(*names: str) -> Callable[[Array, Array], Array]:
     columns = [COMPONENTS.index(name) for name in names]
 
     def of(values: Array, residual: Array) -> Array:
-        observed = np.isfinite(values[:, columns])
-        length = np.sqrt((np.where(observed, values[:, columns], 0) ** 2).sum(axis=1))
-        return np.where(observed.any(axis=1), length, np.nan)
+        parts = values[:, columns]
+        is_observed = np.isfinite(parts)
+        # A part that is not observed counts as 0; without any there is no length.
+        length = np.linalg.norm(np.where(is_observed, parts, 0), axis=1)
+        return np.where(is_observed.any(axis=1), length, np.nan)
 
     return of
 
 
+def _stress(label: str, of: Callable[[Array, Array], Array], signed: bool = False) -> Quantity:
+    return Quantity(
+        label,
+        unit="kPa",
+        size=1e3,
+        min_top=500.0,
+        signed=signed,
+        of=of,
+    )
+
+
 QUANTITIES = {
-    "pressure": Quantity(
-        "pressure −σzz", "kPa", 1e3, 500.0, False, lambda values, residual: -values[:, 2]
-    ),
-    "shear": Quantity(
-        "shear |σzx, σyz|",
-        "kPa",
-        1e3,
-        500.0,
-        False,
-        _length("zx", "yz"),
-    ),
+    "pressure": _stress("pressure −σzz", lambda values, residual: -values[:, 2]),
+    "shear": _stress("shear |σzx, σyz|", _length("zx", "yz")),
     "gradient": Quantity(
-        "gradient |∂σzz/∂x, ∂σzz/∂y|", "kPa/mm", 1e6, 1e5, False, _length("zz_x", "zz_y")
+        "gradient |∂σzz/∂x, ∂σzz/∂y|",
+        unit="kPa/mm",
+        size=1e6,
+        min_top=1e5,
+        signed=False,
+        of=_length("zz_x", "zz_y"),
     ),
-    **{
-        name: Quantity(
-            f"σ{name}",
-            "kPa",
-            1e3,
-            500.0,
-            True,
-            _component(name),
-        )
-        for name in STRESS
-    },
+    **{name: _stress(f"σ{name}", _component(name), signed=True) for name in STRESS},
     "residual": Quantity(
         "residual",
-        "σ",
-        1.0,
-        3.0,
-        False,
-        lambda values, residual: residual,
+        unit="σ",
+        size=1.0,
+        min_top=3.0,
+        signed=False,
+        of=lambda values, residual: residual,
     ),
 }
 """Name -> quantity, of all that markers and the page can show."""
@@ -150,7 +149,7 @@ def colours(quantity: Quantity, values: Array, top: float) -> Array:
 
 
 def _colour_table(hexes: str) -> Array:
-    return np.array([[int(text[i : i + 2], 16) / 255 for i in (0, 2, 4)] for text in hexes.split()])
+    return np.array([tuple(bytes.fromhex(text)) for text in hexes.split()]) / 255
 
 
 def traction_arrows(poses: CubePoses, values: Array, length: float) -> Array:

@@ -27,6 +27,7 @@ MAX_ONE_COLUMN_PADS = 12
 def draw_layout(layout: Layout) -> Figure:
     """Draw a cube with its pads: those towards the viewer filled, those behind as an outline."""
     figure = Figure(figsize=(5, 4.6))
+    # The drawing order is set by hand: matplotlib would sort by the centres of the parts.
     axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
     _draw_edges(axes)
     for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):

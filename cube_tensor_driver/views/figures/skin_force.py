@@ -40,6 +40,7 @@ def draw_forces(
     panels: Any = figure.subplot_mosaic(
         [["force", "path"], ["centre", "path"]], width_ratios=[2.2, 1]
     )
+    # The time axis begins with the measurement.
     times = seconds - seconds.min()
     _draw_components(panels["force"], times, force, measured_force)
     _draw_components(panels["centre"], times, MM * centre, MM * measured_centre)

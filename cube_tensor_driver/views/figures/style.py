@@ -102,6 +102,7 @@ def save(figure: Figure, path: Path) -> None:
         ConfigError: The format is unknown, or the file cannot be written.
     """
     check_picture(path)
+    # A picture that was there before stays until the new one is complete.
     with atomic_write(path) as partial:
         figure.savefig(partial, format=path.suffix[1:] or "png")
 

@@ -154,6 +154,7 @@ class LiveTable:
         Of more than `max_rows` cubes those under the largest normal stress are shown. In a narrow
         terminal the lines, the bar, and components from the last one on are left out.
         """
+        # Pressure is compression, which is negative stress.
         pressure = np.nan_to_num(-self._values[:, COMPONENTS.index("zz")])
         self._peak = max(self._peak * PEAK_DECAY, float(pressure.max()), MIN_PEAK)
         shown = np.arange(len(pressure))
