@@ -94,6 +94,8 @@ def sum_rotated(
     phases = powers.astype(np.complex64)[..., ORDERS]
     total = (circular * phases).sum(axis=1)
 
-    parts = np.concatenate([total.real, total.imag], axis=1).astype(float)
-    field = parts @ FIELD_FROM_CIRCULAR
-    return field[:, :6], field[:, 6:].reshape(-1, 6, 3)
+    parts = np.concatenate([total.real, total.imag], axis=1)
+    field = parts.astype(float) @ FIELD_FROM_CIRCULAR
+    stress = field[:, :6]
+    gradient = field[:, 6:]
+    return stress, gradient.reshape(-1, 6, 3)

@@ -36,6 +36,10 @@ _MIN_HERTZ_ORDER = 6
 _STRESS_AXES = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Axes of the stress components xx, yy, zz, yz, zx, xy."""
 
+_AIRY_COMPONENTS = ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0))
+"""Stress component, axes and sign of the derivative of g that it is: xx = g_yy, yy = g_xx,
+xy = -g_xy."""
+
 _THIRD_DERIVATIVES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
 """Axes of all different third derivatives in a plane: xxx, xxy, xyy, yyy."""
 
@@ -201,7 +205,8 @@ def _check(
         ("sources", sources),
         ("forces", forces),
     ):
-        if array.ndim < 2 or array.shape[-1] != 3 or not np.all(np.isfinite(array)):
+        has_shape = array.ndim >= 2 and array.shape[-1] == 3
+        if not has_shape or not np.all(np.isfinite(array)):
             raise ElasticError(
                 f"{name} have shape {array.shape}; give finite numbers of shape (..., n, 3)"
             )
@@ -231,10 +236,8 @@ def _radial(
     d_i d_j dw/dk + w (delta_ik d_j + delta_jk d_i).
     """
     constant = -3.0 / (2.0 * np.pi)
-    products = np.stack(
-        [d[..., i] * d[..., j] for i, j in _STRESS_AXES],
-        axis=-2,
-    )
+    pairs = [d[..., i] * d[..., j] for i, j in _STRESS_AXES]
+    products = np.stack(pairs, axis=-2)
     w = constant * np.einsum("...i,...i->...", d, forces) / distance**5
     stress = np.einsum("...cl,...l->...c", products, w)
 
@@ -278,6 +281,9 @@ def _airy(
     inv1 = -(u**3)
     inv2 = 3 * u**5
 
+    h2 = f_dot_d * chi3 - fz * log2
+    h3 = f_dot_d * chi4 - fz * log3
+
     def second(
         i: int,
         j: int,
@@ -297,7 +303,8 @@ def _airy(
             n2: h2 of it.
         """
         mixed = force[i] * position[j] + force[j] * position[i]
-        value = t2 * mixed + (f_dot_d * t3 - fz * n2) * position[i] * position[j]
+        by_distance = f_dot_d * t3 - fz * n2
+        value = t2 * mixed + by_distance * position[i] * position[j]
         if i == j:
             value = value + f_dot_d * t2 - fz * n1
         return np.asarray(value.sum(axis=-1))
@@ -308,14 +315,15 @@ def _airy(
         k: int,
     ) -> Array:
         """Return g_ijk; every pair of the three indices contributes alike."""
-        value = (f_dot_d * chi4 - fz * log3) * position[i] * position[j] * position[k]
+        value = h3 * position[i] * position[j] * position[k]
         for a, b, c in ((i, j, k), (j, i, k), (k, i, j)):
             value = value + chi3 * force[a] * position[b] * position[c]
             if b == c:
-                value = value + chi2 * force[a] + (f_dot_d * chi3 - fz * log2) * position[a]
+                value = value + chi2 * force[a]
+                value = value + h2 * position[a]
         return np.asarray(value.sum(axis=-1))
 
-    third_derivatives = {(i, j, k): third(i, j, k) for i, j, k in _THIRD_DERIVATIVES}
+    third_derivatives = {axes: third(*axes) for axes in _THIRD_DERIVATIVES}
 
     # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy; d/dz = -d/dZ
     n_components = len(_STRESS_AXES)
@@ -327,12 +335,14 @@ def _airy(
             3,
         )
     )
-    for component, i, j, sign in ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0)):
+    for component, i, j, sign in _AIRY_COMPONENTS:
         stress[..., component] = sign * second(i, j, chi2, chi3, log1, log2)
         for axis in (0, 1):
             i1, i2, i3 = sorted((i, j, axis))
-            gradient[..., component, axis] = sign * third_derivatives[i1, i2, i3]
-        gradient[..., component, 2] = -sign * second(i, j, log2, log3, inv1, inv2)
+            derivative = third_derivatives[i1, i2, i3]
+            gradient[..., component, axis] = sign * derivative
+        by_z = second(i, j, log2, log3, inv1, inv2)
+        gradient[..., component, 2] = -sign * by_z
     return stress, gradient
 
 
@@ -394,6 +404,7 @@ def _place_forces(
         centre: Centre (2,) in m.
     """
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
-    sources = np.stack([cx + x, cy + y, np.zeros_like(x)], axis=-1)
+    z = np.zeros_like(x)
+    sources = np.stack([cx + x, cy + y, z], axis=-1)
     forces = fractions[:, None] * np.asarray(force, dtype=np.float64)
     return sources, forces

@@ -86,7 +86,8 @@ class _ContactTables:
         inputs = [layer.thickness, layer.poisson, depth]
         table = load_or_compute(self._kind, inputs, self._compute)["table"]
         # One row of real numbers per grid point: a product of real matrices interpolates.
-        self._rows = table.reshape(-1, table.shape[-2] * len(ORDERS)).view(np.float32)
+        n_loads = table.shape[-2]
+        self._rows = table.reshape(-1, n_loads * len(ORDERS)).view(np.float32)
 
     def _compute(self) -> Arrays:
         """Return table (grid points ..., unit loads, 14), complex circular components."""
@@ -135,7 +136,8 @@ class DiscTables(_ContactTables):
         distance = np.arange(_LAST_DISTANCE + 2) * self.depth / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, distance)
         # (radii, distances, R Z T, 14); the tangential force F_t acts with the factor i.
-        table = spectra.radial(bessel, disc_spectra) * np.array([1, 1, 1j])[:, None]
+        factors = np.array([1, 1, 1j])[:, None]
+        table = spectra.radial(bessel, disc_spectra) * factors
         return {"table": table.astype(np.complex64)}
 
     def field(
@@ -230,7 +232,8 @@ class PolygonTables(_ContactTables):
         direction = np.where(is_origin, 1.0, (d + 1j * t) / r_safe)  # exp(i alpha)
 
         # The integral over alpha becomes one over eta: alpha = atan(t / d), t = t(eta).
-        alpha_slope = d * np.hypot(1.0, d) * np.cosh(eta) / r_safe**2
+        t_slope = np.hypot(1.0, d) * np.cosh(eta)
+        alpha_slope = d * t_slope / r_safe**2
         exponents = np.stack(
             [
                 ORDERS - 1,
@@ -245,9 +248,11 @@ class PolygonTables(_ContactTables):
         table = CubicSpline(eta, integrand, axis=1).antiderivative()(eta)
         table -= table[:, _CENTRE_COLUMN : _CENTRE_COLUMN + 1]  # the integral begins at t = 0
 
-        sign = (-1.0) ** ORDERS * np.array([-1.0, -1.0, 1.0, -1j])[:, None]
+        load_sign = np.array([-1.0, -1.0, 1.0, -1j])[:, None]
+        sign = (-1.0) ** ORDERS * load_sign
         # Lengths were divided by the depth: A, B and Z are areas, W is a volume.
-        unit = self.depth ** np.array([2.0, 2.0, 2.0, 3.0])[:, None]
+        dimension = np.array([2.0, 2.0, 2.0, 3.0])[:, None]
+        unit = self.depth**dimension
         return {"table": (table * sign * unit).astype(np.complex64)}
 
     def _integrate_distance(self) -> CubicSpline:
@@ -256,13 +261,15 @@ class PolygonTables(_ContactTables):
         r = np.arange(_LAST_DISTANCE + 2) / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, r * self.depth)
         point_force = np.ones((1, len(spectra.k)))
-        along, normal, across = spectra.radial(bessel, point_force)[0].swapaxes(0, 1)
+        radial = spectra.radial(bessel, point_force)[0]
+        along, normal, across = radial.swapaxes(0, 1)
 
         distance = r[:, None]
         a = (along + across) / 2
         b = (along - across) / 2
         w = across * distance
-        integrand = np.stack([a, b, normal, w], axis=1) * distance[..., None]
+        integrand = np.stack([a, b, normal, w], axis=1)
+        integrand *= distance[..., None]
         return CubicSpline(r, integrand).antiderivative()
 
     def field(
@@ -295,7 +302,8 @@ class PolygonTables(_ContactTables):
         edge /= np.maximum(np.abs(edge), _ORIGIN_TOLERANCE)
 
         # In axes along and across the edge, both ends have the coordinates t - i d.
-        local = np.stack([first, second], axis=-1) * edge.conj()[..., None]
+        ends = np.stack([first, second], axis=-1)
+        local = ends * edge.conj()[..., None]
         signed_distance = -local[..., 0].imag
         side = np.where(signed_distance < 0, -1.0, 1.0)
         direction = -1j * edge * side  # exp(i beta)
@@ -337,7 +345,8 @@ def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
         Weights of bilinear interpolation at four grid points for the start, which are negative, and
         at four for the end; rows of these grid points.
     """
-    column = np.arcsinh(t / np.hypot(1.0, d)[..., None]) / GRID_STEP + _CENTRE_COLUMN
+    ratio = t / np.hypot(1.0, d)[..., None]
+    column = np.arcsinh(ratio) / GRID_STEP + _CENTRE_COLUMN
     column = np.clip(column, 0, _GRID_COLUMNS - 1 - 1e-6)
     row = np.arcsinh(d) / GRID_STEP
     above = row.astype(np.intp)
@@ -353,4 +362,5 @@ def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
     corners = np.array([0, 1, _GRID_COLUMNS, _GRID_COLUMNS + 1])
     first = _GRID_COLUMNS * above[..., None] + left
     rows = first[..., None] + corners
-    return weights.reshape(*d.shape, 8), rows.reshape(*d.shape, 8)
+    shape = (*d.shape, 8)
+    return weights.reshape(shape), rows.reshape(shape)

@@ -136,7 +136,8 @@ def _check(influence: Influence) -> None:
     shape = (influence.layout.n_pads, len(place), 3)
     if influence.pads.shape != shape:
         raise ConfigError(f"pads have shape {influence.pads.shape}, needed is {shape}")
-    if not (np.isfinite(place).all() and np.isfinite(influence.pads).all()):
+    is_finite = np.isfinite(place).all() and np.isfinite(influence.pads).all()
+    if not is_finite:
         raise ConfigError("a position or a stress is not finite")
 
     x, y = np.meshgrid(

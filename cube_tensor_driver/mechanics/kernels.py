@@ -172,8 +172,8 @@ class Kernels:
         )
         self._cross = tables["cross"]
         self._pressure = tables["pressure"]
-        self._real = tables["even"]
-        self._imaginary = tables["odd"]
+        self._real = tables["real"]
+        self._imaginary = tables["imaginary"]
         self.pressure_variance = float(tables["own"])
 
     @property
@@ -192,7 +192,8 @@ class Kernels:
         """
         # Variants are few: cubes that lost the same pad share one.
         matrix = components * self._unit_factors
-        equal = np.flatnonzero((self.component_matrices == matrix).all(axis=(1, 2)))
+        is_equal = self.component_matrices == matrix
+        equal = np.flatnonzero(is_equal.all(axis=(1, 2)))
         if len(equal):
             return int(equal[0])
         self.component_matrices = np.concatenate([self.component_matrices, matrix[None]])
@@ -219,7 +220,8 @@ class Kernels:
 
         Returns:
             cross: R, Z and T (distances, 3, n) of the covariance with the traction at a point.
-            even, odd: Covariance (distances, n, n) of real parts and of imaginary parts.
+            real: Covariance (distances, n, n) of real parts.
+            imaginary: Covariance (distances, n, n) of imaginary parts.
             pressure: Covariance (distances, n) of real parts with the pressure below a point.
             own: Variance of this pressure.
         """
@@ -234,8 +236,8 @@ class Kernels:
         own, _ = points.covariance(points, at_zero, prior, SHEAR_RATIO)
         return {
             "cross": cross,
-            "even": real,
-            "odd": imaginary,
+            "real": real,
+            "imaginary": imaginary,
             "pressure": -with_points[:, :, _CIRCULAR_ZZ],  # pressure = -zz
             "own": own[0, _CIRCULAR_ZZ, _CIRCULAR_ZZ],
         }
@@ -359,7 +361,8 @@ class Kernels:
         distance, direction = _polar(place)
         covariance = self._interpolate(self._pressure, distance)
         real, _ = self._matrices_towards(direction - angle, variant)
-        return np.asarray((real @ covariance[:, :, None])[:, :, 0])
+        measured = real @ covariance[:, :, None]
+        return np.asarray(measured[:, :, 0])
 
     def _rotate_loads(
         self,
@@ -456,7 +459,8 @@ class Kernels:
 
         # Entry 1 of the table belongs to the distance 0.
         shape = (len(index),) + (1,) * (table.ndim - 1)
-        neighbours = [weights[j].reshape(shape) * table[first + j] for j in range(4)]
+        weights = weights.reshape(4, *shape)
+        neighbours = [weights[j] * table[first + j] for j in range(4)]
         return np.asarray(sum(neighbours))
 
 

@@ -100,7 +100,9 @@ class Layer:
             ElasticError: The layer does not contain this depth.
         """
         self.check_depth(depth)
-        kx, ky = np.broadcast_arrays(np.asarray(kx, float), np.asarray(ky, float))
+        kx = np.asarray(kx, float)
+        ky = np.asarray(ky, float)
+        kx, ky = np.broadcast_arrays(kx, ky)
         # L = (cosine, sine, 0); its direction does not matter where k is 0.
         k = np.hypot(kx, ky)
         is_zero = k == 0
@@ -177,7 +179,8 @@ class Layer:
             (1 - nu) * psi2 + nu * psi,
             (1 - nu) * psi3 - (2 - nu) * psi1,
         ]
-        constants = np.linalg.inv(np.stack(conditions, axis=-2))[..., :2]
+        matrix = np.stack(conditions, axis=-2)
+        constants = np.linalg.inv(matrix)[..., :2]
         derivatives = [
             np.einsum("...c,...cl->...l", differentiate(n, zeta), constants) for n in range(4)
         ]
@@ -190,7 +193,8 @@ class Layer:
         a = np.array([1.0, 0.0])
         b = np.array([-1.0, 1.0])  # psi'(0) = A + B
         depth_factor = zeta[..., None]
-        return np.stack([(a + (n + depth_factor) * b) * decay for n in range(4)])
+        derivatives = [(a + (n + depth_factor) * b) * decay for n in range(4)]
+        return np.stack(derivatives)
 
     def _twist(self, k: Array, depth: float) -> _WaveStress:
         """Return the stress under traction along T, the horizontal axis across the wave."""
@@ -202,7 +206,10 @@ class Layer:
             base = decay / (1 + np.exp(-2 * k * self.thickness))
             cosh = base * (1 + reflected)
             sinh = base * (1 - reflected)
-        return {"TzT": (cosh + 0j, k * sinh + 0j), "LTT": (1j * sinh, 1j * k * cosh)}
+        return {
+            "TzT": (cosh + 0j, k * sinh + 0j),
+            "LTT": (1j * sinh, 1j * k * cosh),
+        }
 
     def _uniform(self) -> Array:
         """Return the stress (6, 3) under uniform unit traction along x, y and z."""

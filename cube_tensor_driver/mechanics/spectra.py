@@ -226,7 +226,8 @@ def layer_spectra(layer: Layer, depth: float) -> Spectra:
     circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
 
     # At phi = 0, i^m c = N F_z + (i/2) P (F_x + i F_y) - (i/2) M (F_x - i F_y).
-    x, y, z = np.moveaxis(1j ** ORDERS[:, None] * circular, -1, 0)
+    rotated = 1j ** ORDERS[:, None] * circular
+    x, y, z = np.moveaxis(rotated, -1, 0)
     plus = x.imag - y.real
     minus = -x.imag - y.real
     return Spectra(k, weight, ORDERS, plus, minus, z.real)

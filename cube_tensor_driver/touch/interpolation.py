@@ -69,7 +69,8 @@ class Interpolation:
 
         weights = self._solve_weights(known, columns)
         # Lengths are divided by c, so derivatives are multiplied by it.
-        scale = np.array([1.0, self._length, self._length])[: len(columns)]
+        scale = np.full(len(columns), self._length)
+        scale[0] = 1.0
         scaled = np.where(known, values, 0)[:, columns] * scale
         result: Array = weights.matrix @ scaled.ravel()
         result[np.repeat(weights.empty, n_points)] = np.nan
@@ -94,8 +95,8 @@ class Interpolation:
 
         weights = self._weights[key]
         if not np.array_equal(wanted, weights.known):
-            differs = (wanted != weights.known)[self._near].any(axis=(1, 2))
-            changed = np.flatnonzero(differs)
+            differs = wanted != weights.known
+            changed = np.flatnonzero(differs[self._near].any(axis=(1, 2)))
             weights.data[changed], weights.uncertainty[changed] = self._solve(changed, wanted)
             weights.known = wanted
             weights.empty = ~wanted[self._near, 0].any(axis=1)
@@ -120,7 +121,8 @@ class Interpolation:
         cubes = self._poses.position[near] / self._length
         points = self._patches[chosen] / self._length
         # Directions (n, neighbours, 2 or 0, 3) of the derivatives: the cubes' x and y axes.
-        axes = np.swapaxes(self._poses.rotation[:, :, : width - 1], 1, 2)[near]
+        columns = self._poses.rotation[:, :, : width - 1]
+        axes = np.swapaxes(columns, 1, 2)[near]
 
         offset = cubes[:, :, None] - cubes[:, None]
         matrix = _covariance(
@@ -131,10 +133,12 @@ class Interpolation:
         matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
         # Unknown values become independent of all others and get the weight 0.
         matrix *= is_known[:, :, None] & is_known[:, None]
-        matrix[:, np.arange(size), np.arange(size)] += np.where(is_known, RIDGE, 1.0)
+        diagonal = np.arange(size)
+        matrix[:, diagonal, diagonal] += np.where(is_known, RIDGE, 1.0)
 
         offset = points[:, :, None] - cubes[:, None]
-        no_axes = np.zeros((n, points.shape[1], 1, 0, 3))
+        n_points = points.shape[1]
+        no_axes = np.zeros((n, n_points, 1, 0, 3))
         to_points = _covariance(offset, no_axes, axes[:, None])
         to_points = to_points.reshape(n, -1, size) * is_known[:, None]
 

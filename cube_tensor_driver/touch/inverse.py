@@ -156,7 +156,8 @@ class SurfaceInverse:
         self.spacing = self.pitch / side
         self.area = self.spacing**2
         above = depth * poses.rotation[:, None, :, 2]
-        self.points = (patches(poses, self.spacing, side) + above).reshape(-1, 3)
+        points = patches(poses, self.spacing, side) + above
+        self.points = points.reshape(-1, 3)
         self.cube = np.repeat(np.arange(n), side**2)
 
         observed = np.isfinite(by_pad.sum(axis=2))
@@ -221,12 +222,14 @@ class SurfaceInverse:
             cubes: Indices (n,) of the cubes.
             by_pad: Noise matrices (n, 15, P) as from `noise_by_pad`, with the pads in use.
         """
-        self.by_pad[cubes] = by_pad[:, self.columns] * self._unit_factors[:, None]
+        observed = by_pad[:, self.columns]
+        self.by_pad[cubes] = observed * self._unit_factors[:, None]
         if self._variant_pads is None:
             return
         for cube, own in zip(cubes.tolist(), by_pad, strict=True):
             pads = self._variant_pads[self._whole_variant[cube]]
-            self.variant[cube] = self.kernels.add_variant(pads @ np.nan_to_num(own).T)
+            components = pads @ np.nan_to_num(own).T
+            self.variant[cube] = self.kernels.add_variant(components)
             self._has_other_pads[cube] = not np.array_equal(
                 self.by_pad[cube], self._all_pads[cube], equal_nan=True
             )

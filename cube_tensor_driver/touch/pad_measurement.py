@@ -152,10 +152,13 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
         functions = right[is_kept].reshape(n_kept, 3, -1) / root
         orders += [order] * n_kept
         spectra.append(_hankel_transforms(functions, order, bessel, r * weight))
-        pads.append((left[:, is_kept] * values[is_kept]).reshape(2, -1, n_kept))
+        weighted = left[:, is_kept] * values[is_kept]
+        pads.append(weighted.reshape(2, -1, n_kept))
 
-    plus, minus, normal = (np.concatenate(parts, axis=1) for parts in zip(*spectra, strict=True))
-    to_pads = np.concatenate(pads, axis=2).swapaxes(1, 2).reshape(2 * len(orders), -1)
+    by_kind = zip(*spectra, strict=True)
+    plus, minus, normal = (np.concatenate(parts, axis=1) for parts in by_kind)
+    to_pads = np.concatenate(pads, axis=2).swapaxes(1, 2)  # (real or imaginary, n, P)
+    to_pads = to_pads.reshape(2 * len(orders), -1)
     return Spectra(
         k,
         wave_weight,
@@ -176,7 +179,8 @@ def _hankel_transforms(
     along, normal, across = np.moveaxis(functions, 1, 0)
 
     def transform(function: Array, shift: int) -> Array:
-        return np.asarray(2 * np.pi * bessel(order + shift).T @ (function * weight).T)
+        waves = bessel(order + shift).T
+        return np.asarray(2 * np.pi * waves @ (function * weight).T)
 
     plus = transform(along + across, -1)
     minus = transform(along - across, 1)
@@ -190,8 +194,9 @@ def _fourier_series(influence: Influence, r: Array) -> list[Array]:
     sine = np.sin(angle)
     direction = np.stack([cosine, sine], axis=1)
     # The direction runs from the force to the cube, so the force lies at minus r.
-    place = -(r[:, None, None] * direction).reshape(-1, 2)
-    responses = influence.at(place).reshape(-1, len(r), N_DIRECTIONS, 3)
+    place = -r[:, None, None] * direction
+    responses = influence.at(place.reshape(-1, 2))
+    responses = responses.reshape(-1, len(r), N_DIRECTIONS, 3)
 
     x, y, z = np.moveaxis(responses, -1, 0)
     radial = cosine * x + sine * y

@@ -49,7 +49,8 @@ def noise_by_pad(
         )
     )
     # Cubes may have different numbers of pads; the places beyond them stay 0.
-    for row, (cube, mask) in enumerate(zip(cubes.tolist(), left_out.tolist(), strict=True)):
+    cube_masks = zip(cubes.tolist(), left_out.tolist(), strict=True)
+    for row, (cube, mask) in enumerate(cube_masks):
         own = pipeline.matrix(cube, mask) * pipeline.calibrations[cube].noise
         by_pad[row, :, : own.shape[1]] = own
     return by_pad

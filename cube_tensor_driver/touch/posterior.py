@@ -139,7 +139,8 @@ class WindowPosteriors:
                 window = _solve_window(kernels, own, place[one], angle[one], points)
                 for name, array in window._asdict().items():
                     if name not in solved:
-                        solved[name] = np.empty((len(first), *array.shape), array.dtype)
+                        shape = (len(first), *array.shape)
+                        solved[name] = np.empty(shape, array.dtype)
                     solved[name][number] = array
             return solved
 
@@ -197,7 +198,8 @@ class WindowPosteriors:
         """Compute G y (cubes, rows) of values y (cubes, C), which are 0 where unknown."""
         # The values of each window in one row, as the columns of G expect them.
         gathered = y[self.near].reshape(len(self.near), -1)
-        result = np.empty((len(self.near), self.gain.shape[1]), np.float32)
+        n_rows = self.gain.shape[1]
+        result = np.empty((len(self.near), n_rows), np.float32)
         for kind, rows in self._shared_kinds:
             result[rows] = gathered[rows] @ self.gain[kind].T
         if len(self._single):
@@ -300,7 +302,8 @@ def _solve_window(
     gain[:, known] = known_gain
 
     # diag(G M G') is a sum over the pads of (G B)^2.
-    rows = gain.reshape(-1, ROWS_PER_POINT, n, width)[:, 2:].reshape(-1, n, width)
+    by_point = gain.reshape(-1, ROWS_PER_POINT, n, width)
+    rows = by_point[:, 2:].reshape(-1, n, width)  # both pressures
     by_pad = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
 
     inner = min(INNER_CUBES, n)
@@ -338,8 +341,10 @@ def _cross_covariance(
     traction = kernels.cross(offset, angles, variants)[:, columns]
     pressure = kernels.pressure(offset, angles, variants)[:, columns]
     cross = np.empty((n_points, ROWS_PER_POINT, n, len(columns)))
-    cross[:, :3] = traction.reshape(n, n_points, -1, 3).transpose(1, 3, 0, 2)
-    cross[:, 3] = pressure.reshape(n, n_points, -1).transpose(1, 0, 2)
+    traction = traction.reshape(n, n_points, -1, 3)
+    pressure = pressure.reshape(n, n_points, -1)
+    cross[:, :3] = traction.transpose(1, 3, 0, 2)
+    cross[:, 3] = pressure.transpose(1, 0, 2)
     return AMPLITUDE**2 * cross.reshape(-1, n * len(columns))
 
 
@@ -347,7 +352,8 @@ def _invert_known(matrix: Array, known: Mask) -> Array:
     """Invert the known rows and columns of a covariance matrix; the others become 0."""
     inverse = np.zeros_like(matrix)
     block = np.ix_(known, known)
-    inverse[block] = cho_solve(cho_factor(matrix[block]), np.eye(known.sum()))
+    factor = cho_factor(matrix[block])
+    inverse[block] = cho_solve(factor, np.eye(known.sum()))
     return inverse
 
 
@@ -368,7 +374,8 @@ def _nearest_cubes(poses: CubePoses) -> Index:
     count = min(WINDOW_CUBES, n)
     # More than wanted: the tree may drop any of several cubes at the same distance.
     candidates = min(3 * count, n)
-    near = cKDTree(poses.position).query(poses.position, candidates)[1].reshape(n, -1)
+    tree = cKDTree(poses.position)
+    near = tree.query(poses.position, candidates)[1].reshape(n, -1)
 
     offset = poses.position[near] - poses.position[:, None]
     local = np.einsum("nji,nkj->nki", poses.rotation, offset)

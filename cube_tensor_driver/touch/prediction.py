@@ -65,7 +65,8 @@ class MissingValuePrediction:
             known: Components (cubes, C) that are known now.
         """
         missing = observed & ~known
-        self.variance = np.zeros((len(known), windows.prior.shape[1]))
+        n_pressures = windows.prior.shape[1]
+        self.variance = np.zeros((len(known), n_pressures))
         self._predictions: list[_Prediction] = []
         for cube in np.flatnonzero(missing.any(axis=1)).tolist():
             self._add_cube(windows, missing, cube)
@@ -101,14 +102,16 @@ class MissingValuePrediction:
         if is_missing.all():
             return  # nothing is known nearby: the prediction is the mean of the prior, 0
         by_cube = weights.reshape(len(own), len(near), -1)
-        by_pad = np.einsum("fwc,wcp->fwp", by_cube, windows.pads[near]).reshape(len(own), -1)
+        by_pad = np.einsum("fwc,wcp->fwp", by_cube, windows.pads[near])
+        by_pad = by_pad.reshape(len(own), -1)
         self._predictions.append(_Prediction(cube, own, near, weights, by_pad, rows, gain))
 
     def fill(self, y: Single) -> Single:
         """Return values (cubes, C) whose missing entries, 0 in `y`, are replaced by predictions."""
         filled: Single = y.copy()
         for one in self._predictions:
-            filled[one.cube, one.columns] = one.weights @ y[one.near].ravel()
+            neighbours = y[one.near].ravel()
+            filled[one.cube, one.columns] = one.weights @ neighbours
         return filled
 
     def noise(self, pad_variance: Single) -> Array:
@@ -119,6 +122,7 @@ class MissingValuePrediction:
         """
         total = np.zeros_like(self.variance)
         for one in self._predictions:
-            covariance = (one.by_pad * pad_variance[one.near].ravel()) @ one.by_pad.T
+            neighbours = pad_variance[one.near].ravel()
+            covariance = (one.by_pad * neighbours) @ one.by_pad.T
             total[one.rows] += np.einsum("ncr,cd,ndr->nr", one.gain, covariance, one.gain)
         return total

@@ -117,7 +117,8 @@ class Surface:
         self._patches = patches(poses, self.spacing, side)
         self.points = self._patches.reshape(-1, 3)
         self.cube = np.repeat(np.arange(n), side**2)
-        self.middle = np.arange(n) * side**2 + side // 2 * (side + 1)
+        first_point = np.arange(n) * side**2
+        self.middle = first_point + side // 2 * (side + 1)
 
         self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
         self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
@@ -172,7 +173,8 @@ class Surface:
             sees_shear=bool(np.isfinite(values[:, SHEAR]).any()),
         )
         owner = self._assign_patches(inside)
-        contacts = [self._contact(loaded, owner == number) for number in np.unique(owner)]
+        numbers = np.unique(owner)
+        contacts = [self._contact(loaded, owner == number) for number in numbers]
         return sorted(contacts, key=lambda contact: -contact.normal_force)
 
     def _pressure(self, values: Array) -> Array:
@@ -194,7 +196,7 @@ class Surface:
         n = len(self._patches)
         first, second = self._pairs.T
         joined = inside[first] & inside[second]
-        patch_pairs = (self.cube[first[joined]], self.cube[second[joined]])
+        patch_pairs = self.cube[self._pairs[joined]].T
         # Patches are the nodes of a graph; neighbouring points in contact are its edges.
         links = coo_matrix((joined[joined], patch_pairs), shape=(n, n))
         component = connected_components(links, directed=False)[1]
@@ -245,8 +247,9 @@ class Surface:
             shear: Shear (2, patches, points) in Pa, in the frames of the cubes.
             rotation: Rotations (patches, 3, 3) of these frames.
         """
-        along_x = _weighted_sum(shear[0].sum(axis=1), rotation[:, :, 0])
-        along_y = _weighted_sum(shear[1].sum(axis=1), rotation[:, :, 1])
+        by_patch = shear.sum(axis=2)
+        along_x = _weighted_sum(by_patch[0], rotation[:, :, 0])
+        along_y = _weighted_sum(by_patch[1], rotation[:, :, 1])
         return (along_x + along_y) * self.area
 
 

@@ -87,7 +87,8 @@ def estimate_contact(
     slopes = np.zeros((6, fit.jacobian.shape[1]))
     slopes[:3, first : first + 3] = np.eye(3)
     slopes[3:5, first + 2] = -shift / normal_force
-    slopes[3:5, first + 3 : first + 5] = np.eye(2) * (contact_force[2] / normal_force)
+    share = contact_force[2] / normal_force
+    slopes[3:5, first + 3 : first + 5] = share * np.eye(2)
     slopes[5, first : first + 2] = shift[1], -shift[0]
 
     inverse = np.linalg.inv(fit.normal_matrix)
@@ -156,4 +157,5 @@ def _disc_quadrature(radius: float) -> tuple[Array, Array]:
     x = np.outer(r, np.cos(angle))
     y = np.outer(r, np.sin(angle))
     areas = np.repeat(weights / 2, n_angles) * np.pi * radius**2 / n_angles
-    return np.stack([x.ravel(), y.ravel()], axis=1), areas
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    return points, areas

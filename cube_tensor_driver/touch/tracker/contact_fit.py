@@ -101,6 +101,9 @@ _SCALE_FACTORS = {
 }
 """Factors of the residual scale whose evidence is compared."""
 
+_MIN_SCALE = 1e-4 * AMPLITUDE
+"""Smallest residual scale in Pa; the largest one is `AMPLITUDE`."""
+
 _DIFFERENCE_STEP = 1 / 50
 """Step of the numerical derivatives with respect to the centre of a contact, divided by the
 depth."""
@@ -187,27 +190,32 @@ class Observations:
         Args:
             gain_variance: Variance (n, P, 1) of each pad by its gain, divided by that of its noise.
         """
-        own = self._by_pad @ ((1 + gain_variance) * self._by_pad.swapaxes(1, 2))
+        transposed = self._by_pad.swapaxes(1, 2)
+        own = self._by_pad @ ((1 + gain_variance) * transposed)
         n, width, _ = own.shape
         # Pads of different cubes are independent: only the blocks on the diagonal are not 0.
         blocks = np.zeros((n, width, n, width))
         blocks[np.arange(n), :, np.arange(n), :] = own
-        covariance: Array = blocks.reshape(n * width, -1)[np.ix_(self._known, self._known)]
-        return covariance
+        all_components = blocks.reshape(n * width, -1)
+        known = np.ix_(self._known, self._known)
+        return np.asarray(all_components[known])
 
     def responses(self, centres: Array, size: float) -> Array:
         """Compute the values (K, D, 3) under contacts with 1 N at K centres (K, 2) in m."""
         n = len(centres)
-        offset = (self.place - centres[:, None]).reshape(-1, 2)
+        offset = self.place - centres[:, None]
+        offset = offset.reshape(-1, 2)
         angle = np.tile(self._angle, n)
         variant = np.tile(self._variant, n)
         responses = self.kernels.response(offset, angle, variant, size)
-        return responses[:, self._columns].reshape(n, -1, 3)[:, self._known]
+        observed = responses[:, self._columns].reshape(n, -1, 3)
+        return observed[:, self._known]
 
     def cross(self, points: Array) -> Array:
         """Compute the prior covariance (points, 3, D) of the traction at points with the values."""
         n = len(points)
-        offset = (self.place - points[:, None]).reshape(-1, 2)
+        offset = self.place - points[:, None]
+        offset = offset.reshape(-1, 2)
         angle = np.tile(self._angle, n)
         variant = np.tile(self._variant, n)
         cross = self.kernels.cross(offset, angle, variant)[:, self._columns]
@@ -263,7 +271,8 @@ class ContactFit(NamedTuple):
         covariance[:6, :6] = inverse[own, own]
         covariance[6:, :6] = -q_inverse[:, own]
         covariance[:6, 6:] = covariance[6:, :6].T
-        covariance[6:, 6:] = np.eye(3) - shapes.T @ weighted + q_inverse @ q.T
+        explained = shapes.T @ weighted
+        covariance[6:, 6:] = np.eye(3) - explained + q_inverse @ q.T
         return covariance
 
 
@@ -313,7 +322,8 @@ def fit_contacts(
         ]
 
         # Covariance with the shapes of the previous forces, then the forces by linear regression.
-        shape_parts = [one.shapes @ force for one, force in zip(responses, forces, strict=True)]
+        pairs = zip(responses, forces, strict=True)
+        shape_parts = [one.shapes @ force for one, force in pairs]
         shapes = np.concatenate(shape_parts).T  # (D, 3 contacts)
         noise = observations.rough_noise if is_rough else observations.noise
         noise = noise + shapes @ shapes.T
@@ -346,10 +356,12 @@ def fit_contacts(
         # Gauss-Newton: (J' W J + prior) change = J' W r + prior (mean - parameters)
         right = weighted.T @ residual
         right[5::_N_PARAMETERS] -= (log_sizes - usual_log_size) * SIZE_DEVIATION**-2
-        change = np.linalg.lstsq(normal_matrix, right, rcond=None)[0].reshape(count, _N_PARAMETERS)
+        solution = np.linalg.lstsq(normal_matrix, right, rcond=None)[0]
+        change = solution.reshape(count, _N_PARAMETERS)
         shift = change[:, 3:5]
         growth = change[:, 5]
-        largest = max(np.abs(shift).max() / depth, np.abs(growth).max())
+        largest_shift = np.abs(shift).max() / depth
+        largest_growth = np.abs(growth).max()
 
         # A step that takes back more than half of the previous one
         oscillates = growth * previous_growth < -(previous_growth**2) / 2
@@ -357,7 +369,8 @@ def fit_contacts(
         previous_growth = growth.copy()
 
         scale_is_final = steps == STEPS_TRACKED or is_rough or residual_scale == previous_scale
-        is_settled = largest < SETTLED_STEP and scale_is_final
+        is_small = max(largest_shift, largest_growth) < SETTLED_STEP
+        is_settled = is_small and scale_is_final
         is_last = is_settled and not is_rough
         is_rough &= not is_settled and step < steps - FINE_STEPS
 
@@ -454,7 +467,8 @@ class ContactResponse(NamedTuple):
         slopes = np.concatenate([by_centre, by_log_size[None]])
 
         # Length: contacts displaced along an axis, minus contacts displaced across it.
-        axes = moved[5:].reshape(4, 2, *response.shape).sum(axis=1) / 4
+        both_sides = moved[5:].reshape(4, 2, *response.shape)
+        axes = both_sides.sum(axis=1) / 4
         # Flatness: the contact minus a mixture of a narrower and a wider one. The share of the
         # wider one keeps the second moment of the pressure.
         shrink = np.exp(-2 * SHAPE_WIDENING)
@@ -548,11 +562,13 @@ def _best_scale(
         np.inf,
         (np.empty((0, 0)), True),
     )
-    for scale in np.unique(np.clip(candidates, 1e-4 * AMPLITUDE, AMPLITUDE)).tolist():
+    in_range = np.clip(candidates, _MIN_SCALE, AMPLITUDE)
+    for scale in np.unique(in_range).tolist():
         factor = _factorise(observations, noise, scale)
         weighted = cho_solve(factor, np.column_stack([columns, residual]))
         weighted_residual = weighted[:, -1]
-        normal_matrix = columns.T @ weighted[:, :-1] + np.eye(columns.shape[1])
+        n_parameters = columns.shape[1]
+        normal_matrix = columns.T @ weighted[:, :-1] + np.eye(n_parameters)
         projected = columns.T @ weighted_residual
 
         misfit = residual @ weighted_residual

@@ -83,7 +83,7 @@ class ContactModel:
     def response(self, contacts: list[HertzContact]) -> Array:
         """Compute the response (cubes, C) of all cubes to contacts, in Pa."""
         inverse = self.inverse
-        total = np.zeros((len(inverse.poses.position), len(inverse.columns)))
+        total = np.zeros(inverse.observed.shape)
         for contact in contacts:
             # The skin is unrolled around the home, in whose frame the position is given.
             cubes, place, angle = self._cubes_around(contact.home)

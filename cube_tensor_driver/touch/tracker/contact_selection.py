@@ -137,7 +137,8 @@ def prune_contacts(
         centre = model.centre(contact)
         # Contacts from a split may be close to each other; `find_pair_to_merge` checks these.
         others = [one for one in kept if not (contact.was_split and one.was_split)]
-        distances = [float(np.linalg.norm(centre - model.centre(one))) for one in others]
+        offsets = [centre - model.centre(one) for one in others]
+        distances = [float(np.linalg.norm(offset)) for offset in offsets]
         is_alone = min(distances, default=np.inf) >= MERGE_DISTANCE_PITCHES * model.inverse.pitch
         if peaks[contact.id] > threshold and is_alone:
             kept.append(contact)
@@ -162,7 +163,8 @@ def valley_ratio(
         Lowest pressure along the line between them, divided by the lower one of the pressures at
         its ends; 1 if the pressure does not fall at all.
     """
-    path = first + np.linspace(0, 1, _VALLEY_SAMPLES)[:, None] * (second - first)
+    fractions = np.linspace(0, 1, _VALLEY_SAMPLES)[:, None]
+    path = first + fractions * (second - first)
     along = pressure[model.nearest_points(path)]
     ends = max(min(along[0], along[-1]), _MIN_PRESSURE)
     return float(along.min() / ends)

@@ -70,7 +70,8 @@ def split_contact(
     ]
     two = min(fits, key=lambda fit: fit.score)
 
-    distances = np.linalg.norm(two.centres[:-1] - two.centres[-1], axis=1)
+    offsets = two.centres[:-1] - two.centres[-1]
+    distances = np.linalg.norm(offsets, axis=1)
     ratios = distances / (two.sizes[:-1] + two.sizes[-1])
     is_beside = ratios.min() > MIN_PAIR_DISTANCE and ratios[j] < MAX_PAIR_DISTANCE
     # Both must press: a fit can explain a residual by a contact that pulls.

@@ -182,7 +182,8 @@ class ContactTracker:
             self._fit(y, [contact, *neighbours], STEPS_NEW)
             self._contacts = prune_contacts(model, self._contacts, self._min_pressure)
 
-        results = [self._results[one.id] for one in self._contacts if one.id in self._results]
+        fitted = [one.id for one in self._contacts if one.id in self._results]
+        results = [self._results[number] for number in fitted]
         return sorted(results, key=lambda contact: -contact.normal_force)
 
     def deviation(self, values: Array) -> FieldDeviation:
@@ -220,7 +221,8 @@ class ContactTracker:
     def _neighbours(self, contact: HertzContact, others: list[HertzContact]) -> list[HertzContact]:
         """Return the other contacts that share cubes with this one, nearest first."""
         centre = self._model.centre(contact)
-        distances = [float(np.linalg.norm(self._model.centre(one) - centre)) for one in others]
+        centres = [self._model.centre(one) for one in others]
+        distances = [float(np.linalg.norm(one - centre)) for one in centres]
         reach = JOINT_FIT_PITCHES * self._inverse.pitch
         return [others[k] for k in np.argsort(distances) if distances[k] < reach]
 
@@ -355,8 +357,10 @@ class ContactTracker:
         # The score is -2 ln of the evidence.
         weight = np.exp([(best.score - one.score) / 2 for one in fits])
         weight /= weight.sum()
-        place_squares = [((one.centres[j] - best.centres[j]) ** 2).sum() for one in fits]
-        force_squares = [(one.forces[j] - best.forces[j]) ** 2 for one in fits]
+        shifts = [one.centres[j] - best.centres[j] for one in fits]
+        place_squares = [(shift**2).sum() for shift in shifts]
+        force_changes = [one.forces[j] - best.forces[j] for one in fits]
+        force_squares = [change**2 for change in force_changes]
         contact.force_ambiguity = weight @ force_squares
         ambiguity = float(weight @ place_squares)
         tolerance = POSITION_TOLERANCE_PITCHES * self._inverse.pitch
@@ -446,7 +450,8 @@ class ContactTracker:
         home = int(cubes[nearest])
         rotation = inverse.poses.rotation[home]
         local = to_home[:2, :2] @ (estimate.place - place[nearest])
-        position = inverse.poses.position[home] + rotation @ np.array([*local, inverse.depth])
+        offset = np.array([*local, inverse.depth])
+        position = inverse.poses.position[home] + rotation @ offset
         force = to_home @ estimate.force
         shear = float(np.hypot(force[0], force[1]))
         # Variance of the length of the shear force: that along its direction.
@@ -507,7 +512,8 @@ def _nearest_home(
     Returns:
         Index of the cube, and the rotation (3, 3) from the unrolled skin into its frame.
     """
-    nearest = int(np.argmin(np.linalg.norm(place - centre, axis=1)))
+    distance = np.linalg.norm(place - centre, axis=1)
+    nearest = int(np.argmin(distance))
     c = np.cos(angle[nearest])
     s = np.sin(angle[nearest])
     return nearest, np.array(
