@@ -28,7 +28,7 @@ from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
 from cube_tensor_driver.bags.metadata import typestore
-from cube_tensor_driver.bags.read import Bag
+from cube_tensor_driver.bags.read import Bag, report_damage
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reconstruct, reprocess
 from cube_tensor_driver.bags.source import open_bag
@@ -432,6 +432,31 @@ def test_cut_off_anywhere_is_repaired(bag, tmp_path):
         )
         assert own.keys() == good.keys() and own["message_count"] == complete
         assert own["files"][0].keys() == good["files"][0].keys()
+
+
+def test_a_damaged_summary_is_noticed_and_written_again(bag, copy):
+    path = next(copy.glob("*.mcap"))
+    data = bytearray(path.read_bytes())
+    data[-200] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(BagError, match="the summary does not have its checksum"):
+        Bag(copy).open()
+    assert repair(copy).damaged == 0
+    assert all_differing_bits(stress(copy), stress(bag)) == 0
+
+
+@pytest.mark.parametrize("mistake", [AttributeError, TypeError, AssertionError, MemoryError])
+def test_a_mistake_of_the_program_is_not_called_damage(mistake):
+    with pytest.raises(mistake), report_damage(Path("bag")):
+        raise mistake
+
+
+def test_a_person_sees_what_a_bag_is(bag):
+    assert repr(Bag(bag)) == f"Bag({str(bag)!r}: closed)"
+    with open_bag(bag) as source:
+        assert "/stress (300)" in repr(source.bag)
+        assert "/frequencies" in repr(source) and "3.0 s" in repr(source)
+        assert len(repr(source)) + len(repr(source.recording)) < 500
 
 
 def said_of_itself(path: Path) -> dict:
