@@ -1,4 +1,4 @@
-"""A rigid round punch on an elastic layer, by finite elements: a truth of its own for layer.py.
+"""A rigid round punch on an elastic layer, by finite elements: an independent check of layer.py.
 
 The punch is flat and has no friction; the layer is bonded to rigid ground. Everything is symmetric
 about the axis, so the displacements u_r and u_z depend on r and z, and hoop strain is u_r / r::
@@ -23,10 +23,14 @@ from cube_tensor_driver.core.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class PressedLayer:
-    """What a punch with a force of 1 N does to a layer.
+    """A layer under a punch with a force of 1 N.
 
-    radius: (n,) m of rings under the punch; force: (n,) N that presses on each
-    basis, displacement, moduli: the elements, u per N in 1 / Pa m, Lame's lambda and mu
+    Attributes:
+        radius: (n,) radii of the rings under the punch, in m.
+        force: (n,) force on each ring, in N.
+        basis: The elements.
+        displacement: (dofs,) displacement per N, in 1 / (Pa m).
+        moduli: Lame's lambda and mu, over Young's modulus.
     """
 
     radius: Array
@@ -36,12 +40,12 @@ class PressedLayer:
     moduli: tuple[float, float]
 
     def stress(self, r: Array, depth: float) -> Array:
-        """(m, 4) Pa of rr, tt, zz and rz at places r (m,) m, above 0, at one depth in m."""
+        """Return rr, tt, zz and rz (m, 4) in Pa at radii r (m,) above 0, at one depth in m."""
         points = np.stack([r, np.full(len(r), -depth)])
         return np.array([self._stress_at(point[:, None]) for point in points.T])
 
     def _stress_at(self, point: Array) -> Array:
-        """(4,) from the derivatives of the displacement in the element that holds the point."""
+        """Return the stress (4,) from the displacement of the element that holds the point."""
         mesh, element = self.basis.mesh, self.basis.elem
         cell = mesh.element_finder()(*point)
         local = mesh.mapping().invF(point[:, :, None], tind=cell)
@@ -66,10 +70,16 @@ class PressedLayer:
 def press_layer(
     thickness: float, radius: float, poisson: float, width: float, cells: int = 24
 ) -> PressedLayer:
-    """Press a flat punch of this radius on a layer of this thickness out to r = width; lengths m.
+    """Press a flat punch on a layer.
 
-    cells: across the punch's radius and across the thickness
+    Args:
+        thickness: Thickness of the layer, in m.
+        radius: Radius of the punch, in m.
+        poisson: Poisson's ratio of the layer.
+        width: Radius to which the layer is meshed, in m.
+        cells: Number of elements across the punch's radius and across the thickness.
     """
+    # Elements shrink towards the edge of the punch, where the pressure is infinite.
     r = np.unique(
         np.concatenate(
             [

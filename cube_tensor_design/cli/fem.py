@@ -59,7 +59,9 @@ def arguments(parser: Parser) -> None:
         help="write the calibration (.yaml), or with --surface the influence functions (.npz)",
     )
     parser.add_output(
-        "--figures", kind="folder", help="write pictures of convergence, response and each load"
+        "--figures",
+        kind="folder",
+        help="write pictures of convergence, response and each load",
     )
     parser.add_json()
     parser.add_argument(
@@ -117,6 +119,7 @@ def _run_response(options: argparse.Namespace, model: Model) -> None:
     layout, symmetry = model.layout, model.symmetry
     text = describe(model.body, layout)
     print(f"{text}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
+    # A factorisation in C does not notice Ctrl-C by itself.
     with ends_at_once(), progress_bar() as report:
         result = compute_response(model.body, layout, symmetry, options.meshes, report)
     show_response(result)
@@ -140,7 +143,10 @@ def _run_surface(options: argparse.Namespace, model: Model) -> None:
     from ..studies.surface_study import study_surface
 
     body, layout = model.body, model.layout
-    print(f"{describe(body, layout)} on rigid ground; {layout.n_pads} pads", flush=True)
+    print(
+        f"{describe(body, layout)} on rigid ground; {layout.n_pads} pads",
+        flush=True,
+    )
     with ends_at_once(), progress_bar() as report:
         study = study_surface(body, layout, options.meshes, model.neglect, report)
     show_surface(study)
@@ -179,6 +185,7 @@ def describe(body: Body, layout: Layout) -> str:
 def _command(options: argparse.Namespace) -> str:
     """Return the command line that computes the same, without its outputs."""
     words = ["./cube", "fem"]
+    # Only what changes the result; the default number of meshes is left out.
     if options.model is not None:
         words.append(options.model)
     if options.surface:
@@ -205,19 +212,25 @@ def _draw_response(result: Response, folder: Path) -> None:
     print(f"pictures in {folder}")
 
 
-def _write_calibration(options: argparse.Namespace, model: Model, result: Response) -> None:
+def _write_calibration(
+    options: argparse.Namespace,
+    model: Model,
+    result: Response,
+) -> None:
     """Write the calibration; its first lines say what is computed and what is a placeholder."""
     from cube_tensor_driver.config.calibration import write_calibration
 
     from ..fem.fem import calibration_from_fem
 
     command = _command(options)
+    # A body without the symmetry would lose a part of its response in the coefficients.
     needs_matrix = result.structure_residual > MAX_STRUCTURE_RESIDUAL
     calibration = calibration_from_fem(
         result, needs_matrix, model.neglect, source=f"computed by {command}"
     )
     # A pad is crushed where its stress reaches the modulus of its foam.
-    largest = float(abs(result.matrix[:, result.modes.index("zz")]).max())
+    column = result.matrix[:, result.modes.index("zz")]
+    largest = float(abs(column).max())
     crushing_kpa = calibration.modulus.max() / largest / 1e3
     lines = [
         f"Made by: {command} -o {options.output}",
@@ -243,6 +256,7 @@ def show_response(result: Response) -> None:
     from rich.console import Console
 
     console = Console(highlight=False)
+    # A narrow terminal gets several tables one below the other.
     column = COLUMN_GAP + max(MIN_NUMBER_WIDTH, *(len(name) for name in result.modes))
     fitting = (console.width - LABEL_WIDTH) // column
     count = max(1, min(MAX_MODE_COLUMNS, fitting))
@@ -262,19 +276,29 @@ def show_response(result: Response) -> None:
     )
 
 
-def _matrix_table(result: Response, start: int, count: int) -> Table:
+def _matrix_table(
+    result: Response,
+    start: int,
+    count: int,
+) -> Table:
     """Return the table of pads by `count` modes; the first one has the title of all."""
     title = "response, Pa per Pa; below, what the symmetry does not explain"
     names = result.modes[start : start + count]
     table = new_table("" if start else title, "pad", names)
     modes = slice(start, start + len(names))
-    for number, (pad, row) in enumerate(zip(result.layout.pads, result.matrix, strict=True), 1):
+    rows = zip(result.layout.pads, result.matrix, strict=True)
+    for number, (pad, row) in enumerate(rows, 1):
         label = f"V{number} {pad}" if result.layout.planar else pad
         is_last = number == result.layout.n_pads
         table.add_row(
-            label, *(format_number(value, 4) for value in row[modes]), end_section=is_last
+            label,
+            *(format_number(value, 4) for value in row[modes]),
+            end_section=is_last,
         )
-    table.add_row("left, %", *(f"{100 * result.mode_residual[name]:.2f}" for name in names))
+    table.add_row(
+        "left, %",
+        *(f"{100 * result.mode_residual[name]:.2f}" for name in names),
+    )
     return table
 
 
@@ -319,20 +343,38 @@ def show_surface(study: SurfaceStudy) -> None:
     Console(highlight=False).print(table)
 
 
-def _surface_cells(row: SurfaceRow, name: str, unit: float, digits: int) -> tuple[str, str, str]:
+def _surface_cells(
+    row: SurfaceRow,
+    name: str,
+    unit: float,
+    digits: int,
+) -> tuple[str, str, str]:
     """Return measured stress, true stress and their ratio, empty where the true one is small."""
     measured, true = row.measured[name], row.true[name]
     largest = max(abs(value) for value in row.true.values())
     ratio = f"{measured / true:.2f}" if abs(true) > MIN_SHOWN_SHARE * largest else ""
-    return format_number(measured / unit, digits), format_number(true / unit, digits), ratio
+    return (
+        format_number(measured / unit, digits),
+        format_number(true / unit, digits),
+        ratio,
+    )
 
 
-def new_table(title: str, first: str, columns: Iterable[str]) -> Table:
+def new_table(
+    title: str,
+    first: str,
+    columns: Iterable[str],
+) -> Table:
     """Return an empty table with a first column of names and columns of numbers."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(
+        title=title or None,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+    )
     table.add_column(first)
     for name in columns:
         table.add_column(name, justify="right")

@@ -10,7 +10,11 @@ import numpy as np
 import skfem
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.core.defaults import HALF_SIDE, POISSONS_RATIO, YOUNGS_MODULUS
+from cube_tensor_driver.core.defaults import (
+    HALF_SIDE,
+    POISSONS_RATIO,
+    YOUNGS_MODULUS,
+)
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import Layout
 
@@ -116,10 +120,15 @@ class Body:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain types for JSON; None stands for infinity."""
-        return {name: None if value == np.inf else value for name, value in vars(self).items()}
+        values = vars(self)
+        return {name: None if values[name] == np.inf else values[name] for name in values}
 
 
-def strip_layout(layout: Layout, width: float, centre: float = 0.5) -> Layout:
+def strip_layout(
+    layout: Layout,
+    width: float,
+    centre: float = 0.5,
+) -> Layout:
     """Return the layout with pads of another width at another distance from their face's centre.
 
     Args:
@@ -152,7 +161,8 @@ def check_pads(body: Body, layout: Layout) -> None:
     mm = 1e3 * body.side / 2
     size = layout.pad_size
     for i, j in itertools.combinations(range(layout.n_pads), 2):
-        distance = np.abs(layout.positions[i] - layout.positions[j]).max()
+        apart = layout.positions[i] - layout.positions[j]
+        distance = np.abs(apart).max()
         is_same_face = np.array_equal(layout.normals[i], layout.normals[j])
         if is_same_face and distance < size * (1 - 1e-9):
             raise ElasticError(
@@ -161,7 +171,11 @@ def check_pads(body: Body, layout: Layout) -> None:
             )
 
 
-def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
+def make_mesh(
+    body: Body,
+    layout: Layout,
+    level: int,
+) -> skfem.Mesh:
     """Mesh the body about the cube's centre.
 
     Along an axis where the body is its own mirror image, only the positive part is meshed.
@@ -181,8 +195,10 @@ def make_mesh(body: Body, layout: Layout, level: int) -> skfem.Mesh:
     stops = _pad_edges(layout)
     _check_edges(stops, body.side / 2)
 
-    half = np.array([body.width, body.depth, body.height])[axes] / body.side
-    offset = np.array([body.x, 0.0, body.z])[axes] / (body.side / 2)
+    lengths = np.array([body.width, body.depth, body.height])
+    half = lengths[axes] / body.side
+    centre = np.array([body.x, 0.0, body.z])
+    offset = centre[axes] / (body.side / 2)
     # The ground is on one side only, so it breaks the mirror along z.
     no_mirror = (offset != 0) | (body.ground & (np.array(axes) == 2))
     lower = np.where(no_mirror, half + offset, 0.0).tolist()
@@ -209,13 +225,19 @@ def _pad_edges(layout: Layout) -> Array:
     for position, normal in zip(layout.positions, layout.normals, strict=True):
         for axis in field_axes(layout):
             if normal[axis] == 0:
-                edges += [abs(position[axis] - half), abs(position[axis] + half)]
+                edges += [
+                    abs(position[axis] - half),
+                    abs(position[axis] + half),
+                ]
+    # Edges of different pads that are equal except for rounding must be one stop.
     return np.unique(np.round(edges, 9))
 
 
 def _check_edges(stops: Array, half_side: float) -> None:
     """Raise ElasticError when two edges are closer than the mesh resolves."""
-    distance = np.diff(np.unique([0.0, *stops[stops < 1], 1.0])).min()
+    # Elements also end at the centre of a face and at its edge.
+    ends = np.unique([0.0, *stops[stops < 1], 1.0])
+    distance = np.diff(ends).min()
     if distance < MIN_EDGE_DISTANCE:
         mm = 1e3 * half_side
         raise ElasticError(

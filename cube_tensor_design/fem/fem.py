@@ -17,12 +17,21 @@ import skfem
 
 from cube_tensor_driver.core.arrays import Array, Index
 from cube_tensor_driver.core.calibration import Calibration
-from cube_tensor_driver.core.defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, REST_FREQUENCY
+from cube_tensor_driver.core.defaults import (
+    BETA,
+    FOAM_MODULUS,
+    FREQUENCY_NOISE,
+    REST_FREQUENCY,
+)
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.estimator import LEAK_TOLERANCE, RANK_TOLERANCE
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.response import project
-from cube_tensor_driver.core.symmetry import Structure, default_modes, find_structure
+from cube_tensor_driver.core.symmetry import (
+    Structure,
+    default_modes,
+    find_structure,
+)
 
 from .body import Body, check_pads, field_axes, make_mesh
 from .memory import check_memory
@@ -111,12 +120,11 @@ def compute_response(
     check_memory(grids[-1])
 
     # Each axis with a mirror has two parities, and each parity is one solve.
-    total = sum(2 ** int(np.sum(grid.p.min(axis=1) >= 0)) for grid in grids)
-    done = itertools.count()
-
-    def report(what: str) -> None:
-        if progress is not None:
-            progress(next(done), total, what)
+    total = 0
+    for grid in grids:
+        mirrors = np.sum(grid.p.min(axis=1) >= 0)
+        total += 2 ** int(mirrors)
+    report = count_steps(progress, total)
 
     rows: list[dict[str, Any]] = []
     coarser: Array | None = None
@@ -155,8 +163,23 @@ def compute_response(
     )
 
 
+def count_steps(progress: Progress | None, total: int) -> Callable[[str], None]:
+    """Return a function that reports the next of `total` steps by its name."""
+    done = itertools.count()
+
+    def report(what: str) -> None:
+        if progress is not None:
+            progress(next(done), total, what)
+
+    return report
+
+
 def _solve_mesh(
-    body: Body, layout: Layout, grid: skfem.Mesh, number: int, report: Callable[[str], None]
+    body: Body,
+    layout: Layout,
+    grid: skfem.Mesh,
+    number: int,
+    report: Callable[[str], None],
 ) -> tuple[Array, int]:
     """Return the response matrix on the mesh of this number, and its number of unknowns."""
     try:
@@ -171,7 +194,9 @@ def _solve_mesh(
 
 
 def _mode_residual(
-    structure: Structure, matrix: Array, coefficients: dict[str, float]
+    structure: Structure,
+    matrix: Array,
+    coefficients: dict[str, float],
 ) -> dict[str, float]:
     """Return the relative part of each mode's column that the structure does not explain."""
     explained = np.tensordot(list(coefficients.values()), structure.basis, axes=1)
@@ -185,13 +210,17 @@ def _find_observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[
     """Return the rank of a response matrix, and the modes with a part in its null space."""
     _, singular, rows = np.linalg.svd(matrix)
     rank = int(np.sum(singular > RANK_TOLERANCE * singular[0]))
+    # The last rows span the null space: states that no pad measures.
     null_part = np.linalg.norm(rows[rank:], axis=0)
     pairs = zip(names, null_part, strict=True)
     return rank, tuple(name for name, size in pairs if size > LEAK_TOLERANCE)
 
 
 def calibration_from_fem(
-    result: Response, whole_matrix: bool = False, neglect: tuple[str, ...] = (), source: str = ""
+    result: Response,
+    whole_matrix: bool = False,
+    neglect: tuple[str, ...] = (),
+    source: str = "",
 ) -> Calibration:
     """Return a calibration with the computed response.
 
@@ -204,6 +233,7 @@ def calibration_from_fem(
         neglect: Modes that are assumed to be zero, so that few pads can tell the others.
         source: What the calibration is made from.
     """
+    # A calibration holds one of the two.
     content: dict[str, Any] = {"coefficients": result.coefficients}
     if whole_matrix:
         content = {"matrix": result.matrix}
@@ -221,7 +251,11 @@ def calibration_from_fem(
     )
 
 
-def make_solid(body: Body, layout: Layout, grid: skfem.Mesh | None = None) -> Solid:
+def make_solid(
+    body: Body,
+    layout: Layout,
+    grid: skfem.Mesh | None = None,
+) -> Solid:
     """Return the meshed body; its moduli are relative to Young's modulus of the elastomer.
 
     Args:
@@ -241,7 +275,9 @@ def make_solid(body: Body, layout: Layout, grid: skfem.Mesh | None = None) -> So
 
 
 def linear_response(
-    solid: Solid, layout: Layout, report: Callable[[str], None] = lambda _: None
+    solid: Solid,
+    layout: Layout,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Array:
     """Return the response matrix (pads, modes) on one mesh.
 
@@ -257,7 +293,11 @@ def linear_response(
 
     def forces(parity: Parity) -> Array:
         columns = []
-        parts = zip(_parity_part(stress, parity), _parity_part(gradient, parity), strict=True)
+        parts = zip(
+            _parity_part(stress, parity),
+            _parity_part(gradient, parity),
+            strict=True,
+        )
         for stress_part, gradient_part in parts:
             if stress_part.any() or gradient_part.any():
                 columns.append(solid.linear_forces(stress_part, gradient_part))
@@ -286,6 +326,7 @@ def pad_stresses(
     for parity in each_parity(solid, report):
         load = forces(parity)
         part = np.zeros((layout.n_pads, load.shape[1]))
+        # Most loads have no part of this parity and need no solve.
         used = np.flatnonzero(np.any(load != 0, axis=0))
         pads = [pad for pad in range(layout.n_pads) if has_stress(layout, pad, parity)]
         if pads and len(used):
@@ -315,12 +356,18 @@ def _parity_part(field: Array, parity: Parity) -> Array:
     """
     signs = np.array(parity)
     indices = np.indices(field.shape[1:])
-    is_odd = [np.sum(indices == k, axis=0) % 2 == 1 for k in range(len(parity))]
-    matches = (np.stack(is_odd, axis=-1) == (signs < 0)) | (signs == 0)
+    counts = [np.sum(indices == k, axis=0) for k in range(len(parity))]
+    is_odd = np.stack(counts, axis=-1) % 2 == 1
+    # Along an axis without a mirror every component belongs to the only parity.
+    matches = (is_odd == (signs < 0)) | (signs == 0)
     return np.asarray(field * np.all(matches, axis=-1))
 
 
-def has_stress(layout: Layout, pad: int, parity: Parity) -> bool:
+def has_stress(
+    layout: Layout,
+    pad: int,
+    parity: Parity,
+) -> bool:
     """Return False where a pad's mean stress is zero, because the field is odd about its centre."""
     axes = list(field_axes(layout))
     centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
@@ -328,7 +375,12 @@ def has_stress(layout: Layout, pad: int, parity: Parity) -> bool:
     return bool(np.all((np.array(parity) >= 0) | is_off_mirror))
 
 
-def pad_weights(solid: Solid, parity: Parity, layout: Layout, pad: int) -> tuple[Index, Array]:
+def pad_weights(
+    solid: Solid,
+    parity: Parity,
+    layout: Layout,
+    pad: int,
+) -> tuple[Index, Array]:
     """Return the unknowns (m,) and weights (m,) of a pad's mean normal stress.
 
     It is weights @ reactions[dofs], with the reactions of `Solid.reactions`.
@@ -339,5 +391,7 @@ def pad_weights(solid: Solid, parity: Parity, layout: Layout, pad: int) -> tuple
     intervals = []
     for k, position in enumerate(centre):
         if k != axis:
-            intervals.append((max(position - half, -1.0), min(position + half, 1.0)))
+            # Rounding may put the edge of a pad beyond that of the face.
+            start, stop = max(position - half, -1.0), min(position + half, 1.0)
+            intervals.append((start, stop))
     return solid.pad_weights(parity, axis, float(np.sign(normal[axis])), intervals)

@@ -19,7 +19,12 @@ MAX_WAVENUMBER = 30.0
 """Largest wavenumber times depth. The field has decayed there by exp(-30)."""
 
 
-def line_load(layer: Layer, x: Array, depth: float, scale: float) -> Array:
+def line_load(
+    layer: Layer,
+    x: Array,
+    depth: float,
+    scale: float,
+) -> Array:
     """Return the plane modes at one point of a layer under unit line loads along x and z.
 
     Args:
@@ -31,8 +36,10 @@ def line_load(layer: Layer, x: Array, depth: float, scale: float) -> Array:
     Returns:
         (7, m, 2) amplitudes of the modes `PLANE`, in Pa under 1 N/m.
     """
+    # Midpoints of equal intervals, so that k = 0 needs no limit.
     k = (np.arange(WAVES) + 0.5) * MAX_WAVENUMBER / depth / WAVES
-    transfer = layer.transfer(k, 0 * k, depth)[:, :, [0, 2]]
+    transfer = layer.transfer(k, 0 * k, depth)
+    transfer = transfer[:, :, [0, 2]]  # forces along x and z
     rows = transfer[:, [FIELD.index(name) for name in PLANE.names]]
     is_gradient = ["_" in name for name in PLANE.names]
     rows[:, is_gradient] *= scale
@@ -40,4 +47,5 @@ def line_load(layer: Layer, x: Array, depth: float, scale: float) -> Array:
     # Waves of both signs are conjugate, so twice the real part of one half is the integral.
     step = k[1] - k[0]
     wave = np.exp(-1j * np.outer(x, k)) * (step / np.pi)
-    return np.moveaxis(np.tensordot(wave, rows, axes=1).real, 0, 1)
+    modes = np.tensordot(wave, rows, axes=1).real  # (m, 7, 2)
+    return np.moveaxis(modes, 0, 1)

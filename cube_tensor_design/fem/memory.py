@@ -43,11 +43,13 @@ def available_memory() -> float | None:
     """
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        # The kernel's estimate of what can be taken without swapping, in kB.
         (line,) = (line for line in lines if line.startswith("MemAvailable"))
         free = 1024.0 * float(line.split()[1])
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return free
+        # The limit counts what this process has taken already.
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         return min(free, float(limit - resource.getpagesize() * pages))
     except (OSError, ValueError):

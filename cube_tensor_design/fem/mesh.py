@@ -1,8 +1,8 @@
 """Meshes of a box with a cube |x_k| <= 1 in it, or of the positive part where a mirror allows that.
 
-Lengths are in d0. The stress is infinite at the corner (in space, at the edges) of the cube, so
-elements shrink towards it. Elements end at the edges of pads. Meshes are symmetric under exchange
-of axes where the box and the pads are.
+Lengths are in d0, the half side of the cube. The stress is infinite at the corner (in space, at the
+edges) of the cube, so elements shrink towards it. Elements end at the edges of pads. Meshes are
+symmetric under exchange of axes where the box and the pads are.
 """
 
 from __future__ import annotations
@@ -26,7 +26,16 @@ SECTION_GROWTH = 2.0
 RING_HALF_SIDE = 0.5
 """Half side of the largest ring of triangles around the cube's corner, in d0."""
 _RING_POINTS = np.array(
-    [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], dtype=float
+    [
+        (1.0, 0.0),
+        (1.0, 1.0),
+        (0.0, 1.0),
+        (-1.0, 1.0),
+        (-1.0, 0.0),
+        (-1.0, -1.0),
+        (0.0, -1.0),
+        (1.0, -1.0),
+    ]
 )
 """Points of a ring around the origin, anticlockwise; those with an odd number are corners."""
 
@@ -51,6 +60,7 @@ def mesh_quarter(
         ring: Half side of the first ring, which is smaller where this does not fit.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
+    # The rings must reach neither a pad's edge nor the surface of the body.
     rho = min(ring, 1.0 - inner[-1], *(h - 1.0 for h in half))
     face = np.append(_split(inner, 1.0 - rho, 0.5), 1.0)
     lines = []
@@ -58,29 +68,41 @@ def mesh_quarter(
         outer = _grow_to(1.0 + rho, end, rho, SECTION_GROWTH, largest)
         lines.append(np.concatenate([face, outer]))
 
+    # A product grid has a square hole around the corner, which the rings fill.
     base = skfem.MeshTri.init_tensor(*lines)
-    from_corner = np.abs(base.p[:, base.t].mean(axis=1) - 1.0)
+    centres = base.p[:, base.t].mean(axis=1)
+    from_corner = np.abs(centres - 1.0)
     outside_rings = np.any(from_corner > rho, axis=0)
     ring_points, ring_triangles = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
     points = np.concatenate([base.p.T, ring_points])
-    triangles = np.concatenate([base.t.T[outside_rings], ring_triangles + base.p.shape[1]])
+    # The points of the rings are numbered after those of the grid.
+    ring_triangles = ring_triangles + base.nvertices
+    triangles = np.concatenate([base.t.T[outside_rings], ring_triangles])
     mesh = _merge_points(points.T, triangles.T)
     return mesh.refined(level - 1) if level > 1 else mesh
 
 
 def mesh_section(
-    lower: Sequence[float], upper: Sequence[float], stops: Iterable[float], level: int
+    lower: Sequence[float],
+    upper: Sequence[float],
+    stops: Iterable[float],
+    level: int,
 ) -> skfem.MeshTri:
     """Mesh [-lower[0], upper[0]] x [-lower[1], upper[1]] as `mesh_quarter` meshes a quarter.
 
     Where `lower` is 0, only the positive part is meshed.
     """
     stops = list(stops)
-    ring = min(RING_HALF_SIDE, *(h - 1.0 for h in (*lower, *upper) if h > 0))
+    # All quarters need the same rings, or their common edges would not match.
+    meshed = [length for length in (*lower, *upper) if length > 0]
+    ring = min(RING_HALF_SIDE, min(meshed) - 1.0)
     # The sign and the length of each half that is meshed, along each axis.
     sides = []
     for below, above in zip(lower, upper, strict=True):
-        sides.append([(1, above), (-1, below)] if below > 0 else [(1, above)])
+        halves = [(1, above)]
+        if below > 0:
+            halves.append((-1, below))
+        sides.append(halves)
     parts = []
     for (sign_x, x), (sign_z, z) in itertools.product(*sides):
         parts.append((mesh_quarter((x, z), stops, level, ring=ring), (sign_x, sign_z)))
@@ -89,10 +111,13 @@ def mesh_section(
 
 def mirror_quarter(quarter: skfem.MeshTri) -> skfem.MeshTri:
     """Return the mesh of the whole section from that of its positive quarter."""
-    return _join_quarters([(quarter, signs) for signs in itertools.product((1, -1), repeat=2)])
+    all_signs = itertools.product((1, -1), repeat=2)
+    return _join_quarters([(quarter, signs) for signs in all_signs])
 
 
-def _join_quarters(parts: Sequence[tuple[skfem.MeshTri, tuple[int, ...]]]) -> skfem.MeshTri:
+def _join_quarters(
+    parts: Sequence[tuple[skfem.MeshTri, tuple[int, ...]]],
+) -> skfem.MeshTri:
     """Return one mesh of quarters, each with the signs of its axes, that share their edges."""
     points: list[Array] = []
     triangles: list[Index] = []
@@ -101,7 +126,9 @@ def _join_quarters(parts: Sequence[tuple[skfem.MeshTri, tuple[int, ...]]]) -> sk
         points.append(quarter.p * np.array(signs)[:, None])
         triangles.append(quarter.t + first)
         first += quarter.nvertices
-    return _merge_points(np.concatenate(points, axis=1), np.concatenate(triangles, axis=1))
+    all_points = np.concatenate(points, axis=1)
+    all_triangles = np.concatenate(triangles, axis=1)
+    return _merge_points(all_points, all_triangles)
 
 
 def _merge_points(points: Array, triangles: Index) -> skfem.MeshTri:
@@ -110,7 +137,9 @@ def _merge_points(points: Array, triangles: Index) -> skfem.MeshTri:
     # Adding 0.0 turns -0.0 into 0.0.
     corners = (points + 0.0).T[triangles.T.ravel()] @ [1, 1j]
     unique, inverse = np.unique(corners, return_inverse=True)
-    return skfem.MeshTri(np.array([unique.real, unique.imag]), inverse.reshape(-1, 3).T.copy())
+    merged = np.array([unique.real, unique.imag])
+    # skfem wants contiguous arrays.
+    return skfem.MeshTri(merged, inverse.reshape(-1, 3).T.copy())
 
 
 def mesh_box(
@@ -139,11 +168,15 @@ def mesh_box(
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
     to_edge = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
-    face = np.concatenate([_split(inner, inner[-1], size), to_edge[1:]])
+    to_last_pad = _split(inner, inner[-1], size)
+    face = np.concatenate([to_last_pad, to_edge[1:]])
 
     def half_line(end: float) -> Array:
-        near = 1.0 + _graded(min(end - 1.0, DECAY_DISTANCE), smallest, growth)
-        far = _grow_to(near[-1], end, near[-1] - near[-2], FAR_GROWTH, largest)
+        decay_end = min(end - 1.0, DECAY_DISTANCE)
+        near = 1.0 + _graded(decay_end, smallest, growth)
+        # The first brick far away continues from the last one that is near.
+        last_step = near[-1] - near[-2]
+        far = _grow_to(near[-1], end, last_step, FAR_GROWTH, largest)
         return np.concatenate([face, near[1:], far[1:]])
 
     lines = []
@@ -155,7 +188,11 @@ def mesh_box(
     return skfem.MeshHex.init_tensor(*lines)
 
 
-def _split(stops: Sequence[float], end: float, size: float) -> Array:
+def _split(
+    stops: Sequence[float],
+    end: float,
+    size: float,
+) -> Array:
     """Return points through all stops to the end, at most `size` apart."""
     stops = sorted({*stops, end})
     points = [np.array([stops[0]])]
@@ -165,7 +202,13 @@ def _split(stops: Sequence[float], end: float, size: float) -> Array:
     return np.concatenate(points)
 
 
-def _grow_to(start: float, end: float, first: float, growth: float, largest: float) -> Array:
+def _grow_to(
+    start: float,
+    end: float,
+    first: float,
+    growth: float,
+    largest: float,
+) -> Array:
     """Return points from start to end inclusive, in steps from about `first` up to `largest`."""
     if start == end:
         return np.array([start])
@@ -173,18 +216,30 @@ def _grow_to(start: float, end: float, first: float, growth: float, largest: flo
     return points if np.isinf(largest) else _split(points.tolist(), end, largest)
 
 
-def _graded(length: float, first: float, growth: float) -> Array:
+def _graded(
+    length: float,
+    first: float,
+    growth: float,
+) -> Array:
     """Return points from 0 to length in steps that grow by one factor, from `first` or less."""
     # The geometric series of n steps from `first` must reach the length.
-    exact = np.log1p(length * (growth - 1.0) / first) / np.log(growth)
+    ratio = length * (growth - 1.0) / first
+    exact = np.log1p(ratio) / np.log(growth)
     n = max(1, int(np.ceil(exact - 1e-9)))
     steps = growth ** np.arange(n, dtype=float)
-    points: Array = np.concatenate([[0.0], np.cumsum(steps)]) * (length / steps.sum())
-    points[-1] = length  # free of rounding
+    # The n steps are shrunk together so that they end at the length.
+    points = np.zeros(n + 1)
+    points[1:] = np.cumsum(steps)
+    points *= length / steps.sum()
+    points[-1] = length  # free of rounding, so that neighbouring parts share it
     return points
 
 
-def _rings(rho: float, ratio: float, smallest: float) -> tuple[Array, Index]:
+def _rings(
+    rho: float,
+    ratio: float,
+    smallest: float,
+) -> tuple[Array, Index]:
     """Return points (n, 2) and triangles (m, 3) of rings of eight trapezoids about (1, 1).
 
     Each ring is the one before it times `ratio`; the first one has the half side `rho`.
@@ -192,6 +247,7 @@ def _rings(rho: float, ratio: float, smallest: float) -> tuple[Array, Index]:
     n = int(np.ceil(np.log(smallest) / np.log(ratio)))
     radii = rho * ratio ** np.arange(n + 1)
     around = 1.0 + np.multiply.outer(radii, _RING_POINTS).reshape(-1, 2)
+    # The corner of the cube is the last point.
     points = np.concatenate([around, [[1.0, 1.0]]])
     triangles = []
     for outer in range(0, 8 * n, 8):  # number of the ring's first point
@@ -202,6 +258,7 @@ def _rings(rho: float, ratio: float, smallest: float) -> tuple[Array, Index]:
                 triangles.append((outer + side, outer + corner, inner + corner))
                 triangles.append((outer + side, inner + corner, inner + side))
     # The last ring is closed by triangles to the corner of the cube itself.
-    last = 8 * n
-    triangles += [(last + j, last + (j + 1) % 8, len(points) - 1) for j in range(8)]
+    last, corner = 8 * n, len(points) - 1
+    for j in range(8):
+        triangles.append((last + j, last + (j + 1) % 8, corner))
     return points, np.array(triangles)

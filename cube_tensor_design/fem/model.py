@@ -14,11 +14,26 @@ from typing import Any
 
 from cube_tensor_driver.config.calibration import named_layout
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.schema import TEXT, Schema, list_of, mapping, real
+from cube_tensor_driver.config.schema import (
+    TEXT,
+    Schema,
+    list_of,
+    mapping,
+    real,
+)
 from cube_tensor_driver.config.yaml import read_yaml
-from cube_tensor_driver.core.errors import ConfigError, CubeError, ElasticError, LayoutError
+from cube_tensor_driver.core.errors import (
+    ConfigError,
+    CubeError,
+    ElasticError,
+    LayoutError,
+)
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.core.symmetry import default_modes, find_structure, largest_symmetry
+from cube_tensor_driver.core.symmetry import (
+    default_modes,
+    find_structure,
+    largest_symmetry,
+)
 
 from .body import Body, strip_layout
 
@@ -28,8 +43,15 @@ DEFAULT_LAYOUT = "planar"
 _LENGTH = real("a length in m greater than 0", exclusiveMinimum=0)
 _OFFSET = real("a distance in m")
 _YOUNG = real("a Young's modulus in Pa greater than 0", exclusiveMinimum=0)
-_POISSON = real("a Poisson's ratio of at least 0 and below 0.5", minimum=0, exclusiveMaximum=0.5)
-_MODES = list_of(TEXT, "names of modes") | {"minItems": 0, "description": "a list of modes"}
+_POISSON = real(
+    "a Poisson's ratio of at least 0 and below 0.5",
+    minimum=0,
+    exclusiveMaximum=0.5,
+)
+_MODES = list_of(TEXT, "names of modes") | {
+    "minItems": 0,
+    "description": "a list of modes",
+}
 _RIGID = {"type": "boolean", "description": "true or false"}
 _SYMMETRY = {
     "enum": ["full", "slab", "mirrors", "none"],
@@ -154,7 +176,11 @@ def _build_body(data: Mapping[str, Any]) -> Body:
     return Body(**values)
 
 
-def _place_pads(layout: Layout, pads: Mapping[str, float], half_side: float) -> Layout:
+def _place_pads(
+    layout: Layout,
+    pads: Mapping[str, float],
+    half_side: float,
+) -> Layout:
     """Return the layout with the pads' width and centre distance (m) that the model asks for."""
     if not pads:
         return layout

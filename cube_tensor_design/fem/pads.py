@@ -23,7 +23,13 @@ import numpy as np
 from cube_tensor_driver.core.arrays import Array
 
 
-def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: float) -> Array:
+def interval_weights(
+    nodes: Array,
+    order: int,
+    parity: int,
+    start: float,
+    stop: float,
+) -> Array:
     """Return the weights w (n,) with w . r = integral of the traction from start to stop.
 
     Args:
@@ -43,7 +49,12 @@ def interval_weights(nodes: Array, order: int, parity: int, start: float, stop: 
     return from_centre(stop) - from_centre(start)
 
 
-def face_weights(nodes: Array, order: int, start: float, stop: float) -> Array:
+def face_weights(
+    nodes: Array,
+    order: int,
+    start: float,
+    stop: float,
+) -> Array:
     """Return the weights as `interval_weights` does, for nodes on a whole face.
 
     Args:
@@ -53,7 +64,10 @@ def face_weights(nodes: Array, order: int, start: float, stop: float) -> Array:
         stop: End of the interval.
     """
     half = len(nodes) // 2
-    even, odd = (interval_weights(nodes[half:], order, sign, start, stop) for sign in (1, -1))
+    # The forces are split into an even and an odd part about the centre.
+    upper = nodes[half:]
+    even = interval_weights(upper, order, 1, start, stop)
+    odd = interval_weights(upper, order, -1, start, stop)
     weights = np.zeros(len(nodes))
     weights[half:] = (even + odd) / 2
     weights[half::-1] += (even - odd) / 2
@@ -61,7 +75,12 @@ def face_weights(nodes: Array, order: int, start: float, stop: float) -> Array:
     return weights
 
 
-def _weights_from_centre(nodes: Array, order: int, parity: int, stop: float) -> Array:
+def _weights_from_centre(
+    nodes: Array,
+    order: int,
+    parity: int,
+    stop: float,
+) -> Array:
     """Return the weights (n,) of the integral from 0 to stop.
 
     They solve (int phi_i t_j)^T w = int_0^stop t_j for all trial functions t_j.
@@ -80,9 +99,11 @@ def _weights_from_centre(nodes: Array, order: int, parity: int, stop: float) -> 
     # An odd traction is zero in the centre, and the mirror plane holds the node there.
     keep = slice(0 if parity > 0 else 1, n - 1)
     trial = np.eye(n)[:, keep]
+    # The traction at the corner is that of the polynomial of the last element.
     trial[-1, -order:] = _continuation(order)
     weights = np.zeros(n)
-    weights[keep] = np.linalg.solve((mass @ trial)[keep].T, trial.T @ integral)
+    matrix = (mass @ trial)[keep].T
+    weights[keep] = np.linalg.solve(matrix, trial.T @ integral)
     return weights
 
 
@@ -91,12 +112,15 @@ def _line_element(order: int) -> tuple[Array, Array]:
     points, weight = np.polynomial.legendre.leggauss(order + 1)
     points = (points + 1) / 2
     weight = weight / 2
-    to_nodal = np.linalg.inv(np.vander(np.arange(order + 1) / order, increasing=True))
+    nodes = np.arange(order + 1) / order
+    to_nodal = np.linalg.inv(np.vander(nodes, increasing=True))
     phi = np.vander(points, order + 1, increasing=True) @ to_nodal
     return (phi * weight[:, None]).T @ phi, weight @ phi
 
 
 def _continuation(order: int) -> Array:
     """Return the values at the element's end of the polynomials through its other nodes."""
-    powers = np.vander(np.arange(order) / order, increasing=True)
+    nodes = np.arange(order) / order
+    powers = np.vander(nodes, increasing=True)
+    # At the end 1 all powers are one.
     return np.ones(order) @ np.linalg.inv(powers)

@@ -32,7 +32,10 @@ from .solid import Solid
 
 
 def compute_influence(
-    body: Body, layout: Layout, level: int = 1, report: Callable[[str], None] = lambda _: None
+    body: Body,
+    layout: Layout,
+    level: int = 1,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Influence:
     """Compute the influence functions of the pads in a body on rigid ground.
 
@@ -67,11 +70,14 @@ def compute_influence(
 
 
 def _surface_influence(
-    solid: Solid, layout: Layout, report: Callable[[str], None]
+    solid: Solid,
+    layout: Layout,
+    report: Callable[[str], None],
 ) -> tuple[Array, Array]:
     """Return positions (n, dim - 1) and influence (P, n, dim) of the nodes on the surface, d0."""
     x, dim = solid.positions, solid.dim
-    on_top = np.abs(x[-1] - x[-1].max()) < 1e-12
+    height = x[-1]
+    on_top = np.abs(height - height.max()) < 1e-12
     # The unknowns of the components at the same nodes, in the same order.
     surface_dofs = []
     for axis in range(dim):
@@ -84,13 +90,15 @@ def _surface_influence(
     mirrors = [np.array(signs) for signs in itertools.product(*sides)]
     total = np.zeros((len(mirrors), layout.n_pads, len(nodes), dim))
     for parity in each_parity(solid, report):
+        # The weights of the pads are the right-hand sides, all of one parity in one solve.
         gaps = np.zeros((solid.basis.N, layout.n_pads))
         for pad in range(layout.n_pads):
             if has_stress(layout, pad, parity):
                 dofs, weights = pad_weights(solid, parity, layout, pad)
                 gaps[dofs, pad] = weights
         displacement = solid.solve(parity, solid.body @ gaps)
-        on_surface = np.stack([displacement[dofs].T for dofs in surface_dofs], axis=-1)
+        components = [displacement[dofs].T for dofs in surface_dofs]
+        on_surface = np.stack(components, axis=-1)
         for number, signs in enumerate(mirrors):
             # An even field has an odd displacement along the axis.
             flip = np.prod(np.where(signs < 0, parity, 1)) * signs
@@ -99,5 +107,6 @@ def _surface_influence(
     places = np.concatenate([nodes * signs[:-1] for signs in mirrors])
     pads = np.concatenate(list(total), axis=1)
     # A node on a mirror is there twice, with the same value.
-    places, first = np.unique(np.round(places, 9), axis=0, return_index=True)
+    rounded = np.round(places, 9)
+    places, first = np.unique(rounded, axis=0, return_index=True)
     return places, pads[:, first]

@@ -4,7 +4,7 @@ Where box and cube are symmetric under the mirrors x_k -> -x_k, every load split
 *parity* (+1 even or -1 odd for each axis), and each part is solved where all coordinates are
 positive. On the plane x_k = 0 an even field has u_k = 0; an odd one has the other components zero.
 Along an axis without a mirror the whole box is solved, and the parity is 0.
-Lengths are in units of d0. For all test functions w::
+Lengths are in units of d0, the half side of the cube. For all test functions w::
 
     int sigma(u) : eps(w) dV = int_outer w . (sigma_load n) dS = int sigma_load : eps(w) dV
 
@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 import skfem
 from scipy.sparse.linalg import SuperLU, splu
-from skfem.helpers import ddot, dot, sym_grad, trace
+from skfem.helpers import ddot, dot, sym_grad
+from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from cube_tensor_driver.core.arrays import Array, Index, Mask
 
@@ -42,13 +43,16 @@ def _is_at(x: Array, value: float | Array) -> Mask:
     return np.asarray(np.abs(x - value) < SAME_COORDINATE)
 
 
-def lame(young: float, poisson: float, plane: str = "strain") -> tuple[float, float]:
+def lame(
+    young: float,
+    poisson: float,
+    plane: str = "strain",
+) -> tuple[float, float]:
     """Return Lame's constants lambda and mu, in Pa.
 
     For plane stress, lambda is the one with which a computation in plane strain has no sigma_yy.
     """
-    mu = young / (2.0 * (1.0 + poisson))
-    lam = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    lam, mu = lame_parameters(young, poisson)
     if plane == "stress":
         lam = 2.0 * lam * mu / (lam + 2.0 * mu)
     return lam, mu
@@ -61,7 +65,7 @@ def stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
         basis: The elements.
         moduli: Lame's constants lambda and mu.
     """
-    return skfem.BilinearForm(_virtual_work).assemble(basis, lam=moduli[0], mu=moduli[1]).tocsr()
+    return linear_elasticity(*moduli).assemble(basis).tocsr()
 
 
 def brick_stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
@@ -76,8 +80,9 @@ def brick_stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_m
     lengths = np.ptp(corners, axis=1)  # (dim, elements)
     dim = len(lengths)
     slopes = _unit_slopes(basis)
-    # (dim, dim, elements)
-    stretch = np.prod(lengths, axis=0) / (lengths[:, None] * lengths[None])
+    volume = np.prod(lengths, axis=0)
+    stretch = volume / (lengths[:, None] * lengths[None])  # (dim, dim, elements)
+    # The part of mu grad u : grad w couples equal components only.
     laplace = mu * np.einsum("aae,aamn->emn", stretch, slopes)
 
     total = sp.csr_matrix((basis.N, basis.N))
@@ -86,8 +91,10 @@ def brick_stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_m
         block = np.einsum("e,mn->emn", stretch[i, j], pair)
         if i == j:
             block += laplace
-        rows = np.broadcast_to(basis.element_dofs[i::dim].T[:, :, None], block.shape)
-        columns = np.broadcast_to(basis.element_dofs[j::dim].T[:, None, :], block.shape)
+        # The dofs of an element alternate between the components.
+        row_dofs, column_dofs = (basis.element_dofs[k::dim].T for k in (i, j))
+        rows = np.broadcast_to(row_dofs[:, :, None], block.shape)
+        columns = np.broadcast_to(column_dofs[:, None, :], block.shape)
         indices = (rows.ravel(), columns.ravel())
         total += sp.csr_matrix((block.ravel(), indices), total.shape)
     return total
@@ -99,15 +106,9 @@ def _unit_slopes(basis: skfem.Basis) -> Array:
     # Its corners have the order of those of mesh_box.
     cell = skfem.MeshHex.init_tensor(ends, ends, ends)
     unit = skfem.Basis(cell, basis.elem.elem, quadrature=(basis.X, basis.W))
-    # (nodes, dim, points)
-    gradient = np.stack([unit.basis[m][0].grad[:, 0] for m in range(unit.Nbfun)])
+    gradients = [shape[0].grad[:, 0] for shape in unit.basis]
+    gradient = np.stack(gradients)  # (nodes, dim, points)
     return np.asarray(np.einsum("maq,nbq,q->abmn", gradient, gradient, unit.dx[0]))
-
-
-def _virtual_work(u: Any, w: Any, p: Any) -> Any:
-    strain, test_strain = sym_grad(u), sym_grad(w)
-    volume_part = p.lam * trace(strain) * trace(test_strain)
-    return volume_part + 2.0 * p.mu * ddot(strain, test_strain)
 
 
 _STRESS_WORK = skfem.LinearForm(lambda w, p: ddot(p.sigma, sym_grad(w)))
@@ -156,7 +157,8 @@ class Solid:
         self.is_rigid = cube is None
         self._ground = ground
         # Without a mirror, an axis has the parity 0 alone.
-        signs = [(0,) if low < -SAME_COORDINATE else (1, -1) for low in mesh.p.min(axis=1)]
+        has_mirror = mesh.p.min(axis=1) > -SAME_COORDINATE
+        signs = [(1, -1) if mirrored else (0,) for mirrored in has_mirror]
         self.parities: list[Parity] = list(itertools.product(*signs))
 
         scalar = skfem.ElementTriP4() if self.dim == 2 else skfem.ElementHex2()
@@ -168,13 +170,15 @@ class Solid:
             self.component[self.basis.get_dofs(elements=True).all(f"u^{k + 1}")] = k
 
         # (dim, dofs) number of the line of the product grid of bricks on which each dof lies
-        lines = [np.unique(np.round(x, 9), return_inverse=True) for x in self.positions]
+        rounded = np.round(self.positions, 9)
+        lines = [np.unique(x, return_inverse=True) for x in rounded]
         self._grid = np.stack([index for _, index in lines])
         self._first_equal_axis = _find_equal_axes([line for line, _ in lines])
         self._last_solve: _Factors | None = None
 
         assemble = stiffness if self.dim == 2 else brick_stiffness
-        in_cube = np.all(np.abs(mesh.p[:, mesh.t].mean(axis=1)) < 1.0, axis=0)
+        centres = mesh.p[:, mesh.t].mean(axis=1)
+        in_cube = np.all(np.abs(centres) < 1.0, axis=0)
         self.body = assemble(self._restrict(~in_cube), body)
         self.total = self.body
         if cube is not None:
@@ -188,7 +192,8 @@ class Solid:
             gradient: G (dim, dim, dim).
         """
         x = np.asarray(self.basis.default_parameters()["x"])
-        sigma = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, x)
+        linear_part = np.einsum("ijk,kep->ijep", gradient, x)
+        sigma = stress[:, :, None, None] + linear_part
         return np.asarray(_STRESS_WORK.assemble(self.basis, sigma=sigma))
 
     def outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
@@ -200,7 +205,8 @@ class Solid:
         """
         mesh = self.basis.mesh
         edges = mesh.boundary_facets()
-        centres = mesh.p[:, mesh.facets[:, edges]].mean(axis=1)
+        corners = mesh.p[:, mesh.facets[:, edges]]
+        centres = corners.mean(axis=1)
         total: Array | float = 0.0
         for axis in range(self.dim):
             outer = edges[_is_at(centres[axis], mesh.p[axis].max())]
@@ -208,7 +214,9 @@ class Solid:
             x = np.asarray(face.default_parameters()["x"])
             stress = _parity_part(field, x.reshape(self.dim, -1).T, parity)
             traction = stress[..., axis]  # (q, n, dim)
-            loads = np.moveaxis(traction, (1, 2), (0, 1)).reshape(-1, *x.shape)
+            # One assembly for each field, with the traction at the face's own points.
+            by_field = np.moveaxis(traction, (1, 2), (0, 1))
+            loads = by_field.reshape(-1, *x.shape)
             forces = [_TRACTION_WORK.assemble(face, t=load) for load in loads]
             total = total + np.stack(forces, axis=1)
         return np.asarray(total)
@@ -232,8 +240,14 @@ class Solid:
             free = free[nested_dissection(self._grid[:, free])]
             ordering = "NATURAL"
         matrix = self.total[free][:, free].tocsc()
+        # The matrix is positive definite, so no pivoting is needed.
         symmetric = {"SymmetricMode": True}
-        factors = splu(matrix, permc_spec=ordering, diag_pivot_thresh=0.0, options=symmetric)
+        factors = splu(
+            matrix,
+            permc_spec=ordering,
+            diag_pivot_thresh=0.0,
+            options=symmetric,
+        )
         return _Factors(parity, free, factors)
 
     def with_sorted_axes(self, parity: Parity) -> tuple[Parity, Index]:
@@ -270,7 +284,11 @@ class Solid:
         return np.asarray(self.body @ u)
 
     def pad_weights(
-        self, parity: Parity, axis: int, side: float, intervals: Sequence[tuple[float, float]]
+        self,
+        parity: Parity,
+        axis: int,
+        side: float,
+        intervals: Sequence[tuple[float, float]],
     ) -> tuple[Index, Array]:
         """Return unknowns and weights that make the mean normal stress of a pad of the reactions.
 
@@ -294,7 +312,8 @@ class Solid:
 
         weights = np.full(len(dofs), float(sign))
         for k, (start, stop) in zip(others, intervals, strict=True):
-            nodes, index = np.unique(np.round(x[k, dofs], 14), return_inverse=True)
+            rounded = np.round(x[k, dofs], 14)
+            nodes, index = np.unique(rounded, return_inverse=True)
             if parity[k] == 0:
                 along = face_weights(nodes, self.order, start, stop)
             else:
@@ -309,7 +328,7 @@ class Solid:
         return skfem.Basis(mesh, self.basis.elem, elements=numbers, intorder=order)
 
     def _held(self, parity: Parity) -> Mask:
-        """Return which unknowns (dofs,) are zero.
+        """Return which unknowns (dofs,) are held at zero.
 
         Mirrors, the ground and a rigid cube hold some; others are held to stop rigid motions. A
         translation is odd along its axis, a rotation along both axes of its plane. A rigid cube can
@@ -319,24 +338,30 @@ class Solid:
         held = np.zeros(len(component), dtype=bool)
         for k, sign in enumerate(parity):
             if sign != 0:
-                held |= _is_at(x[k], 0.0) & ((component == k) == (sign > 0))
+                # Even: the normal component is zero on the mirror; odd: the other ones.
+                is_normal = component == k
+                held |= _is_at(x[k], 0.0) & (is_normal == (sign > 0))
         if self._ground:
             return held | _is_at(x[-1], x[-1].min())
         if self.is_rigid:
-            return np.asarray(held | np.all(np.abs(x) < 1.0 + SAME_COORDINATE, axis=0))
+            in_cube = np.all(np.abs(x) < 1.0 + SAME_COORDINATE, axis=0)
+            return np.asarray(held | in_cube)
 
         def admits(*odd: int) -> bool:
             """Return whether a motion that is odd along these axes has the parity."""
-            return all(sign in (0, -1 if k in odd else 1) for k, sign in enumerate(parity))
+            wanted = [-1 if k in odd else 1 for k in range(self.dim)]
+            return all(sign in (0, want) for sign, want in zip(parity, wanted, strict=True))
 
         for k in range(self.dim):
             if admits(k):  # a translation along k: hold the centre
-                held |= (component == k) & np.all(_is_at(x, 0.0), axis=0)
+                at_centre = np.all(_is_at(x, 0.0), axis=0)
+                held |= (component == k) & at_centre
         for i, j in itertools.combinations(range(self.dim), 2):
             if admits(i, j):  # a rotation: hold component i of a point on axis j
                 point = np.zeros(self.dim)
                 point[j] = 1.0
-                held |= (component == i) & np.all(_is_at(x, point[:, None]), axis=0)
+                at_point = np.all(_is_at(x, point[:, None]), axis=0)
+                held |= (component == i) & at_point
         return held
 
 
@@ -348,11 +373,16 @@ def _find_equal_axes(lines: Sequence[Array]) -> list[int]:
 
     found = []
     for k, line in enumerate(lines):
-        found.append(next(m for m in range(k + 1) if is_equal(lines[m], line)))
+        equal = [m for m in range(k + 1) if is_equal(lines[m], line)]
+        found.append(equal[0])
     return found
 
 
-def _parity_part(field: Callable[[Array], Array], x: Array, parity: Parity) -> Array:
+def _parity_part(
+    field: Callable[[Array], Array],
+    x: Array,
+    parity: Parity,
+) -> Array:
     """Return the part of one parity of a stress field at x (q, dim).
 
     It is the mean of the field over all mirrored points, with the signs of the parity.
@@ -360,8 +390,11 @@ def _parity_part(field: Callable[[Array], Array], x: Array, parity: Parity) -> A
     mirrors = list(itertools.product((1.0, -1.0), repeat=len(parity)))
     part = np.zeros(())
     for mirror in map(np.array, mirrors):
-        weight = np.prod(np.where(mirror < 0, parity, 1)) / len(mirrors)
-        part = part + weight * np.outer(mirror, mirror) * field(x * mirror)
+        sign = np.prod(np.where(mirror < 0, parity, 1))
+        weight = sign / len(mirrors)
+        # A component sigma_ij changes its sign with each of its axes that is mirrored.
+        signs = np.outer(mirror, mirror)
+        part = part + weight * signs * field(x * mirror)
     return part
 
 
@@ -377,7 +410,8 @@ def nested_dissection(grid: Index) -> Index:
     """
 
     def order(part: Index) -> Index:
-        axis = int(np.argmax(np.ptp(grid[:, part], axis=1)))
+        extent = np.ptp(grid[:, part], axis=1)
+        axis = int(np.argmax(extent))
         along = grid[axis, part]
         # Even lines are planes between elements.
         planes = np.unique(along[along % 2 == 0])[1:-1]

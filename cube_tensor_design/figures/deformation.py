@@ -12,7 +12,11 @@ from matplotlib.tri import Triangulation
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style, symbol
+from cube_tensor_driver.views.figures.style import (
+    SIGNED_COLOURS,
+    print_style,
+    symbol,
+)
 
 from ..paper.virtual_bench import Deformation
 
@@ -24,7 +28,8 @@ FIGURE_4_TITLES = {
 MAX_DISPLACEMENT = 0.4
 """Largest displacement of the drawn outline, in d0."""
 COLOUR_PERCENTILE = 95
-"""Percentile of the stress at which the colours end. It is infinite at the corners of the cube."""
+"""Percentile of the stress at which the colours end. At the corners of the cube the stress is
+infinite."""
 
 
 @print_style()
@@ -41,9 +46,18 @@ def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
         scale = _draw_deformation(axis, deformation, 4)
         axis.set_title(f"{symbol(name)}, 10 kPa (displacements times {scale:.2g})")
         _draw_pads(axis, layout, 1e3 * deformation.half_side)
-    pad = Patch(facecolor="white", edgecolor="black", hatch="||||", label="pad")
+    pad = Patch(
+        facecolor="white",
+        edgecolor="black",
+        hatch="||||",
+        label="pad",
+    )
     axes.flat[-1].axis("off")
-    axes.flat[-1].legend(handles=[pad], loc="center", handlelength=4)
+    axes.flat[-1].legend(
+        handles=[pad],
+        loc="center",
+        handlelength=4,
+    )
     figure.supxlabel(r"$x$ / mm")
     return figure
 
@@ -69,25 +83,48 @@ def draw_figure_4(deformations: dict[str, Deformation]) -> Figure:
     return figure
 
 
-def _draw_pads(axis: Any, layout: Layout, half_side: float) -> None:
+def _draw_pads(
+    axis: Any,
+    layout: Layout,
+    half_side: float,
+) -> None:
     """Draw pads on the faces of an undeformed cube; half_side in mm."""
-    centres, normals = layout.positions[:, [0, 2]], layout.normals[:, [0, 2]]
+    centres = layout.positions[:, [0, 2]]
+    normals = layout.normals[:, [0, 2]]
     for centre, normal in zip(centres, normals, strict=True):
         along = layout.pad_size * (1 - np.abs(normal))
         ends = half_side * (centre + np.outer((-0.5, 0.5), along)).T
-        axis.plot(*ends, color="black", linewidth=7, solid_capstyle="butt")
+        axis.plot(
+            *ends,
+            color="black",
+            linewidth=7,
+            solid_capstyle="butt",
+        )
         # White dashes on the black line are the hatches of the pad.
         dashes = (0, (0.5, 0.5))
-        axis.plot(*ends, color="white", linewidth=3.5, linestyle=dashes, dash_capstyle="butt")
+        axis.plot(
+            *ends,
+            color="white",
+            linewidth=3.5,
+            linestyle=dashes,
+            dash_capstyle="butt",
+        )
 
 
-def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> float:
+def _draw_deformation(
+    axis: Any,
+    deformation: Deformation,
+    window: float,
+) -> float:
     """Draw σzz on the deformed body within `window` d0 of the cube.
 
     Returns:
         Scale of the displacements.
     """
-    d0, points, moved = deformation.half_side, deformation.points, deformation.displacement
+    d0 = deformation.half_side
+    points = deformation.points
+    moved = deformation.displacement
+    # Displacements far away are large and not drawn.
     is_near = np.abs(points[0]) < window
     scale = MAX_DISPLACEMENT * d0 / np.hypot(*moved[:, is_near]).max()
     drawn = 1e3 * (d0 * points + scale * moved)
@@ -96,19 +133,37 @@ def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> flo
     _draw_stress(axis, deformation, drawn, window)
     _draw_arrows(axis, deformation, drawn, limits)
 
-    corners = 1e3 * d0 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
-    axis.plot(*corners, "k:", linewidth=0.8)
-    face = np.flatnonzero(np.isclose(np.abs(points).max(axis=0), 1))
+    # Dotted: where the cube was. White: where it is.
+    corners_x = np.array([-1, 1, 1, -1, -1])
+    corners_z = np.array([-1, -1, 1, 1, -1])
+    axis.plot(1e3 * d0 * corners_x, 1e3 * d0 * corners_z, "k:", linewidth=0.8)
+    ring = np.abs(points).max(axis=0)
+    face = np.flatnonzero(np.isclose(ring, 1))
     by_angle = np.argsort(np.arctan2(*points[::-1, face]))
     outline = drawn[:, face[by_angle]]
-    axis.fill(*outline, facecolor="white", edgecolor="black", linewidth=1.2)
+    axis.fill(
+        *outline,
+        facecolor="white",
+        edgecolor="black",
+        linewidth=1.2,
+    )
     x, z = limits
-    axis.set(xlim=(-x, x), ylim=(-z, z), aspect="equal", ylabel=r"$z$ / mm")
+    axis.set(
+        xlim=(-x, x),
+        ylim=(-z, z),
+        aspect="equal",
+        ylabel=r"$z$ / mm",
+    )
     axis.grid(False)
     return float(scale)
 
 
-def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: float) -> None:
+def _draw_stress(
+    axis: Any,
+    deformation: Deformation,
+    drawn: Array,
+    window: float,
+) -> None:
     """Draw σzz of the elastomer as colours and contour lines on the points `drawn` (2, n), mm."""
     points, triangles = deformation.points, deformation.triangles
     ring = np.abs(points).max(axis=0)
@@ -127,12 +182,21 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
     limit = np.percentile(np.abs(kilopascal[is_near]), COLOUR_PERCENTILE)
 
     mesh = Triangulation(drawn[0], drawn[1], around.T)
-    colours = {"cmap": SIGNED_COLOURS, "vmin": -limit, "vmax": limit}
+    colours = {
+        "cmap": SIGNED_COLOURS,
+        "vmin": -limit,
+        "vmax": limit,
+    }
     image = axis.tripcolor(mesh, kilopascal, shading="gouraud", **colours)
     # matplotlib dashes the lines below zero.
     levels = _contour_levels(limit)
     lines = axis.tricontour(mesh, kilopascal, levels, colors="black", linewidths=0.7)
-    for label in axis.clabel(lines, fontsize=7, fmt="%g", inline=False):
+    for label in axis.clabel(
+        lines,
+        fontsize=7,
+        fmt="%g",
+        inline=False,
+    ):
         label.set_rotation(0)
         label.set_path_effects([withStroke(linewidth=2, foreground="white")])
         beside_cube = np.abs(label.get_position()).max() < 1.5e3 * deformation.half_side
@@ -144,12 +208,19 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
 
 def _contour_levels(limit: float) -> Array:
     """Return ten levels at round steps. None is 0 or 10 kPa, which large parts of a body have."""
-    steps = np.multiply.outer([1, 2, 3, 5], 10.0 ** np.arange(-9, 10)).ravel()
+    powers = 10.0 ** np.arange(-9, 10)
+    steps = np.multiply.outer([1, 2, 3, 5], powers).ravel()
+    # Four steps should be about the range of the colours on one side of zero.
     step = steps[np.argmin(np.abs(np.log(4 * steps / limit)))]
     return np.asarray(step * (np.arange(-5, 5) + 0.5))
 
 
-def _draw_arrows(axis: Any, deformation: Deformation, drawn: Array, limits: Array) -> None:
+def _draw_arrows(
+    axis: Any,
+    deformation: Deformation,
+    drawn: Array,
+    limits: Array,
+) -> None:
     """Draw the displacements of the mesh's nodes next to a regular grid; limits (2,) in mm."""
     d0 = deformation.half_side
     window = limits[0] / (1e3 * d0)
@@ -159,6 +230,7 @@ def _draw_arrows(axis: Any, deformation: Deformation, drawn: Array, limits: Arra
     for point in grid.reshape(2, -1).T:
         distance = np.hypot(*(deformation.points - point[:, None]))
         nodes.append(np.argmin(distance))
+    # Nodes are drawn where they have moved to, as the body is.
     tails, moved = drawn[:, nodes], deformation.displacement[:, nodes]
     # The longest arrow is as long as d0; only those are drawn that are in view as a whole.
     arrows = 1e3 * d0 * moved / np.hypot(*moved).max()

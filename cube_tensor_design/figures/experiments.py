@@ -9,7 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.views.figures.style import curve_style, print_style, symbol
+from cube_tensor_driver.views.figures.style import (
+    curve_style,
+    print_style,
+    symbol,
+)
 
 from ..paper.experiments import ON_LOWER, Experiment, foam_frequency
 from ..paper.rod_parts import RodParts
@@ -59,12 +63,20 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
     x = 1e3 * result.displacement
     frequency = foam_frequency(result.pads)[:, ON_LOWER]
     for number, label in enumerate(PAD_LABELS):
-        axes[0].plot(x, frequency[:, number] / 1e3, label=label, **curve_style(number))
+        curve = frequency[:, number] / 1e3
+        axes[0].plot(x, curve, label=label, **curve_style(number))
     axes[0].set(title="frequencies", ylabel="frequency / kHz")
     for number, label in enumerate(SIGNAL_LABELS):
         style = curve_style(number) | {"linestyle": "-"}
-        axes[1].plot(x, result.prototype[:, number] / 1e3, label=label, **style)
-    axes[1].plot(x, result.upper[:, 1] / 1e3, label=UPPER_LABEL, color="tab:red", linestyle="--")
+        curve = result.prototype[:, number] / 1e3
+        axes[1].plot(x, curve, label=label, **style)
+    axes[1].plot(
+        x,
+        result.upper[:, 1] / 1e3,
+        label=UPPER_LABEL,
+        color="tab:red",
+        linestyle="--",
+    )
     axes[1].set(title="prototype, eqs. 8 to 10", ylabel="signal / kHz")
     _draw_modes(axes[2], result, range(3))
     axes[2].set(title="stress (dashed: true)", ylabel=r"$\sigma$ / kPa")
@@ -79,15 +91,23 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
     return figure
 
 
-def _draw_modes(axis: Any, result: Experiment, modes: range) -> None:
+def _draw_modes(
+    axis: Any,
+    result: Experiment,
+    modes: range,
+) -> None:
     """Draw the recovered and the true amplitudes of some modes."""
     x = 1e3 * result.displacement
     for number, mode in enumerate(modes):
         style = curve_style(number)
-        recovered, true = result.recovered[:, mode] / 1e3, result.truth[:, mode] / 1e3
-        axis.plot(x, recovered, label=symbol(PLANE.names[mode]), **style | {"linestyle": "-"})
+        recovered = result.recovered[:, mode] / 1e3
+        true = result.truth[:, mode] / 1e3
+        label = symbol(PLANE.names[mode])
+        axis.plot(x, recovered, label=label, **style | {"linestyle": "-"})
         axis.plot(x, true, **style | {"linestyle": "--"})
-    shown = np.abs(np.stack([result.recovered, result.truth])[:, :, list(modes)])
+    # Rounding errors of modes that are zero must not fill a panel.
+    both = np.stack([result.recovered, result.truth])
+    shown = np.abs(both[:, :, list(modes)])
     floor = MIN_SHOWN_SHARE * float(np.abs(result.recovered).max())
     if shown.max() < floor:
         axis.set(ylim=(-1, 1), yticks=[0])
@@ -104,11 +124,21 @@ def draw_rod_parts(found: dict[str, RodParts]) -> Figure:
     for axis, (name, one) in zip(axes, strips.items(), strict=True):
         curves = np.column_stack([one.signal, one.parts]) / 1e3
         for number, label in enumerate(PART_LABELS):
-            axis.plot(1e3 * one.place, curves[:, number], label=label, **curve_style(number))
-        axis.set(title=name, xlabel="distance of the rod's centre from the cube's / mm")
+            curve = curves[:, number]
+            axis.plot(1e3 * one.place, curve, label=label, **curve_style(number))
+        axis.set(
+            title=name,
+            xlabel="distance of the rod's centre from the cube's / mm",
+        )
     axes[0].set_ylabel("$-v_1 + v_2 + v_3 - v_4$ / kPa")
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, handlelength=4, ncols=3, loc="outside lower center")
+    figure.legend(
+        handles,
+        labels,
+        handlelength=4,
+        ncols=3,
+        loc="outside lower center",
+    )
     figure.suptitle("Signal for shear and its parts; rod pressed 1 mm and held, bonded bottom")
     return figure
 
@@ -138,10 +168,26 @@ def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
     for axis, experiment in zip(axes, experiments, strict=True):
         x = 1e3 * experiment.displacement
         for number, style in enumerate(("o-", "s-", "^:")):
-            signal, label = 1e-3 * experiment.prototype[:, number], SIGNAL_LABELS[number]
-            axis.plot(x, signal, style, color="black", mfc="white", ms=4, label=label)
+            signal = 1e-3 * experiment.prototype[:, number]
+            label = SIGNAL_LABELS[number]
+            axis.plot(
+                x,
+                signal,
+                style,
+                color="black",
+                mfc="white",
+                ms=4,
+                label=label,
+            )
         upper = 1e-3 * experiment.upper[:, 1]
-        axis.plot(x, upper, color="black", lw=1, dashes=(2, 2), label=UPPER_LABEL)
+        axis.plot(
+            x,
+            upper,
+            color="black",
+            lw=1,
+            dashes=(2, 2),
+            label=UPPER_LABEL,
+        )
         axis.set(title=experiment.name, xlabel="displacement / mm")
         axis.title.set_fontsize(8)
     axes[0].set_ylabel(r"signal $\sum \pm\Delta f_i$ / kHz")

@@ -39,7 +39,12 @@ def draw_methods(example: FieldExample, prefix: str = "") -> Figure:
         title = f"{prefix}{name}\nrms error {100 * share:.0f} %"
         maps[name if name == "truth" else title] = pressure
     image = _draw_maps(axes[0], example, maps)
-    figure.colorbar(image, ax=axes, label=PRESSURE_LABEL, shrink=0.8)
+    figure.colorbar(
+        image,
+        ax=axes,
+        label=PRESSURE_LABEL,
+        shrink=0.8,
+    )
     _add_legend(axes[0, 0])
     return figure
 
@@ -53,7 +58,8 @@ def draw_traction(example: FieldExample) -> Figure:
     """
     figure = Figure(figsize=(9, 5.6))
     axes = _map_axes(figure, 2, 3)
-    truth, predicted = example.pressure["truth"], example.pressure["standard deviation"]
+    truth = example.pressure["truth"]
+    predicted = example.pressure["standard deviation"]
 
     maps = {"truth": truth}
     for name in METHODS:
@@ -75,14 +81,29 @@ def draw_traction(example: FieldExample) -> Figure:
 
 def relative_rms(values: Array, reference: Array) -> float:
     """Return the rms of values over the rms of a reference."""
-    return float(np.sqrt((values**2).mean() / (reference**2).mean()))
+    square, reference_square = (values**2).mean(), (reference**2).mean()
+    return float(np.sqrt(square / reference_square))
 
 
-def _map_axes(figure: Figure, rows: int, columns: int) -> Any:
+def _map_axes(
+    figure: Figure,
+    rows: int,
+    columns: int,
+) -> Any:
     """Return axes (rows, columns) of maps with one scale."""
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(
+        rows,
+        columns,
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+    )
     for axis in axes.flat:
-        axis.set(aspect="equal", xlim=(-VIEW_MM, VIEW_MM), ylim=(-VIEW_MM, VIEW_MM))
+        axis.set(
+            aspect="equal",
+            xlim=(-VIEW_MM, VIEW_MM),
+            ylim=(-VIEW_MM, VIEW_MM),
+        )
         axis.grid(False)
     for axis in axes[-1]:
         axis.set_xlabel("$x$ / mm")
@@ -91,30 +112,70 @@ def _map_axes(figure: Figure, rows: int, columns: int) -> Any:
     return axes
 
 
-def _draw_maps(axes: Any, example: FieldExample, maps: Mapping[str, Array]) -> Any:
+def _draw_maps(
+    axes: Any,
+    example: FieldExample,
+    maps: Mapping[str, Array],
+) -> Any:
     """Draw maps (M,) in Pa by their title, with cubes and load, from 0 to the largest of all."""
     points = example.points
-    order = np.lexsort((points[:, 0].round(9), points[:, 1].round(9)))
+    # The points are a square grid in the order of the cubes' patches, not of rows.
+    rounded = points.round(9)
+    order = np.lexsort((rounded[:, 0], rounded[:, 1]))
     side = round(np.sqrt(len(points)))
-    x, y = (1e3 * points[order, k].reshape(side, side) for k in (0, 1))
+    x = 1e3 * points[order, 0].reshape(side, side)
+    y = 1e3 * points[order, 1].reshape(side, side)
     top = 1e-3 * max(values.max() for values in maps.values())
     levels = np.arange(CONTOUR_STEP_KPA / 2, top, CONTOUR_STEP_KPA)
     for axis, (title, values) in zip(axes, maps.items(), strict=True):
         # A method may compute tension, which no contact makes.
         kilopascal = 1e-3 * np.maximum(values, 0)[order].reshape(side, side)
         image = axis.pcolormesh(
-            x, y, kilopascal, vmin=0, vmax=top, shading="nearest", rasterized=True
+            x,
+            y,
+            kilopascal,
+            vmin=0,
+            vmax=top,
+            shading="nearest",
+            rasterized=True,
         )
-        axis.contour(x, y, kilopascal, levels=levels, colors="white", linewidths=0.5)
+        axis.contour(
+            x,
+            y,
+            kilopascal,
+            levels=levels,
+            colors="white",
+            linewidths=0.5,
+        )
         cubes, load = 1e3 * example.cubes[:, :2].T, 1e3 * example.centre
-        axis.plot(*cubes, "s", ms=4, mfc="none", mec="0.8", label="cube")
-        axis.plot(*load, "P", ms=7, mfc="red", mec="white", mew=0.8, label="load")
+        axis.plot(
+            *cubes,
+            "s",
+            ms=4,
+            mfc="none",
+            mec="0.8",
+            label="cube",
+        )
+        axis.plot(
+            *load,
+            "P",
+            ms=7,
+            mfc="red",
+            mec="white",
+            mew=0.8,
+            label="load",
+        )
         axis.set_title(title)
     return image
 
 
 def _add_legend(axis: Any) -> None:
-    axis.legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
+    axis.legend(
+        fontsize=7,
+        loc="lower left",
+        facecolor="0.3",
+        labelcolor="white",
+    )
 
 
 @print_style()
@@ -130,14 +191,30 @@ def draw_field_study(study: FieldStudy) -> Figure:
     for kind, (axis, title) in enumerate(zip(axes, titles, strict=True), 1):
         for row, (width, marker) in enumerate(zip(study.widths, "os^Dv", strict=True)):
             grey = str(0.7 * row / len(study.widths))
-            style: dict[str, Any] = {"color": grey, "marker": marker, "ms": 4, "lw": 1}
+            style: dict[str, Any] = {
+                "color": grey,
+                "marker": marker,
+                "ms": 4,
+                "lw": 1,
+            }
             errors = study.error[row]
-            axis.loglog(pitches, errors[:, 0], ls="--", mfc="none", **style)
+            axis.loglog(
+                pitches,
+                errors[:, 0],
+                ls="--",
+                mfc="none",
+                **style,
+            )
             axis.loglog(pitches, errors[:, kind], label=f"{1e3 * width:.0f} mm", **style)
         axis.set(xlabel="pitch of the cubes / mm", title=title)
         axis.set_xticks(pitches, [f"{pitch:.0f}" for pitch in pitches], minor=False)
         axis.minorticks_off()
+    # Both panels share the legend: their widths have the same greys and markers.
     axes[0].set_ylabel("rms error / rms pressure")
     legend = "width of the contact\n(dashed: without gradients)"
-    axes[0].legend(title=legend, fontsize=7, title_fontsize=7)
+    axes[0].legend(
+        title=legend,
+        fontsize=7,
+        title_fontsize=7,
+    )
     return figure

@@ -14,7 +14,11 @@ from matplotlib.patches import Rectangle
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, curve_style, print_style
+from cube_tensor_driver.views.figures.style import (
+    SIGNED_COLOURS,
+    curve_style,
+    print_style,
+)
 
 from ..studies.pads_example import BALL_X, LOAD, Sweep, simple_loads
 
@@ -35,10 +39,12 @@ def draw_pads(calibration: Calibration) -> Figure:
     figure = Figure(figsize=(9, 5.6))
     axes = figure.subplots(2, len(loads))
     pads = 1e-3 * np.array([calibration.response @ state for state in loads.values()])
+    # One scale for all loads.
     limit = np.abs(pads).max()
     colours = ScalarMappable(Normalize(-limit, limit), colormaps[SIGNED_COLOURS])
     for column, (title, state) in enumerate(loads.items()):
-        _draw_load(axes[0, column], dict(zip(calibration.modes.names, state, strict=True)))
+        by_mode = dict(zip(calibration.modes.names, state, strict=True))
+        _draw_load(axes[0, column], by_mode)
         _draw_frame(axes[0, column], title)
         _draw_cube(axes[1, column], calibration.layout, pads[column], colours)
         _draw_frame(axes[1, column], "stress of the pads / kPa")
@@ -53,35 +59,79 @@ def _draw_load(axis: Any, state: dict[str, float]) -> None:
     scale = ARROW_LENGTH / abs(LOAD)
     for side in (1, -1):
         for x in ARROWS:
+            # The stress grows with x / d0 by its gradient times d0.
             length = scale * abs(state["zz"] + state["zz_x"] * x)
             if length > 0.1:
                 _draw_arrow(axis, (x, side * (1 + length)), (x, side))
+        # Shear on one face needs shear on the other ones, or the square would turn.
         if state["zx"]:
             near, far = 1.15 * side, 0.9 * side
             _draw_arrow(axis, (-far, near), (far, near))
             _draw_arrow(axis, (near, -far), (near, far))
 
 
-def _draw_arrow(axis: Any, tail: tuple[float, float], tip: tuple[float, float]) -> None:
-    style = {"arrowstyle": "-|>", "color": "tab:blue", "shrinkA": 0, "shrinkB": 0}
-    axis.annotate("", xy=tip, xytext=tail, arrowprops=style)
+def _draw_arrow(
+    axis: Any,
+    tail: tuple[float, float],
+    tip: tuple[float, float],
+) -> None:
+    style = {
+        "arrowstyle": "-|>",
+        "color": "tab:blue",
+        "shrinkA": 0,
+        "shrinkB": 0,
+    }
+    axis.annotate(
+        "",
+        xy=tip,
+        xytext=tail,
+        arrowprops=style,
+    )
 
 
-def _draw_cube(axis: Any, layout: Layout, pads: Array, colours: ScalarMappable) -> None:
+def _draw_cube(
+    axis: Any,
+    layout: Layout,
+    pads: Array,
+    colours: ScalarMappable,
+) -> None:
     """Draw pads on the section of the cube in the colour and with the number of their stress."""
-    centres, normals = layout.positions[:, [0, 2]], layout.normals[:, [0, 2]]
+    centres = layout.positions[:, [0, 2]]
+    normals = layout.normals[:, [0, 2]]
     for centre, normal, value in zip(centres, normals, pads, strict=True):
         size = np.where(normal == 0, PAD_WIDTH, PAD_THICKNESS)
         corner = centre + PAD_THICKNESS / 2 * normal - size / 2
         axis.add_patch(Rectangle(corner, *size, fc=colours.to_rgba(value), ec="black"))
         text = f"{value:.1f}".replace("-", "−")
-        axis.text(*(centre + 0.55 * normal), text, ha="center", va="center", fontsize=8)
+        axis.text(
+            *(centre + 0.55 * normal),
+            text,
+            ha="center",
+            va="center",
+            fontsize=8,
+        )
 
 
 def _draw_frame(axis: Any, title: str) -> None:
-    axis.add_patch(Rectangle((-1, -1), 2, 2, fc="0.93", ec="black", zorder=0.5))
+    axis.add_patch(
+        Rectangle(
+            (-1, -1),
+            2,
+            2,
+            fc="0.93",
+            ec="black",
+            zorder=0.5,
+        )
+    )
     ticks = (-1, 0, 1)
-    axis.set(xlim=(-2, 2), ylim=(-2, 2), xticks=ticks, yticks=ticks, aspect="equal", title=title)
+    axis.set(
+        xlim=(-2, 2),
+        ylim=(-2, 2),
+        xticks=ticks,
+        yticks=ticks,
+        aspect="equal",
+        title=title,
+    )
     axis.grid(False)
 
 
@@ -94,18 +144,35 @@ def draw_sweep(sweep: Sweep) -> Figure:
     figure = Figure(figsize=(9, 3.4))
     left, right = figure.subplots(1, 2)
     x = 1e3 * sweep.place
-    left.plot(x, 1e-3 * sweep.profile, "k", label="$\\sigma_{zz}$ in the plane of the sensor")
+    left.plot(
+        x,
+        1e-3 * sweep.profile,
+        "k",
+        label="$\\sigma_{zz}$ in the plane of the sensor",
+    )
     near = np.array([-2.5, 2.5])
     tangent = 1e-3 * (sweep.value + 1e-3 * sweep.slope * near)
     left.plot(near, tangent, "tab:red", lw=3, label="value and slope at a cube")
     left.plot(0, 1e-3 * sweep.value, "s", color="tab:red")
-    left.axvline(1e3 * BALL_X, color="0.6", ls=":", label="the ball presses here")
+    left.axvline(
+        1e3 * BALL_X,
+        color="0.6",
+        ls=":",
+        label="the ball presses here",
+    )
     left.set(xlabel="$x$ / mm", ylabel="$\\sigma_{zz}$ / kPa")
-    curves = {"true": sweep.truth, "eight pads": sweep.cube, "two upper pads": sweep.pair}
+    curves = {
+        "true": sweep.truth,
+        "eight pads": sweep.cube,
+        "two upper pads": sweep.pair,
+    }
     for number, (name, value) in enumerate(curves.items()):
         style = curve_style(number) | {"markevery": (4 * number, 16)}
         right.plot(x, 1e-3 * value, label=name, **style)
-    right.set(xlabel="place of the ball, $x$ / mm", ylabel="shear $\\sigma_{zx}$ / kPa")
+    right.set(
+        xlabel="place of the ball, $x$ / mm",
+        ylabel="shear $\\sigma_{zx}$ / kPa",
+    )
     for axis in (left, right):
         axis.legend(fontsize=7)
     return figure

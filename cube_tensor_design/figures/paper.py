@@ -42,6 +42,7 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
         written.append(folder / f"{name}.png")
         save(figure, written[-1])
 
+    # Each picture is written as soon as it is there: the whole takes many minutes.
     report(0, 1, "Fig. 4")
     save_picture(draw_figure_4(figure_4()), "figure_4")
     numbers: dict[str, Any] = {}
@@ -58,7 +59,11 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
     save_picture(draw_rod_parts(parts), "rod_parts")
     numbers["rod parts"] = {name: _columns(one) for name, one in parts.items()}
     told = _report_part(report, "rod, held force")
-    parts = rod_parts(places=NEAR_PLACES, held="force", progress=told)
+    parts = rod_parts(
+        places=NEAR_PLACES,
+        held="force",
+        progress=told,
+    )
     numbers["rod parts, held force"] = {name: _columns(one) for name, one in parts.items()}
 
     recovered = rod_shear(progress=_report_part(report, "shear"))
@@ -70,10 +75,14 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
 
 
 def _report_part(report: Progress, name: str) -> Progress:
-    """Return the progress of a part, which reports that of the whole."""
+    """Return a function that reports the progress of a part as progress of the whole."""
     begin, end = PROGRESS_SPANS[name]
 
-    def report_part(done: float, total: float, what: str) -> None:
+    def report_part(
+        done: float,
+        total: float,
+        what: str,
+    ) -> None:
         report(begin + (end - begin) * done / total, 1, f"{name}: {what}")
 
     return report_part

@@ -9,7 +9,12 @@ from matplotlib.ticker import NullFormatter
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.mechanics.influence import Influence
-from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, curve_style, print_style, symbol
+from cube_tensor_driver.views.figures.style import (
+    SIGNED_COLOURS,
+    curve_style,
+    print_style,
+    symbol,
+)
 
 from ..fem.fem import Response
 
@@ -40,15 +45,25 @@ def draw_convergence(result: Response) -> Figure:
     shown = sorted(values, key=lambda name: -abs(values[name]))[:MAX_COEFFICIENTS]
     for number, name in enumerate(shown):
         change = np.array([row["coefficients"][name] - values[name] for row in coarser])
-        axis.loglog(unknowns, 100 * abs(change) / largest, label=name, **curve_style(number))
+        axis.loglog(
+            unknowns,
+            100 * abs(change) / largest,
+            label=name,
+            **curve_style(number),
+        )
     label = f"distance from the result with {finest['unknowns']} unknowns / % of the largest"
     axis.set(xlabel="unknowns of the mesh", ylabel=label)
+    # A single mesh has nothing to compare it with.
     if unknowns:
         axis.set_xticks(unknowns, [str(n) for n in unknowns], minor=False)
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:.2g}")
-        axis.legend(fontsize="small", ncol=2, handlelength=4)
+        axis.legend(
+            fontsize="small",
+            ncol=2,
+            handlelength=4,
+        )
     return figure
 
 
@@ -59,21 +74,41 @@ def draw_response(result: Response) -> Figure:
     figure = Figure(figsize=(0.6 * n_modes + 2.5, 0.35 * n_pads + 1.5))
     axis = figure.subplots()
     limit = np.abs(result.matrix).max()
-    image = axis.imshow(result.matrix, cmap=SIGNED_COLOURS, vmin=-limit, vmax=limit, aspect="auto")
+    image = axis.imshow(
+        result.matrix,
+        cmap=SIGNED_COLOURS,
+        vmin=-limit,
+        vmax=limit,
+        aspect="auto",
+    )
     axis.grid(False)
     labels = [symbol(mode) for mode in result.modes]
     axis.set_xticks(range(n_modes), labels, rotation=60 if n_modes > 7 else 0)
-    axis.set_yticks(range(n_pads), [f"V{k}  {pad}" for k, pad in enumerate(result.layout.pads, 1)])
+    pads = [f"V{k}  {pad}" for k, pad in enumerate(result.layout.pads, 1)]
+    axis.set_yticks(range(n_pads), pads)
     for (pad, mode), value in np.ndenumerate(result.matrix):
         if abs(value) > MIN_LABELLED * limit:
+            # The colour map is dark below zero.
             color = "black" if value > -0.1 * limit else "white"
-            axis.text(mode, pad, f"{value:.2f}", ha="center", va="center", fontsize=7, color=color)
+            axis.text(
+                mode,
+                pad,
+                f"{value:.2f}",
+                ha="center",
+                va="center",
+                fontsize=7,
+                color=color,
+            )
     figure.colorbar(image, ax=axis, label="pad stress over amplitude of the mode / (Pa/Pa)")
     return figure
 
 
 @print_style()
-def draw_influence(influence: Influence, layout: Layout, half_side: float) -> Figure:
+def draw_influence(
+    influence: Influence,
+    layout: Layout,
+    half_side: float,
+) -> Figure:
     """Draw the stress of each pad over the place of a force along x, above the cube's centre line.
 
     There is a panel for each direction of the force. Pads with the same curve share one.
@@ -83,11 +118,17 @@ def draw_influence(influence: Influence, layout: Layout, half_side: float) -> Fi
         layout: Pads of the cube.
         half_side: Half side of the cube, in m.
     """
+    # The picture ends where the influence functions end.
     ends = influence.place[[0, -1], 0]
     reach = min(REACH * half_side, *np.abs(ends))
     x = np.linspace(-reach, reach, POINTS)
     along_x = np.eye(influence.place.shape[1])[0]
-    stress = influence.at(x[:, None] * along_x)[:, :, [-1, 0]] * [-1, 1]  # against z, along x
+    forces = influence.at(x[:, None] * along_x)
+    stress = forces[:, :, [-1, 0]] * [
+        -1,
+        1,
+    ]  # under a force against z, and along x
+    # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.
     unit, force = (1.0, "1 N/mm") if layout.planar else (1e3, "1 N")
     figure = Figure(figsize=(10, 4.5))
     axes = figure.subplots(1, 2)
@@ -95,7 +136,13 @@ def draw_influence(influence: Influence, layout: Layout, half_side: float) -> Fi
         label = ", ".join(layout.pads[pad] for pad in pads)
         for k, axis in enumerate(axes):
             curve = stress[pads[0], :, k] / unit
-            axis.plot(1e3 * x, curve, label=label, markevery=20, **curve_style(number))
+            axis.plot(
+                1e3 * x,
+                curve,
+                label=label,
+                markevery=20,
+                **curve_style(number),
+            )
     for axis, direction in zip(axes, ("pressing", "along x"), strict=True):
         axis.set(
             xlabel="place of the force from the cube's centre, x / mm",
@@ -103,7 +150,13 @@ def draw_influence(influence: Influence, layout: Layout, half_side: float) -> Fi
             title=f"a force of {force} {direction}",
         )
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncol=3, fontsize="small")
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncol=3,
+        fontsize="small",
+    )
     return figure
 
 

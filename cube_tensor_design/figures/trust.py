@@ -10,7 +10,11 @@ from matplotlib.patches import Patch
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
-from cube_tensor_driver.views.figures.style import curve_style, print_style, symbol
+from cube_tensor_driver.views.figures.style import (
+    curve_style,
+    print_style,
+    symbol,
+)
 
 from ..studies.layout_study import MAX_TRUSTED_ERROR, LayoutStudy
 
@@ -31,11 +35,18 @@ def draw_trust(result: LayoutStudy) -> Figure:
     """
     rows, columns = len(result.sides), len(result.error)
     figure = Figure(figsize=(4 * columns, 3 * rows))
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(
+        rows,
+        columns,
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+    )
     for column, (name, error) in enumerate(result.error.items()):
         for row, side in enumerate(result.sides):
             _draw_errors(axes[row][column], 1e3 * result.widths, error[row])
             axes[row][column].set_title(f"layout {name}, side {1e3 * side:g} mm")
+    # NaN is a component that the layout does not observe.
     smallest = min(float(np.nanmin(error)) for error in result.error.values())
     axes[0][0].set_ylim(0.7 * smallest, MAX_SHOWN_ERROR)
 
@@ -58,7 +69,11 @@ def draw_trust(result: LayoutStudy) -> Figure:
     return figure
 
 
-def _draw_errors(axis: Any, widths: Array, errors: Array) -> None:
+def _draw_errors(
+    axis: Any,
+    widths: Array,
+    errors: Array,
+) -> None:
     """Draw one panel: errors (W, C) over widths (W,) in mm."""
     axis.axhspan(MAX_TRUSTED_ERROR, 100, color="0.92")
     for number, component in enumerate(COMPONENTS):

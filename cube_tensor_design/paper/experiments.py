@@ -33,9 +33,10 @@ FOAM_MODULUS = 3e6
 MODE_AMPLITUDE = 1e4
 """Amplitude of each mode in the pictures of deformation, in Pa."""
 ON_LOWER = [2, 3, 0, 1]
-"""Columns of V1 .. V8 that are C1 .. C4, with C1 and C2 on the lower face."""
+"""Columns of the planar layout's pads V1 .. V8 that are the prototype's pads C1 .. C4, if C1 and C2
+are on the lower face."""
 ON_UPPER = [0, 1, 2, 3]
-"""The same with C1 and C2 on the upper face."""
+"""Columns of V1 .. V8 that are C1 .. C4, if C1 and C2 are on the upper face."""
 SHEAR_SIGNS = np.array([-1.0, 1.0, 1.0, -1.0])
 """Signs of C1 .. C4 in P_shear, the paper's eq. 9."""
 GRAD_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
@@ -79,7 +80,9 @@ class _Protocol:
 
 
 def experiments(
-    body: Body | None = None, finite: bool = False, progress: Progress | None = None
+    body: Body | None = None,
+    finite: bool = False,
+    progress: Progress | None = None,
 ) -> list[Experiment]:
     """Run the three experiments, with bonded plates and with plates that slide.
 
@@ -92,6 +95,7 @@ def experiments(
     """
     body = body or Body()
     protocols = _protocols(body)
+    # The cube is calibrated in the same body, which has the symmetry of a slab.
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
     done = itertools.count(1)
     # With the cube and without it.
@@ -103,6 +107,7 @@ def experiments(
 
     found = []
     for protocol in protocols:
+        # Every step reports the name of its experiment.
         told = partial(report, protocol.name)
         found.append(_run_experiment(protocol, body, finite, calibration, told))
     # Experiment (a) is how (b) begins.
@@ -126,7 +131,9 @@ def _protocols(body: Body) -> list[_Protocol]:
     return [
         _Protocol("b, pressed 3 mm then sheared, bonded", both, bonded + sheared),
         _Protocol(
-            "b, pressed 3 mm by sliding plates that then grip, sheared", both, sliding + gripped
+            "b, pressed 3 mm by sliding plates that then grip, sheared",
+            both,
+            sliding + gripped,
         ),
         _Protocol("c, 5 mm rod above C2, bonded bottom", DISPLACEMENTS, dents),
         _Protocol("c, 5 mm rod above C2, sliding bottom", DISPLACEMENTS, sliding_dents),
@@ -137,7 +144,8 @@ def _first_half(experiment: Experiment, name: str) -> Experiment:
     """Return the pressing steps of an experiment, under another name."""
     columns = {}
     for field in fields(Experiment)[1:]:
-        columns[field.name] = getattr(experiment, field.name)[: len(DISPLACEMENTS)]
+        column = getattr(experiment, field.name)
+        columns[field.name] = column[: len(DISPLACEMENTS)]
     return Experiment(name=name, **columns)
 
 
@@ -148,10 +156,14 @@ def _run_experiment(
     calibration: Response,
     report: Callable[[], None],
 ) -> Experiment:
-    with_cube = VirtualBench(body, finite=finite).run(protocol.steps, report)
-    without = VirtualBench(body, cube=False, finite=finite).run(protocol.steps, report)
+    bench = VirtualBench(body, finite=finite)
+    empty_bench = VirtualBench(body, cube=False, finite=finite)
+    with_cube = bench.run(protocol.steps, report)
+    without = empty_bench.run(protocol.steps, report)
     frequency = foam_frequency(with_cube.pads)
-    estimator = make_estimator(calibration.matrix, np.ones(8), PLANE, targets=np.eye(7))
+    # All pads have the same noise, and every mode of the plane is wanted.
+    noise, targets = np.ones(8), np.eye(7)
+    estimator = make_estimator(calibration.matrix, noise, PLANE, targets=targets)
     return Experiment(
         name=protocol.name,
         displacement=protocol.displacement,
@@ -180,7 +192,11 @@ def prototype(frequency: Array) -> Array:
 
 
 def plates(
-    body: Body, pressed: float, sheared: float = 0.0, bonded: bool = True, gripped: bool = False
+    body: Body,
+    pressed: float,
+    sheared: float = 0.0,
+    bonded: bool = True,
+    gripped: bool = False,
 ) -> LoadStep:
     """Press the top plate down and move the bottom plate along x.
 
@@ -193,6 +209,7 @@ def plates(
     """
 
     def prescribed(x: Array) -> Array:
+        # Only the bottom plate moves along x, so a bonded top stays.
         moved = _bottom_plate(body, x, bonded, sheared)
         top = x[1] > body.height / 2 - 1e-9
         moved[1, top] = -pressed
@@ -203,12 +220,25 @@ def plates(
     return LoadStep(prescribed, gripped=gripped, sliding=not bonded)
 
 
-def dent(body: Body, rod: Rod, bonded: bool = True) -> LoadStep:
+def dent(
+    body: Body,
+    rod: Rod,
+    bonded: bool = True,
+) -> LoadStep:
     """Press a rod into the top, with the bottom bonded to its plate or sliding on it."""
-    return LoadStep(lambda x: _bottom_plate(body, x, bonded, 0.0), rod, sliding=not bonded)
+
+    def prescribed(x: Array) -> Array:
+        return _bottom_plate(body, x, bonded, 0.0)
+
+    return LoadStep(prescribed, rod, sliding=not bonded)
 
 
-def _bottom_plate(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
+def _bottom_plate(
+    body: Body,
+    x: Array,
+    bonded: bool,
+    sheared: float,
+) -> Array:
     """Return the displacements (2, n) that the bottom plate prescribes, NaN elsewhere."""
     moved = np.full(x.shape, np.nan)
     bottom = x[1] < -body.height / 2 + 1e-9
@@ -220,12 +250,14 @@ def _bottom_plate(body: Body, x: Array, bonded: bool, sheared: float) -> Array:
 
 def figure_4(body: Body | None = None) -> dict[str, Deformation]:
     """Return section 3: shear only ("zx"), and a normal stress that grows along x ("zz_x")."""
-    return _deformations(VirtualBench(body or Body(), size=0.2), ("zx", "zz_x"))
+    bench = VirtualBench(body or Body(), size=0.2)
+    return _deformations(bench, ("zx", "zz_x"))
 
 
 def mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
     """Return the section under `MODE_AMPLITUDE` of each plane mode, by the mode's name."""
-    return _deformations(VirtualBench(body, layout=layout, size=0.3), PLANE.names)
+    bench = VirtualBench(body, layout=layout, size=0.3)
+    return _deformations(bench, PLANE.names)
 
 
 def _deformations(bench: VirtualBench, names: Sequence[str]) -> dict[str, Deformation]:

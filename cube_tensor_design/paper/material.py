@@ -41,22 +41,27 @@ class Material:
         if not self.finite:
             strain = _strain(f)
             squares = np.sum(strain * strain, axis=(-2, -1))
-            return np.asarray(self.lam / 2 * _trace(strain) ** 2 + self.mu * squares)
-        log = np.log(determinant(f))
+            dilation = _trace(strain)
+            return np.asarray(self.lam / 2 * dilation**2 + self.mu * squares)
+        log = np.log(np.linalg.det(f))
         squares = np.sum(f * f, axis=(-2, -1))
-        return np.asarray(self.mu / 2 * (squares - 2 - 2 * log) + self.lam / 2 * log**2)
+        distortion = self.mu / 2 * (squares - 2 - 2 * log)
+        return np.asarray(distortion + self.lam / 2 * log**2)
 
     def stress(self, f: Array) -> Array:
         """Return the first Piola-Kirchhoff stress P = dW/dF (..., 2, 2), in Pa.
 
         It is the force over the undeformed area.
         """
-        lam, mu = self.lam[..., None, None], self.mu[..., None, None]
+        # Two more axes for the components i and j.
+        two_axes = (..., None, None)
+        lam, mu = self.lam[two_axes], self.mu[two_axes]
         if not self.finite:
             strain = _strain(f)
-            return np.asarray(lam * _trace(strain)[..., None, None] * _ONE + 2 * mu * strain)
+            dilation = _trace(strain)[two_axes]
+            return np.asarray(lam * dilation * _ONE + 2 * mu * strain)
         inverse = _inverse_transposed(f)
-        log = np.log(determinant(f))[..., None, None]
+        log = np.log(np.linalg.det(f))[two_axes]
         return np.asarray(mu * (f - inverse) + lam * log * inverse)
 
     def cauchy(self, f: Array) -> Array:
@@ -67,37 +72,37 @@ class Material:
         p = self.stress(f)
         if not self.finite:
             return p
-        return np.asarray(p @ np.swapaxes(f, -2, -1) / determinant(f)[..., None, None])
+        transposed = np.swapaxes(f, -2, -1)
+        volume_ratio = np.linalg.det(f)[..., None, None]
+        return np.asarray(p @ transposed / volume_ratio)
 
     def moduli(self, f: Array) -> Array:
         """Return dP_ij/dF_kl (..., 2, 2, 2, 2), in Pa."""
-        lam, mu = (x[..., None, None, None, None] for x in (self.lam, self.mu))
+        four_axes = (..., None, None, None, None)
+        lam, mu = self.lam[four_axes], self.mu[four_axes]
         identity = np.einsum("ik,jl->ijkl", _ONE, _ONE)
         if not self.finite:
             outer = np.einsum("ij,kl->ijkl", _ONE, _ONE)
             crossed = np.einsum("il,jk->ijkl", _ONE, _ONE)
             return np.asarray(lam * outer + mu * (identity + crossed))
         inverse = _inverse_transposed(f)
-        log = np.log(determinant(f))[..., None, None, None, None]
+        log = np.log(np.linalg.det(f))[four_axes]
         # With g = F^-T, these are g_ij g_kl and g_il g_kj.
-        outer = inverse[..., :, :, None, None] * inverse[..., None, None, :, :]
+        outer = np.einsum("...ij,...kl->...ijkl", inverse, inverse)
         crossed = np.swapaxes(outer, -3, -1)
-        return np.asarray(mu * identity + (mu - lam * log) * crossed + lam * outer)
-
-
-def determinant(f: Array) -> Array:
-    """Return det F (...)."""
-    return np.asarray(f[..., 0, 0] * f[..., 1, 1] - f[..., 0, 1] * f[..., 1, 0])
+        # The derivative of F^-T by F is -crossed.
+        shear_part = mu * identity + (mu - lam * log) * crossed
+        return np.asarray(shear_part + lam * outer)
 
 
 def _inverse_transposed(f: Array) -> Array:
-    entries = [f[..., 1, 1], -f[..., 1, 0], -f[..., 0, 1], f[..., 0, 0]]
-    cofactors = np.stack(entries, axis=-1).reshape(f.shape)
-    return np.asarray(cofactors / determinant(f)[..., None, None])
+    inverse = np.linalg.inv(f)
+    return np.asarray(np.swapaxes(inverse, -2, -1))
 
 
 def _strain(f: Array) -> Array:
-    return np.asarray((f + np.swapaxes(f, -2, -1)) / 2 - _ONE)
+    transposed = np.swapaxes(f, -2, -1)
+    return np.asarray((f + transposed) / 2 - _ONE)
 
 
 def _trace(e: Array) -> Array:

@@ -72,6 +72,7 @@ def find_balance(
         u (dofs,), or None where the method does not converge.
     """
     fixed = ~np.isnan(constraints.prescribed)
+    # The first step moves the prescribed unknowns to their values, where they stay.
     jump = np.where(fixed, constraints.prescribed - u, 0.0)
     search = _Search(np.flatnonzero(~fixed), constraints.row, balance)
     state = balance(u)
@@ -81,7 +82,9 @@ def find_balance(
         reached = None
         for matrix in tangents(u):
             change = search.correction(u, state, matrix, jump)
-            if linear or np.abs(change).max() < TOLERANCE * np.abs(u).max():
+            largest_change, largest = np.abs(change).max(), np.abs(u).max()
+            is_small = largest_change < TOLERANCE * largest
+            if linear or is_small:
                 return np.asarray(u + change)
             if jump.any():  # prescribed displacements are not shortened
                 reached = u + change, balance(u + change)
@@ -100,14 +103,23 @@ class _Search:
     """Corrections of the free unknowns `free` (m,), and how much of a correction is taken."""
 
     def __init__(
-        self, free: Index, row: Array | None, balance: Callable[[Array], Balance | None]
+        self,
+        free: Index,
+        row: Array | None,
+        balance: Callable[[Array], Balance | None],
     ) -> None:
         self._free = free
         self._row = row
         self._held = None if row is None else row[free]
         self._balance = balance
 
-    def correction(self, u: Array, state: Balance, matrix: sp.csr_matrix, jump: Array) -> Array:
+    def correction(
+        self,
+        u: Array,
+        state: Balance,
+        matrix: sp.csr_matrix,
+        jump: Array,
+    ) -> Array:
         """Return the change (dofs,) of u that balances the linearised forces.
 
         Args:
@@ -125,15 +137,22 @@ class _Search:
             return change
         # A force along the row holds row @ (u + change) = 0.
         border = sp.csr_matrix(self._held)
-        bordered = sp.bmat([[inner, border.T], [border, None]])
+        blocks = [[inner, border.T], [border, None]]
+        bordered = sp.bmat(blocks)
         right = np.append(right, -float(self._row @ u))
         change[free] = factors(bordered).solve(right)[:-1]
         return change
 
-    def descend(self, u: Array, state: Balance, change: Array) -> tuple[Array, Balance] | None:
+    def descend(
+        self,
+        u: Array,
+        state: Balance,
+        change: Array,
+    ) -> tuple[Array, Balance] | None:
         """Take as much of a change as lowers the energy or the forces out of balance, or None."""
         slope = float(state.force @ change)
         unbalanced = self._unbalanced(state.force)
+        # A longer step would leave the region in which the linearised forces mean anything.
         size = min(1.0, MAX_CORRECTION / np.abs(change).max())
         for _ in range(MAX_HALVINGS):
             reached = self._balance(u + size * change)
@@ -150,6 +169,7 @@ class _Search:
         """Return the norm of the forces that nothing holds."""
         free, held = force[self._free], self._held
         if held is not None:
+            # The force along the row is what holds the row.
             free = free - held * (held @ free) / (held @ held)
         return float(np.linalg.norm(free))
 

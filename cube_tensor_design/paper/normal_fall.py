@@ -47,13 +47,20 @@ def normal_fall(experiment: Experiment) -> NormalFall:
     pressed = len(experiment.displacement) // 2 - 1
     zz_before = experiment.truth[pressed, 0]
     zz, zx, xx = experiment.truth[-1, :3]
-    before, after = experiment.pads[[pressed, -1], :4].mean(axis=1)
-    sin, cos = np.sin(experiment.rotation[-1]), np.cos(experiment.rotation[-1])
-    field = np.array([zz - zz_before, -2 * zx * sin * cos, (xx - zz) * sin**2])
+    normal_pads = experiment.pads[:, :4]
+    before, after = normal_pads[[pressed, -1]].mean(axis=1)
+    angle = experiment.rotation[-1]
+    sin, cos = np.sin(angle), np.cos(angle)
+    shear_part = -2 * zx * sin * cos
+    normal_part = (xx - zz) * sin**2
+    field = np.array([zz - zz_before, shear_part, normal_part])
     # What the field does not explain is the change of c.
     stress = np.append(field, after - before - field.sum())
 
     # Four equal pads, after each part has been added to those before it.
     mean_stress = np.cumsum([before, *stress])
-    signal = prototype(foam_frequency(np.tile(mean_stress[:, None], 4)))[:, 0]
-    return NormalFall(stress, np.diff(signal, append=experiment.prototype[-1, 0]))
+    equal_pads = np.tile(mean_stress[:, None], 4)
+    signal = prototype(foam_frequency(equal_pads))[:, 0]
+    # The last part leads to the signal of the pads as they are.
+    end = experiment.prototype[-1, 0]
+    return NormalFall(stress, np.diff(signal, append=end))

@@ -49,7 +49,12 @@ class Rod:
     width: float = 5e-3
     edge_radius: float = 1e-3
 
-    def lower_side(self, x: Array, top: float, unit: float) -> tuple[Array, Array, Array]:
+    def lower_side(
+        self,
+        x: Array,
+        top: float,
+        unit: float,
+    ) -> tuple[Array, Array, Array]:
         """Return h, dh/dx and d²h/dx² at x; x, top and h are in units of `unit` m."""
         radius = self.edge_radius / unit
         flat = (self.width / 2 - self.edge_radius) / unit
@@ -74,7 +79,12 @@ class RodContact:
     """Energy, nodal forces and tangent of a rod on the facets of a basis."""
 
     def __init__(
-        self, facets: skfem.FacetBasis, rod: Rod, unit: float, young: float, finite: bool
+        self,
+        facets: skfem.FacetBasis,
+        rod: Rod,
+        unit: float,
+        young: float,
+        finite: bool,
     ) -> None:
         """Set up the contact.
 
@@ -95,13 +105,15 @@ class RodContact:
     def energy(self, u: Array) -> float:
         """Return the energy at displacements u (dofs,)."""
         p = self._penetration(u).p
-        return float((self._stiffness / 2 * p**2 * self._facets.dx).sum())
+        density = self._stiffness / 2 * p**2
+        return float((density * self._facets.dx).sum())
 
     def force(self, u: Array) -> Array:
         """Return the nodal forces (dofs,) at displacements u (dofs,)."""
         at = self._penetration(u)
         pressure = self._stiffness * at.p * at.dp
-        return np.asarray(_PUSH.assemble(self._facets, pressure=pressure, slope=at.slope))
+        force = _PUSH.assemble(self._facets, pressure=pressure, slope=at.slope)
+        return np.asarray(force)
 
     def tangent(self, u: Array, curved: bool = True) -> sp.csr_matrix:
         """Return the derivative of the nodal forces, sparse (dofs, dofs).
@@ -120,28 +132,43 @@ class RodContact:
         at, other = self._penetration(u), self._penetration(v)
         change = np.asarray(self._facets.interpolate(u - v))[1]
         has_moved = np.abs(change) > SAME_DISPLACEMENT
-        quotient = (at.p * at.dp - other.p * other.dp) / np.where(has_moved, change, 1.0)
+        difference = at.p * at.dp - other.p * other.dp
+        quotient = difference / np.where(has_moved, change, 1.0)
         # Where nothing has moved, the secant is the tangent.
-        normal = self._stiffness * np.where(has_moved, quotient, at.dp**2 + at.p * at.ddp)
+        tangent = at.dp**2 + at.p * at.ddp
+        normal = self._stiffness * np.where(has_moved, quotient, tangent)
         zero = np.zeros_like(normal)
         return self._assemble(normal, zero, zero)
 
-    def _assemble(self, normal: Array, slope: Array, bending: Array) -> sp.csr_matrix:
+    def _assemble(
+        self,
+        normal: Array,
+        slope: Array,
+        bending: Array,
+    ) -> sp.csr_matrix:
         form = skfem.BilinearForm(_push_change)
-        return form.assemble(self._facets, normal=normal, slope=slope, bending=bending)
+        return form.assemble(
+            self._facets,
+            normal=normal,
+            slope=slope,
+            bending=bending,
+        )
 
     def _penetration(self, u: Array) -> _Penetration:
         x = np.asarray(self._facets.default_parameters()["x"])
         moved = np.asarray(self._facets.interpolate(u))
         position = x[0] + self._finite * moved[0]
-        height, slope, curvature = self._rod.lower_side(position, x[1].max(), self._unit)
+        top = x[1].max()
+        height, slope, curvature = self._rod.lower_side(position, top, self._unit)
         g = x[1] + moved[1] - height
+        # A smooth max(g, 0): it differs from it within the onset length only.
         root = np.hypot(g, ONSET_LENGTH)
         p = (g + root) / 2
         return _Penetration(
             p=p,
             dp=p / root,
             ddp=ONSET_LENGTH**2 / (2 * root**3),
+            # In linear theory the rod presses along z, whatever its slope.
             slope=self._finite * slope,
             curvature=self._finite * curvature,
         )
@@ -151,7 +178,13 @@ _PUSH = skfem.LinearForm(lambda w, p: p.pressure * (w[1] - p.slope * w[0]))
 """Work of the pressure along the rod's normal in a test function w."""
 
 
-def _push_change(u: Any, w: Any, p: Any) -> Any:
+def _push_change(
+    u: Any,
+    w: Any,
+    p: Any,
+) -> Any:
     """Derivative of `_PUSH` by u: the penetration changes, and so does the normal."""
-    along_normal = (w[1] - p.slope * w[0]) * (u[1] - p.slope * u[0])
+    normal_w = w[1] - p.slope * w[0]
+    normal_u = u[1] - p.slope * u[0]
+    along_normal = normal_w * normal_u
     return p.normal * along_normal + p.bending * w[0] * u[0]

@@ -51,7 +51,10 @@ Held = Literal["displacement", "force"]
 
 PARTS = ("shear", "normal", "gradients", "second", "higher")
 """Uniform shear, uniform normal stresses, gradients, second derivatives of stress, the rest."""
-PADS = {"strips": LAYOUTS["planar"], "half faces": strip_layout(LAYOUTS["planar"], 1.0)}
+PADS = {
+    "strips": LAYOUTS["planar"],
+    "half faces": strip_layout(LAYOUTS["planar"], 1.0),
+}
 """Layouts whose signal is split."""
 RADII = {"rounded rod": 1e-3, "sharp rod": 1e-5}
 """Radii of the rod's edges, in m."""
@@ -60,13 +63,13 @@ P_SHEAR = np.append(SHEAR_SIGNS, np.zeros(4))
 ORDERS = 8
 """Number of orders of the polynomials. Beyond them 0.2 % of the signal is left."""
 SAME_DEPTH = 1e-8
-"""Difference below which two depths of a rod are the same, in m. The force is then far closer to
-the one that is held, as the secant method converges fast."""
+"""Difference between two depths of a rod below which the search for the held force ends, in m. The
+secant method converges fast, so the force is then much closer to the held one."""
 
 
 @dataclass(frozen=True, eq=False)
 class RodParts:
-    """Parts of the signal by the position of the rod.
+    """Parts of the signal P_shear by the position of the rod.
 
     Attributes:
         place: (n,) position of the rod along x, in m.
@@ -110,8 +113,10 @@ def rod_parts(
                 progress(done, total, f"{rod} at {1e3 * place:g} mm")
             step = dent(bench.body, Rod(pressed, place, edge_radius=radius))
             rows.append(split_signals(bench, step, signals, held))
-        for pads, parts in zip(PADS, np.moveaxis(np.array(rows), 1, 0), strict=True):
-            found[f"{rod}, {pads}"] = RodParts(np.array(places), parts.sum(axis=1), parts)
+        by_pads = np.moveaxis(np.array(rows), 1, 0)  # (pads, places, parts)
+        for pads, parts in zip(PADS, by_pads, strict=True):
+            signal = parts.sum(axis=1)
+            found[f"{rod}, {pads}"] = RodParts(np.array(places), signal, parts)
     return found
 
 
@@ -127,15 +132,20 @@ def draw_back(bench: VirtualBench, step: LoadStep) -> LoadStep:
     @cache
     def excess(depth: float) -> float:
         """Return how much larger the force is, relative to that without the cube."""
-        return float(bench.rod_pressure(step_to(depth))[1].sum() / force - 1)
+        _, forces = bench.rod_pressure(step_to(depth))
+        return float(forces.sum() / force - 1)
 
     force = bench.without_cube().rod_pressure(step)[1].sum()
+    # The force is nearly proportional to the depth.
     guess = rod.pressed / (1 + excess(rod.pressed))
     return step_to(newton(excess, rod.pressed, x1=guess, tol=SAME_DEPTH))
 
 
 def split_signals(
-    bench: VirtualBench, step: LoadStep, signals: Sequence[Array], held: Held = "displacement"
+    bench: VirtualBench,
+    step: LoadStep,
+    signals: Sequence[Array],
+    held: Held = "displacement",
 ) -> Array:
     """Return the parts (signals, 5) of each signal under a step of a linear bench.
 
@@ -162,26 +172,35 @@ def split_signals(
     # Columns of one size keep the fit well conditioned.
     size = np.linalg.norm(polynomials, axis=1)
     scaled = (polynomials / size[:, None]).T
-    amplitude = np.linalg.lstsq(scaled, field[dofs], rcond=None)[0] / size
+    scaled_amplitude = np.linalg.lstsq(scaled, field[dofs], rcond=None)[0]
+    amplitude = scaled_amplitude / size
 
     rows = []
     for weights in signals:
         adjoint = np.zeros_like(u)
+        # The adjoint turns the solve for w, which is the same for all signals, into one of the
+        # signal's weights.
         right = np.zeros(matrix.shape[0])
-        right[: len(free)] = -_forces(bench, weights, ~in_cube)[free]
-        adjoint[free] = solver.solve(right)[: len(free)]
+        n = len(free)  # a held force has one unknown more
+        right[:n] = -_forces(bench, weights, ~in_cube)[free]
+        adjoint[free] = solver.solve(right)[:n]
         # The signal is response @ u0.
         response = _forces(empty, weights + adjoint, in_cube)
         response -= _forces(bench, adjoint, in_cube)
         each = (polynomials @ response[dofs]) * amplitude
         parts = np.bincount(part, each, len(PARTS))
+        # What the polynomials leave of the field belongs to the higher derivatives.
         parts[-1] += response @ field - each.sum()
         rows.append(parts)
     return np.array(rows)
 
 
 def _superposed_matrix(
-    bench: VirtualBench, step: LoadStep, with_cube: LoadStep, u: Array, field: Array
+    bench: VirtualBench,
+    step: LoadStep,
+    with_cube: LoadStep,
+    u: Array,
+    field: Array,
 ) -> sp.spmatrix:
     """Return the matrix of w: K + S of the free unknowns, bordered where the force is held.
 
@@ -197,17 +216,24 @@ def _superposed_matrix(
     if step.rod is None or with_cube.rod is None:
         return matrix
     along_z = (bench.section.component == 1).astype(float)
-    drawn_back = (step.rod.pressed - with_cube.rod.pressed) / (bench.body.side / 2)
+    half_side = bench.body.side / 2
+    drawn_back = (step.rod.pressed - with_cube.rod.pressed) / half_side
     contact = bench.rod_contact(step.rod)
     springs = contact.secant(u - drawn_back * along_z, field)
     matrix = matrix + springs[free][:, free]
     if with_cube is step:
         return matrix
+    # The unknown -d has the displacement e, so its row and column are those of the contact's force.
     push = sp.csr_matrix((springs @ along_z)[free])
-    return sp.bmat([[matrix, push.T], [push, [[along_z @ springs @ along_z]]]])
+    total_push = [[along_z @ springs @ along_z]]
+    return sp.bmat([[matrix, push.T], [push, total_push]])
 
 
-def _forces(bench: VirtualBench, u: Array, elements: Mask) -> Array:
+def _forces(
+    bench: VirtualBench,
+    u: Array,
+    elements: Mask,
+) -> Array:
     """Return the nodal forces (dofs,) of some elements at u: their stiffness times u."""
     section = bench.section
     return section.forces(section.material.stress(section.deformation(u)), elements)
@@ -223,12 +249,16 @@ def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
     fields = [1.0 + 0 * z, 1j + 0 * z, 1j * z]
     part = [PARTS.index("higher")] * 3
     for order in range(1, ORDERS + 1):
+        # Real and imaginary parts of a and of b are independent amplitudes.
         for a, b in ((1, 0), (1j, 0), (0, 1), (0, 1j)):
             if order == 1 and a == 1j:  # a rotation
                 continue
             slope = order * z * np.conj(a * z ** (order - 1))
-            fields.append(ratio * a * z**order - slope - np.conj(b * z**order))
+            power = z**order
+            fields.append(ratio * a * power - slope - np.conj(b * power))
             is_shear = order == 1 and b == 1j
             part.append(PARTS.index("shear") if is_shear else min(order, 4))
     values = np.array(fields)
-    return np.where(section.component == 0, values.real, values.imag), np.array(part)
+    is_along_x = section.component == 0
+    displacements = np.where(is_along_x, values.real, values.imag)
+    return displacements, np.array(part)

@@ -83,13 +83,16 @@ def rod_shear(
     layout, depth = LAYOUTS["planar"], body.height / 2
     with_cube, without = VirtualBench(body), VirtualBench(body, cube=False)
     response = compute_response(body, layout, "slab", meshes=1).matrix
-    estimator = make_estimator(response, np.ones(8), PLANE, targets=np.eye(7)).matrix
+    # All pads have the same noise, and every mode of the plane is wanted.
+    estimator = make_estimator(response, np.ones(8), PLANE, targets=np.eye(7))
     zx = PLANE.names.index("zx")
     influence = compute_influence(replace(body, ground=True), layout)
 
     # Components of the tensor (7, m, 2) and stresses of the pads (8, m, 2) per traction at x.
-    x = np.arange(-body.width / 2, body.width / 2 + GRID_STEP / 2, GRID_STEP)
-    tensor_kernel = line_load(Layer(body.height, body.poisson), x, depth, body.side / 2)
+    end = body.width / 2
+    x = np.arange(-end, end + GRID_STEP / 2, GRID_STEP)
+    layer = Layer(body.height, body.poisson)
+    tensor_kernel = line_load(layer, x, depth, body.side / 2)
     pad_kernel = influence.at(x[:, None])
     shear_kernel = tensor_kernel[zx]
     from_tensor = _shear_weights(tensor_kernel, shear_kernel, x, depth)
@@ -100,28 +103,39 @@ def rod_shear(
         if progress is not None:
             progress(number, len(places), f"rod at {1e3 * place:g} mm")
         step = dent(body, Rod(pressed, place))
+        # The same rod at the same depth; with the cube it needs more force.
         pads = with_cube.run([step]).pads[0]
-        modes = estimator @ pads
+        modes = estimator.matrix @ pads
         positions, force = with_cube.rod_pressure(step)
+        shear_at_rod = np.interp(positions, x, shear_kernel[:, 1])
+        pads_at_rod = influence.at(positions[:, None])[:, :, 1]
+        eq_4_gain = SHEAR_SIGNS @ response[:4, zx]
         rows.append(
             RodShear(
                 place=np.array(place),
                 truth=without.run([step]).state[0, zx],
                 # The rod presses against z.
-                same_load=-np.interp(positions, x, shear_kernel[:, 1]) @ force,
-                eq_4=SHEAR_SIGNS @ pads[:4] / (SHEAR_SIGNS @ response[:4, zx]),
+                same_load=-shear_at_rod @ force,
+                eq_4=SHEAR_SIGNS @ pads[:4] / eq_4_gain,
                 tensor=modes[zx],
                 points=from_tensor @ modes,
                 pads=from_pads @ pads,
                 seen=pads,
-                predicted=-influence.at(positions[:, None])[:, :, 1] @ force,
+                predicted=-pads_at_rod @ force,
             )
         )
-    columns = {name: np.array([getattr(row, name) for row in rows]) for name in vars(rows[0])}
+    columns = {}
+    for name in vars(rows[0]):
+        columns[name] = np.array([getattr(row, name) for row in rows])
     return RodShear(**columns)
 
 
-def _shear_weights(kernel: Array, shear_kernel: Array, x: Array, depth: float) -> Array:
+def _shear_weights(
+    kernel: Array,
+    shear_kernel: Array,
+    x: Array,
+    depth: float,
+) -> Array:
     """Return the weights h S H' (H S H' + N)^-1 (n,) of the measurements y for the shear.
 
     Args:
@@ -133,13 +147,18 @@ def _shear_weights(kernel: Array, shear_kernel: Array, x: Array, depth: float) -
     square_distance = np.subtract.outer(x, x) ** 2
     gaussians = []
     for length in PRIOR_LENGTHS:
-        gaussians.append(np.exp(-square_distance / 2 / (length * depth) ** 2))
+        square_length = (length * depth) ** 2
+        gaussians.append(np.exp(-square_distance / 2 / square_length))
     prior = np.mean(gaussians, axis=0)
 
-    total, cross = np.zeros((len(kernel), len(kernel))), np.zeros(len(kernel))
+    n = len(kernel)
+    total, cross = np.zeros((n, n)), np.zeros(n)
+    # The prior takes shear and pressure for independent, with these relative sizes.
     for component, size in enumerate((SHEAR_RATIO, 1.0)):
-        smooth = size**2 * kernel[:, :, component] @ prior
-        total += smooth @ kernel[:, :, component].T
+        own = kernel[:, :, component]
+        smooth = size**2 * own @ prior
+        total += smooth @ own.T
         cross += smooth @ shear_kernel[:, component]
-    total[np.diag_indices(len(kernel))] *= 1 + MODEL_ERROR**2
+    # Independent errors of the measurements, relative to their size under the prior.
+    total[np.diag_indices(n)] *= 1 + MODEL_ERROR**2
     return np.asarray(np.linalg.solve(total, cross), dtype=float)

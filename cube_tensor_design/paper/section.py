@@ -15,7 +15,7 @@ import skfem
 
 from cube_tensor_driver.core.arrays import Array, Mask
 
-from .material import Material, determinant
+from .material import Material
 from .newton import Balance
 
 
@@ -32,34 +32,45 @@ class Section:
 
     def __init__(self, mesh: skfem.MeshTri, material: Material) -> None:
         self.mesh, self.material = mesh, material
-        self.basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=4)
-        self.points = np.moveaxis(np.asarray(self.basis.default_parameters()["x"]), 0, -1)
+        element = skfem.ElementVector(skfem.ElementTriP2())
+        self.basis = skfem.Basis(mesh, element, intorder=4)
+        points = np.asarray(self.basis.default_parameters()["x"])
+        self.points = np.moveaxis(points, 0, -1)
         self.component = np.zeros(self.basis.N, dtype=int)
-        self.component[self.basis.get_dofs(elements=True).all("u^2")] = 1
+        all_dofs = self.basis.get_dofs(elements=True)
+        self.component[all_dofs.all("u^2")] = 1
         self._dofs = self.basis.element_dofs.T
         self._shape = self.basis.dx.shape  # (elements, points)
         # d u_i / d x_j at the quadrature points is
         # slopes (elements, points, 2 i + j, n) @ u[dofs] (elements, n).
-        slopes = np.stack([shape[0].grad for shape in self.basis.basis], axis=-1)
-        self._slopes = np.moveaxis(slopes, (0, 1), (2, 3)).reshape(*self._shape, 4, -1)
+        gradients = [shape[0].grad for shape in self.basis.basis]
+        slopes = np.stack(gradients, axis=-1)
+        slopes = np.moveaxis(slopes, (0, 1), (2, 3))
+        self._slopes = slopes.reshape(*self._shape, 4, -1)
         self._linear_tangent: sp.csr_matrix | None = None
 
     def node(self, x: float, z: float) -> int:
         """Return the number of the corner of an element that is nearest to this point."""
-        return int(np.argmin(np.hypot(self.mesh.p[0] - x, self.mesh.p[1] - z)))
+        nodes_x, nodes_z = self.mesh.p
+        distance = np.hypot(nodes_x - x, nodes_z - z)
+        return int(np.argmin(distance))
 
     def deformation(self, u: Array) -> Array:
         """Return F = 1 + grad u (elements, points, 2, 2)."""
         gradient = self._slopes @ u[self._dofs][:, None, :, None]
-        return np.asarray(gradient.reshape(*self._shape, 2, 2) + np.eye(2))
+        gradient = gradient.reshape(*self._shape, 2, 2)
+        return np.asarray(gradient + np.eye(2))
 
     def balance(self, u: Array) -> Balance | None:
         """Return nodal forces and energy; None when an element is inside out."""
         f = self.deformation(u)
-        if self.material.finite and determinant(f).min() <= 0:
+        # A linear material knows no volume, so it has no limit.
+        if self.material.finite and np.linalg.det(f).min() <= 0:
             return None
-        energy = float((self.material.energy(f) * self.basis.dx).sum())
-        return Balance(self.forces(self.material.stress(f)), energy)
+        density = self.material.energy(f)
+        energy = float((density * self.basis.dx).sum())
+        forces = self.forces(self.material.stress(f))
+        return Balance(forces, energy)
 
     def forces(self, stress: Array, elements: Mask | slice = slice(None)) -> Array:
         """Return the nodal forces (dofs,) of a stress over some of the elements.
@@ -68,7 +79,9 @@ class Section:
             stress: (elements, points, 2, 2) in Pa.
             elements: Which elements count.
         """
-        weighted = (stress * self.basis.dx[..., None, None]).reshape(*self._shape, 4)
+        weighted = stress * self.basis.dx[..., None, None]
+        weighted = weighted.reshape(*self._shape, 4)
+        # Forces of each element e: the sum over its points p and stress components i.
         local = np.einsum("epi,epin->en", weighted[elements], self._slopes[elements])
         dofs = self._dofs[elements]
         total = np.bincount(dofs.ravel(), local.ravel(), self.basis.N)
@@ -85,14 +98,19 @@ class Section:
         n = len(self.basis.basis)
         # The moduli of a linear material are the same at all points of an element.
         own_points = self._shape[1] if self.material.finite else 1
-        moduli = self.material.moduli(self.deformation(u)).reshape(-1, own_points, 4, 4)
-        weighted = (moduli * self.basis.dx[..., None, None]) @ self._slopes
-        left = np.swapaxes(self._slopes.reshape(elements, -1, n), 1, 2)
-        local = left @ weighted.reshape(elements, -1, n)
-        rows = np.broadcast_to(self._dofs[:, :, None], local.shape).ravel()
-        columns = np.broadcast_to(self._dofs[:, None], local.shape).ravel()
+        f = self.deformation(u)
+        moduli = self.material.moduli(f).reshape(-1, own_points, 4, 4)
+        # One matrix product per element: points and components are one axis of it.
+        weights = self.basis.dx[..., None, None]
+        weighted = (moduli * weights) @ self._slopes
+        right = weighted.reshape(elements, -1, n)
+        left = self._slopes.reshape(elements, -1, n)
+        local = np.swapaxes(left, 1, 2) @ right
+        rows = np.broadcast_to(self._dofs[:, :, None], local.shape)
+        columns = np.broadcast_to(self._dofs[:, None], local.shape)
         size = (self.basis.N, self.basis.N)
-        matrix = sp.coo_matrix((local.ravel(), (rows, columns)), size).tocsr()
+        entries = (local.ravel(), (rows.ravel(), columns.ravel()))
+        matrix = sp.coo_matrix(entries, size).tocsr()
         if not self.material.finite:
             self._linear_tangent = matrix
         return matrix

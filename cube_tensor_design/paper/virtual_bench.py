@@ -156,7 +156,8 @@ class VirtualBench:
 
         mesh = _bench_mesh(body, self.layout, cube, size)
         check_memory(mesh, BYTES_PER_CORNER)
-        self.in_cube = np.all(np.abs(mesh.p[:, mesh.t].mean(axis=1)) < 1.0, axis=0)
+        centres = mesh.p[:, mesh.t].mean(axis=1)
+        self.in_cube = np.all(np.abs(centres) < 1.0, axis=0)
         lam, mu = lame(body.young, body.poisson, body.plane)
         stiffness = np.where(self.in_cube & cube, CUBE_STIFFNESS_RATIO, 1.0)[:, None]
         self.section = Section(mesh, Material(lam * stiffness, mu * stiffness, finite))
@@ -168,7 +169,11 @@ class VirtualBench:
         # Its numbers have the size of the stiffness, so that the equations are well conditioned.
         self._bottom_mean = bottom_mean * body.young
 
-    def run(self, steps: Sequence[LoadStep], report: Callable[[], None] = lambda: None) -> BenchRun:
+    def run(
+        self,
+        steps: Sequence[LoadStep],
+        report: Callable[[], None] = lambda: None,
+    ) -> BenchRun:
         """Solve the steps, each starting from the last solution.
 
         Args:
@@ -189,7 +194,8 @@ class VirtualBench:
             if not step.gripped:
                 loose = u
             displacement = self._half_side * u[self.section.basis.nodal_dofs]
-            rows.append((self._pad_stresses(u), self._state(u), self._rotation(u), displacement))
+            pads, rotation = self._pad_stresses(u), self._rotation(u)
+            rows.append((pads, self._state(u), rotation, displacement))
             report()
         return BenchRun(*map(np.array, zip(*rows, strict=True)))
 
@@ -211,7 +217,8 @@ class VirtualBench:
         if u is None or step.rod is None or self.finite:
             raise ElasticError("give a linear step with a rod, that presses less")
         force = self.rod_contact(step.rod).force(u)
-        dofs = np.flatnonzero((force != 0) & (self.section.component == 1))
+        is_along_z = self.section.component == 1
+        dofs = np.flatnonzero((force != 0) & is_along_z)
         positions = self.section.basis.doflocs[0, dofs]
         return self._half_side * positions, self._half_side * force[dofs]
 
@@ -227,13 +234,15 @@ class VirtualBench:
         x, component = self.section.basis.doflocs, self.section.component
         half = layout.pad_size / 2
         weights = np.zeros((layout.n_pads, self.section.basis.N))
-        positions, normals = layout.positions[:, [0, 2]], layout.normals[:, [0, 2]]
+        positions = layout.positions[:, [0, 2]]
+        normals = layout.normals[:, [0, 2]]
         for pad, (position, normal) in enumerate(zip(positions, normals, strict=True)):
             axis = 0 if normal[0] else 1
             other = 1 - axis
             start, stop = position[other] - half, position[other] + half
             on_face = np.abs(x[axis] - normal[axis]) < SURFACE_TOLERANCE
             on_face &= np.abs(x[other]) < 1 + SURFACE_TOLERANCE
+            # Once the cube has turned, forces along both axes act along a pad's normal.
             for along in (0, 1):
                 face = np.flatnonzero(on_face & (component == along))
                 face = face[np.argsort(x[other, face])]
@@ -246,14 +255,17 @@ class VirtualBench:
         """Return a linear bench of the same mesh, with elastomer in the cube's place."""
         bench = copy(self)
         material = self.section.material
-        lam, mu = (np.full_like(one, one.min()) for one in (material.lam, material.mu))
+        # The elastomer is softer than the cube.
+        lam = np.full_like(material.lam, material.lam.min())
+        mu = np.full_like(material.mu, material.mu.min())
         bench.section = Section(self.section.mesh, Material(lam, mu, False))
         return bench
 
     def free(self, step: LoadStep) -> Index:
         """Return the numbers of the unknowns that a step from rest does not prescribe."""
         rest = np.zeros(self.section.basis.N)
-        return np.flatnonzero(np.isnan(self._task(step, rest).constraints.prescribed))
+        task = self._task(step, rest)
+        return np.flatnonzero(np.isnan(task.constraints.prescribed))
 
     def rod_contact(self, rod: Rod) -> RodContact:
         """Return the contact of a rod with the top."""
@@ -271,18 +283,21 @@ class VirtualBench:
         section, mesh = self.section, self.section.mesh
         field = stress + np.einsum("ijk,epk->epij", gradient, section.points)
         force = section.forces(field)
+        # Three unknowns stop the rigid motions; the loads balance, so they bear no force.
         centre, side = section.node(0.0, 0.0), section.node(1.0, 0.0)
-        pinned = [*section.basis.nodal_dofs[:, centre], section.basis.nodal_dofs[1, side]]
+        nodal_dofs = section.basis.nodal_dofs
+        pinned = [*nodal_dofs[:, centre], nodal_dofs[1, side]]
         free = np.setdiff1d(np.arange(section.basis.N), pinned)
         u = np.zeros(section.basis.N)
-        u[free] = factors(section.tangent(u)[free][:, free]).solve(force[free])
+        matrix = section.tangent(u)[free][:, free]
+        u[free] = factors(matrix).solve(force[free])
         result = section.material.stress(section.deformation(u))
         return Deformation(
             points=mesh.p,
             triangles=mesh.t,
             half_side=self._half_side,
             height=self.body.height,
-            displacement=self._half_side * u[section.basis.nodal_dofs],
+            displacement=self._half_side * u[nodal_dofs],
             stress_zz=result[..., 1, 1].mean(axis=1),
         )
 
@@ -307,7 +322,12 @@ class VirtualBench:
         return _Task(Constraints(prescribed, row), step.rod)
 
     def _advance(
-        self, start: _Position, guess: Array, task: _Task, number: int, halvings: int = 0
+        self,
+        start: _Position,
+        guess: Array,
+        task: _Task,
+        number: int,
+        halvings: int = 0,
     ) -> _Position:
         """Solve one step of the load from a guess; the step is halved where that fails."""
         u = self._newton(guess, task)
@@ -318,10 +338,12 @@ class VirtualBench:
             raise ElasticError(
                 f"step {number} of the load is too large even in {parts} parts; press less"
             )
+        # First to the middle of the step, then on from there in the same direction.
         half = self._half_task(start, task)
         guess = (start.u + guess) / 2
         middle = self._advance(start, guess, half, number, halvings + 1)
-        return self._advance(middle, 2 * middle.u - start.u, task, number, halvings + 1)
+        guess = 2 * middle.u - start.u
+        return self._advance(middle, guess, task, number, halvings + 1)
 
     def _half_task(self, start: _Position, task: _Task) -> _Task:
         """Return the task that is half of the way from the start."""
@@ -342,8 +364,10 @@ class VirtualBench:
                 yield tangent
             else:
                 yield tangent + contact.tangent(u, curved=True)
+                # The rod's curvature can make the tangent indefinite, which gives no descent.
                 yield tangent + contact.tangent(u, curved=False)
 
+        # Even a linear body has a contact that is not linear.
         linear = not self.finite and contact is None
         balance = partial(self._balance, contact=contact)
         with np.errstate(all="ignore"):  # a failed attempt passes through inverted elements
@@ -354,13 +378,16 @@ class VirtualBench:
         inner = self.section.balance(u)
         if inner is None or contact is None:
             return inner
-        return Balance(inner.force + contact.force(u), inner.energy + contact.energy(u))
+        force = inner.force + contact.force(u)
+        energy = inner.energy + contact.energy(u)
+        return Balance(force, energy)
 
     def _rotation(self, u: Array) -> float:
         """Return the angle of the cube in rad, of the line between the centres of its sides."""
         nodal_dofs = self.section.basis.nodal_dofs
-        left, right = (u[nodal_dofs[:, self.section.node(x, 0.0)]] for x in (-1.0, 1.0))
-        along = right - left
+        left_node = self.section.node(-1.0, 0.0)
+        right_node = self.section.node(1.0, 0.0)
+        along = u[nodal_dofs[:, right_node]] - u[nodal_dofs[:, left_node]]
         return float(np.arctan2(along[1], 2.0 + along[0]))
 
     def _pad_stresses(self, u: Array) -> Array:
@@ -381,23 +408,35 @@ class VirtualBench:
         stress = section.material.cauchy(section.deformation(u))[is_near]
         x = points[is_near]
         design = np.column_stack([np.ones(len(x)), x])
-        columns = np.stack([stress[:, 0, 0], stress[:, 1, 1], stress[:, 0, 1]], axis=1)
-        xx, zz, zx = np.linalg.lstsq(design, columns, rcond=None)[0].T
-        return np.array([zz[0], zx[0], xx[0], zz[1], zz[2], xx[2], xx[1]])
+        columns = stress[:, [0, 1, 0], [0, 1, 1]]  # xx, zz, zx
+        # Of each component its value, its slope along x and its slope along z.
+        fit = np.linalg.lstsq(design, columns, rcond=None)[0]
+        xx, zz, zx = fit.T
+        values = [zz[0], zx[0], xx[0]]
+        slopes = [zz[1], zz[2], xx[2], xx[1]]
+        return np.array(values + slopes)
 
 
-def _bench_mesh(body: Body, layout: Layout, cube: bool, size: float) -> skfem.MeshTri:
+def _bench_mesh(
+    body: Body,
+    layout: Layout,
+    cube: bool,
+    size: float,
+) -> skfem.MeshTri:
     """Return triangles of the section, in d0, refined at the cube and where rods press."""
     half_side, half_pad = body.side / 2, layout.pad_size / 2
     across = np.abs(layout.positions - layout.normals).max(axis=1)
-    stops = np.unique(np.round([across - half_pad, across + half_pad], 9))
+    edges = np.round([across - half_pad, across + half_pad], 9)
+    stops = np.unique(edges)
     top = body.height / 2 / half_side
     half = [body.width / 2 / half_side, top]
+    # Two rings at the corner of the cube; the cuts below refine its faces.
     quarter = mesh_quarter(half, stops, 1, smallest=0.3, largest=size)
     quarter = _refine(quarter, lambda x, z: (z > top - 0.9) & (x < 6.0))
     # Rods stretch the surface most here.
     quarter = _refine(quarter, lambda x, z: (z > top - 0.25) & (x < 2.4))
     for _ in range(CUBE_REFINEMENTS if cube else 0):
+        # The ring of triangles from the faces of the cube to 0.3 d0 outside of it.
         quarter = _refine(quarter, lambda x, z: np.abs(np.maximum(x, z) - 1.15) < 0.15)
     return mirror_quarter(quarter)
 
@@ -405,5 +444,6 @@ def _bench_mesh(body: Body, layout: Layout, cube: bool, size: float) -> skfem.Me
 def _refine(mesh: skfem.MeshTri, where: Callable[[Array, Array], Mask]) -> skfem.MeshTri:
     """Cut the triangles in four for whose centroids `where` is true."""
     x, z = mesh.p[:, mesh.t].mean(axis=1)
-    mesh = mesh.refined(np.flatnonzero(where(x, z)))
+    chosen = np.flatnonzero(where(x, z))
+    mesh = mesh.refined(chosen)
     return skfem.MeshTri(mesh.p.copy(), mesh.t.copy())

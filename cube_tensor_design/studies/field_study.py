@@ -12,7 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.core.defaults import CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
+from cube_tensor_driver.core.defaults import (
+    CONTACT_PRESSURE,
+    POISSONS_RATIO,
+    SURFACE_DEPTH,
+)
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.mechanics import contact
@@ -75,16 +79,19 @@ class FieldStudy:
         saved = np.full((len(self.widths), len(SKIN_KINDS)), np.nan)
         for row, curves in enumerate(self.error):
             pitch = np.array([self._pitch_for(error, curve) for curve in curves.T])
+            # The number of cubes per area falls with the square of the pitch.
             saved[row] = (pitch / pitch[0]) ** 2
         return saved
 
     def _pitch_for(self, error: float, curve: Array) -> float:
         """Return the pitch at which a curve of errors (pitches,) reaches this one, or NaN."""
+        # Noise may make a curve fall for a step, and np.interp needs it to rise.
         rising = np.maximum.accumulate(curve)
         if not rising[0] < error < rising[-1]:
             return np.nan
-        pitch = np.interp(np.log(error), np.log(rising), np.log(self.pitches))
-        return float(np.exp(pitch))
+        # Errors are nearly powers of the pitch.
+        log_error, log_pitches = np.log(rising), np.log(self.pitches)
+        return float(np.exp(np.interp(np.log(error), log_error, log_pitches)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +120,8 @@ def flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
     """
     count = 2 * round(side / pitch / 2) + 1
     line = (np.arange(count) - count // 2) * pitch
-    x, y = np.meshgrid(line, line)
-    position = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    x, y = (column.ravel() for column in np.meshgrid(line, line))
+    position = np.stack([x, y, 0 * x], axis=1)
     rotation = np.tile(np.eye(3), (len(position), 1, 1))
     return CubePoses(position, rotation, np.full(len(position), SURFACE_DEPTH / 2))
 
@@ -122,10 +129,16 @@ def flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
 def draw_force(random: np.random.Generator) -> Array:
     """Return the force (3,) of the ball in N, with its shear in a random direction."""
     angle = 2 * np.pi * random.random()
-    return FORCE * np.array([FRICTION * np.cos(angle), FRICTION * np.sin(angle), -1.0])
+    shear_x, shear_y = FRICTION * np.cos(angle), FRICTION * np.sin(angle)
+    return FORCE * np.array([shear_x, shear_y, -1.0])
 
 
-def true_components(points: Array, width: float, force: Array, centre: Array) -> Array:
+def true_components(
+    points: Array,
+    width: float,
+    force: Array,
+    centre: Array,
+) -> Array:
     """Return the components at points of the cubes' plane below a ball.
 
     Args:
@@ -137,6 +150,7 @@ def true_components(points: Array, width: float, force: Array, centre: Array) ->
     Returns:
         `COMPONENTS` (N, 15), stresses in Pa and gradients in Pa/m.
     """
+    # The contact model has its origin on the surface.
     depth = np.full(len(points), -SURFACE_DEPTH)
     below = np.column_stack([points[:, :2], depth])
     order = contact.hertz_order(width / 2, SURFACE_DEPTH)
@@ -161,13 +175,18 @@ def field_example(pitch: float = 0.010, width: float = 0.012) -> FieldExample:
     return FieldExample(surface.points, pressure, skin.position, centre)
 
 
-def field_study(pitches: Array = PITCHES, widths: Array = WIDTHS, cases: int = CASES) -> FieldStudy:
+def field_study(
+    pitches: Array = PITCHES,
+    widths: Array = WIDTHS,
+    cases: int = CASES,
+) -> FieldStudy:
     """Run the study, with the same numbers every time. It takes about two minutes."""
     shape = (len(widths), len(pitches), len(SKIN_KINDS))
     error, position, force = np.zeros((3, *shape))
     for column, pitch in enumerate(pitches):
         trial = _Trial(pitch)
         for row, width in enumerate(widths):
+            # The same contacts for every pitch and width make the errors comparable.
             random = np.random.default_rng(SEED)
             errors = np.array([trial.errors(width, random) for _ in range(cases)])
             squares, distances, forces = np.moveaxis(errors, 1, 0)  # each (cases, kinds)
@@ -189,7 +208,8 @@ class _Trial:
             has_gradients = kind != "values alone"
             self._surfaces[kind] = Surface(self._skin, SURFACE_DEPTH, side, gradients=has_gradients)
         points = self._surfaces["values alone"].points
-        self._window = np.abs(points[:, :2]).max(axis=1) < WINDOW / 2
+        from_centre = np.abs(points[:, :2]).max(axis=1)
+        self._window = from_centre < WINDOW / 2
         self._points = points[self._window]
 
     def errors(self, width: float, random: np.random.Generator) -> Array:
@@ -209,7 +229,8 @@ class _Trial:
             if kind == "planar cubes":
                 values[:, UNOBSERVED_BY_PLANAR] = np.nan
             computed = surface.field(values).pressure[self._window]
-            square = ((computed - pressure) ** 2).mean() / (pressure**2).mean()
+            difference = computed - pressure
+            square = (difference**2).mean() / (pressure**2).mean()
             distance, force_error = WINDOW, -1.0
             contacts = surface.contacts(values, CONTACT_PRESSURE)
             if contacts:

@@ -27,7 +27,13 @@ from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE, to_matrix
 from cube_tensor_driver.mechanics import contact
 
 from ..fem.body import Body, make_mesh
-from ..fem.fem import Progress, linear_response, make_solid, pad_stresses
+from ..fem.fem import (
+    Progress,
+    count_steps,
+    linear_response,
+    make_solid,
+    pad_stresses,
+)
 from ..fem.memory import check_memory
 
 MAX_TRUSTED_ERROR = 0.2
@@ -42,7 +48,11 @@ LATERAL_OFFSET = 1e-3
 MAX_POINT_SPACING = 4e-3
 """Largest distance between the points of the contact's quadrature, in m: the side of the largest
 cube."""
-NEGLECTED_MODES = {"quad": ("xx", "xx_z", "xx_x"), "planar": (), "cube": ()}
+NEGLECTED_MODES = {
+    "quad": ("xx", "xx_z", "xx_x"),
+    "planar": (),
+    "cube": (),
+}
 """Modes that each layout takes as zero."""
 
 
@@ -64,19 +74,15 @@ class LayoutStudy:
         widths: (W,) widths of the indenter, in m.
         offsets: (X,) positions of the indenter along x, in m.
         depth: Depth of the cube's centre, in m.
-        truth: (S, W, X, C) components in the order of `COMPONENTS`, gradients times d0, in Pa per N
-            of force.
-        recovered: By layout (S, W, X, C), NaN where a layout does not observe a component.
-        error: By layout (S, W, C), the largest |recovered - truth| over the offsets divided by
-            (max - min) of truth.
+        error: By layout (S, W, C), the largest |recovered - true| over the offsets divided by
+            (max - min) of the true component; NaN where a layout does not observe it. The order is
+            that of `COMPONENTS`.
     """
 
     sides: Array
     widths: Array
     offsets: Array
     depth: float
-    truth: Array
-    recovered: dict[str, Array]
     error: dict[str, Array]
 
     def trusted(self, limit: float = MAX_TRUSTED_ERROR) -> list[TrustedWidth]:
@@ -88,6 +94,7 @@ class LayoutStudy:
             for k, component in enumerate(COMPONENTS):
                 if np.isnan(error[i, 0, k]):
                     continue
+                # Every wider indenter must be trusted, too.
                 bad = np.flatnonzero(error[i, :, k] > limit)
                 first = bad[-1] + 1 if len(bad) else 0
                 width = float(self.widths[first]) if first < len(self.widths) else None
@@ -98,6 +105,7 @@ class LayoutStudy:
         """Return plain types for JSON; None where a layout does not observe a component."""
         errors = {}
         for name, error in self.error.items():
+            # JSON knows no NaN.
             plain = error.astype(object)
             plain[np.isnan(error)] = None
             errors[name] = plain.tolist()
@@ -171,31 +179,39 @@ def layout_study(
     matrix, pads = _solve_box(passages, poisson, progress)
 
     shape = (len(sides), len(widths), len(offsets), len(COMPONENTS))
-    truth = np.array([passage.components() for passage in passages]).reshape(shape)
-    recovered, error = {}, {}
+    components = [passage.components() for passage in passages]
+    truth = np.array(components).reshape(shape)
+    error = {}
     for name, layout in LAYOUTS.items():
         # The pads of quad and planar are the first ones of the cube.
         estimate = pads[: layout.n_pads].T @ _recovery_matrix(matrix, name).T
-        recovered[name] = estimate.reshape(shape)
-        largest = np.abs(recovered[name] - truth).max(axis=2)
+        difference = estimate.reshape(shape) - truth
+        largest = np.abs(difference).max(axis=2)
         error[name] = largest / np.ptp(truth, axis=2)
     return LayoutStudy(
         sides=np.asarray(sides),
         widths=np.asarray(widths),
         offsets=np.asarray(offsets),
         depth=depth,
-        truth=truth,
-        recovered=recovered,
         error=error,
     )
 
 
 def _solve_box(
-    passages: Sequence[_Passage], poisson: float, progress: Progress | None
+    passages: Sequence[_Passage],
+    poisson: float,
+    progress: Progress | None,
 ) -> tuple[Array, Array]:
     """Return response (pads, modes) and pad stresses (pads, passages) of a cube in its box."""
     # The cube is rigid; lengths are in units of its side.
-    body = Body(BOX_RATIO, BOX_RATIO, BOX_RATIO, side=1.0, poisson=poisson, cube_young=np.inf)
+    body = Body(
+        BOX_RATIO,
+        BOX_RATIO,
+        BOX_RATIO,
+        side=1.0,
+        poisson=poisson,
+        cube_young=np.inf,
+    )
     layout = LAYOUTS["cube"]
     grid = make_mesh(body, layout, 0)
     check_memory(grid)
@@ -210,13 +226,8 @@ def _solve_box(
             known_fields[key] = to_matrix(np.stack(stresses, axis=1))
         return known_fields[key]
 
-    steps = itertools.count()
-    total = 2 * 2**solid.dim  # all parities, of the modes and of the passages
-
-    def report(what: str) -> None:
-        if progress is not None:
-            progress(next(steps), total, what)
-
+    # All parities are solved for the modes and for the passages.
+    report = count_steps(progress, 2 * len(solid.parities))
     matrix = linear_response(solid, layout, report)
     pads = pad_stresses(solid, layout, lambda parity: solid.outer_forces(parity, field), report)
     report("done")

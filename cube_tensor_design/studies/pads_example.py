@@ -44,11 +44,15 @@ def simple_loads(calibration: Calibration) -> dict[str, Array]:
     states = {
         rf"pressure: $\sigma_{{zz}} = -{size}$ kPa": {"zz": LOAD},
         rf"shear: $\sigma_{{zx}} = {size}$ kPa": {"zx": -LOAD},
-        rf"growing pressure: $-{size}\,(1 + x/d_0)$ kPa": {"zz": LOAD, "zz_x": LOAD},
+        rf"growing pressure: $-{size}\,(1 + x/d_0)$ kPa": {
+            "zz": LOAD,
+            "zz_x": LOAD,
+        },
     }
     loads = {}
     for title, state in states.items():
-        loads[title] = np.array([state.get(name, 0.0) for name in calibration.modes.names])
+        names = calibration.modes.names
+        loads[title] = np.array([state.get(name, 0.0) for name in names])
     return loads
 
 
@@ -86,6 +90,7 @@ def sweep(points: int = 129) -> Sweep:
     at_sensor, slope_at_sensor = _stress_and_slope(np.array([-BALL_X]))
 
     stress, slope = _stress_and_slope(-place)
+    # The state of the planar modes at the sensor, gradients times d0.
     state = []
     for name in calibration.modes.names:
         component, _, axis = name.partition("_")
@@ -97,7 +102,9 @@ def sweep(points: int = 129) -> Sweep:
 
     estimator = make_estimator(calibration.response, calibration.noise, calibration.modes)
     left, right = (calibration.layout.index(name) for name in PAIR)
+    # The pair reads the difference of its pads as shear, with the gain of uniform shear.
     to_shear = calibration.response[:, calibration.modes.names.index("zx")]
+    pair_gain = to_shear[left] - to_shear[right]
     return Sweep(
         place=place,
         profile=profile,
@@ -105,13 +112,14 @@ def sweep(points: int = 129) -> Sweep:
         slope=float(slope_at_sensor["zz"][0, 0]),
         truth=stress["zx"],
         cube=pads @ estimator.matrix[COMPONENTS.index("zx")],
-        pair=(pads[:, left] - pads[:, right]) / (to_shear[left] - to_shear[right]),
+        pair=(pads[:, left] - pads[:, right]) / pair_gain,
     )
 
 
 def _stress_and_slope(x: Array) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return stress (N,) and gradient (N, 3) by component, at x (N,) from the ball's centre."""
-    points = np.stack([x, 0 * x, np.full(len(x), -SURFACE_DEPTH)], axis=1)
+    depth = np.full(len(x), -SURFACE_DEPTH)
+    points = np.stack([x, 0 * x, depth], axis=1)
     ball = contact.hertz(BALL_RADIUS, BALL_FORCE, np.zeros(2))
     stress, gradient = contact.field(points, *ball, POISSONS_RATIO)
     numbers = list(enumerate(STRESS))

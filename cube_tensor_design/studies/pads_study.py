@@ -25,21 +25,36 @@ from .field_study import FORCE, FRICTION, FieldExample
 from .traction_study import CUBES, Bench, Errors, Setting
 
 FORMS = ("points", "pads")
-"""What the inverse takes the cubes for."""
-BODY = Body(width=80e-3, depth=80e-3, cube_young=np.inf, ground=True)
+"""Models of a cube that the inverse assumes: a point, or pads with influence functions."""
+BODY = Body(
+    width=80e-3,
+    depth=80e-3,
+    cube_young=np.inf,
+    ground=True,
+)
 """The body of the shipped influence functions."""
 THIN = tuple(
-    Setting(cubes=cubes, depth=BODY.height / 2, thickness=BODY.height, known_thickness=BODY.height)
+    Setting(
+        cubes=cubes,
+        depth=BODY.height / 2,
+        thickness=BODY.height,
+        known_thickness=BODY.height,
+    )
     for cubes in CUBES
 )
-"""Skins with a pitch of 8 mm and cubes in the middle of that layer, whose thickness is known."""
+"""Skins in a thin layer of known thickness, with a pitch of 8 mm and the cubes in the middle of the
+layer."""
 
 
 class LayerBench(Bench):
     """A skin in a layer, whose pads have the stress that finite elements of a cube in it give."""
 
     def __init__(
-        self, setting: Setting, true: Influence, known: Influence | None = None, side: int = 4
+        self,
+        setting: Setting,
+        true: Influence,
+        known: Influence | None = None,
+        side: int = 4,
     ) -> None:
         """Set up the inverse.
 
@@ -57,7 +72,12 @@ class LayerBench(Bench):
             distance = np.abs(true.layout.positions - position).max(axis=1)
             self._pads.append(int(np.argmin(distance)))
 
-    def pads_under(self, width: float, force: Array, centre: Array) -> Array:
+    def pads_under(
+        self,
+        width: float,
+        force: Array,
+        centre: Array,
+    ) -> Array:
         sources, forces = self.point_forces(width, force, centre)
         rotation = self.poses.rotation
         # Positions and forces in the frame of each cube.
@@ -67,6 +87,7 @@ class LayerBench(Bench):
 
         influence = self._true.at(place.reshape(-1, 2))[self._pads]
         influence = influence.reshape(-1, len(rotation), len(sources), 3)
+        # The pads p of cube n add up the point forces s.
         return np.asarray(np.einsum("pnsi,nsi->np", influence, local_forces))
 
 
@@ -75,8 +96,12 @@ def coarse_influence() -> Influence:
     return compute_influence(BODY, LAYOUTS["cube"], 0)
 
 
-def _make_benches(setting: Setting, true: Influence, side: int = 4) -> dict[str, LayerBench]:
-    """Return a bench for each of `FORMS`; pads have the shipped influence functions."""
+def _make_benches(
+    setting: Setting,
+    true: Influence,
+    side: int = 4,
+) -> dict[str, LayerBench]:
+    """Return a bench for each of `FORMS`; for pads, the inverse assumes the shipped functions."""
     shipped = read_influence(find_influence("cube_11mm"))
     known = {"points": None, "pads": shipped}
     return {form: LayerBench(setting, true, known[form], side) for form in FORMS}

@@ -15,7 +15,7 @@ true stress is that of layer.py.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ from cube_tensor_driver.mechanics.kernels import Kernels
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
 
 from ..fem.body import Body
-from ..fem.fem import compute_response
+from ..fem.fem import Progress, compute_response, count_steps
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 
@@ -102,7 +102,7 @@ def study_surface(
     layout: Layout,
     meshes: int = 3,
     neglect: Sequence[str] = (),
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> SurfaceStudy:
     """Compare measured and true stress under balls above the cube and beside it.
 
@@ -111,12 +111,13 @@ def study_surface(
         layout: Pads of the cube.
         meshes: Number of meshes, 1 to 3; the last one gives the result.
         neglect: Modes that the cube takes as zero.
-        progress: Called as progress(stage, stages, name) before every stage and at the end.
+        progress: Called before every stage and at the end.
 
     Raises:
         ElasticError: No contact of `WIDTHS` fits onto the body, the layout observes none of
             `COMPONENTS`, pads overlap, or the mesh does not fit into memory.
     """
+    # Above the cube, and beside it by its side.
     offsets = (0.0, body.side)
     reach = body.width / 2 - abs(body.x) - offsets[-1]
     widths = [width for width in WIDTHS if width / 2 <= reach]
@@ -125,15 +126,10 @@ def study_surface(
             f"the body's width is {body.width * 1e3:g} mm; beside a cube of {body.side * 1e3:g} mm "
             f"there must be room for a contact of {min(WIDTHS) * 1e3:g} mm, so make it wider"
         )
-    stages = ("response matrix", "influence functions", "done")
-
-    def report(stage: int) -> None:
-        if progress is not None:
-            progress(stage, len(stages) - 1, stages[stage])
-
-    report(0)
+    report = count_steps(progress, 2)
+    report("response matrix")
     inverse = _inverse_rows(body, layout, meshes, neglect)
-    report(1)
+    report("influence functions")
     influence = compute_influence(replace(body, ground=True), layout, meshes - 1)
 
     rows = []
@@ -141,6 +137,7 @@ def study_surface(
         axis, sign = LOADS[load]
         points, parts = hertz_points(width / 2, 1 if layout.planar else 2)
         points[:, 0] += offset
+        # The integral of influence functions and traction, by reciprocity.
         pads = influence.at(points)[:, :, axis] @ (sign * parts)
         measured = {name: float(row @ pads) for name, row in inverse.items()}
         if layout.planar:
@@ -149,23 +146,29 @@ def study_surface(
             field = _true_stress_in_space(body, width, offset)
         true = {name: sign * float(field[name][axis]) for name in inverse}
         rows.append(SurfaceRow(load, width, offset, measured, true))
-    report(2)
+    report("done")
     return SurfaceStudy(body, layout, influence, tuple(rows))
 
 
 def _inverse_rows(
-    body: Body, layout: Layout, meshes: int, neglect: Sequence[str]
+    body: Body,
+    layout: Layout,
+    meshes: int,
+    neglect: Sequence[str],
 ) -> dict[str, Array]:
     """Return, by component, the row (P,) of R^+ where the pads tell it from all other modes."""
     response = compute_response(body, layout, largest_symmetry(layout), meshes)
     names = [name for name in response.modes if name not in neglect]
-    matrix = response.matrix[:, [response.modes.index(name) for name in names]]
+    columns = [response.modes.index(name) for name in names]
+    matrix = response.matrix[:, columns]
     inverse = np.linalg.pinv(matrix)
+    # R^+ R is the identity for the modes that the pads tell from all others.
     own_entry = np.diag(inverse @ matrix)
-    observed = {
-        name: inverse[k] for k, name in enumerate(names) if abs(own_entry[k] - 1) < MAX_LEAK
-    }
-    rows = {name: observed[name] for name in COMPONENTS if name in observed}
+    rows = {}
+    for name in COMPONENTS:
+        k = names.index(name) if name in names else None
+        if k is not None and abs(own_entry[k] - 1) < MAX_LEAK:
+            rows[name] = inverse[k]
     if not rows:
         raise ElasticError(
             f"layout {layout.name!r} tells none of {', '.join(COMPONENTS)} from the other modes; "
@@ -174,7 +177,11 @@ def _inverse_rows(
     return rows
 
 
-def _true_stress_in_plane(body: Body, x: Array, parts: Array) -> dict[str, Array]:
+def _true_stress_in_plane(
+    body: Body,
+    x: Array,
+    parts: Array,
+) -> dict[str, Array]:
     """Return, by component, the stress (2,) at the cube's centre under unit line loads.
 
     Args:
@@ -186,14 +193,21 @@ def _true_stress_in_plane(body: Body, x: Array, parts: Array) -> dict[str, Array
     if body.plane == "stress":
         # Plane stress is plane strain of a material with this ratio.
         poisson = body.poisson / (1 + body.poisson)
-    modes = line_load(Layer(body.height, poisson), x, _depth(body), body.side / 2)
+    layer = Layer(body.height, poisson)
+    modes = line_load(layer, x, _depth(body), body.side / 2)
     return {name: parts @ modes[PLANE.names.index(name)] for name in COMPONENTS}
 
 
-def _true_stress_in_space(body: Body, width: float, offset: float) -> dict[str, Array]:
+def _true_stress_in_space(
+    body: Body,
+    width: float,
+    offset: float,
+) -> dict[str, Array]:
     """Return, by component, the stress (3,) at the cube's centre under a ball's unit force."""
-    kernels = Kernels(Layer(body.height, body.poisson), _depth(body), body.side / 2)
-    field = kernels.field(np.array([[-offset, 0.0]]), width / 2)[0]
+    layer = Layer(body.height, body.poisson)
+    kernels = Kernels(layer, _depth(body), body.side / 2)
+    from_load = np.array([[-offset, 0.0]])
+    field = kernels.field(from_load, width / 2)[0]
     return {name: field[FIELD.index(name)] for name in COMPONENTS}
 
 
@@ -213,7 +227,8 @@ def hertz_points(radius: float, dim: int) -> tuple[Array, Array]:
         Points (n, dim) in m from the contact's centre, and the share (n,) of the force on each.
     """
     line = (2 * np.arange(POINTS_ACROSS) + 1) / POINTS_ACROSS - 1
-    points = np.stack(np.meshgrid(*[line] * dim), axis=-1).reshape(-1, dim)
+    grid = np.meshgrid(*[line] * dim)
+    points = np.stack(grid, axis=-1).reshape(-1, dim)
     square = 1 - (points**2).sum(axis=1)
     is_inside = square > 0
     pressure = np.sqrt(square[is_inside])

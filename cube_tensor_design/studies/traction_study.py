@@ -14,11 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cube_tensor_driver.config.calibration import find_calibration, read_calibration
+from cube_tensor_driver.config.calibration import (
+    find_calibration,
+    read_calibration,
+)
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.arrays import Array, PadMasks
 from cube_tensor_driver.core.calibration import Calibration
-from cube_tensor_driver.core.defaults import CONTACT_PRESSURE, FREQUENCY_NOISE, POISSONS_RATIO
+from cube_tensor_driver.core.defaults import (
+    CONTACT_PRESSURE,
+    FREQUENCY_NOISE,
+    POISSONS_RATIO,
+)
 from cube_tensor_driver.core.modes import to_matrix
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -35,7 +42,14 @@ from cube_tensor_driver.touch.pad_noise import noise_of_all_pads
 from cube_tensor_driver.touch.surface import Surface
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
-from .field_study import FORCE, FRICTION, WINDOW, FieldExample, draw_force, flat_skin
+from .field_study import (
+    FORCE,
+    FRICTION,
+    WINDOW,
+    FieldExample,
+    draw_force,
+    flat_skin,
+)
 
 CUBES = ("24-pad", "planar", "planar, crosswise")
 """Kinds of cubes. Crosswise, every second planar cube is turned by a quarter about z."""
@@ -46,12 +60,12 @@ SHAPES = ("ball", "flat punch", "rounded punch", "two balls")
 ROUNDED_RADII = np.linspace(0.6, 1.0, 8)
 """Relative radii of the flat punches whose mean is a rounded punch."""
 GAIN_ERROR = 0.01
-"""Standard deviation of a pad's true gain relative to its calibration. The inverse assumes the
-value in pad_noise.py."""
+"""Standard deviation of the error of a pad's calibrated gain, relative to the gain. The inverse
+assumes the value in pad_noise.py."""
 CASES = 16
 """Number of loads for each setting and width."""
 SKIN_SIDE = 0.072
-"""Smallest side of the skin, in m; it is at least five pitches."""
+"""Side of the skin, in m. It is five pitches if that is more."""
 ORDER = 14
 """Order of the quadrature of a ball. The stress at 4 mm below a contact of 20 mm is then within
 1e-3 of its peak."""
@@ -130,7 +144,12 @@ class Bench:
         window: (M,) which points of the inverse are in the middle of the skin.
     """
 
-    def __init__(self, setting: Setting, side: int = 4, influence: Influence | None = None) -> None:
+    def __init__(
+        self,
+        setting: Setting,
+        side: int = 4,
+        influence: Influence | None = None,
+    ) -> None:
         """Set up the inverse.
 
         Args:
@@ -144,6 +163,7 @@ class Bench:
         calibrations = [self.calibration] * len(self.poses.position)
         self._pipeline = Pipeline(calibrations)
 
+        # What the inverse assumes: noise of the pads, their response, and the layer.
         by_pad = noise_of_all_pads(calibrations)
         reading = None if influence is None else model_pads(influence, calibrations)
         known_layer = Layer(setting.known_thickness)
@@ -151,33 +171,55 @@ class Bench:
             self.poses, by_pad, known_layer, setting.depth, side, reading
         )
         self.surface = Surface(self.poses, setting.depth, side)
-        self.window = np.abs(self.inverse.points[:, :2]).max(axis=1) < WINDOW / 2
+        points = np.abs(self.inverse.points[:, :2])
+        from_centre = points.max(axis=1)
+        self.window = from_centre < WINDOW / 2
 
         self._true_layer: Kernels | None = None
         if np.isfinite(setting.thickness):
             layer = Layer(setting.thickness, setting.poisson)
             self._true_layer = Kernels(layer, setting.depth, 1.0)
 
-    def truth(self, points: Array, width: float, force: Array, centre: Array) -> Array:
+    def truth(
+        self,
+        points: Array,
+        width: float,
+        force: Array,
+        centre: Array,
+    ) -> Array:
         """Return stress and gradient (N, 24), in Pa and Pa/m, below points (N, 2)."""
+        # A table of the layer under a ball's unit forces, or the closed form of a half space.
         if self._true_layer is not None:
-            return np.asarray(self._true_layer.field(points - centre, width / 2) @ force)
+            unit_fields = self._true_layer.field(points - centre, width / 2)
+            return np.asarray(unit_fields @ force)
         depth = self.setting.depth + self.setting.depth_error
         below = np.column_stack([points, np.full(len(points), -depth)])
         sources, forces = self.point_forces(width, force, centre)
         stress, gradient = contact.field(below, sources, forces, self.setting.poisson)
-        return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
+        slopes = gradient.reshape(len(points), 18)
+        return np.concatenate([stress, slopes], axis=1)
 
-    def surface_truth(self, width: float, force: Array, centre: Array) -> Array:
+    def surface_truth(
+        self,
+        width: float,
+        force: Array,
+        centre: Array,
+    ) -> Array:
         """Return the pressure (M,) on the surface, in Pa, as the mean over each point's square."""
         inverse = self.inverse
         sources, forces = self.point_forces(width, force, centre, SURFACE_ORDER)
-        nearest = cKDTree(inverse.points[:, :2]).query(sources[:, :2])[1]
+        # Each point force counts for the square in which it lies.
+        tree = cKDTree(inverse.points[:, :2])
+        nearest = tree.query(sources[:, :2])[1]
         total = np.bincount(nearest, -forces[:, 2], len(inverse.points))
         return np.asarray(total / inverse.area)
 
     def point_forces(
-        self, width: float, force: Array, centre: Array, order: int = ORDER
+        self,
+        width: float,
+        force: Array,
+        centre: Array,
+        order: int = ORDER,
     ) -> tuple[Array, Array]:
         """Return the load as point forces: positions (S, 3) in m and forces (S, 3) in N."""
         shape, radius = self.setting.shape, width / 2
@@ -196,14 +238,24 @@ class Bench:
         return np.concatenate(sources), np.concatenate(forces)
 
     def values(
-        self, width: float, force: Array, centre: Array, random: np.random.Generator
+        self,
+        width: float,
+        force: Array,
+        centre: Array,
+        random: np.random.Generator,
     ) -> Array:
         """Return the components (cubes, 15) that the pipeline computes under a load."""
         return self.measured(self.pads_under(width, force, centre), random)
 
-    def pads_under(self, width: float, force: Array, centre: Array) -> Array:
+    def pads_under(
+        self,
+        width: float,
+        force: Array,
+        centre: Array,
+    ) -> Array:
         """Return the pad stresses (cubes, P), in Pa, under a load."""
-        return self.pads_in(self.truth(self.poses.position[:, :2], width, force, centre))
+        cubes = self.poses.position[:, :2]
+        return self.pads_in(self.truth(cubes, width, force, centre))
 
     def pads_in(self, field: Array) -> Array:
         """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 24) in the skin's frame."""
@@ -211,13 +263,17 @@ class Bench:
         # Tensors of the skin's frame become those of each cube's frame.
         stress = to_matrix(field[:, :6])
         stress = np.einsum("nai,nbj,nab->nij", rotation, rotation, stress)
-        gradient = to_matrix(field[:, 6:].reshape(-1, 6, 3).swapaxes(1, 2))  # (n, axis, 3, 3)
+        slopes = field[:, 6:].reshape(-1, 6, 3)
+        gradient = to_matrix(slopes.swapaxes(1, 2))  # (n, axis, 3, 3)
         gradient = np.einsum("nai,nbj,nck,ncab->nijk", rotation, rotation, rotation, gradient)
         state = calibration.modes.state(stress, calibration.half_side * gradient)
         return np.asarray(state @ calibration.response.T)
 
     def measured(
-        self, pads: Array, random: np.random.Generator, left_out: PadMasks | None = None
+        self,
+        pads: Array,
+        random: np.random.Generator,
+        left_out: PadMasks | None = None,
     ) -> Array:
         """Return the components (cubes, 15) that the pipeline computes of pad stresses.
 
@@ -227,7 +283,8 @@ class Bench:
             left_out: (cubes,) one bit for each pad that is not used.
         """
         calibration = self.calibration
-        pads = pads * (1 + self.setting.gain_error * random.standard_normal(pads.shape))
+        gain = 1 + self.setting.gain_error * random.standard_normal(pads.shape)
+        pads = pads * gain
         rest = calibration.rest_frequency
         frequency = pad_frequency(pads, rest, calibration.beta, calibration.modulus)
         frequency *= 1 + FREQUENCY_NOISE * random.standard_normal(frequency.shape)
@@ -240,25 +297,32 @@ class Bench:
         force = draw_force(random)
         return force, self.setting.pitch * (random.random(2) - 0.5)
 
-    def errors(self, width: float, cases: int = CASES, seed: int = 8) -> Errors:
+    def errors(
+        self,
+        width: float,
+        cases: int = CASES,
+        seed: int = 8,
+    ) -> Errors:
         """Return the errors for random loads of this width; a seed gives the same loads."""
         random = np.random.default_rng(seed)
         results = [self._case_errors(width, random) for _ in range(cases)]
         square, force, position, ratio, field_squares, found = zip(*results, strict=True)
-        field_ratio = [np.sqrt(np.concatenate(z).mean()) for z in zip(*field_squares, strict=True)]
+        # At the cubes' depth and on the surface, over the points of all loads.
+        below, surface = (np.concatenate(one) for one in zip(*field_squares, strict=True))
         return Errors(
             width=width,
             field=np.sqrt(np.mean(square, axis=0)),
             force=np.sqrt(np.mean(np.square(force), axis=0)),
             position=np.percentile(position, 95, axis=0),
             ratio=np.sqrt(np.nanmean(np.square(ratio), axis=0)),
-            field_ratio=np.array(field_ratio),
+            field_ratio=np.sqrt([below.mean(), surface.mean()]),
             found=float(np.mean(found)),
         )
 
     def _case_errors(self, width: float, random: np.random.Generator) -> _CaseErrors:
         """Return the errors for one random load."""
         force, centre = self.load(random)
+        # Near the edge of the skin there are cubes on one side only, so it does not count.
         points = self.inverse.points[self.window, :2]
         true = -self.truth(points, width, force, centre)[:, 2]
         values = self.values(width, force, centre, random)
@@ -271,7 +335,8 @@ class Bench:
             self.inverse.field(values).depth_pressure[self.window],
             tracker.field.depth_pressure[self.window],
         ]
-        square = [((field - true) ** 2).mean() / (true**2).mean() for field in fields]
+        size = (true**2).mean()
+        square = [((field - true) ** 2).mean() / size for field in fields]
 
         predicted = tracker.deviation(values)
         on_surface = self.surface_truth(width, force, centre)
@@ -327,6 +392,8 @@ def _sum_contacts(contacts: list[Any]) -> _TotalContact:
     position_deviations = np.array([one.position_uncertainty for one in contacts])
     total = float(forces.sum())
     centre = forces @ positions / total
+    # The uncertain force of a contact moves the centre along the line to the contact; the two
+    # coordinates share that deviation.
     lever = np.linalg.norm(positions - centre, axis=1) / np.sqrt(2)
     moment_variance = (forces * position_deviations) ** 2 + (lever * force_deviations) ** 2
     deviation = float(np.sqrt(moment_variance.sum())) / total
@@ -337,10 +404,11 @@ def _place_cubes(setting: Setting) -> CubePoses:
     skin = flat_skin(setting.pitch, max(SKIN_SIDE, 5 * setting.pitch))
     if setting.cubes != "planar, crosswise":
         return skin
-    cell = np.round(skin.position[:, :2] / setting.pitch).astype(int)
-    is_turned = cell.sum(axis=1) % 2 == 1
+    cell = np.round(skin.position[:, :2] / setting.pitch)
+    is_turned = cell.astype(int).sum(axis=1) % 2 == 1
     quarter = rotation_from_rpy(0, 0, np.pi / 2)
-    return skin._replace(rotation=np.where(is_turned[:, None, None], quarter, np.eye(3)))
+    rotation = np.where(is_turned[:, None, None], quarter, np.eye(3))
+    return skin._replace(rotation=rotation)
 
 
 def _shipped_calibration(setting: Setting) -> Calibration:
@@ -355,7 +423,14 @@ def traction_example() -> FieldExample:
     The pressure at the cubes' depth is the true one, that of each of `METHODS`, and the "standard
     deviation" that the inverse predicts, in Pa.
     """
-    bench = Bench(Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3), side=10)
+    bench = Bench(
+        Setting(
+            cubes=CUBES[2],
+            pitch=10e-3,
+            depth=4e-3,
+        ),
+        side=10,
+    )
     centre = bench.setting.pitch * np.array([0.35, 0.25])
     width = 6e-3
     force = FORCE * np.array([FRICTION, 0.0, -1.0])
@@ -373,7 +448,12 @@ def traction_example() -> FieldExample:
     return FieldExample(points, pressure, bench.poses.position, centre)
 
 
-def flat_punch(radius: float, force: Array, centre: Array, order: int) -> tuple[Array, Array]:
+def flat_punch(
+    radius: float,
+    force: Array,
+    centre: Array,
+    order: int,
+) -> tuple[Array, Array]:
     """Return the load of a rigid flat punch as point forces.
 
     The traction is F / (2 pi a sqrt(a^2 - r^2)) (Johnson, Contact Mechanics, 3.8).
@@ -392,7 +472,9 @@ def flat_punch(radius: float, force: Array, centre: Array, order: int) -> tuple[
     angle = 2 * np.pi * np.arange(count) / count
     x = np.outer(r, np.cos(angle)).ravel()
     y = np.outer(r, np.sin(angle)).ravel()
-    sources = np.stack([centre[0] + x, centre[1] + y, 0 * x], axis=1)
+    sources = np.zeros((len(x), 3))
+    sources[:, 0] = centre[0] + x
+    sources[:, 1] = centre[1] + y
     shares = np.repeat(weight / 2 / count, count)
     return sources, shares[:, None] * np.asarray(force)
 
@@ -418,15 +500,22 @@ def traction_study(
 
 
 MAIN = tuple(Setting(cubes=cubes) for cubes in CUBES)
-"""Skins with a pitch of 8 mm and a depth of 5 mm in a half space that is one."""
+"""Skins with a pitch of 8 mm and a depth of 5 mm. The elastomer is a half space, as the inverse
+assumes."""
 PITCHES = tuple(
-    Setting(cubes=cubes, pitch=pitch, depth=4e-3) for pitch in (12e-3, 24e-3) for cubes in CUBES[:2]
+    Setting(
+        cubes=cubes,
+        pitch=pitch,
+        depth=4e-3,
+    )
+    for pitch in (12e-3, 24e-3)
+    for cubes in CUBES[:2]
 )
-"""Skins with larger pitches."""
+"""Skins with pitches of 12 and 24 mm and a depth of 4 mm."""
 SHAPED = tuple(
     replace(setting, shape=shape) for shape in SHAPES[1:] for setting in (*MAIN[:2], *PITCHES)
 )
-"""Skins under loads that are no balls."""
+"""Skins with pitches of 8, 12 and 24 mm under loads that are not balls."""
 WRONG = {
     "everything as known": Setting(),
     "5 % gain spread": Setting(gain_error=0.05),
@@ -436,4 +525,5 @@ WRONG = {
     "layer of 11 mm, known": Setting(thickness=11e-3, known_thickness=11e-3),
     "flat punch instead of a ball": Setting(shape="flat punch"),
 }
-"""Skins about which the inverse knows something wrong."""
+"""Skins about which the inverse assumes something wrong, by what is wrong. The first one has no
+wrong assumption, for comparison."""

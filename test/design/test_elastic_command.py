@@ -440,14 +440,11 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
     error = {name: np.tile([[[0.5], [0.1]]], (2, 1, 15)) for name in LAYOUTS}
     error["quad"][..., 1] = np.nan
     error["cube"][1] = 0.3
-    shape = (2, 2, 3, 15)
     found = LayoutStudy(
         np.array([2e-3, 1e-3]),
         np.array([2e-3, 1e-2]),
         np.arange(3.0),
         5e-3,
-        np.ones(shape),
-        dict.fromkeys(LAYOUTS),
         error,
     )
     monkeypatch.setattr(

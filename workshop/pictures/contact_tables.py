@@ -133,7 +133,7 @@ def _method_rows(results: Mapping[str, Sequence[Errors]]) -> list[list[Any]]:
             rows.append(
                 [
                     name,
-                    1e3 * one.width,
+                    round(1e3 * one.width),
                     one.field.round(3).tolist(),
                     (100 * one.force).round(1).tolist(),
                     (1e3 * one.position).round(2).tolist(),
@@ -147,8 +147,8 @@ def _method_rows(results: Mapping[str, Sequence[Errors]]) -> list[list[Any]]:
 def _shape_rows(results: Mapping[Setting, Sequence[Errors]]) -> list[list[Any]]:
     """Return one row for each skin and width, with the errors of the contacts for each shape."""
     by_skin: dict[str, dict[str, Sequence[Errors]]] = {}
-    for setting, all_widths in results.items():
-        by_skin.setdefault(_name(setting), {})[setting.shape] = all_widths
+    for setting in sorted(results, key=lambda one: (one.cubes, one.pitch)):
+        by_skin.setdefault(_name(setting), {})[setting.shape] = results[setting]
     rows = []
     for name, by_shape in by_skin.items():
         for k, width in enumerate(WIDTHS):
@@ -157,8 +157,13 @@ def _shape_rows(results: Mapping[Setting, Sequence[Errors]]) -> list[list[Any]]:
             )
             others = round((1 - balls.found) * FEW_LOADS)
             counted = f"{others} of {FEW_LOADS}"
-            cells = [_contact_cell(rounded), _contact_cell(balls), counted, _contact_cell(flat)]
-            rows.append([name, 1e3 * width, *cells])
+            cells = [
+                _contact_cell(rounded),
+                _contact_cell(balls),
+                counted,
+                _contact_cell(flat),
+            ]
+            rows.append([name, round(1e3 * width), *cells])
     return rows
 
 
@@ -170,12 +175,19 @@ def _contact_cell(one: Errors) -> list[float]:
     return [round(float(value), count) for value, count in digits]
 
 
-def _form_rows(results: Mapping[tuple[Setting, str], Sequence[Errors]]) -> list[list[Any]]:
+def _form_rows(
+    results: Mapping[tuple[Setting, str], Sequence[Errors]],
+) -> list[list[Any]]:
     rows = []
     for setting in dict.fromkeys(setting for setting, _ in results):
         for both in zip(*(results[setting, form] for form in FORMS), strict=True):
             cells = (
-                (one.field[2], 100 * one.force[1], 1e3 * one.position[1], *one.ratio[1])
+                (
+                    one.field[2],
+                    100 * one.force[1],
+                    1e3 * one.position[1],
+                    *one.ratio[1],
+                )
                 for one in both
             )
             columns = zip(*cells, strict=True)
@@ -183,5 +195,5 @@ def _form_rows(results: Mapping[tuple[Setting, str], Sequence[Errors]]) -> list[
                 [round(float(value), digits) for value in column]
                 for column, digits in zip(columns, (3, 1, 2, 2, 2), strict=True)
             ]
-            rows.append([setting.cubes, 1e3 * both[0].width, *rounded])
+            rows.append([setting.cubes, round(1e3 * both[0].width), *rounded])
     return rows

@@ -12,70 +12,101 @@ from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import SURFACE_DEPTH
 from cube_tensor_driver.views.figures.style import print_style
 
-PITCH = 12e-3
-"""Of the cubes that `./cube config grid` writes, m."""
-FOAM = 0.2e-3
-"""Thickness of the foam in the drawing, m."""
+PITCH_MM = 12.0
+"""Distance between the cubes that `./cube config grid` writes, in mm."""
+FOAM_MM = 0.2
+"""Thickness of the foam, in mm."""
+DEPTH_MM = 1e3 * SURFACE_DEPTH
+"""Depth of the cubes' centres below the surface, in mm."""
+MARGIN_MM = 8.0
+"""Width of the skin beside the two cubes, in mm."""
+CENTRE_LINE: dict[str, Any] = {"color": "0.6", "lw": 0.6, "ls": ":"}
+"""Style of a line through the centre of a cube."""
 
 
 @print_style()
 def draw_cube(calibration: Calibration) -> Figure:
-    """Left: a section of the skin through two cubes. Right: one cube with its pads."""
+    """Draw a section of the skin through two cubes, and beside it one cube with its pads."""
     figure = Figure(figsize=(9, 4))
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    half, depth = 1e3 * calibration.half_side, 1e3 * SURFACE_DEPTH
-    pitch, thickness = 1e3 * PITCH, 1e3 * FOAM
-
-    bottom = -2 * depth
-    left.add_patch(Rectangle((-8, bottom), 2 * 8 + pitch, depth - bottom, fc="0.93", ec="none"))
-    left.add_patch(Rectangle((-8, bottom - 1), 2 * 8 + pitch, 1, fc="0.6", ec="none"))
-    left.text(pitch / 2, bottom - 0.5, "ground, bonded", ha="center", va="center", fontsize=8)
-    left.text(pitch / 2, bottom + 1.5, "elastomer", ha="center", fontsize=8)
-    for x in (0.0, pitch):
-        _draw_cube(left, calibration, x, half, thickness)
-    _measure(left, (0, 5.0), (pitch, 5.0), f"pitch {pitch:g}")
-    _measure(left, (-4, 0), (-4, depth), f"depth {depth:g}")
-    left.axhline(depth, color="black", lw=1)
-    left.axhline(0, color="0.6", lw=0.6, ls=":")
-    left.set(xlim=(-8, pitch + 8), ylim=(bottom - 1, 6.5), title="section of the skin / mm")
-
-    _draw_cube(right, calibration, 0.0, half, thickness)
-    layout = calibration.layout
-    size = half * layout.pad_size
-    for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):
-        shown = half * centre + 0.85 * normal
-        right.text(shown[0], shown[2], name, ha="center", va="center", fontsize=7)
-    right.axhline(0, color="0.6", lw=0.6, ls=":")
-    right.axvline(0, color="0.6", lw=0.6, ls=":")
-    _measure(right, (-half, -3.6), (half, -3.6), f"$2\\,d_0$ = {2 * half:g}")
-    centre = half * abs(layout.positions[0, 0])
-    _measure(right, (0, 1.2), (centre, 1.2), f"{centre:g}")
-    _measure(right, (centre - size / 2, 0.5), (centre + size / 2, 0.5), f"{size:g}")
-    for tip, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "z")):
-        start = np.array([-1.4, -1.4])
-        arrow = {"arrowstyle": "-|>", "color": "tab:blue", "shrinkA": 0, "shrinkB": 0}
-        right.annotate("", xy=start + tip, xytext=start, arrowprops=arrow)
-        right.text(*(start + 1.15 * np.array(tip)), f"${name}$", color="tab:blue", fontsize=8)
-    right.set(xlim=(-3.9, 3.9), ylim=(-4.4, 3.6), title="cube and pads / mm")
+    _draw_section(left, calibration)
+    _draw_pads(right, calibration)
     for axis in (left, right):
         axis.set_aspect("equal")
         axis.axis("off")
     return figure
 
 
-def _draw_cube(axis: Any, calibration: Calibration, x: float, half: float, foam: float) -> None:
-    """A cube at x and its pads; sizes in mm."""
+def _draw_section(axis: Any, calibration: Calibration) -> None:
+    """Draw ground, elastomer and two cubes, with pitch and depth."""
+    bottom = -2 * DEPTH_MM
+    width = PITCH_MM + 2 * MARGIN_MM
+    elastomer = Rectangle((-MARGIN_MM, bottom), width, DEPTH_MM - bottom, fc="0.93", ec="none")
+    axis.add_patch(elastomer)
+    axis.add_patch(Rectangle((-MARGIN_MM, bottom - 1), width, 1, fc="0.6", ec="none"))
+    centre = PITCH_MM / 2
+    axis.text(centre, bottom - 0.5, "ground, bonded", ha="center", va="center", fontsize=8)
+    axis.text(centre, bottom + 1.5, "elastomer", ha="center", fontsize=8)
+    for x in (0.0, PITCH_MM):
+        _draw_cube(axis, calibration, x)
+    _draw_dimension(axis, (0, 5.0), (PITCH_MM, 5.0), f"pitch {PITCH_MM:g}")
+    _draw_dimension(axis, (-4, 0), (-4, DEPTH_MM), f"depth {DEPTH_MM:g}")
+    axis.axhline(DEPTH_MM, color="black", lw=1)
+    axis.axhline(0, **CENTRE_LINE)
+    axis.set(
+        xlim=(-MARGIN_MM, PITCH_MM + MARGIN_MM),
+        ylim=(bottom - 1, 6.5),
+        title="section of the skin / mm",
+    )
+
+
+def _draw_pads(axis: Any, calibration: Calibration) -> None:
+    """Draw one cube with the names and the dimensions of its pads, and its frame."""
+    half = 1e3 * calibration.half_side
+    _draw_cube(axis, calibration, 0.0)
+    layout = calibration.layout
+    for name, position, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):
+        # The name stands outside of the pad.
+        x, _, z = half * position + 0.85 * normal
+        axis.text(x, z, name, ha="center", va="center", fontsize=7)
+    axis.axhline(0, **CENTRE_LINE)
+    axis.axvline(0, **CENTRE_LINE)
+
+    _draw_dimension(axis, (-half, -3.6), (half, -3.6), f"$2\\,d_0$ = {2 * half:g}")
+    centre = half * abs(layout.positions[0, 0])
+    size = half * layout.pad_size
+    _draw_dimension(axis, (0, 1.2), (centre, 1.2), f"{centre:g}")
+    _draw_dimension(axis, (centre - size / 2, 0.5), (centre + size / 2, 0.5), f"{size:g}")
+    origin = np.array([-1.4, -1.4])
+    style = {"arrowstyle": "-|>", "color": "tab:blue", "shrinkA": 0, "shrinkB": 0}
+    for name, direction in (("x", np.array([1.0, 0.0])), ("z", np.array([0.0, 1.0]))):
+        axis.annotate("", xy=origin + direction, xytext=origin, arrowprops=style)
+        label = origin + 1.15 * direction
+        axis.text(*label, f"${name}$", color="tab:blue", fontsize=8)
+    axis.set(xlim=(-3.9, 3.9), ylim=(-4.4, 3.6), title="cube and pads / mm")
+
+
+def _draw_cube(axis: Any, calibration: Calibration, x: float) -> None:
+    """Draw a cube with its centre at x, and its pads."""
+    half = 1e3 * calibration.half_side
     axis.add_patch(Rectangle((x - half, -half), 2 * half, 2 * half, fc="0.75", ec="black"))
     layout = calibration.layout
-    for centre, normal in zip(layout.positions, layout.normals, strict=True):
-        place, out = half * centre[[0, 2]], normal[[0, 2]]
-        size = np.where(out == 0, half * layout.pad_size, foam)
-        corner = place + foam / 2 * out - size / 2
+    centres = half * layout.positions[:, [0, 2]]
+    normals = layout.normals[:, [0, 2]]
+    for centre, normal in zip(centres, normals, strict=True):
+        size = np.where(normal == 0, half * layout.pad_size, FOAM_MM)
+        # The foam lies outside of the face.
+        corner = centre + FOAM_MM / 2 * normal - size / 2
         axis.add_patch(Rectangle((x + corner[0], corner[1]), *size, fc="tab:orange", ec="black"))
 
 
-def _measure(axis: Any, first: tuple[float, float], last: tuple[float, float], text: str) -> None:
-    """A dimension line with its text above it, or to its left."""
+def _draw_dimension(
+    axis: Any,
+    first: tuple[float, float],
+    last: tuple[float, float],
+    text: str,
+) -> None:
+    """Draw a dimension line with its text above it, or to its left if it is vertical."""
     arrow = {"arrowstyle": "<->", "color": "black", "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
     axis.annotate("", xy=last, xytext=first, arrowprops=arrow)
     x, y = np.add(first, last) / 2

@@ -15,12 +15,19 @@ from pathlib import Path
 import numpy as np
 
 from cube_tensor_design.figures.experiments import draw_prototype
-from cube_tensor_design.figures.field import draw_field_study, draw_methods, draw_traction
+from cube_tensor_design.figures.field import (
+    draw_field_study,
+    draw_methods,
+    draw_traction,
+)
 from cube_tensor_design.figures.pads_example import draw_pads, draw_sweep
 from cube_tensor_design.paper.experiments import experiments
 from cube_tensor_design.studies.field_study import field_example, field_study
 from cube_tensor_design.studies.pads_example import planar_calibration, sweep
-from cube_tensor_design.studies.pads_study import coarse_influence, layer_example
+from cube_tensor_design.studies.pads_study import (
+    coarse_influence,
+    layer_example,
+)
 from cube_tensor_design.studies.traction_study import traction_example
 from cube_tensor_driver.cli import ROOT
 from cube_tensor_driver.config.output_files import atomic_write
@@ -28,7 +35,11 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError, CubeError
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import (
+    Process,
+    SimulatedHubs,
+    skin_processes,
+)
 from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
 from cube_tensor_driver.views.figures.style import save
 
@@ -112,7 +123,10 @@ def make_pictures(folder: Path) -> None:
 
     save(draw_traction(traction_example()), folder / "traction.png")
     true_pads = coarse_influence()
-    save(draw_methods(layer_example(true_pads), "cubes as "), folder / "thin_layer.png")
+    save(
+        draw_methods(layer_example(true_pads), "cubes as "),
+        folder / "thin_layer.png",
+    )
     write_contact_tables(folder / "contacts.json", true_pads)
     written = ", ".join(sorted(path.name for path in folder.iterdir()))
     print(f"wrote {written} to {folder}")
@@ -132,7 +146,10 @@ def _draw_gripper(path: Path) -> None:
     pixels = load.picture(760, 900, lookat=np.array([0.0, 0.0, 0.1]), distance=0.25, azimuth=150.0)
     links = np.array([cube.link for cube in skin.cubes])
     fingers = {name: np.flatnonzero(links == name) for name in ("left", "right")}
-    save(draw_fingers(pixels, load.poses, load.touch.read(), fingers, load.depth), path)
+    save(
+        draw_fingers(pixels, load.poses, load.touch.read(), fingers, load.depth),
+        path,
+    )
 
 
 @contextmanager
@@ -160,9 +177,20 @@ def _photograph(children: Children, path: Path) -> None:
     """
     url = children.wait_for_line("view", "http://", START_S).split()[0]
     # In a process of its own, so that only a machine with Chromium needs selenium.
-    command = [sys.executable, "-m", "workshop.pictures.photograph", url, str(path.resolve())]
+    command = [
+        sys.executable,
+        "-m",
+        "workshop.pictures.photograph",
+        url,
+        str(path.resolve()),
+    ]
     done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=PHOTOGRAPH_S, check=False
+        command,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=PHOTOGRAPH_S,
+        check=False,
     )
     if done.returncode:
         raise CubeError(f"no picture of {url}:\n{done.stderr[-500:]}")

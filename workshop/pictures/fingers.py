@@ -1,13 +1,15 @@
-"""A robot in simulation, and beside it what the skin of its fingers feels."""
+"""A robot in simulation, and beside it pressure and shear on the skin of its fingers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array, Index
 from cube_tensor_driver.core.modes import STRESS
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
@@ -15,7 +17,11 @@ from cube_tensor_driver.touch.surface import Surface
 from cube_tensor_driver.views.figures.style import print_style
 
 ARROW_KPA = 2.0
-"""Shear of the arrow in the key."""
+"""Shear of the arrow in the key, in kPa."""
+ARROW_MM = 5.0
+"""Length of that arrow, in mm."""
+SURFACE_SIDE = 6
+"""Number of points along the side of a cube's patch."""
 
 
 @print_style()
@@ -23,54 +29,78 @@ def draw_fingers(
     pixels: NDArray[np.uint8],
     poses: CubePoses,
     rows: StressRows,
-    fingers: Mapping[str, NDArray[np.intp]],
+    fingers: Mapping[str, Index],
     depth: float,
 ) -> Figure:
-    """Pressure between the cubes of each finger, and the shear on each of them as arrows.
+    """Draw the pressure between the cubes of each finger, and the shear on each cube as arrows.
 
-    pixels: (height, width, 3) of the robot
-    poses: in a parent frame whose x is across a finger and whose z is up; depth: of the cubes, m
-    rows: one row per cube of the skin, in any order
-    fingers: name -> numbers of its cubes
+    Args:
+        pixels: (height, width, 3) picture of the robot.
+        poses: Poses in a parent frame whose x is across a finger and whose z is up.
+        rows: One row per cube of the skin, in any order.
+        fingers: Numbers of the cubes of each finger by its name.
+        depth: Depth of the cubes, in m.
     """
     values = np.full((len(poses.position), 15), np.nan)
     values[rows.cube] = np.concatenate([rows.stress, rows.gradient], axis=1)
-    maps = {}
+    parts, pressures, points = {}, {}, {}
     for name, cubes in fingers.items():
-        part = CubePoses(*(column[cubes] for column in poses))
-        surface = Surface(part, depth, side=6)
-        maps[name] = (part, surface.points, 1e-3 * surface.field(values[cubes]).pressure)
-    top = max(float(np.nanmax(pressure)) for *_, pressure in maps.values())
+        parts[name] = CubePoses(*(column[cubes] for column in poses))
+        surface = Surface(parts[name], depth, side=SURFACE_SIDE)
+        points[name] = surface.points
+        pressures[name] = 1e-3 * surface.field(values[cubes]).pressure
+    # One scale for all fingers.
+    top = max(float(np.nanmax(pressure)) for pressure in pressures.values())
 
     figure = Figure(figsize=(9, 4))
-    robot, *axes = figure.subplots(1, 1 + len(maps), width_ratios=[1.9] + [1.0] * len(maps))
+    robot, *axes = figure.subplots(1, 1 + len(fingers), width_ratios=[1.9] + [1.0] * len(fingers))
     robot.imshow(pixels)
     robot.set_axis_off()
-    for axis, (name, (part, points, pressure)) in zip(axes, maps.items(), strict=True):
-        order = np.lexsort((points[:, 0].round(6), points[:, 2].round(6)))
-        shape = (-1, len(np.unique(points[:, 0].round(6))))
-        x, z = (1e3 * points[order, k].reshape(shape) for k in (0, 2))
-        image = axis.pcolormesh(x, z, pressure[order].reshape(shape), vmin=0, vmax=top)
-        image.set_rasterized(True)
-        shear = 1e-3 * values[fingers[name]][:, [STRESS.index("zx"), STRESS.index("yz")]]
-        along = np.einsum("nik,nk->ni", part.rotation[:, :, :2], shear)
-        place = 1e3 * part.position
-        axis.plot(place[:, 0], place[:, 2], "s", ms=3, mfc="none", mec="0.7", lw=0.5)
-        arrows = axis.quiver(
-            place[:, 0],
-            place[:, 2],
-            along[:, 0],
-            along[:, 2],
-            color="black",
-            angles="xy",
-            scale_units="xy",
-            scale=ARROW_KPA / 5,
-            width=0.012,
-        )
-        label = f"shear {ARROW_KPA:g} kPa"
-        axis.quiverkey(arrows, 0.5, 1.04, ARROW_KPA, label, color="black", labelpos="N")
+    for axis, (name, cubes) in zip(axes, fingers.items(), strict=True):
+        image = _draw_pressure(axis, points[name], pressures[name], top)
+        _draw_shear(axis, parts[name], 1e-3 * values[cubes])
         axis.set(title=f"{name} finger\n\n", xlabel="$x$ / mm", aspect="equal")
         axis.grid(False)
     axes[0].set_ylabel("$z$ / mm")
     figure.colorbar(image, ax=axes, label="pressure in the cubes' plane / kPa")
     return figure
+
+
+def _draw_pressure(
+    axis: Any,
+    points: Array,
+    pressure: Array,
+    top: float,
+) -> Any:
+    """Draw the pressure (M,) in kPa at points (M, 3) in m, from 0 to `top` kPa."""
+    # The points are a grid in the order of the cubes' patches, not of rows.
+    across, up = points[:, 0].round(6), points[:, 2].round(6)
+    order = np.lexsort((across, up))
+    shape = (-1, len(np.unique(across)))
+    x = 1e3 * points[order, 0].reshape(shape)
+    z = 1e3 * points[order, 2].reshape(shape)
+    image = axis.pcolormesh(x, z, pressure[order].reshape(shape), vmin=0, vmax=top)
+    image.set_rasterized(True)
+    return image
+
+
+def _draw_shear(axis: Any, poses: CubePoses, kilopascal: Array) -> None:
+    """Draw the shear of cubes, whose components are (cubes, 15), as arrows."""
+    shear = kilopascal[:, [STRESS.index("zx"), STRESS.index("yz")]]
+    # The shear acts along the x and y axes of each cube.
+    along = np.einsum("nik,nk->ni", poses.rotation[:, :, :2], shear)
+    x, _, z = 1e3 * poses.position.T
+    axis.plot(x, z, "s", ms=3, mfc="none", mec="0.7", lw=0.5)
+    arrows = axis.quiver(
+        x,
+        z,
+        along[:, 0],
+        along[:, 2],
+        color="black",
+        angles="xy",
+        scale_units="xy",
+        scale=ARROW_KPA / ARROW_MM,
+        width=0.012,
+    )
+    label = f"shear {ARROW_KPA:g} kPa"
+    axis.quiverkey(arrows, 0.5, 1.04, ARROW_KPA, label, color="black", labelpos="N")
