@@ -8,8 +8,8 @@
         for rows in source:
             print(reconstruct(rows).stress[:, 2])
 
-Sources yield `FrequencyRows`, a `Reconstructor` makes `StressRows` of them, and publishers, bags
-and plots take those. docs/python.md goes on from here.
+Sources yield `FrequencyRows`, and a `Reconstructor` computes `StressRows` from them, which
+publishers, bags and plots take. docs/python.md continues from here.
 """
 
 from __future__ import annotations
@@ -42,11 +42,10 @@ __all__ = [
     "simulate",
 ]
 
-# The generated messages live in the install space, the sources may be elsewhere: one package sees
-# both.
+# ROS installs the generated messages as a package of the same name in another place. With this path,
+# both are one package.
 __path__ = pkgutil.extend_path(__path__, __name__)
 
-# Loaded when somebody asks for them: a node needs no bags, and a notebook no serial ports.
 _HOMES = {
     "CubeError": ".core.errors",
     "Forces": ".core.forces",
@@ -59,13 +58,19 @@ _HOMES = {
     "read_skin": ".config.skin",
     "simulate": ".simulation.source",
 }
+"""Module of each public name.
+
+It is imported when the name is first used, because a node needs no bags and a notebook no ports.
+"""
 
 
 def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOMES[name], __name__), name)
 
 
 def __dir__() -> list[str]:
+    """List the public names also before they are imported, for completion in a notebook."""
     return sorted([*globals(), *__all__])

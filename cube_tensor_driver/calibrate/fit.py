@@ -302,7 +302,7 @@ class _Model:
         return np.moveaxis(by_coefficient, 1, 2)
 
     def predict(self, theta: Array, design: Array) -> Array:
-        """Return the readings (N, P), in Pa."""
+        """Return the predicted readings (N, P), in Pa."""
         coefficients, gain = self.unpack(theta)
         readings: Array = gain * (design @ coefficients)
         return readings

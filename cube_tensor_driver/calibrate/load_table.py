@@ -90,7 +90,7 @@ def _check_columns(
     modes: Modes,
 ) -> None:
     allowed = {*layout.pads, *modes.names, *FORCE, TEMPERATURE}
-    # All columns are checked before any is used, so that one message names all of them.
+    # One message names all columns with the same mistake, so that few attempts are needed.
     mistakes = {
         "unknown": [name for name in header if name not in allowed],
         "twice": sorted({name for name in header if header.count(name) > 1}),

@@ -57,8 +57,8 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     """
     is_measured = np.isfinite(frequency)
     counts = is_measured.sum(axis=0)
-    # A count of at least 1 avoids a division by 0; pads without a sample are silent, see below.
     total = np.where(is_measured, frequency, 0).sum(axis=0)
+    # A count of at least 1 avoids a division by 0; pads without a sample are silent, see below.
     mean = total / np.maximum(counts, 1)
     deviation = np.where(is_measured, frequency - mean, 0)
 

@@ -230,7 +230,7 @@ class Explanation:
 
     @property
     def changes(self) -> float:
-        """Number of changes; a swap concerns two pads."""
+        """Number of changes: one for a rotation, and one for each swap of two pads."""
         return int(self.is_rotated) + len(self.swapped) / 2
 
 

@@ -152,7 +152,14 @@ def _read_reference(
     area: float | None,
     half_side: float,
 ) -> tuple[Times, Array]:
-    """Return times (N,), rising, in ns, and states (N, M), in Pa. BagError: see the caller."""
+    """Read the loads that a reference sensor measured.
+
+    Returns:
+        Times (N,), rising, in ns, and states (N, M), in Pa.
+
+    Raises:
+        BagError: There is no such topic, it has another type, or there are fewer than two messages.
+    """
     types = {one.msgtype for one in bag.connections if one.topic == topic}
     msgtype = types.pop() if types else None
     if msgtype == BATCH_TYPE:

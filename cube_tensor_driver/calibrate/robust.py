@@ -40,7 +40,7 @@ NORMAL_MEDIAN_RATIO = 1.4826
 
 
 def estimate_scatter(r: Array) -> float:
-    """Estimate the standard deviation of residuals from the median of |r|.
+    """Estimate the scatter (standard deviation) of residuals from the median of |r|.
 
     The result is never 0, so that perfect data have a scale, too.
     """
@@ -83,7 +83,10 @@ def null_space(jacobian: Array) -> Array:
 
 
 def find_undetermined(null: Array, count: int) -> Mask:
-    """Return which of the first parameters (count,) a direction of the null space changes."""
+    """Return which of the first parameters (count,) the readings do not determine.
+
+    These are the parameters that a direction of the null space changes.
+    """
     part = np.linalg.norm(null[:count], axis=1)
     undetermined: Mask = part > DIRECTION_TOLERANCE
     return undetermined

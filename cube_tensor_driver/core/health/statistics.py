@@ -82,7 +82,10 @@ class Window(NamedTuple):
 
 
 class WindowStatistics:
-    """Sums over the present window. Differences continue from window to window."""
+    """Sums over the present window.
+
+    The differences between rows continue from window to window.
+    """
 
     def __init__(self, rest_frequency: Array) -> None:
         """Start the first window.
@@ -312,7 +315,7 @@ class WindowStatistics:
         return ratio.astype(np.float32), weight.astype(np.float32)
 
     def _note_gaps(self, cubes: Cubes, interval: Times) -> None:
-        """Remember the longest of the intervals (B, N), in ns, forward or back."""
+        """Remember the longest gap among intervals (B, N), in ns; negative if time went back."""
         is_gap = (interval < 0) | (interval >= GAP_NS)
         gap = np.where(is_gap, interval, 0)
         if not gap.any():
