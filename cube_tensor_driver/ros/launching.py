@@ -14,7 +14,11 @@ from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import Action, LaunchContext, Substitution
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, SetLaunchConfiguration
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    SetLaunchConfiguration,
+)
 from launch.substitutions import LaunchConfiguration
 from launch_ros.utilities.namespace_utils import make_namespace_absolute, prefix_namespace
 
@@ -59,7 +63,11 @@ def declare_text(
     default: str = "",
 ) -> DeclareLaunchArgument:
     """Declare a launch argument that is a text."""
-    return DeclareLaunchArgument(name, default_value=default, description=description)
+    return DeclareLaunchArgument(
+        name,
+        default_value=default,
+        description=description,
+    )
 
 
 def declare_switch(

@@ -40,7 +40,11 @@ from ..msg import (
 from .callbacks import LOG_PERIOD_S
 
 
-def log_refused_message(node: Node, topic: str, error: CubeError) -> None:
+def log_refused_message(
+    node: Node,
+    topic: str,
+    error: CubeError,
+) -> None:
     """Log from time to time that messages of a topic are damaged or contradict themselves."""
     node.get_logger().error(f"{topic}: {error}", throttle_duration_sec=LOG_PERIOD_S)
 

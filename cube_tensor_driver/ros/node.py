@@ -15,11 +15,19 @@ from typing import Any, TypeVar
 
 import rclpy
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.clock import ROSClock
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
-from rclpy.lifecycle import LifecycleNode, LifecyclePublisher, TransitionCallbackReturn
+from rclpy.lifecycle import (
+    LifecycleNode,
+    LifecyclePublisher,
+    TransitionCallbackReturn,
+)
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -151,18 +159,35 @@ class CubeNode(LifecycleNode):
     def create_subscription(self, *arguments: Any, **options: Any) -> Any:
         message_type, topic, callback, *others = arguments
         callback = self.callback_errors.catch(callback)
-        return super().create_subscription(message_type, topic, callback, *others, **options)
+        return super().create_subscription(
+            message_type,
+            topic,
+            callback,
+            *others,
+            **options,
+        )
 
     def create_timer(self, *arguments: Any, **options: Any) -> Any:
         period, callback, *others = arguments
         callback = self.callback_errors.catch(callback)
-        return super().create_timer(period, callback, *others, **options)
+        return super().create_timer(
+            period,
+            callback,
+            *others,
+            **options,
+        )
 
     def create_service(self, *arguments: Any, **options: Any) -> Any:
         service_type, name, callback, *others = arguments
         callback = self.callback_errors.catch_in_service(callback)
         options.setdefault("qos_profile", SERVICES)
-        return super().create_service(service_type, name, callback, *others, **options)
+        return super().create_service(
+            service_type,
+            name,
+            callback,
+            *others,
+            **options,
+        )
 
     def _protect_lifecycle_services(self) -> None:
         """Catch errors of the lifecycle services, which rclpy makes without `create_service`.
@@ -203,7 +228,15 @@ class CubeNode(LifecycleNode):
     def _refusal(self, name: str, value: Any) -> str:
         """Return why a parameter cannot have a value now, or an empty text if it can."""
         # rclpy also asks about parameters of its own, such as use_sim_time.
-        known = self._parameters_by_name.get(name, Parameter(name, None, "", live=True))
+        known = self._parameters_by_name.get(
+            name,
+            Parameter(
+                name,
+                None,
+                "",
+                live=True,
+            ),
+        )
         if known.choices and value not in known.choices.split(", "):
             return f"parameter {name} is {value!r}, allowed: {known.choices}"
         if isinstance(value, float) and not math.isfinite(value):

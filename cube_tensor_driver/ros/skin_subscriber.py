@@ -59,8 +59,19 @@ class SkinSubscriber:
         catch = CallbackErrors(node).catch
         on_info, on_stress = catch(self._receive_info), catch(self._receive_stress)
         self._subscriptions = [
-            node.create_subscription(SkinInfo, "info", on_info, LATCHED),
-            node.create_subscription(SkinStress, "stress", on_stress, NEWEST, raw=True),
+            node.create_subscription(
+                SkinInfo,
+                "info",
+                on_info,
+                LATCHED,
+            ),
+            node.create_subscription(
+                SkinStress,
+                "stress",
+                on_stress,
+                NEWEST,
+                raw=True,
+            ),
         ]
 
     def close(self) -> None:

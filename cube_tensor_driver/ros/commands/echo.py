@@ -169,7 +169,12 @@ class _Listener:
             # Rows number the cubes; their names are in the info.
             self._needs_names = True
             info = f"{self._topic.rpartition('/')[0]}/info"
-            self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)
+            self._node.create_subscription(
+                SkinInfo,
+                info,
+                self._on_info,
+                LATCHED,
+            )
             self._add(SkinStress, self._on_stress, profile, raw=True)
         else:
             self._add(kind, self._on_message, profile)
@@ -187,7 +192,13 @@ class _Listener:
     def _add(
         self, kind: type, receive: Callable[[Any], None], profile: QoSProfile, raw: bool = False
     ) -> Any:
-        return self._node.create_subscription(kind, self._topic, receive, profile, raw=raw)
+        return self._node.create_subscription(
+            kind,
+            self._topic,
+            receive,
+            profile,
+            raw=raw,
+        )
 
     def _on_message(self, message: Any) -> None:
         self.waiting.append(message)
@@ -205,9 +216,19 @@ class _Listener:
         names = dict(enumerate(self._names or []))
         values = np.hstack([rows.stress, rows.gradient]).tolist()
         columns = (rows.stamp_ns, rows.cube, rows.residual, rows.status)
-        each_row = zip(*(column.tolist() for column in columns), values, strict=True)
+        each_row = zip(
+            *(column.tolist() for column in columns),
+            values,
+            strict=True,
+        )
         for stamp_ns, cube, residual, status, row in each_row:
-            yield StressReading(stamp_ns, names.get(cube, f"cube {cube}"), row, residual, status)
+            yield StressReading(
+                stamp_ns,
+                names.get(cube, f"cube {cube}"),
+                row,
+                residual,
+                status,
+            )
 
     def _read_tensor(self, message: StressTensorStamped) -> StressReading:
         tensor = message.tensor
@@ -215,4 +236,10 @@ class _Listener:
         stress = [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z]
         values = [*stress, *tensor.normal_gradient.tolist()]
         stamp_ns = to_ns(message.header.stamp)
-        return StressReading(stamp_ns, self._cube, values, tensor.residual, tensor.status)
+        return StressReading(
+            stamp_ns,
+            self._cube,
+            values,
+            tensor.residual,
+            tensor.status,
+        )

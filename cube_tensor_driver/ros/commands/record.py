@@ -139,7 +139,13 @@ class Recorder:
 
         kind = message_class(topic, type_name)
         self._subscriptions.append(
-            self._node.create_subscription(kind, topic, receive, profile, raw=True)
+            self._node.create_subscription(
+                kind,
+                topic,
+                receive,
+                profile,
+                raw=True,
+            )
         )
 
     def _write(self) -> None:

@@ -361,7 +361,11 @@ def replay(
         thread = threading.Thread(target=play, name="player")
         thread.start()
         try:
-            spin_until(executor, lambda: not thread.is_alive(), on_step=lambda: each(player))
+            spin_until(
+                executor,
+                lambda: not thread.is_alive(),
+                on_step=lambda: each(player),
+            )
         finally:
             player.end()
             thread.join()

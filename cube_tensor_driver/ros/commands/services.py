@@ -8,7 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rcl_interfaces.srv import (
+    GetParameters,
+    ListParameters,
+    SetParameters,
+)
 from rclpy.node import Node
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from std_srvs.srv import Trigger
@@ -81,10 +85,22 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
             name = service.rpartition("/")[0]
             if clear:
                 request = Trigger.Request()
-                answer = call_service(node, executor, Trigger, f"{name}/clear_tare", request)
+                answer = call_service(
+                    node,
+                    executor,
+                    Trigger,
+                    f"{name}/clear_tare",
+                    request,
+                )
             else:
                 request = Tare.Request(cubes=list(cubes))
-                answer = call_service(node, executor, Tare, service, request)
+                answer = call_service(
+                    node,
+                    executor,
+                    Tare,
+                    service,
+                    request,
+                )
             answers.append(TareAnswer(name, bool(answer.success), answer.message))
         return answers
 
@@ -178,9 +194,20 @@ class _NodeParameters:
         if not result.successful:
             raise ConfigError(f"{refusal}: {result.reason}")
 
-    def _call(self, service_type: type, service: str, request: Any) -> Any:
+    def _call(
+        self,
+        service_type: type,
+        service: str,
+        request: Any,
+    ) -> Any:
         name = f"{self._name}/{service}"
-        return call_service(self._node, self._executor, service_type, name, request)
+        return call_service(
+            self._node,
+            self._executor,
+            service_type,
+            name,
+            request,
+        )
 
 
 def _find_nodes(

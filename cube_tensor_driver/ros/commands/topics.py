@@ -120,4 +120,10 @@ def _subscribe(node: Node, topic: ListedTopic) -> Any:
 
     offers = node.get_publishers_info_by_topic(topic.listened)
     profile = offered_profile(offers, QUEUE_DEPTH)
-    return node.create_subscription(kind, topic.listened, receive, profile, raw=True)
+    return node.create_subscription(
+        kind,
+        topic.listened,
+        receive,
+        profile,
+        raw=True,
+    )

@@ -69,4 +69,10 @@ def _link_status(report: LinkReport) -> DiagnosticStatus:
         levels.append(DiagnosticStatus.WARN)
     uid = "" if report.hub_uid is None else f"{report.hub_uid:#x}"
     text = "; ".join(report.notes) or report.state.value
-    return make_status(f"link {report.name}", uid, max(levels), text, report.values)
+    return make_status(
+        f"link {report.name}",
+        uid,
+        max(levels),
+        text,
+        report.values,
+    )

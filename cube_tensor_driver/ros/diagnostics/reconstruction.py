@@ -105,7 +105,13 @@ class ReconstructionDiagnostics:
             )
         has_problem = bool(self.refused_messages) or lost > 0
         level = DiagnosticStatus.WARN if has_problem else DiagnosticStatus.OK
-        rows = make_status("rows", self._skin.name, level, "; ".join(texts), values)
+        rows = make_status(
+            "rows",
+            self._skin.name,
+            level,
+            "; ".join(texts),
+            values,
+        )
         return [rows, *cubes], changes
 
 
@@ -152,7 +158,13 @@ class CubeHealth:
             hardware_id = f"{uid:#x}" if uid else ""
             values = {"rows since the last": int(rows[number])}
             statuses.append(
-                make_status(f"cube {cube.name}", hardware_id, bytes([level]), text, values)
+                make_status(
+                    f"cube {cube.name}",
+                    hardware_id,
+                    bytes([level]),
+                    text,
+                    values,
+                )
             )
         self._reported = words
         return statuses, changes
@@ -196,7 +208,11 @@ class CubeHealth:
         if not len(cubes):
             return {}
         health = self._health
-        newest = FrequencyRows.of(cubes, health.last[cubes], temperature=health.temperature[cubes])
+        newest = FrequencyRows.of(
+            cubes,
+            health.last[cubes],
+            temperature=health.temperature[cubes],
+        )
         is_suspect = self._pipeline.suspects(newest, health.mask[cubes])
         names = {}
         for cube, suspects in zip(cubes.tolist(), is_suspect, strict=True):

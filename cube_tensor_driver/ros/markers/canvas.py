@@ -24,6 +24,7 @@ from .legend import (
     legend_markers,
 )
 from .serialised import (
+    WHITE,
     Colour,
     SerialisedMarkers,
     allocate,
@@ -237,19 +238,22 @@ class Canvas:
         return markers
 
     def _make_lines(self, frame_id: str, crosses: bool) -> list[Marker]:
-        """Return arrows of three lines, fault crosses of two, and principal crosses of three."""
+        """Return the markers of arrows and of crosses over faults; principal ones if `crosses`."""
+        # Name, number of points of a cube, and colour; None: each point has its own.
+        kinds: list[tuple[str, int, Colour | None]] = [
+            ("traction", 6, TRACTION_COLOUR),
+            ("gradient", 6, GRADIENT_COLOUR),
+            ("faults", 4, None),
+        ]
+        if crosses:
+            kinds.append(("crosses", 6, None))
         n_cubes = len(self._poses.position)
-        traction = make_marker(frame_id, "traction", Marker.LINE_LIST, TRACTION_COLOUR)
-        gradient = make_marker(frame_id, "gradient", Marker.LINE_LIST, GRADIENT_COLOUR)
-        faults = make_marker(frame_id, "faults", Marker.LINE_LIST)
-        principal = make_marker(frame_id, "crosses", Marker.LINE_LIST)
-        allocate(traction, 6 * n_cubes, with_colours=False)
-        allocate(gradient, 6 * n_cubes, with_colours=False)
-        allocate(faults, 4 * n_cubes, with_colours=True)
-        allocate(principal, 6 * n_cubes, with_colours=True)
-        markers = [traction, gradient, faults, *([principal] if crosses else [])]
-        for marker in markers:
+        markers = []
+        for name, n_points, colour in kinds:
+            marker = make_marker(frame_id, name, Marker.LINE_LIST, colour or WHITE)
             marker.scale.x = LINE_WIDTH * self._pitch
+            allocate(marker, n_points * n_cubes, with_colours=colour is None)
+            markers.append(marker)
         return markers
 
 
@@ -270,13 +274,23 @@ def _to_array(vector: Point | Vector3) -> Array:
 
 def _make_contacts(frame_id: str, pitch: float) -> list[Marker]:
     """Return rings and texts for the contacts of a skin with this pitch, in m."""
-    rings = make_marker(frame_id, "contacts", Marker.LINE_LIST, CONTACT_COLOUR)
+    rings = make_marker(
+        frame_id,
+        "contacts",
+        Marker.LINE_LIST,
+        CONTACT_COLOUR,
+    )
     rings.scale.x = RING_WIDTH * pitch
     allocate(rings, 2 * MAX_CONTACTS * RING_CORNERS, with_colours=False)
     markers = [rings]
     for number in range(MAX_CONTACTS):
         height, placeholder = FORCE_TEXT_HEIGHT * pitch, _force_text(0.0, 0.0)
-        text = make_text(frame_id, f"contact {number}", height, placeholder)
+        text = make_text(
+            frame_id,
+            f"contact {number}",
+            height,
+            placeholder,
+        )
         text.color.r, text.color.g, text.color.b = CONTACT_COLOUR
         markers.append(text)
     return markers

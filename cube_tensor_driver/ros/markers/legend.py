@@ -56,8 +56,20 @@ class ArrowScale(NamedTuple):
 
 
 SCALES = (
-    ArrowScale("traction", "kPa", 1e3, TRACTION_LENGTH, TRACTION_COLOUR),
-    ArrowScale("gradient", "kPa/mm", 1e6, GRADIENT_LENGTH, GRADIENT_COLOUR),
+    ArrowScale(
+        "traction",
+        "kPa",
+        1e3,
+        TRACTION_LENGTH,
+        TRACTION_COLOUR,
+    ),
+    ArrowScale(
+        "gradient",
+        "kPa/mm",
+        1e6,
+        GRADIENT_LENGTH,
+        GRADIENT_COLOUR,
+    ),
 )
 
 TITLE_BYTES = 128
@@ -121,7 +133,13 @@ class LegendPlace(NamedTuple):
         # A legend as narrow as a single cube could not be read.
         width = max(high[0] - low[0], 4 * pitch)
         centre_x = float(low[0] + high[0]) / 2
-        return cls(pitch, float(width), centre_x, low[1] - 1.1 * pitch, low[2])
+        return cls(
+            pitch,
+            float(width),
+            centre_x,
+            low[1] - 1.1 * pitch,
+            low[2],
+        )
 
     def point(self, across: float, line: float) -> Array:
         """Return a point (3,).
@@ -181,7 +199,11 @@ class Legend:
 
     def draw_scale(self, traction_pa: float, gradient_pa_per_m: float) -> None:
         """Draw what the longest arrows stand for."""
-        for scale, value in zip(SCALES, (traction_pa, gradient_pa_per_m), strict=True):
+        for scale, value in zip(
+            SCALES,
+            (traction_pa, gradient_pa_per_m),
+            strict=True,
+        ):
             self._markers.write_text(f"{scale.name} scale", _scale_text(scale, value))
 
 
@@ -205,15 +227,30 @@ def legend_markers(
 
     for number, across in enumerate(NUMBER_POSITIONS):
         placeholder = ("+" if signed else "") + four_characters(0.0)
-        text = make_text(frame_id, f"legend number {number}", height, placeholder)
+        text = make_text(
+            frame_id,
+            f"legend number {number}",
+            height,
+            placeholder,
+        )
         markers.append(_move(text, place.point(across, NUMBERS_LINE)))
 
     for number, scale in enumerate(SCALES):
-        arrow = make_marker(frame_id, f"{scale.name} arrow", Marker.LINE_LIST, scale.colour)
+        arrow = make_marker(
+            frame_id,
+            f"{scale.name} arrow",
+            Marker.LINE_LIST,
+            scale.colour,
+        )
         arrow.scale.x = 0.05 * place.pitch
         allocate(arrow, 6, with_colours=False)
         placeholder = _scale_text(scale, 0.0)
-        text = make_text(frame_id, f"{scale.name} scale", height, placeholder)
+        text = make_text(
+            frame_id,
+            f"{scale.name} scale",
+            height,
+            placeholder,
+        )
         # A letter is about half as wide as high; the text begins beside the longest arrow.
         begin = (TRACTION_LENGTH + 0.3) * place.pitch / place.width
         across = begin + 0.25 * len(placeholder) * TEXT_HEIGHT

@@ -175,7 +175,12 @@ class SerialisedMarkers:
         start: int,
         shape: tuple[int, ...],
     ) -> AnyArray:
-        view: AnyArray = np.ndarray(shape, dtype, self.data, ENCAPSULATION_BYTES + start)
+        view: AnyArray = np.ndarray(
+            shape,
+            dtype,
+            self.data,
+            ENCAPSULATION_BYTES + start,
+        )
         return view
 
 

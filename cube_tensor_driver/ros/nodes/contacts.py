@@ -69,9 +69,19 @@ class Contacts(SkinSubscriberNode):
         if self._traction is not None and self._has_traction_listeners():
             cloud = finder.cloud(values)
             if cloud is not None:
-                message = traction_message(make_message, skin.stamp_ns, frame_id, cloud)
+                message = traction_message(
+                    make_message,
+                    skin.stamp_ns,
+                    frame_id,
+                    cloud,
+                )
                 self._traction.publish(message)
-        return contacts_message(make_message, skin.stamp_ns, frame_id, contacts)
+        return contacts_message(
+            make_message,
+            skin.stamp_ns,
+            frame_id,
+            contacts,
+        )
 
     def _take_finder(self) -> ContactFinder | None:
         """Return the finder, or None while it is set up or if it could not be, which is logged."""

@@ -119,7 +119,15 @@ class Driver(CubeNode):
     def _publish_info(self) -> None:
         now_ns = self.get_clock().now().nanoseconds
         uids = self._published_uids
-        self._info.publish(info_message(self._skin, self._pipeline, now_ns, uids, "driver"))
+        self._info.publish(
+            info_message(
+                self._skin,
+                self._pipeline,
+                now_ns,
+                uids,
+                "driver",
+            )
+        )
 
     def _statuses(self) -> list[DiagnosticStatus]:
         """Return the status of all rows, and of each link while the node is active."""

@@ -30,7 +30,14 @@ class Markers(SkinSubscriberNode):
     def configure(self) -> None:
         self._quantity = scene.QUANTITIES[self.value("quantity")]
         self._contacts: SkinContacts | None = None
-        self.own(self.create_subscription(SkinContacts, "contacts", self._on_contacts, 2))
+        self.own(
+            self.create_subscription(
+                SkinContacts,
+                "contacts",
+                self._on_contacts,
+                2,
+            )
+        )
         super().configure()
 
     def prepare(self, skin: FollowedSkin) -> None:

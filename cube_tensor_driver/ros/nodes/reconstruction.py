@@ -16,7 +16,11 @@ from ...core.rows import FrequencyRows
 from ...messages.codec import frequency_codec
 from ...msg import SkinFrequencies, SkinInfo
 from ..compat import with_number
-from ..diagnostics.reconstruction import LostMessages, ReconstructionDiagnostics, log_changes
+from ..diagnostics.reconstruction import (
+    LostMessages,
+    ReconstructionDiagnostics,
+    log_changes,
+)
 from ..diagnostics.updater import Diagnostics
 from ..messages import info_message, log_refused_message
 from ..node import CubeNode, run
@@ -79,7 +83,14 @@ class Reconstruction(CubeNode):
         self._diagnostics = ReconstructionDiagnostics(
             skin, self._reconstructor, self._taring, self._lost
         )
-        self.own(self.create_subscription(SkinInfo, "driver/info", self._taring.on_info, LATCHED))
+        self.own(
+            self.create_subscription(
+                SkinInfo,
+                "driver/info",
+                self._taring.on_info,
+                LATCHED,
+            )
+        )
         if self._subscribes:
             frequencies = self.create_subscription(
                 SkinFrequencies,
@@ -156,7 +167,12 @@ class Reconstruction(CubeNode):
         newest_ns = self._reconstructor.health.newest_ns
         since_ns = newest_ns + 1 if newest_ns else self.get_clock().now().nanoseconds
         self._published_rest_changes = self._reconstructor.rest_changes
-        info = info_message(self._skin, self._reconstructor.pipeline, since_ns, self._taring.uids)
+        info = info_message(
+            self._skin,
+            self._reconstructor.pipeline,
+            since_ns,
+            self._taring.uids,
+        )
         self._info.publish(info)
 
     def _statuses(self) -> list[DiagnosticStatus]:

@@ -70,7 +70,16 @@ class StressPublisher:
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(stress_codec.buffer)
         self._publisher = node.own(node.create_lifecycle_publisher(SkinStress, "stress", profile))
         self._cubes = CubeTopics(node, skin, reconstructor, side)
-        self._forces = ForceCloud(node, skin, profile, side) if with_forces else None
+        self._forces = (
+            ForceCloud(
+                node,
+                skin,
+                profile,
+                side,
+            )
+            if with_forces
+            else None
+        )
         node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
     def publish(
@@ -203,7 +212,13 @@ class CubeTopics:
         stress, gradient = rows.stress[chosen], rows.gradient[chosen]
         sides = self._sides[cubes][:, None]
         forces, torques = contact_wrench(stress, gradient, sides)
-        each = zip(chosen.tolist(), cubes, forces, torques, strict=True)
+        each = zip(
+            chosen.tolist(),
+            cubes,
+            forces,
+            torques,
+            strict=True,
+        )
         for row, cube, force, torque in each:
             header = self._header(rows, row, cube)
             message = wrench_message(header, force, torque)

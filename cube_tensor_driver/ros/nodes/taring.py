@@ -156,7 +156,12 @@ class Taring:
             name = self._skin.names[number]
             self._node.get_logger().warning(f"cube {name}: tare not kept: {error}")
 
-    def _update_file(self, number: int, rest: Array, created: datetime | None) -> None:
+    def _update_file(
+        self,
+        number: int,
+        rest: Array,
+        created: datetime | None,
+    ) -> None:
         """Write the tare of a cube whose uid is known, or remove it if `created` is None.
 
         Raises:
@@ -170,7 +175,13 @@ class Taring:
             return
         calibration = self._skin.cubes[number].calibration
         rest_of_cube = rest[number, : calibration.layout.n_pads]
-        write_tare(self._folder, uid, calibration, rest_of_cube, created)
+        write_tare(
+            self._folder,
+            uid,
+            calibration,
+            rest_of_cube,
+            created,
+        )
 
     def _on_tare(self, request: Tare.Request, response: Tare.Response) -> Tare.Response:
         try:
@@ -220,7 +231,12 @@ class Taring:
         self._node.get_logger().info(f"clear_tare: {response.message}")
         return response
 
-    def _decide(self, number: int, rest: Array, created: datetime | None) -> None:
+    def _decide(
+        self,
+        number: int,
+        rest: Array,
+        created: datetime | None,
+    ) -> None:
         """Keep the tare of a cube, or remove it, now or once its uid is known.
 
         Raises:
