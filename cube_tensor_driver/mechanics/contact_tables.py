@@ -219,7 +219,11 @@ class PolygonTables(_ContactTables):
     _kind = "polygon_tables"
 
     def _compute(self) -> Arrays:
-        """Compute A, B, Z and W (rows of d, columns of t, 4, 14) of the module head."""
+        """Tabulate the components of right triangles.
+
+        Returns:
+            A, B, Z and W of the module head (rows of d, columns of t, 4, 14).
+        """
         over_distance = self._integrate_distance()
 
         # Grid of d (rows) and t (columns), divided by the depth.

@@ -37,7 +37,7 @@ class Influence:
     pads: Array
 
     def at(self, place: Array) -> Array:
-        """Interpolate with cubic splines.
+        """Interpolate the pad stresses between the positions of the grid, with cubic splines.
 
         Args:
             place: Positions (m, dim - 1) of forces, in m.

@@ -200,7 +200,15 @@ class Kernels:
         return len(self.component_matrices) - 1
 
     def _tabulate_discs(self, spectra: Spectra, bessel: BesselTable) -> Array:
-        """Return R, Z and T (radii, distances, 3, n) under the discs of `DISC_SIZES`."""
+        """Tabulate the response to forces on discs of all radii `DISC_SIZES`.
+
+        Args:
+            spectra: Spectra of the n circular components.
+            bessel: Bessel functions at the tabulated distances.
+
+        Returns:
+            Functions R, Z and T of circular.py (radii, distances, 3, n).
+        """
         inputs = [self.depth, *vars(spectra).values()]
 
         def compute() -> Arrays:
@@ -374,7 +382,7 @@ class Kernels:
         """Return circular components in rotated frames under loads along x, y and z.
 
         Args:
-            table: R, Z and T (distances, 3, n).
+            table: Functions R, Z and T of circular.py (distances, 3, n).
             place: Positions (N, 2) from the load.
             angle: Rotations (N,) of the frames.
             order: Orders (n,) of the components.
@@ -434,7 +442,7 @@ class Kernels:
         """Interpolate a table between the radii of discs.
 
         Args:
-            discs: R, Z and T (radii, distances, 3, n).
+            discs: Functions R, Z and T of circular.py (radii, distances, 3, n).
             size: Radius of the disc in m.
             place: Positions (N, 2) at which the table will be used.
 
@@ -478,7 +486,11 @@ def hertz_pressure(distance: Array, size: float) -> Array:
 
 
 def disc_spectrum(x: Array) -> Array:
-    """Compute the spectrum B of Hertz's pressure with a force of 1 N over x = k a."""
+    """Compute the spectrum B of Hertz's pressure with a force of 1 N.
+
+    Args:
+        x: Wavenumbers k multiplied by the radius a of the contact.
+    """
     # Near zero, the difference of sin and cos would lose all digits.
     safe = np.maximum(x, 1e-2)
     exact = 3 * (np.sin(safe) - safe * np.cos(safe)) / safe**3

@@ -127,8 +127,9 @@ class Layer:
         return np.concatenate([stress, gradient], axis=-2)
 
     def _plane_strain(self, k: Array, depth: float) -> _WaveStress:
-        """Return the stress under traction along L (keys "..L") and along z (keys "..z")."""
-        psi = self._airy(k, -k * depth)  # (derivatives 0 to 3, ..., psi(0) = 1 or psi'(0) = 1)
+        """Return the stress under traction along z and along L, the horizontal axis of the wave."""
+        # Derivatives 0 to 3; on the last axis for psi(0) = 1 and for psi'(0) = 1
+        psi = self._airy(k, -k * depth)
         by_load = {"L": 1j * psi[..., 1], "z": -psi[..., 0]}
 
         nu = self.poisson

@@ -68,7 +68,8 @@ class Spectra:
     normal: Array
 
     def radial(self, bessel: BesselTable, load_spectra: Array) -> Array:
-        """Compute the R, Z and T of forces of 1 N that are spread over the surface.
+        """Compute the functions R, Z and T of circular.py for forces that are spread over the
+        surface.
 
         Args:
             bessel: Bessel functions at the wanted distances.

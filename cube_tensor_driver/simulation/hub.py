@@ -149,7 +149,12 @@ class SimulatedHub:
         return b"".join(self._answer(request, now_us) for request in requests)
 
     def prepare(self, frequency: Millihertz) -> None:
-        """Encode in advance what is the same in every SAMPLE of this very array of frequencies."""
+        """Encode a SAMPLE in advance, except for number, time and checksum.
+
+        Args:
+            frequency: Frequencies (cubes, pads) in mHz. `sample` uses the frame for the same
+                object.
+        """
         sample = self._build_sample(0, 0, frequency)
         self._prepared[id(frequency)] = frequency, PreparedFrame(sample)
 

@@ -69,7 +69,8 @@ class Fields(Protocol):
 
     @property
     def period(self) -> float:
-        """The same time, or a duration in s that counts as the whole load."""
+        """Time in s after which the load repeats, or else a duration that counts as the whole
+        load."""
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         """Compute the fields at a time.

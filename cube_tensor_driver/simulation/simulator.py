@@ -115,9 +115,9 @@ class Simulator:
             ConfigError: Cubes of one hub have different numbers of pads, the folder or a TCP
                 address cannot be used, or a fault names a link, cube or pad that does not exist.
         """
-        # Both clocks are read together: the log converts simulated time to wall clock.
         self._ports = ports
         self._load = LoadMemory(load)
+        # Both clocks are read together: the log converts simulated time to wall clock.
         self._start_ns = time.monotonic_ns()
         self.start_time_ns = time.time_ns()
         self._links: list[PlayedLink] = []
@@ -275,7 +275,7 @@ class Simulator:
         watched: dict[str, int],
         link: PlayedLink,
     ) -> None:
-        """Wait for bytes on a line as it is plugged now.
+        """Let the selector wait for bytes on a line, which may have been plugged or unplugged.
 
         Args:
             selector: Selector of the main loop.

@@ -77,7 +77,12 @@ class Interpolation:
         return result
 
     def uncertainty(self, values: Array, columns: list[int]) -> Array:
-        """Compute the standard deviation (M,) relative to that of the quantity itself, 0 to 1."""
+        """Compute the uncertainty of `values`, with the same arguments.
+
+        Returns:
+            Standard deviation (M,) of each interpolated value divided by the standard deviation of
+            the quantity over the skin: 0 at a cube with a value, 1 far from all cubes.
+        """
         return self._solve_weights(np.isfinite(values), columns).uncertainty.ravel()
 
     def _solve_weights(self, known: Mask, columns: list[int]) -> _Weights:
@@ -103,7 +108,7 @@ class Interpolation:
         return weights
 
     def _solve(self, chosen: Index, known: Mask) -> tuple[Array, Array]:
-        """Solve some patches.
+        """Compute the interpolation weights of some patches.
 
         Args:
             chosen: Indices (patches,) of the patches.

@@ -57,7 +57,7 @@ def noise_by_pad(
 
 
 def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
-    """Return the noise matrices B (cubes, 15, P) of cubes that use all of their pads."""
+    """Return the noise matrices (cubes, 15, P) as `noise_by_pad`, for cubes that use all pads."""
     n = len(calibrations)
     no_pads = np.zeros(n, np.uint32)
     return noise_by_pad(Pipeline(calibrations), np.arange(n), no_pads)

@@ -195,7 +195,14 @@ class WindowPosteriors:
         return _number_distinct(np.concatenate(features, axis=1))
 
     def product(self, y: Single) -> Single:
-        """Compute G y (cubes, rows) of values y (cubes, C), which are 0 where unknown."""
+        """Compute the posterior mean G y of the traction on the patches of all cubes.
+
+        Args:
+            y: Values (cubes, C) in Pa, 0 where unknown.
+
+        Returns:
+            Posterior mean (cubes, rows) in Pa; `ROWS_PER_POINT` rows for each point.
+        """
         # The values of each window in one row, as the columns of G expect them.
         gathered = y[self.near].reshape(len(self.near), -1)
         n_rows = self.gain.shape[1]
@@ -239,7 +246,7 @@ class WindowPosteriors:
         )
 
     def noise(self, pad_variance: Single) -> Array:
-        """Compute the variances (cubes, points x 2) that the noise of the pads causes.
+        """Compute the variances (cubes, points x 2) of both pressures that the pad noise causes.
 
         Args:
             pad_variance: Variance (cubes, P) of each pad divided by that of its noise.

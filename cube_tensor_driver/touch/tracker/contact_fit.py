@@ -413,7 +413,7 @@ def _regress(
     response: Array,
     y: Array,
 ) -> Array:
-    """Return the weighted least squares solution (3 contacts,) of response @ forces = y."""
+    """Return the forces (3 contacts,) that explain the values y best, weighted with W."""
     # R' W R f = R' W y. Contacts on the same place make it singular, so lstsq.
     weighted = cho_solve(factor, response)
     return np.asarray(

@@ -61,7 +61,8 @@ class HertzContact:
 
 
 class ContactModel:
-    """Response of the cubes and traction on the surface for contacts on the skin of an inverse.
+    """Computes what Hertz contacts cause: the response of all cubes, and the traction on the
+    surface.
 
     Attributes:
         inverse: Inverse of the skin.
