@@ -330,4 +330,6 @@ def round_range(low: float, high: float) -> tuple[float, float]:
     # The tolerance keeps a size of exactly 1, 2 or 5 from taking the next step.
     min_step = size * (1 - 1e-9)
     step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= min_step) / 2
-    return float(np.floor(min(low, 0) / step) * step), float(np.ceil(max(high, 0) / step) * step)
+    n_below = np.floor(min(low, 0) / step)
+    n_above = np.ceil(max(high, 0) / step)
+    return float(n_below * step), float(n_above * step)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ PRISM_SIDES = 6
 """Number of sides of the prisms that arrows, crosses and rings consist of."""
 
 CUBE: Mesh = (
-    np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float),
+    np.array(list(product((-1.0, 1.0), repeat=3))),
     np.array(
         [
             *([0, 1, 3], [0, 3, 2]),
@@ -111,7 +112,8 @@ def arrows(lines: Array, unit: float) -> Mesh:
 
     Arrows that would be hardly more than a head are left out.
     """
-    length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1, keepdims=True)
+    along = lines[:, 1] - lines[:, 0]
+    length = np.linalg.norm(along, axis=1, keepdims=True)
     is_drawn = length[:, 0] > MIN_ARROW * unit
     lines, length = lines[is_drawn], length[is_drawn]
     tail, tip = lines[:, 0], lines[:, 1]
@@ -126,8 +128,10 @@ def arrows(lines: Array, unit: float) -> Mesh:
 def ring(radius: float, thickness: float) -> Mesh:
     """Make a ring about the origin in the x-y plane from prisms with the radius `thickness`."""
     angle = np.linspace(0, 2 * np.pi, RING_POINTS)
-    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * radius
-    return rods(np.stack([circle[:-1], circle[1:]], axis=1), thickness)
+    unit_circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    points = radius * unit_circle
+    lines = np.stack([points[:-1], points[1:]], axis=1)
+    return rods(lines, thickness)
 
 
 def hit(

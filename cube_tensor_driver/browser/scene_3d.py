@@ -132,7 +132,8 @@ class Scene3D:
         placement = Placement.of(poses)
         self.shown = Shown()
         # The cube in the middle is chosen at first.
-        self.selected = int((placement.poses.position**2).sum(axis=1).argmin())
+        distance = np.linalg.norm(placement.poses.position, axis=1)
+        self.selected = int(distance.argmin())
         self._unit = placement.unit
         _set_up_lights(api)
         self.bar = ScaleBar(api, placement, surface).length
@@ -192,11 +193,13 @@ class ScaleBar:
         self.length = round_down(span / 4)
         points = placement.point(surface.points)
         low, high = points.min(axis=0), points.max(axis=0)
-        y, z = low[1] - 0.16 * SPAN, low[2] - float(placement.poses.half_side.max())
+        y = low[1] - 0.16 * SPAN
+        z = low[2] - float(placement.poses.half_side.max())
 
         start = np.array([low[0], y, z])
         end = start + np.array([self.length * placement.unit, 0, 0])
-        _set_mesh(_add_mesh(api, "bar", DARK), rods(np.array([[start, end]]), 0.006 * SPAN))
+        bar = np.array([[start, end]])
+        _set_mesh(_add_mesh(api, "bar", DARK), rods(bar, 0.006 * SPAN))
         middle = tuple((start + end) / 2 - np.array([0, 0.03 * SPAN, 0]))
         api.add_label(
             "/bar/label", f"{1e3 * self.length:g} mm", position=middle, anchor="top-center"
@@ -397,7 +400,8 @@ class Arrows:
         self._mesh.visible = visible
         if visible:
             scale = style.full_length * unit / self.longest
-            _set_mesh(self._mesh, arrows(style.lines(self._placement.poses, values, scale), unit))
+            lines = style.lines(self._placement.poses, values, scale)
+            _set_mesh(self._mesh, arrows(lines, unit))
 
 
 class PrincipalCrosses:

@@ -59,13 +59,15 @@ class Raster:
             reach: Distance in metres from every point above which a pixel is transparent.
         """
         flat = points[:, :2]
-        columns, rows = np.ceil((np.ptp(flat, axis=0) + 1.4 * reach) / pixel).astype(int)
+        extent = np.ptp(flat, axis=0) + 1.4 * reach
+        columns, rows = np.ceil(extent / pixel).astype(int)
         middle = (flat.min(axis=0) + flat.max(axis=0)) / 2
         half = np.array([columns, rows]) * pixel / 2
         self.low, self.high = middle - half, middle + half
         x = self.low[0] + (np.arange(columns) + 0.5) * pixel
         y = self.high[1] - (np.arange(rows) + 0.5) * pixel
-        distance, self.owner = cKDTree(flat).query(np.stack(np.meshgrid(x, y), axis=2))
+        centres = np.stack(np.meshgrid(x, y), axis=2)
+        distance, self.owner = cKDTree(flat).query(centres)
         # This index is that of the transparent entry in `image`.
         self.owner[distance > reach] = len(points)
 
@@ -87,7 +89,8 @@ class TopView:
         surface: Surface,
     ) -> None:
         self._names, self._poses = names, poses
-        size = float(np.ptp(surface.points[:, :2], axis=0).max()) + surface.spacing
+        sides = np.ptp(surface.points[:, :2], axis=0)
+        size = float(sides.max()) + surface.spacing
         pixel = max(size / MAX_PIXELS_PER_SIDE, surface.spacing / 4)
         self._raster = Raster(surface.points, pixel, 0.75 * surface.spacing)
         extent = self._raster.high - self._raster.low
@@ -120,7 +123,9 @@ class TopView:
     def _drawn(self, point: Array) -> tuple[float, float]:
         """Return the place of a point (2,) or (3,), in metres, in the drawing."""
         x = MARGIN + (point[0] - self._raster.low[0]) * self._scale
-        return float(x), float((self._raster.high[1] - point[1]) * self._scale)
+        # In an SVG, y points down.
+        y = (self._raster.high[1] - point[1]) * self._scale
+        return float(x), float(y)
 
     def _heat_map(self, colours: Array) -> str:
         data = base64.b64encode(png_of_pixels(self._raster.image(colours))).decode()
@@ -196,5 +201,6 @@ def _text(
 
 def _ticks(low: float, high: float, step: float) -> list[float]:
     """Return the multiples of a step between two numbers, without rounding errors."""
-    numbers = np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+    first, last = np.ceil(low / step), np.floor(high / step)
+    numbers = np.arange(first, last + 1)
     return [float(f"{number * step:.6g}") for number in numbers]

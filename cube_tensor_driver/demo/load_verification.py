@@ -73,11 +73,11 @@ class ForceHistory:
         offset, normal = (self.measured_centre - self.centre)[loaded], self.normal[loaded]
         height = np.einsum("ti,ti->t", offset, normal)
         along_skin = offset - height[:, None] * normal
-        centre_error = float(np.sqrt(np.mean((along_skin**2).sum(axis=1))))
+        distance = np.linalg.norm(along_skin, axis=1)
         return {
             "force_peak_n": np.abs(self.force).max(axis=0).round(2).tolist(),
             "force_error_n": force_error.round(2).tolist(),
-            "centre_error_mm": round(1e3 * centre_error, 2),
+            "centre_error_mm": round(1e3 * rms(distance), 2),
         }
 
 
@@ -211,7 +211,8 @@ class LoadVerification:
 
         times = np.linspace(0, self._load.period, RANGE_TIMES)
         script = [self._truth(time) for time in times]
-        span = np.nanmax(script, axis=(0, 1)) - np.nanmin(script, axis=(0, 1))
+        lowest = np.nanmin(script, axis=(0, 1))
+        span = np.nanmax(script, axis=(0, 1)) - lowest
         error = np.concatenate(errors)
         # A component that the script never changes has no range to compare with.
         relative = error[:, span > 0] / span[span > 0]

@@ -40,6 +40,12 @@ RANGE_DECAY = 0.98
 """Share of its top that an automatic range keeps from one picture to the next, while the values
 are smaller."""
 
+CROSS_SIZE = 1.3
+"""Half the width of the cross over a cube with a fault, in half sides of the cube."""
+
+CROSS_HEIGHT = 1.2
+"""Height of that cross above the centre of the cube, in half sides of the cube."""
+
 BARB_LENGTH = 0.25
 """Length of the barbs of an arrow of lines, relative to the arrow."""
 
@@ -218,9 +224,11 @@ def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
 
     The lines of a fine cube have a length of 0.
     """
-    corner = np.array([[[-1, -1, 0.0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]) * 1.3
+    diagonals = [[[-1, -1, 0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]
+    has_fault = (health != FINE)[:, None, None, None]
     # The crosses float a little above the face, and have no size over a fine cube.
-    corner = np.where((health != FINE)[:, None, None, None], corner, 0) + np.array([0, 0, 1.2])
+    corner = np.where(has_fault, CROSS_SIZE * np.array(diagonals), 0.0)
+    corner += np.array([0, 0, CROSS_HEIGHT])
     scaled = corner * poses.half_side[:, None, None, None]
     in_parent = np.einsum("nij,nabj->nabi", poses.rotation, scaled)
     return np.asarray(poses.position[:, None, None] + in_parent)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Result, Sample, Stats
 
 from ..conversation import PERIOD_US, UNKNOWN
@@ -184,7 +184,7 @@ def start_and_stop_again(transcript: Transcript) -> RuleResult:
     return passed("a second START moves no sample; both are answered 0")
 
 
-def phases(samples: list[Sample], period_us: int) -> NDArray[np.float64]:
+def phases(samples: list[Sample], period_us: int) -> Array:
     """Return the position of each sample within the period, 0 to 1."""
     times = [sample.device_us for sample in first_frames(samples)]
     return np.array(times) % max(1, period_us) / max(1, period_us)

@@ -9,8 +9,8 @@ from collections import Counter
 from itertools import groupby, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.device.clock.line import MAX_DRIFT
 from cube_tensor_driver.device.wire.protocol import Hello, Sample, Stats
 
@@ -48,7 +48,7 @@ def first_frames(samples: list[Sample]) -> list[Sample]:
     return [*samples[:1], *later]
 
 
-def periods_us(samples: list[Sample]) -> NDArray[np.float64]:
+def periods_us(samples: list[Sample]) -> Array:
     """Return the device time from sample to sample, per sequence number, in µs."""
     gaps = [
         (after.device_us - before.device_us) / forward(after.sequence, before.sequence)
@@ -121,7 +121,7 @@ def device_time_runs(transcript: Transcript) -> RuleResult:
     return passed(f"never back, {text}")
 
 
-def drift_of(host: NDArray[np.float64], device: NDArray[np.float64]) -> tuple[float, float, float]:
+def drift_of(host: Array, device: Array) -> tuple[float, float, float]:
     """Compare the rates of two clocks.
 
     The delay of an arrival is never negative, so that the arrivals with the smallest delay in both
@@ -137,7 +137,8 @@ def drift_of(host: NDArray[np.float64], device: NDArray[np.float64]) -> tuple[fl
     delay = host - device
     # The drift moves the delays apart, and the more so the further apart the two samples are.
     half = len(delay) // 2
-    early, late = int(np.argmin(delay[:half])), half + int(np.argmin(delay[half:]))
+    early = int(np.argmin(delay[:half]))
+    late = half + int(np.argmin(delay[half:]))
     apart = float(host[late] - host[early])
     drift = float(delay[early] - delay[late]) / apart
     above = delay + drift * host

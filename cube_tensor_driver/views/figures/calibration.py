@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def draw_layout(layout: Layout) -> Figure:
 def _draw_edges(axes: Any) -> None:
     """Draw the edges of the cube; those that end in its hidden corner are dotted."""
     # Two corners are joined by an edge if they differ in one coordinate.
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     hidden = -np.sign(_VIEW)
     for i, a in enumerate(corners):
         for b in corners[i + 1 :]:
