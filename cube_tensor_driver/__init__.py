@@ -42,8 +42,8 @@ __all__ = [
     "simulate",
 ]
 
-# ROS installs the generated messages as a package of the same name in another place. With this path,
-# both are one package.
+# ROS installs the generated messages as a package of the same name in another place, and this path
+# makes one package of both.
 __path__ = pkgutil.extend_path(__path__, __name__)
 
 _HOMES = {
