@@ -1,4 +1,4 @@
-"""Child processes: none outlives the process that started it."""
+"""Child processes, none of which outlives the process that started it, and signals to end."""
 
 from __future__ import annotations
 
@@ -45,6 +45,25 @@ def test_a_child_ends_with_a_parent_that_is_killed(tmp_path, monkeypatch, late):
     for process in left:
         process.kill()
     assert not left
+
+
+IGNORING = """
+import os, signal
+from cube_tensor_driver.processes.stop_signals import stop_event
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+stop = stop_event()
+os.kill(os.getpid(), signal.SIGHUP)
+print(stop.is_set())
+os.kill(os.getpid(), signal.SIGTERM)
+print(stop.is_set())
+"""
+
+
+def test_a_process_under_nohup_survives_its_terminal():
+    done = subprocess.run(
+        [sys.executable, "-c", IGNORING], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["False", "True"], done.stderr
 
 
 def _wait_for_name(process: psutil.Process, name: str) -> None:

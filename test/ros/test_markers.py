@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from cube_tensor_driver.config import parameters
 from cube_tensor_driver.core.latest_stress import DOUBTFUL, FAULTY, FINE, STALE, LatestStress
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
@@ -68,6 +69,10 @@ def test_colours_are_the_table_s_ends_grey_where_unknown_and_monotonous_in_light
     assert (np.diff(lightness) < 0).all()
     signed = scene.colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ [0.299, 0.587, 0.114]
     assert signed[1] > 2 * max(signed[0], signed[2])
+
+
+def test_the_parameter_quantity_allows_what_can_be_drawn():
+    assert tuple(QUANTITIES) == parameters.QUANTITIES
 
 
 def test_automatic_range_rises_at_once_and_falls_slowly():
