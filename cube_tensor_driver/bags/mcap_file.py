@@ -59,6 +59,8 @@ ROSBAG2 = "rosbag2"
 """Name of the metadata record in which rosbag2 looks for the description of a file."""
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
+"""Size of the footer record, which stands in front of the last `MAGIC`."""
+
 CHECKSUM_BYTES = 4
 """Size of the checksum (CRC-32) at the end of the footer record."""
 

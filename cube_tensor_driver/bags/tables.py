@@ -13,7 +13,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from ..core.errors import BagError
-from ..core.modes import COMPONENTS, STRESS
+from ..core.modes import GRADIENT, STRESS
 from ..core.rows import StressRows
 
 ROWS_PER_GROUP = 1 << 16
@@ -21,14 +21,13 @@ ROWS_PER_GROUP = 1 << 16
 
 # A dictionary keeps each name once, however many rows a cube has.
 _CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
-_GRADIENTS = COMPONENTS[len(STRESS) :]
 _SCHEMA = pyarrow.schema(
     [
         ("stamp_ns", pyarrow.int64()),
         ("cube", _CUBE_NAME),
         ("sequence", pyarrow.uint32()),
         *((f"stress_{name}_Pa", pyarrow.float32()) for name in STRESS),
-        *((f"gradient_{name}_Pa_per_m", pyarrow.float32()) for name in _GRADIENTS),
+        *((f"gradient_{name}_Pa_per_m", pyarrow.float32()) for name in GRADIENT),
         ("residual", pyarrow.float32()),
         ("status", pyarrow.uint16()),
         ("observed", pyarrow.uint16()),

@@ -9,7 +9,7 @@ import numpy as np
 import zarr
 
 from ..core.errors import BagError
-from ..core.modes import COMPONENTS, STRESS
+from ..core.modes import GRADIENT, STRESS
 from ..core.rows import StressRows, concatenate
 from .tables import report_write_errors
 
@@ -21,10 +21,7 @@ _UNITS = {
     "stress": "Pa",
     "gradient": "Pa/m",
 }
-_COMPONENTS = {
-    "stress": COMPONENTS[: len(STRESS)],
-    "gradient": COMPONENTS[len(STRESS) :],
-}
+_COMPONENTS = {"stress": STRESS, "gradient": GRADIENT}
 _COLUMNS: dict[str, Any] = {
     "stamp_ns": np.int64,
     "cube": np.uint16,
