@@ -712,6 +712,37 @@ except BagError as error:
 """
 
 
+KILL_THE_WRITER = """
+import os, signal, sys
+from pathlib import Path
+
+from cube_tensor_driver.bags.write import BagWriter
+
+writer = BagWriter(Path(sys.argv[1]), sys.argv[2])
+writer.add_topic("/text", "std_msgs/msg/String")
+for number in range(400):
+    writer.write("/text", 1000 + number, bytes(5000))
+    if number == 299:
+        writer.flush()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_killed_writer_leaves_what_was_flushed(tmp_path, storage):
+    path = tmp_path / "killed"
+    subprocess.run(
+        [sys.executable, "-c", KILL_THE_WRITER, str(path), storage], cwd=ROOT, check=False
+    )
+    with pytest.raises(BagError, match="repair"):
+        Bag(path)
+    done = repair(path)
+    assert done.messages >= 300 and done.damaged == 0
+    with Bag(path) as bag:
+        times = [entry.time_ns for entry in bag.entries()]
+    assert times == list(range(1000, 1000 + done.messages))
+
+
 def test_disk_full_leaves_what_was_written(bag, tmp_path):
     """The file system takes 300 kB, then no more."""
     command = [sys.executable, "-c", FILL_THE_DISK, str(bag), str(tmp_path / "full")]
