@@ -31,16 +31,16 @@ def principal_stresses(stress: Real) -> tuple[Array, Array]:
         sign of a direction is arbitrary. Rows with NaN give NaN.
     """
     matrices = to_matrix(stress).astype(float)
-    is_unknown = ~np.isfinite(matrices).all(axis=(-2, -1))
+    is_known = np.isfinite(matrices).all(axis=(-2, -1))
     # LAPACK raises an error for NaN, so unknown rows are computed as zero and replaced below.
-    matrices[is_unknown] = 0
+    matrices[~is_known] = 0
     ascending, vectors = np.linalg.eigh(matrices)
     values = ascending[..., ::-1].copy()
     # LAPACK returns vectors as columns.
     rows = np.swapaxes(vectors, -1, -2)
     directions = rows[..., ::-1, :].copy()
-    values[is_unknown] = np.nan
-    directions[is_unknown] = np.nan
+    values[~is_known] = np.nan
+    directions[~is_known] = np.nan
     return values, directions
 
 

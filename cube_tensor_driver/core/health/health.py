@@ -151,10 +151,8 @@ class Health:
         rest = self._pipeline.rest_frequency
 
         def frequency_at(strain: float) -> Single:
-            frequency: Single = pad_frequency(strain * modulus, rest, beta, modulus).astype(
-                np.float32
-            )
-            return frequency
+            frequency = pad_frequency(strain * modulus, rest, beta, modulus)
+            return frequency.astype(np.float32)
 
         self._limits = _Limits(
             low=frequency_at(MIN_STRAIN),
@@ -312,7 +310,8 @@ class Health:
 
     def _make_pattern(self, cube: AnyArray) -> _Pattern:
         n_cubes, n_pads = self._exists.shape
-        if len(cube) and (int(cube.min()) < 0 or int(cube.max()) >= n_cubes):
+        is_known = (cube >= 0) & (cube < n_cubes)
+        if not is_known.all():
             raise self._misfit(cube, (len(cube), n_pads))
         repeats = count_repeats(cube)
         scan = cube[:0]
