@@ -45,7 +45,8 @@ def damaged_frames(size: int) -> bytes:
     """Return frames in which some bytes were replaced by random ones."""
     random = np.random.default_rng(2)
     data = np.frombuffer(clean_frames(size), np.uint8).copy()
-    where = random.integers(0, len(data), int(DAMAGED_SHARE * len(data)))
+    n_damaged = int(DAMAGED_SHARE * len(data))
+    where = random.integers(0, len(data), n_damaged)
     data[where] = random.integers(0, 256, len(where))
     return bytes(data)
 
@@ -85,6 +86,7 @@ def bench_decode(*, json_path: Path | None = None) -> int:
     fastest = {name: dict.fromkeys(decoders, 0.0) for name in data}
     for _ in range(ROUNDS):
         for name, chunk in data.items():
+            # In turn, so that whatever else the machine does slows down all decoders.
             for kind, make_decoder in decoders.items():
                 gb_per_s = len(chunk) / _time_decoding_ns(make_decoder(), chunk)
                 fastest[name][kind] = max(fastest[name][kind], gb_per_s)

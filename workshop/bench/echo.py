@@ -43,7 +43,8 @@ class BareSource(CubeNode):
 
     def configure(self) -> None:
         """Make the publisher and the arrays that every message has."""
-        n, rate = int(self.value("cubes")), float(self.value("rate"))
+        n = int(self.value("cubes"))
+        rate = float(self.value("rate"))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
             SkinFrequencies, "frequencies", batch_profile(rate)
         )
@@ -76,7 +77,8 @@ class BareEcho(CubeNode):
 
     def configure(self) -> None:
         """Subscribe, and make the arrays that every answer has."""
-        n, quality = int(self.value("cubes")), batch_profile(float(self.value("rate")))
+        n = int(self.value("cubes"))
+        quality = batch_profile(float(self.value("rate")))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
             SkinStress, "stress", quality
         )
@@ -86,6 +88,7 @@ class BareEcho(CubeNode):
         )
 
     def _answer(self, message: SkinFrequencies) -> None:
+        # Columns are given as bytes, because rclpy checks each element of a list.
         zeros = self._zeros
         answer = SkinStress(
             cube=message.cube,

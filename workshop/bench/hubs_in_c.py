@@ -42,6 +42,7 @@ class HubLoad:
     @classmethod
     def of(cls, cubes: int) -> HubLoad:
         """Choose hubs for `cubes` cubes, or a few more: all hubs have the same number."""
+        # As few hubs as possible, with the cubes shared out evenly.
         hubs = math.ceil(cubes / MAX_CUBES_PER_HUB)
         return cls(hubs, math.ceil(cubes / hubs))
 

@@ -80,6 +80,7 @@ def bench_links(
 
         def on_rows(rows: FrequencyRows) -> None:
             nonlocal delivered
+            # Nothing else is done with the rows: only reading is measured.
             delivered += len(rows)
 
         with _hubs(program, folder, load, rate):
@@ -94,6 +95,7 @@ def bench_links(
             links.start()
             try:
                 _wait(lambda: delivered > 0)
+                # Connecting and the first use of memory are not measured.
                 time.sleep(SETTLE_S)
                 before, lost = (
                     (

@@ -16,6 +16,9 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.demo.running import report
 
+Function = Callable[[], Any]
+"""Function that is timed."""
+
 LAYOUT = "planar"
 """Layout of the cubes."""
 
@@ -35,7 +38,7 @@ def bench_pipeline(*, cubes: int, json_path: Path | None = None) -> int:
     """
     result: dict[str, Any] = {"cubes": cubes}
     for dtype in (np.float32, np.float64):
-        pipeline_us, floor_us = _time_in_turn(*_make_functions(cubes, dtype))
+        pipeline_us, floor_us = _time_in_turn(_make_functions(cubes, dtype))
         result[np.dtype(dtype).name] = {
             "pipeline_us": pipeline_us,
             "floor_us": floor_us,
@@ -45,7 +48,10 @@ def bench_pipeline(*, cubes: int, json_path: Path | None = None) -> int:
     return 0
 
 
-def _make_functions(cubes: int, dtype: Any) -> tuple[Callable[[], Any], Callable[[], Any]]:
+def _make_functions(
+    cubes: int,
+    dtype: Any,
+) -> list[Function]:
     """Return one call of the pipeline, and one of the bare equations, for one scan."""
     calibration = illustrative(LAYOUT)
     rng = np.random.default_rng(0)
@@ -56,6 +62,7 @@ def _make_functions(cubes: int, dtype: Any) -> tuple[Callable[[], Any], Callable
     pipeline = Pipeline([calibration] * cubes, dtype)
     rows = FrequencyRows.of(np.arange(cubes), frequency)
     rest = np.tile(calibration.rest_frequency, (cubes, 1)).astype(dtype)
+    # Any matrix of the size of an estimator takes the same time.
     matrix = rng.normal(size=(8, 16)).astype(dtype)
     beta = dtype(calibration.beta[0])
 
@@ -63,10 +70,10 @@ def _make_functions(cubes: int, dtype: Any) -> tuple[Callable[[], Any], Callable
         ratio = frequency / rest
         return ((ratio - 1) / (1 + beta * (1 - ratio))) @ matrix
 
-    return lambda: pipeline.process(rows), compute_floor
+    return [lambda: pipeline.process(rows), compute_floor]
 
 
-def _time_in_turn(*functions: Callable[[], Any]) -> list[float]:
+def _time_in_turn(functions: list[Function]) -> list[float]:
     """Return the median time of each function, in µs.
 
     They are called in turn, so that whatever else the machine does slows down all of them.

@@ -194,6 +194,7 @@ def _measure_both(
     after = _measure_echo(cubes, bench, progress)
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     loads = [f"cpu_{load}_percent" for load in LOADS]
+    # The load is not part of what a robot runs.
     used = [value for name, value in skin.items() if name.startswith("cpu_") and name not in loads]
     return {
         "cubes": cubes,
@@ -232,6 +233,7 @@ def _measure_skin(
             observed = _Observed(processes, children, f"skin of {load.cubes} cubes")
             measured = observed.measure(bench.rate, bench.duration, receive, progress)
             taken, skipped = _end_load(processes[0].executable, children, log, load)
+    # Rows of the first cube of each hub stand for all: keeping all would delay the receiver.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
     cpu = measured.cpu_percent
     seconds = 1e-9 * (measured.end_ns - measured.start_ns)
@@ -269,6 +271,7 @@ def _make_processes(
     except FirmwareError as error:
         progress.console.print(f"The Python simulator is the load, which takes more: {error}")
         return processes
+    # Unlike the simulator, the program expects the folder to exist.
     ports.mkdir()
     arguments = (
         *load.arguments(ports, bench.rate),
@@ -367,6 +370,7 @@ class _Observed:
             if not n_messages:
                 logs = "\n".join(self.children.log(name)[-800:] for name in self._names())
                 raise CubeError(f"{self.description}: no tensor after {MAX_START_S:g} s\n{logs}")
+            # From here on, discovery and imports do not count.
             first_tensor_s = time.monotonic() - began_s
             observer.spin(SETTLE_S)
             usage = Usage(self.children, self._names())
@@ -416,6 +420,7 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     if n_values * MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:
         return result
 
+    # The last four fifths of the time are divided among the blocks.
     block_minutes = 0.8 * n_values * MEMORY_PERIOD_S / 60 / GROWTH_BLOCKS
     slopes = []
     for values in nodes:
@@ -427,7 +432,8 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
             1,
             cov=True,
         )
-        slopes.append((float(line[0]), float(np.sqrt(covariance[0, 0]))))
+        error = np.sqrt(covariance[0, 0])
+        slopes.append((float(line[0]), float(error)))
     slope, error = max(slopes)
     return result | {
         "rss_mb_per_minute": round(slope, 3),

@@ -116,7 +116,7 @@ def _is_lost_with_power(run: Run) -> Mask:
             # Samples are in the order of time, so the order of indices is that of time.
             mine = np.flatnonzero(of_link & (samples.boot == boot))
             mine_arrived = mine[arrived[mine]]
-            # After the last restart, the driver hears of all losses from the counters of the hub.
+            # Only a restart ends the reports of a hub about the samples that it has dropped.
             if boot != boots[-1]:
                 lost[mine[mine > mine_arrived.max(initial=-1)]] = True
             if len(mine_arrived) and samples.number[mine[0]] > WRAPPED_NUMBER:

@@ -64,7 +64,7 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     arrived = np.unique(sample[known] * n_cubes + rows.cube[known])
     received = np.bincount(arrived // n_cubes, minlength=len(samples))
     is_checked = record.contains(samples.time_ns)
-    # Before the record begins, the topics were not connected yet.
+    # Before the record begins, the driver was not active.
     is_recorded = samples.time_ns >= record.begin_ns
     missing = np.where(is_recorded, samples.row_count - received, 0)
     lost = np.flatnonzero(is_checked & (missing > 0) & ~_may_be_missing(run))

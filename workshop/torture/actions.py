@@ -46,6 +46,13 @@ MIN_TARED_S = 1.0
 """Shortest time, in seconds, for which a tare stays in force, so that its tensors can be checked
 also where this process is late."""
 
+MIN_RATE_S = 1.1
+"""Time, in seconds, for which a rate stays in force that was set late. It can only be checked if
+the next change does not follow at once."""
+
+MAX_RATE_DELAY_S = 0.05
+"""Delay, in seconds, of a rate above which the next change would follow too early."""
+
 MAX_STRESS_AGE_S = 0.5
 """Age, in seconds, of the newest stress above which the host is too busy for a tare, which may be
 refused then."""
@@ -126,6 +133,7 @@ class Actions:
             CubeError: It did not become active.
         """
         self._observer.spin(MAX_START_S, self._states["driver"].service_is_ready)
+        # The pipe exists as soon as the simulator has opened its ports.
         if not self._activate_driver(set(), fault_pipe.exists):
             log = self._children.log("driver")[-1500:]
             raise CubeError(f"the driver did not become active:\n{log}")
@@ -151,8 +159,11 @@ class Actions:
         self.done.append(action)
         if kind == "tare":
             self._observer.spin(MIN_TARED_S)
+        if kind == "rate" and delay_s > MAX_RATE_DELAY_S:
+            self._observer.spin(MIN_RATE_S)
 
     def _pause(self, name: str, seconds: float) -> ActionResult:
+        # A process that is stopped stands for one that does not get a processor.
         self._children.pause(name)
         self._observer.spin(seconds)
         self._children.resume(name)
@@ -182,6 +193,7 @@ class Actions:
         return succeeded, answer
 
     def _restart_reconstruction(self) -> ActionResult:
+        # The messages of the next process are numbered from 1 again.
         self._children.kill("reconstruction")
         self._stress.expect_new_publisher()
         self._children.start(self._processes["reconstruction"])
@@ -218,6 +230,7 @@ class Actions:
         node = self._observer.node
 
         def is_connected() -> bool:
+            # The node `markers` subscribes to stress as well.
             return (
                 node.count_publishers("stress") > 0
                 and node.count_subscribers("stress") > 1

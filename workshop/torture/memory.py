@@ -37,8 +37,11 @@ class MemoryMonitor:
             return
         self._next_s = now_s + PERIOD_S
         running = set(self._names).intersection(self._children.names())
-        for name, size_mb in Usage(self._children, running).memory_mb().items():
-            self._sizes.setdefault(self._children.pid(name), []).append((now_s, size_mb))
+        # A process that is being started again does not run for a moment.
+        usage = Usage(self._children, running)
+        for name, size_mb in usage.memory_mb().items():
+            sizes = self._sizes.setdefault(self._children.pid(name), [])
+            sizes.append((now_s, size_mb))
 
     def count_threads(self) -> dict[str, int]:
         """Return the number of threads of each process."""
@@ -61,4 +64,5 @@ class MemoryMonitor:
 
 def _median_slope(x: Array, y: Array) -> float:
     later, earlier = np.tril_indices(len(x), -1)
-    return float(np.median((y[later] - y[earlier]) / (x[later] - x[earlier])))
+    rise, run = y[later] - y[earlier], x[later] - x[earlier]
+    return float(np.median(rise / run))

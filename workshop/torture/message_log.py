@@ -67,6 +67,7 @@ class _RawSubscription:
         """Return messages that have arrived since the last call."""
         taken: list[Message] = []
         handle = self._subscription.handle
+        # The handle must not be destroyed meanwhile.
         with handle:
             while len(taken) < MAX_MESSAGES_TAKEN:
                 item = handle.take_message(self._kind, True)
@@ -123,6 +124,7 @@ class TopicLog(Generic[AnyRows]):
             expected = self._last_number + 1 if message.number > self._last_number else 1
             self._last_number = message.number
             if message.number > expected:
+                # The place of a gap is counted in rows, so all rows before it must be decoded.
                 self._decode()
                 self._gaps.append((self._n_rows, message.number - expected))
             self._waiting.append(message)
@@ -142,7 +144,9 @@ class TopicLog(Generic[AnyRows]):
     def newest_ns(self) -> int:
         """Return the stamp of the newest message, 0 before the first."""
         self._decode()
-        return int(self._decoded[-1].stamp_ns[-1]) if self._decoded else 0
+        if not self._decoded:
+            return 0
+        return int(self._decoded[-1].stamp_ns[-1])
 
     def received(self) -> Received[AnyRows]:
         """Return all that arrived.
@@ -169,6 +173,7 @@ class TopicLog(Generic[AnyRows]):
             try:
                 decoded = self._codec.decode(*(message.data for message in messages))
             except MessageError:
+                # The checks report it: a torture must not end here.
                 self._unreadable += len(messages)
                 continue
             if decoded.frame_id != self._frame_id:
@@ -176,7 +181,9 @@ class TopicLog(Generic[AnyRows]):
             self._n_rows += len(decoded.rows)
             self._decoded.append(decoded.rows)
             sent_ns = [message.sent_ns for message in messages]
-            self._sent_ns.append(np.repeat(sent_ns, len(decoded.rows) // len(messages)))
+            # Messages of one shape have the same number of rows.
+            rows_per_message = len(decoded.rows) // len(messages)
+            self._sent_ns.append(np.repeat(sent_ns, rows_per_message))
             self._cubes.update(np.unique(decoded.rows.cube).tolist())
 
     def _shape_of(self, message: Message) -> tuple[int, bytes]:
@@ -209,6 +216,7 @@ class CubeTopicLog:
                 self._count += 1
                 if self._count % MESSAGES_PER_SAMPLE == 0:
                     self._kept[name].append(message.data)
+        # Without a subscriber, the reconstruction does not make these messages any more.
         if self._count > MAX_CUBE_MESSAGES:
             for subscription in self._subscriptions.values():
                 subscription.close()

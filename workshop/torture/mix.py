@@ -97,6 +97,7 @@ def schedule(duration: float, seed: int) -> list[tuple[float, Event]]:
     Frames are damaged all the time, links are cut one after the other, pads break, hubs get warm,
     and the actions of `ROUND` are repeated.
     """
+    # The order of these calls decides what each seed gives.
     mix = _Mix(duration, seed)
     mix.add_rounds()
     mix.add_frame_faults()
@@ -129,16 +130,22 @@ class _Mix:
             self._add(at, **fault)
 
     def add_rounds(self) -> None:
-        for start in np.arange(0.0, max(self._end, 0.1), ROUND_S).tolist():
+        """Add the actions, and the holds of the load."""
+        # A torture that is shorter than its last quiet seconds has one round without events.
+        starts = np.arange(0.0, max(self._end, 0.1), ROUND_S)
+        for start in starts.tolist():
             for after, event in ROUND:
+                # Rounds after the first leave out what would end the life of a process.
                 is_due = start == 0 or event.get("action") not in FIRST_ROUND_ONLY
                 if start + after < self._end and is_due:
                     self._add(start + after, **event)
 
     def add_frame_faults(self) -> None:
+        """Damage frames all the time, on all hubs."""
         random, at = self._random, 0.0
         while (at := at + random.exponential(0.15)) < self._duration:
-            kind, hub = str(random.choice(FRAME_FAULTS)), int(random.integers(HUBS))
+            kind = str(random.choice(FRAME_FAULTS))
+            hub = int(random.integers(HUBS))
             self._add(
                 at,
                 kind=kind,
@@ -147,6 +154,7 @@ class _Mix:
             )
 
     def add_opening(self) -> None:
+        """Add one fault of each kind to the pads of a hub, and a warm hub."""
         for kind, cube in zip(PAD_FAULTS, OPENING_CUBES, strict=True):
             pad = int(self._random.integers(PADS))
             self._add(
@@ -171,6 +179,7 @@ class _Mix:
         ]
 
     def add_cuts(self, hub: int) -> None:
+        """Cut the link of a hub, or its clock, again and again."""
         random = self._random
         at = random.uniform(FIRST_CUT_S, FIRST_CUT_S + 3.0)
         while at < self._end:
@@ -187,9 +196,11 @@ class _Mix:
             elif kind == "wrap":
                 fault["count"] = int(random.integers(100, 3000))
             self._add_quietly(at, **fault)
+            # A link that was cut delivers for a while before the next cut.
             at += seconds + random.uniform(4.0, 20.0)
 
     def add_pad_faults(self) -> None:
+        """Break pads of all hubs."""
         random, at = self._random, FIRST_CUT_S
         while (at := at + random.uniform(1.0, 4.0)) < self._end:
             self._add_quietly(
@@ -202,6 +213,7 @@ class _Mix:
             )
 
     def add_temperatures(self) -> None:
+        """Warm hubs, except the one whose load is held."""
         random, at = self._random, 0.0
         while (at := at + random.uniform(8.0, 25.0)) < self._end - 1:
             link, value = f"hub{random.integers(1, HUBS)}", round(random.uniform(1.0, 10.0), 2)
@@ -223,6 +235,9 @@ class _Mix:
 def _disturbs_tare(at: float, seconds: float) -> bool:
     """Return whether a fault of the held hub would be too close to a tare."""
     holds = [after for after, event in ROUND if event.get("kind") == "hold"]
+    # The fault may last into the next round.
     rounds = np.arange(0.0, at + ROUND_S + 10, ROUND_S)
     hold_s = np.add.outer(rounds, holds)
-    return bool(np.any((at < hold_s + QUIET_AFTER_S) & (at + seconds > hold_s - QUIET_BEFORE_S)))
+    begins_before = at < hold_s + QUIET_AFTER_S
+    ends_after = at + seconds > hold_s - QUIET_BEFORE_S
+    return bool((begins_before & ends_after).any())

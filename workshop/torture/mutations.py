@@ -148,7 +148,10 @@ def _columns(**changes: Callable[[Any], Any]) -> Callable[[Rows], Rows]:
     """Change columns of rows, each by a function of its old values."""
 
     def change(rows: Rows) -> Rows:
-        columns = {name: make(np.array(getattr(rows, name))) for name, make in changes.items()}
+        columns = {}
+        for name, make in changes.items():
+            # A copy, because the change may be in place, and others still need the old values.
+            columns[name] = make(np.array(getattr(rows, name)))
         return replace(rows, **columns)
 
     return change
@@ -173,8 +176,11 @@ def _stale(name: str) -> Callable[[Rows], Rows]:
         now = np.array(getattr(rows, name))
         before = last.pop() if last else now
         last.append(now)
-        is_due = next(numbers) % MESSAGES_PER_CHANGE == 0 and before.shape == now.shape
-        return replace(rows, **{name: before}) if is_due else rows
+        is_due = next(numbers) % MESSAGES_PER_CHANGE == 0
+        # Messages around a cut have other numbers of rows.
+        if not is_due or before.shape != now.shape:
+            return rows
+        return replace(rows, **{name: before})
 
     return change
 
@@ -199,6 +205,7 @@ def _drop_last_row() -> Patch:
         is_due = message is not None and next(numbers) % MESSAGES_PER_CHANGE == 0
         if is_due and len(message.rows) > 1:
             part = message.rows.select(slice(len(message.rows) - 1))
+            # A message has a fixed number of rows, so a smaller one is made.
             publisher._next = publisher._make_buffer(len(part), part.frequency.shape[1])
             publisher._next.fill(part)
         original(publisher)
@@ -206,9 +213,16 @@ def _drop_last_row() -> Patch:
     return _wrap("ros.nodes.driver:FrequenciesPublisher", "publish", publish)
 
 
+def _swap_pads(frequency: Any) -> Any:
+    frequency[:, [0, 1]] = frequency[:, [1, 0]]
+    return frequency
+
+
 def _swap_cubes(rows: FrequencyRows) -> FrequencyRows:
-    one, other = np.flatnonzero(rows.cube == 1), np.flatnonzero(rows.cube == 2)
+    one = np.flatnonzero(rows.cube == 1)
+    other = np.flatnonzero(rows.cube == 2)
     frequency = np.array(rows.frequency)
+    # A message may have rows of one of the cubes only.
     if len(one) == len(other):
         frequency[np.r_[one, other]] = frequency[np.r_[other, one]]
     return replace(rows, frequency=frequency)
@@ -237,6 +251,7 @@ def _ignore_checksums() -> None:
 
 
 def _leave_thread(original: Any, *arguments: Any) -> None:
+    # A daemon, so that the process can still end.
     threading.Thread(target=threading.Event().wait, daemon=True).start()
     original(*arguments)
 
@@ -245,6 +260,11 @@ def _swap_open_and_short(status: Any) -> Any:
     swapped = status & ~np.uint16(OPEN | SHORT)
     swapped |= np.where(status & OPEN, SHORT, 0).astype(np.uint16)
     return swapped | np.where(status & SHORT, OPEN, 0).astype(np.uint16)
+
+
+def _transpose(gradient: Any) -> Any:
+    matrices = gradient.reshape(-1, 3, 3)
+    return matrices.transpose(0, 2, 1).reshape(-1, 9)
 
 
 def _flag_sound_pad(
@@ -263,6 +283,7 @@ def _never_release(
     found: Any,
     came: Any,
 ) -> None:
+    # `_recent` holds the conditions of the last windows, the newest first. They must not age.
     kept = conditions._recent[0] | found
     original(conditions, found, came)
     conditions._recent[0] |= kept
@@ -275,6 +296,7 @@ def _use_bad_pads(
     left_out: Any = None,
 ) -> Any:
     wrong = original(pipeline, rows, np.zeros(len(rows), np.uint32))
+    # Only the components are wrong: the row still states that pads are left out.
     right = original(pipeline, rows, left_out)
     return replace(right, stress=wrong.stress, gradient=wrong.gradient)
 
@@ -307,7 +329,7 @@ DRIVER: dict[str, tuple[str, Patch]] = {
     ),
     "swapped pads": (
         "two pads of each cube are swapped",
-        _frequencies(frequency=lambda f: np.hstack([f[:, [1, 0]], f[:, 2:]])),
+        _frequencies(frequency=_swap_pads),
     ),
     "swapped cubes": (
         "the readings of two cubes are swapped",
@@ -454,7 +476,7 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
     "per millimetre": ("gradients are in Pa/mm", _stress(gradient=lambda value: value / 1e3)),
     "gradient transposed": (
         "gradients have columns for rows",
-        _stress(gradient=lambda g: g.reshape(-1, 3, 3).transpose(0, 2, 1).reshape(-1, 9)),
+        _stress(gradient=_transpose),
     ),
     "unknown is zero": (
         "components that are not observed are 0",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import socket
 import time
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
@@ -116,6 +117,7 @@ def play(
                 logs = "\n".join(children.log(name)[-500:] for name in NODES)
                 raise CubeError(f"no tensor arrived within {MAX_START_S:g} s:\n{logs}")
 
+            # All threads are there when tensors arrive, and further ones are leaks.
             threads = memory.count_threads()
             _carry_out(observer, actions, ports / FAULT_PIPE, schedule(duration, seed), duration)
             observer.spin(SETTLE_S - ARRIVAL_S)
@@ -152,14 +154,18 @@ def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
 
     failed = [f"{action.kind}: {action.answer}" for action in actions.done if not action.succeeded]
     return {
-        "faults": dict(sorted(Counter(record.fault.kind for record in log.faults).items())),
-        "deeds": dict(sorted(Counter(action.kind for action in actions.done).items())),
+        "faults": _count_sorted(record.fault.kind for record in log.faults),
+        "deeds": _count_sorted(action.kind for action in actions.done),
         "timeline": [span(action) for action in actions.done],
         # A busy host may refuse a tare.
         "deeds_failed": len(failed) - len(actions.refused),
         "failed": failed,
         "refused": [f"tare: {answer}" for answer in actions.refused],
     }
+
+
+def _count_sorted(kinds: Iterable[str]) -> dict[str, int]:
+    return dict(sorted(Counter(kinds).items()))
 
 
 def _make_processes(
@@ -177,6 +183,7 @@ def _make_processes(
         markers=True,
         simulated=hubs,
     ):
+        # The driver is activated later, when everybody has discovered it.
         if process.executable == "driver":
             process.parameters.update({"autostart": False, "port_directory": ""})
         if process.executable == "reconstruction":
@@ -203,6 +210,7 @@ def _write_skin(folder: Path, ports: Path) -> Path:
     )
     for number, link in enumerate(data["links"]):
         link["port"], link["hub_uid"] = str(ports / "*"), number + 1
+    # The system chooses a free port, which the simulator opens again a moment later.
     with socket.create_server(("127.0.0.1", 0)) as free:
         data["links"][-1]["port"] = f"socket://127.0.0.1:{free.getsockname()[1]}"
     path = folder / "skin.yaml"
@@ -219,6 +227,7 @@ def _carry_out(
 ) -> None:
     """Carry out events at their times, and wait for the end of the duration."""
     began_s = time.monotonic()
+    # Each line is flushed, because the simulator must carry the fault out at once.
     with fault_pipe.open("w") as pipe:
         for at_s, event in events:
             observer.spin(began_s + at_s - time.monotonic())

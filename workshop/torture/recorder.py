@@ -102,8 +102,10 @@ class Recorder:
     def _count(self) -> dict[str, int]:
         """Return the counters of the driver that runs."""
         counts = {name: int(value) for name, value in self._totals.items()}
+        # A link that has not been connected yet has no counters.
         for name in LINK_COUNTERS:
-            counts[name] = sum(int(link.get(name, 0)) for link in self._links.values())
+            values = [int(link.get(name, 0)) for link in self._links.values()]
+            counts[name] = sum(values)
         return counts
 
     def finish(self, checked: Span, actions: list[Action]) -> Record:

@@ -156,6 +156,7 @@ def torture(
     mutation: str = "",
 ) -> dict[str, Any]:
     """Play one torture and return all figures, see `play` for the arguments."""
+    # A skin that runs elsewhere on this machine must not be heard.
     with own_domain(), tempfile.TemporaryDirectory(prefix="cube_torture_") as folder:
         played = play(duration, seed, Path(folder), interrupted, mutation)
         figures = check_all(played.record, played.log)
