@@ -68,8 +68,7 @@ class Spectra:
     normal: Array
 
     def radial(self, bessel: BesselTable, load_spectra: Array) -> Array:
-        """Compute the functions R, Z and T of circular.py for forces that are spread over the
-        surface.
+        """Compute R, Z and T of circular.py for forces that are spread over the surface.
 
         Args:
             bessel: Bessel functions at the wanted distances.

@@ -69,8 +69,7 @@ class Fields(Protocol):
 
     @property
     def period(self) -> float:
-        """Time in s after which the load repeats, or else a duration that counts as the whole
-        load."""
+        """Time in s after which the load repeats, or that stands for such a time."""
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         """Compute the fields at a time.

@@ -202,25 +202,25 @@ class Observations:
 
     def responses(self, centres: Array, size: float) -> Array:
         """Compute the values (K, D, 3) under contacts with 1 N at K centres (K, 2) in m."""
-        n = len(centres)
-        offset = self.place - centres[:, None]
-        offset = offset.reshape(-1, 2)
-        angle = np.tile(self._angle, n)
-        variant = np.tile(self._variant, n)
-        responses = self.kernels.response(offset, angle, variant, size)
-        observed = responses[:, self._columns].reshape(n, -1, 3)
-        return observed[:, self._known]
+        responses = self.kernels.response(*self._cubes_from(centres), size)
+        return self._select_known(responses, len(centres))
 
     def cross(self, points: Array) -> Array:
         """Compute the prior covariance (points, 3, D) of the traction at points with the values."""
-        n = len(points)
+        cross = self.kernels.cross(*self._cubes_from(points))
+        return self._select_known(cross, len(points)).swapaxes(1, 2)
+
+    def _cubes_from(self, points: Array) -> tuple[Array, Array, Index]:
+        """Return position (K n, 2), rotation and variant (K n,) of n cubes from K points (K, 2)."""
+        count = len(points)
         offset = self.place - points[:, None]
-        offset = offset.reshape(-1, 2)
-        angle = np.tile(self._angle, n)
-        variant = np.tile(self._variant, n)
-        cross = self.kernels.cross(offset, angle, variant)[:, self._columns]
-        known = cross.reshape(n, -1, 3)[:, self._known]
-        return np.asarray(known.swapaxes(1, 2))
+        angle = np.tile(self._angle, count)
+        return offset.reshape(-1, 2), angle, np.tile(self._variant, count)
+
+    def _select_known(self, components: Array, count: int) -> Array:
+        """Select the known values (K, D, 3) of all components (K n, 15, 3) of n cubes."""
+        observed = components[:, self._columns].reshape(count, -1, 3)
+        return np.asarray(observed[:, self._known])
 
 
 class ContactFit(NamedTuple):

@@ -61,8 +61,7 @@ class HertzContact:
 
 
 class ContactModel:
-    """Computes what Hertz contacts cause: the response of all cubes, and the traction on the
-    surface.
+    """Computes the response of all cubes to Hertz contacts, and the traction on the surface.
 
     Attributes:
         inverse: Inverse of the skin.

@@ -270,7 +270,8 @@ class ContactTracker:
 
         # Centres on the skin unrolled around the home of the first contact.
         homes = np.array([contact.home for contact in contacts])
-        origins, rotations = _home_frames(*inverse.unroll(home, homes))
+        origins, angles = inverse.unroll(home, homes)
+        rotations = _plane_rotations(angles)
         places = np.array([contact.place for contact in contacts])
         centres = origins + np.einsum("jab,jb->ja", rotations, places)
         sizes = np.array([contact.size for contact in contacts])
@@ -493,13 +494,13 @@ class ContactTracker:
         return self._priors[key]
 
 
-def _home_frames(place: Array, angle: Array) -> tuple[Array, Array]:
-    """Return origins (J, 2) of cubes and rotations (J, 2, 2) from their frames."""
+def _plane_rotations(angle: Array) -> Array:
+    """Return the rotation matrices (J, 2, 2) of angles (J,) in rad."""
     cosine = np.cos(angle)
     sine = np.sin(angle)
     first_row = np.stack([cosine, -sine], axis=-1)
     second_row = np.stack([sine, cosine], axis=-1)
-    return place, np.stack([first_row, second_row], axis=-2)
+    return np.stack([first_row, second_row], axis=-2)
 
 
 def _nearest_home(
