@@ -337,6 +337,7 @@ class MessageCodec(Generic[AnyRows]):
     ) -> None:
         """Write what all messages of a layout have in common into records (M,)."""
         record["encapsulation"] = LITTLE_ENDIAN
+        # Void data keep the closing zero, which numpy removes from strings of bytes.
         record["frame_id"] = np.void(frame_id)
         for name, count in zip(layout.sequences, layout.counts.tolist(), strict=True):
             record[f"length of {name}"] = count
@@ -430,6 +431,7 @@ class MessageCodec(Generic[AnyRows]):
         for field in self._fields[:n_fields]:
             count_at, values = None, 1
             if field.width != PER_MESSAGE:
+                # The values follow their number without a gap, as none is wider than 4 bytes.
                 count_at = _align(end)
                 end = count_at + 4
                 width = shape.pads if field.width == PER_PAD else field.width
