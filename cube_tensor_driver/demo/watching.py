@@ -118,6 +118,9 @@ def watch(
         Interrupted: Ctrl-C.
         CubeError: A file cannot be used, tensors do not come, or another skin publishes here.
     """
+    # Ctrl-C during the imports must not wait for the display.
+    if interrupted.is_set():
+        raise Interrupted("interrupted")
     skin = read_skin(skin_file)
     if settings.imperfections is not None:
         # The simulator reads it, too, but its error would be buried in its log.
