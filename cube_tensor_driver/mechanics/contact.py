@@ -37,8 +37,8 @@ _STRESS_AXES = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Axes of the stress components xx, yy, zz, yz, zx, xy."""
 
 _AIRY_COMPONENTS = ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0))
-"""Stress component, axes and sign of the derivative of g that it is: xx = g_yy, yy = g_xx,
-xy = -g_xy."""
+"""Stress components that are second derivatives of the Airy function g, as index of the component,
+the two axes of the derivative, and its sign: xx = g_yy, yy = g_xx, xy = -g_xy."""
 
 _THIRD_DERIVATIVES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
 """Axes of all different third derivatives in a plane: xxx, xxy, xyy, yyy."""

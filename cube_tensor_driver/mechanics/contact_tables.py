@@ -50,16 +50,16 @@ MAX_LEG_RATIO = 50.0
 there: beyond it hardly any stress reaches the cube."""
 
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
-"""Index of the largest tabulated distance."""
+"""Index of the largest tabulated distance between a round contact and a cube."""
 
 _GRID_ROWS = int(np.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP)) + 2
-"""Number of tabulated values of d."""
+"""Number of rows of the polygon tables: values of the distance d of an edge from the cube."""
 
 _CENTRE_COLUMN = int(np.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP))
-"""Index of t = 0 among the tabulated values of t."""
+"""Column of the polygon tables for t = 0, where t is the length along an edge."""
 
 _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
-"""Number of tabulated values of t."""
+"""Number of columns of the polygon tables: values of the length t along an edge, of either sign."""
 
 _ORIGIN_TOLERANCE = 1e-12
 """Length of an edge, divided by the depth, below which it counts as a point."""

@@ -64,7 +64,8 @@ CUT_FAULTS = (
     "pads",
     "version",
 )
-"""Faults that interrupt a link or its clock."""
+"""Faults that interrupt a link, change what its hub reports of itself, or disturb the hub's
+clock."""
 
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """Faults that end as soon as they have begun. All others last `seconds`."""

@@ -170,7 +170,8 @@ class SurfaceInverse:
         self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
         self._all_pads = self.by_pad.copy()
 
-        # Variants change when pads are left out; these are the ones with all pads.
+        # A cube gets another variant of the measurement model when pads are left out. These are the
+        # variants with all pads.
         self._whole_variant = np.zeros(n, np.intp) if model is None else model.variant
         self._variant_pads = None if model is None else model.pads
         self.variant = self._whole_variant.copy()

@@ -310,7 +310,7 @@ def _solve_window(
 
     # diag(G M G') is a sum over the pads of (G B)^2.
     by_point = gain.reshape(-1, ROWS_PER_POINT, n, width)
-    rows = by_point[:, 2:].reshape(-1, n, width)  # both pressures
+    rows = by_point[:, 2:].reshape(-1, n, width)  # on the surface and at depth
     by_pad = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
 
     inner = min(INNER_CUBES, n)

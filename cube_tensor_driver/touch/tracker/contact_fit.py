@@ -208,7 +208,8 @@ class Observations:
     def cross(self, points: Array) -> Array:
         """Compute the prior covariance (points, 3, D) of the traction at points with the values."""
         cross = self.kernels.cross(*self._cubes_from(points))
-        return self._select_known(cross, len(points)).swapaxes(1, 2)
+        known = self._select_known(cross, len(points))
+        return np.asarray(known.swapaxes(1, 2))
 
     def _cubes_from(self, points: Array) -> tuple[Array, Array, Index]:
         """Return position (K n, 2), rotation and variant (K n,) of n cubes from K points (K, 2)."""

@@ -31,7 +31,8 @@ DETECTION_VALLEY = 0.8
 below which they are two."""
 
 MERGE_VALLEY = 0.92
-"""The same ratio, above which two existing contacts become one."""
+"""Lowest pressure between two existing contacts, divided by the smaller of their pressures, above
+which they become one."""
 
 SPLIT_OVERLAP = 0.6
 """Distance of two contacts that a split of one contact made (contact_split.py), divided by the sum
