@@ -116,7 +116,8 @@ def _run_response(options: argparse.Namespace, model: Model) -> None:
 
     from ..fem.fem import compute_response
 
-    layout, symmetry = model.layout, model.symmetry
+    layout = model.layout
+    symmetry = model.symmetry
     text = describe(model.body, layout)
     print(f"{text}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
     # A factorisation in C does not notice Ctrl-C by itself.
@@ -142,7 +143,8 @@ def _run_surface(options: argparse.Namespace, model: Model) -> None:
     from ..figures.response import draw_influence
     from ..studies.surface_study import study_surface
 
-    body, layout = model.body, model.layout
+    body = model.body
+    layout = model.layout
     print(
         f"{describe(body, layout)} on rigid ground; {layout.n_pads} pads",
         flush=True,
@@ -306,7 +308,7 @@ def _convergence_table(result: Response) -> Table:
     """Return the table of the coefficients on each mesh."""
     meshes = result.convergence
     unknowns = [str(mesh["unknowns"]) for mesh in meshes]
-    title = "coefficients on meshes with these numbers of unknowns"
+    title = "coefficients on each mesh"
     table = new_table(title, "unknowns", [*unknowns, "last step"])
     names = list(result.coefficients)[:MAX_COEFFICIENTS_SHOWN]
     for name in names:
@@ -329,11 +331,12 @@ def show_surface(study: SurfaceStudy) -> None:
 
     is_plane = study.layout.planar
     names = list(study.rows[0].measured)
-    heads = [f"{name} {column}" for name in names for column in ("measured", "true", "ratio")]
+    # Short, so that the table fits into 80 columns.
+    heads = [f"{name} {column}" for name in names for column in ("cube", "true", "ratio")]
     table = new_table(
         f"stress in kPa under {'1 N/mm' if is_plane else '1 N'}: measured by the cube, and true",
         "load",
-        ["width, mm", "beside, mm", *heads],
+        ["width, mm", "at x, mm", *heads],
     )
     # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.
     unit, digits = (1.0, 1) if is_plane else (1e3, 2)
@@ -350,7 +353,8 @@ def _surface_cells(
     digits: int,
 ) -> tuple[str, str, str]:
     """Return measured stress, true stress and their ratio, empty where the true one is small."""
-    measured, true = row.measured[name], row.true[name]
+    measured = row.measured[name]
+    true = row.true[name]
     largest = max(abs(value) for value in row.true.values())
     ratio = f"{measured / true:.2f}" if abs(true) > MIN_SHOWN_SHARE * largest else ""
     return (

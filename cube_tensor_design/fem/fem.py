@@ -286,7 +286,8 @@ def linear_response(
         layout: Pads of the cube.
         report: Called as report(what) before every solve.
     """
-    axes, modes = field_axes(layout), default_modes(layout)
+    axes = field_axes(layout)
+    modes = default_modes(layout)
     numbers = range(modes.n_modes)
     stress = modes.stress[np.ix_(numbers, axes, axes)]
     gradient = modes.gradient[np.ix_(numbers, axes, axes, axes)]
@@ -370,7 +371,8 @@ def has_stress(
 ) -> bool:
     """Return False where a pad's mean stress is zero, because the field is odd about its centre."""
     axes = list(field_axes(layout))
-    centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
+    centre = layout.positions[pad, axes]
+    normal = layout.normals[pad, axes]
     is_off_mirror = (np.abs(centre) > 1e-9) | (normal != 0)
     return bool(np.all((np.array(parity) >= 0) | is_off_mirror))
 
@@ -385,13 +387,16 @@ def pad_weights(
 
     It is weights @ reactions[dofs], with the reactions of `Solid.reactions`.
     """
-    axes, half = list(field_axes(layout)), layout.pad_size / 2
-    centre, normal = layout.positions[pad, axes], layout.normals[pad, axes]
+    axes = list(field_axes(layout))
+    half = layout.pad_size / 2
+    centre = layout.positions[pad, axes]
+    normal = layout.normals[pad, axes]
     axis = int(np.argmax(np.abs(normal)))
     intervals = []
     for k, position in enumerate(centre):
         if k != axis:
             # Rounding may put the edge of a pad beyond that of the face.
-            start, stop = max(position - half, -1.0), min(position + half, 1.0)
+            start = max(position - half, -1.0)
+            stop = min(position + half, 1.0)
             intervals.append((start, stop))
     return solid.pad_weights(parity, axis, float(np.sign(normal[axis])), intervals)

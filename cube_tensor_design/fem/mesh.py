@@ -258,7 +258,8 @@ def _rings(
                 triangles.append((outer + side, outer + corner, inner + corner))
                 triangles.append((outer + side, inner + corner, inner + side))
     # The last ring is closed by triangles to the corner of the cube itself.
-    last, corner = 8 * n, len(points) - 1
+    last = 8 * n
+    corner = len(points) - 1
     for j in range(8):
         triangles.append((last + j, last + (j + 1) % 8, corner))
     return points, np.array(triangles)

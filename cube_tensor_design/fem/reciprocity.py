@@ -75,7 +75,8 @@ def _surface_influence(
     report: Callable[[str], None],
 ) -> tuple[Array, Array]:
     """Return positions (n, dim - 1) and influence (P, n, dim) of the nodes on the surface, d0."""
-    x, dim = solid.positions, solid.dim
+    x = solid.positions
+    dim = solid.dim
     height = x[-1]
     on_top = np.abs(height - height.max()) < 1e-12
     # The unknowns of the components at the same nodes, in the same order.

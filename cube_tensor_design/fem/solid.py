@@ -40,7 +40,7 @@ SMALLEST_DISSECTED = 60
 
 
 def _is_at(x: Array, value: float | Array) -> Mask:
-    return np.asarray(np.abs(x - value) < SAME_COORDINATE)
+    return np.abs(x - value) < SAME_COORDINATE
 
 
 def lame(
@@ -323,7 +323,8 @@ class Solid:
 
     def _restrict(self, elements: Mask) -> skfem.Basis:
         """Return the basis on some of the elements."""
-        mesh, order = self.basis.mesh, 2 * self.order
+        mesh = self.basis.mesh
+        order = 2 * self.order
         numbers = np.flatnonzero(elements)
         return skfem.Basis(mesh, self.basis.elem, elements=numbers, intorder=order)
 
@@ -334,7 +335,8 @@ class Solid:
         translation is odd along its axis, a rotation along both axes of its plane. A rigid cube can
         be held altogether, since these motions are free for the body, too.
         """
-        x, component = self.positions, self.component
+        x = self.positions
+        component = self.component
         held = np.zeros(len(component), dtype=bool)
         for k, sign in enumerate(parity):
             if sign != 0:
@@ -418,7 +420,8 @@ def nested_dissection(grid: Index) -> Index:
         if len(part) < SMALLEST_DISSECTED or len(planes) == 0:
             return part
         cut = planes[len(planes) // 2]
-        lower, upper = order(part[along < cut]), order(part[along > cut])
+        lower = order(part[along < cut])
+        upper = order(part[along > cut])
         return np.concatenate([lower, upper, part[along == cut]])
 
     return order(np.arange(grid.shape[1]))

@@ -165,7 +165,8 @@ def _draw_stress(
     window: float,
 ) -> None:
     """Draw σzz of the elastomer as colours and contour lines on the points `drawn` (2, n), mm."""
-    points, triangles = deformation.points, deformation.triangles
+    points = deformation.points
+    triangles = deformation.triangles
     ring = np.abs(points).max(axis=0)
     outside_cube = ring[triangles].max(axis=0) > 1 + 1e-9
     # Labels of the contour lines must be in view.
@@ -231,7 +232,8 @@ def _draw_arrows(
         distance = np.hypot(*(deformation.points - point[:, None]))
         nodes.append(np.argmin(distance))
     # Nodes are drawn where they have moved to, as the body is.
-    tails, moved = drawn[:, nodes], deformation.displacement[:, nodes]
+    tails = drawn[:, nodes]
+    moved = deformation.displacement[:, nodes]
     # The longest arrow is as long as d0; only those are drawn that are in view as a whole.
     arrows = 1e3 * d0 * moved / np.hypot(*moved).max()
     ends = np.abs([tails, tails + arrows])

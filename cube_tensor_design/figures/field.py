@@ -81,7 +81,8 @@ def draw_traction(example: FieldExample) -> Figure:
 
 def relative_rms(values: Array, reference: Array) -> float:
     """Return the rms of values over the rms of a reference."""
-    square, reference_square = (values**2).mean(), (reference**2).mean()
+    square = (values**2).mean()
+    reference_square = (reference**2).mean()
     return float(np.sqrt(square / reference_square))
 
 
@@ -147,7 +148,8 @@ def _draw_maps(
             colors="white",
             linewidths=0.5,
         )
-        cubes, load = 1e3 * example.cubes[:, :2].T, 1e3 * example.centre
+        cubes = 1e3 * example.cubes[:, :2].T
+        load = 1e3 * example.centre
         axis.plot(
             *cubes,
             "s",

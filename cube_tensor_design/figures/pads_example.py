@@ -65,7 +65,8 @@ def _draw_load(axis: Any, state: dict[str, float]) -> None:
                 _draw_arrow(axis, (x, side * (1 + length)), (x, side))
         # Shear on one face needs shear on the other ones, or the square would turn.
         if state["zx"]:
-            near, far = 1.15 * side, 0.9 * side
+            near = 1.15 * side
+            far = 0.9 * side
             _draw_arrow(axis, (-far, near), (far, near))
             _draw_arrow(axis, (near, -far), (near, far))
 

@@ -33,7 +33,8 @@ def draw_trust(result: LayoutStudy) -> Figure:
     Full lines are stresses. Dashed lines are gradients: the marker stands for the component, the
     colour for the direction.
     """
-    rows, columns = len(result.sides), len(result.error)
+    rows = len(result.sides)
+    columns = len(result.error)
     figure = Figure(figsize=(4 * columns, 3 * rows))
     axes = figure.subplots(
         rows,
@@ -88,5 +89,6 @@ def _component_style(number: int) -> dict[str, Any]:
     if number < len(STRESS):
         return curve_style(number) | {"linestyle": "-"}
     component, direction = divmod(number - len(STRESS), 3)
-    dashes, colour = DIRECTION_DASHES[direction], DIRECTION_COLOURS[direction]
+    dashes = DIRECTION_DASHES[direction]
+    colour = DIRECTION_COLOURS[direction]
     return curve_style(component) | {"linestyle": dashes, "color": colour}

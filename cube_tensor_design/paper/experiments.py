@@ -162,7 +162,8 @@ def _run_experiment(
     without = empty_bench.run(protocol.steps, report)
     frequency = foam_frequency(with_cube.pads)
     # All pads have the same noise, and every mode of the plane is wanted.
-    noise, targets = np.ones(8), np.eye(7)
+    noise = np.ones(8)
+    targets = np.eye(7)
     estimator = make_estimator(calibration.matrix, noise, PLANE, targets=targets)
     return Experiment(
         name=protocol.name,
@@ -186,7 +187,11 @@ def prototype(frequency: Array) -> Array:
     """Return P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4), eqs. 8 to 10."""
     change = frequency - REST_FREQUENCY
     return np.stack(
-        [-change.sum(axis=1), change @ SHEAR_SIGNS, change @ GRAD_SIGNS],
+        [
+            -change.sum(axis=1),
+            change @ SHEAR_SIGNS,
+            change @ GRAD_SIGNS,
+        ],
         axis=1,
     )
 

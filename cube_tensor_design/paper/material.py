@@ -42,7 +42,8 @@ class Material:
             strain = _strain(f)
             squares = np.sum(strain * strain, axis=(-2, -1))
             dilation = _trace(strain)
-            return np.asarray(self.lam / 2 * dilation**2 + self.mu * squares)
+            volume_part = self.lam / 2 * dilation**2
+            return np.asarray(volume_part + self.mu * squares)
         log = np.log(np.linalg.det(f))
         squares = np.sum(f * f, axis=(-2, -1))
         distortion = self.mu / 2 * (squares - 2 - 2 * log)
@@ -55,11 +56,12 @@ class Material:
         """
         # Two more axes for the components i and j.
         two_axes = (..., None, None)
-        lam, mu = self.lam[two_axes], self.mu[two_axes]
+        lam = self.lam[two_axes]
+        mu = self.mu[two_axes]
         if not self.finite:
             strain = _strain(f)
             dilation = _trace(strain)[two_axes]
-            return np.asarray(lam * dilation * _ONE + 2 * mu * strain)
+            return lam * dilation * _ONE + 2 * mu * strain
         inverse = _inverse_transposed(f)
         log = np.log(np.linalg.det(f))[two_axes]
         return np.asarray(mu * (f - inverse) + lam * log * inverse)
@@ -79,7 +81,8 @@ class Material:
     def moduli(self, f: Array) -> Array:
         """Return dP_ij/dF_kl (..., 2, 2, 2, 2), in Pa."""
         four_axes = (..., None, None, None, None)
-        lam, mu = self.lam[four_axes], self.mu[four_axes]
+        lam = self.lam[four_axes]
+        mu = self.mu[four_axes]
         identity = np.einsum("ik,jl->ijkl", _ONE, _ONE)
         if not self.finite:
             outer = np.einsum("ij,kl->ijkl", _ONE, _ONE)
@@ -97,13 +100,13 @@ class Material:
 
 def _inverse_transposed(f: Array) -> Array:
     inverse = np.linalg.inv(f)
-    return np.asarray(np.swapaxes(inverse, -2, -1))
+    return np.swapaxes(inverse, -2, -1)
 
 
 def _strain(f: Array) -> Array:
     transposed = np.swapaxes(f, -2, -1)
-    return np.asarray((f + transposed) / 2 - _ONE)
+    return (f + transposed) / 2 - _ONE
 
 
 def _trace(e: Array) -> Array:
-    return np.asarray(e[..., 0, 0] + e[..., 1, 1])
+    return e[..., 0, 0] + e[..., 1, 1]

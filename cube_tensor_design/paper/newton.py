@@ -82,10 +82,11 @@ def find_balance(
         reached = None
         for matrix in tangents(u):
             change = search.correction(u, state, matrix, jump)
-            largest_change, largest = np.abs(change).max(), np.abs(u).max()
+            largest_change = np.abs(change).max()
+            largest = np.abs(u).max()
             is_small = largest_change < TOLERANCE * largest
             if linear or is_small:
-                return np.asarray(u + change)
+                return u + change
             if jump.any():  # prescribed displacements are not shortened
                 reached = u + change, balance(u + change)
             else:
@@ -167,7 +168,8 @@ class _Search:
 
     def _unbalanced(self, force: Array) -> float:
         """Return the norm of the forces that nothing holds."""
-        free, held = force[self._free], self._held
+        free = force[self._free]
+        held = self._held
         if held is not None:
             # The force along the row is what holds the row.
             free = free - held * (held @ free) / (held @ held)

@@ -50,7 +50,8 @@ def normal_fall(experiment: Experiment) -> NormalFall:
     normal_pads = experiment.pads[:, :4]
     before, after = normal_pads[[pressed, -1]].mean(axis=1)
     angle = experiment.rotation[-1]
-    sin, cos = np.sin(angle), np.cos(angle)
+    sin = np.sin(angle)
+    cos = np.cos(angle)
     shear_part = -2 * zx * sin * cos
     normal_part = (xx - zz) * sin**2
     field = np.array([zz - zz_before, shear_part, normal_part])

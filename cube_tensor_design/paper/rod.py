@@ -123,14 +123,18 @@ class RodContact:
             curved: Whether the rod's curvature counts, which can make the tangent indefinite.
         """
         at = self._penetration(u)
+        # The derivatives of the pressure k p dp/dg by g and by the slope of the rod.
         normal = self._stiffness * (at.dp**2 + at.p * at.ddp)
-        bending = -self._stiffness * at.p * at.dp * at.curvature * curved
+        pressure = self._stiffness * at.p * at.dp
+        bending = -pressure * at.curvature * curved
         return self._assemble(normal, at.slope, bending)
 
     def secant(self, u: Array, v: Array) -> sp.csr_matrix:
         """Return S, sparse (dofs, dofs), with S (u - v) = force(u) - force(v); linear theory."""
-        at, other = self._penetration(u), self._penetration(v)
-        change = np.asarray(self._facets.interpolate(u - v))[1]
+        at = self._penetration(u)
+        other = self._penetration(v)
+        moved = np.asarray(self._facets.interpolate(u - v))
+        change = moved[1]
         has_moved = np.abs(change) > SAME_DISPLACEMENT
         difference = at.p * at.dp - other.p * other.dp
         quotient = difference / np.where(has_moved, change, 1.0)
@@ -187,4 +191,5 @@ def _push_change(
     normal_w = w[1] - p.slope * w[0]
     normal_u = u[1] - p.slope * u[0]
     along_normal = normal_w * normal_u
-    return p.normal * along_normal + p.bending * w[0] * u[0]
+    rotation = w[0] * u[0]
+    return p.normal * along_normal + p.bending * rotation

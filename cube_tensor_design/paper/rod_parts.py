@@ -138,7 +138,8 @@ def draw_back(bench: VirtualBench, step: LoadStep) -> LoadStep:
     force = bench.without_cube().rod_pressure(step)[1].sum()
     # The force is nearly proportional to the depth.
     guess = rod.pressed / (1 + excess(rod.pressed))
-    return step_to(newton(excess, rod.pressed, x1=guess, tol=SAME_DEPTH))
+    depth = newton(excess, rod.pressed, x1=guess, tol=SAME_DEPTH)
+    return step_to(depth)
 
 
 def split_signals(
@@ -157,9 +158,11 @@ def split_signals(
     """
     if bench.finite or step.sliding:
         raise ElasticError("fields superpose on a linear bench whose bottom is bonded; take that")
-    empty, in_cube = bench.without_cube(), bench.in_cube
+    empty = bench.without_cube()
+    in_cube = bench.in_cube
     with_cube = draw_back(bench, step) if held == "force" else step
-    u, field = bench.solve(with_cube), empty.solve(step)
+    u = bench.solve(with_cube)
+    field = empty.solve(step)
     if u is None or field is None:
         raise ElasticError("the load is too large for one step; press less")
 
@@ -226,7 +229,8 @@ def _superposed_matrix(
     # The unknown -d has the displacement e, so its row and column are those of the contact's force.
     push = sp.csr_matrix((springs @ along_z)[free])
     total_push = [[along_z @ springs @ along_z]]
-    return sp.bmat([[matrix, push.T], [push, total_push]])
+    blocks = [[matrix, push.T], [push, total_push]]
+    return sp.bmat(blocks)
 
 
 def _forces(
@@ -236,15 +240,18 @@ def _forces(
 ) -> Array:
     """Return the nodal forces (dofs,) of some elements at u: their stiffness times u."""
     section = bench.section
-    return section.forces(section.material.stress(section.deformation(u)), elements)
+    stress = section.material.stress(section.deformation(u))
+    return section.forces(stress, elements)
 
 
 def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
     """Return displacements (n, dofs) in balance without a cube, and the part (n,) of each one."""
-    body, section = bench.body, bench.section
+    body = bench.body
+    section = bench.section
     lam, mu = lame(body.young, body.poisson, body.plane)
     ratio = (lam + 3 * mu) / (lam + mu)
-    z = section.basis.doflocs[0] + 1j * section.basis.doflocs[1]
+    x, y = section.basis.doflocs
+    z = x + 1j * y
     # No pad feels the rigid motions, which come first.
     fields = [1.0 + 0 * z, 1j + 0 * z, 1j * z]
     part = [PARTS.index("higher")] * 3
@@ -253,11 +260,13 @@ def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
         for a, b in ((1, 0), (1j, 0), (0, 1), (0, 1j)):
             if order == 1 and a == 1j:  # a rotation
                 continue
-            slope = order * z * np.conj(a * z ** (order - 1))
+            derivative = a * z ** (order - 1)
+            slope = order * z * np.conj(derivative)
             power = z**order
             fields.append(ratio * a * power - slope - np.conj(b * power))
             is_shear = order == 1 and b == 1j
-            part.append(PARTS.index("shear") if is_shear else min(order, 4))
+            # Numbers of PARTS; from the fourth order on they are the higher derivatives.
+            part.append(0 if is_shear else min(order, 4))
     values = np.array(fields)
     is_along_x = section.component == 0
     displacements = np.where(is_along_x, values.real, values.imag)

@@ -80,11 +80,15 @@ def rod_shear(
         progress: Called before every place.
     """
     body = body or Body()
-    layout, depth = LAYOUTS["planar"], body.height / 2
-    with_cube, without = VirtualBench(body), VirtualBench(body, cube=False)
+    layout = LAYOUTS["planar"]
+    depth = body.height / 2
+    with_cube = VirtualBench(body)
+    without = VirtualBench(body, cube=False)
     response = compute_response(body, layout, "slab", meshes=1).matrix
     # All pads have the same noise, and every mode of the plane is wanted.
-    estimator = make_estimator(response, np.ones(8), PLANE, targets=np.eye(7))
+    noise = np.ones(8)
+    targets = np.eye(7)
+    estimator = make_estimator(response, noise, PLANE, targets=targets)
     zx = PLANE.names.index("zx")
     influence = compute_influence(replace(body, ground=True), layout)
 
@@ -108,7 +112,8 @@ def rod_shear(
         modes = estimator.matrix @ pads
         positions, force = with_cube.rod_pressure(step)
         shear_at_rod = np.interp(positions, x, shear_kernel[:, 1])
-        pads_at_rod = influence.at(positions[:, None])[:, :, 1]
+        influence_at_rod = influence.at(positions[:, None])
+        pads_at_rod = influence_at_rod[:, :, 1]
         eq_4_gain = SHEAR_SIGNS @ response[:4, zx]
         rows.append(
             RodShear(
@@ -126,7 +131,8 @@ def rod_shear(
         )
     columns = {}
     for name in vars(rows[0]):
-        columns[name] = np.array([getattr(row, name) for row in rows])
+        column = [getattr(row, name) for row in rows]
+        columns[name] = np.array(column)
     return RodShear(**columns)
 
 
@@ -152,7 +158,8 @@ def _shear_weights(
     prior = np.mean(gaussians, axis=0)
 
     n = len(kernel)
-    total, cross = np.zeros((n, n)), np.zeros(n)
+    total = np.zeros((n, n))
+    cross = np.zeros(n)
     # The prior takes shear and pressure for independent, with these relative sizes.
     for component, size in enumerate((SHEAR_RATIO, 1.0)):
         own = kernel[:, :, component]

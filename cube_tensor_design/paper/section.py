@@ -31,7 +31,8 @@ class Section:
     """
 
     def __init__(self, mesh: skfem.MeshTri, material: Material) -> None:
-        self.mesh, self.material = mesh, material
+        self.mesh = mesh
+        self.material = material
         element = skfem.ElementVector(skfem.ElementTriP2())
         self.basis = skfem.Basis(mesh, element, intorder=4)
         points = np.asarray(self.basis.default_parameters()["x"])
@@ -57,7 +58,8 @@ class Section:
 
     def deformation(self, u: Array) -> Array:
         """Return F = 1 + grad u (elements, points, 2, 2)."""
-        gradient = self._slopes @ u[self._dofs][:, None, :, None]
+        own_dofs = u[self._dofs]  # (elements, n)
+        gradient = self._slopes @ own_dofs[:, None, :, None]
         gradient = gradient.reshape(*self._shape, 2, 2)
         return np.asarray(gradient + np.eye(2))
 
@@ -99,7 +101,8 @@ class Section:
         # The moduli of a linear material are the same at all points of an element.
         own_points = self._shape[1] if self.material.finite else 1
         f = self.deformation(u)
-        moduli = self.material.moduli(f).reshape(-1, own_points, 4, 4)
+        moduli = self.material.moduli(f)
+        moduli = moduli.reshape(-1, own_points, 4, 4)
         # One matrix product per element: points and components are one axis of it.
         weights = self.basis.dx[..., None, None]
         weighted = (moduli * weights) @ self._slopes
@@ -109,7 +112,8 @@ class Section:
         rows = np.broadcast_to(self._dofs[:, :, None], local.shape)
         columns = np.broadcast_to(self._dofs[:, None], local.shape)
         size = (self.basis.N, self.basis.N)
-        entries = (local.ravel(), (rows.ravel(), columns.ravel()))
+        indices = (rows.ravel(), columns.ravel())
+        entries = (local.ravel(), indices)
         matrix = sp.coo_matrix(entries, size).tocsr()
         if not self.material.finite:
             self._linear_tangent = matrix

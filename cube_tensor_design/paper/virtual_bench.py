@@ -150,7 +150,8 @@ class VirtualBench:
         """
         if finite and body.plane != "strain":
             raise ElasticError(f"plane is {body.plane!r}; the finite bench knows 'strain' only")
-        self.body, self.finite = body, finite
+        self.body = body
+        self.finite = finite
         self.layout = layout or LAYOUTS["planar"]
         self._half_side = body.side / 2
 
@@ -159,8 +160,10 @@ class VirtualBench:
         centres = mesh.p[:, mesh.t].mean(axis=1)
         self.in_cube = np.all(np.abs(centres) < 1.0, axis=0)
         lam, mu = lame(body.young, body.poisson, body.plane)
-        stiffness = np.where(self.in_cube & cube, CUBE_STIFFNESS_RATIO, 1.0)[:, None]
-        self.section = Section(mesh, Material(lam * stiffness, mu * stiffness, finite))
+        ratio = np.where(self.in_cube & cube, CUBE_STIFFNESS_RATIO, 1.0)
+        stiffness = ratio[:, None]  # the same at all points of an element
+        material = Material(lam * stiffness, mu * stiffness, finite)
+        self.section = Section(mesh, material)
 
         top = body.height / 2 / self._half_side
         self._top = self._horizontal_facets(top)
@@ -183,21 +186,26 @@ class VirtualBench:
         Raises:
             ElasticError: A step is too large for Newton's method.
         """
-        position = before = _Position(np.zeros(self.section.basis.N), None)
+        rest = np.zeros(self.section.basis.N)
+        position = before = _Position(rest, None)
         loose = position.u
         rows = []
         for number, step in enumerate(steps, 1):
             guess = 2 * position.u - before.u  # continues as the last step went
-            reached = self._advance(position, guess, self._task(step, loose), number)
-            before, position = position, reached
+            task = self._task(step, loose)
+            reached = self._advance(position, guess, task, number)
+            before = position
+            position = reached
             u = position.u
             if not step.gripped:
                 loose = u
             displacement = self._half_side * u[self.section.basis.nodal_dofs]
-            pads, rotation = self._pad_stresses(u), self._rotation(u)
+            pads = self._pad_stresses(u)
+            rotation = self._rotation(u)
             rows.append((pads, self._state(u), rotation, displacement))
             report()
-        return BenchRun(*map(np.array, zip(*rows, strict=True)))
+        columns = zip(*rows, strict=True)
+        return BenchRun(*map(np.array, columns))
 
     def solve(self, step: LoadStep) -> Array | None:
         """Return the displacements (dofs,) under one step from rest, or None if it is too large."""
@@ -229,9 +237,11 @@ class VirtualBench:
             layout: Pads that end where elements of this bench's mesh end.
             angle: Rotation of the cube, in rad.
         """
-        cos, sin = np.cos(angle), np.sin(angle)
+        cos = np.cos(angle)
+        sin = np.sin(angle)
         axes = np.array([[cos, sin], [-sin, cos]])
-        x, component = self.section.basis.doflocs, self.section.component
+        x = self.section.basis.doflocs
+        component = self.section.component
         half = layout.pad_size / 2
         weights = np.zeros((layout.n_pads, self.section.basis.N))
         positions = layout.positions[:, [0, 2]]
@@ -239,7 +249,8 @@ class VirtualBench:
         for pad, (position, normal) in enumerate(zip(positions, normals, strict=True)):
             axis = 0 if normal[0] else 1
             other = 1 - axis
-            start, stop = position[other] - half, position[other] + half
+            start = position[other] - half
+            stop = position[other] + half
             on_face = np.abs(x[axis] - normal[axis]) < SURFACE_TOLERANCE
             on_face &= np.abs(x[other]) < 1 + SURFACE_TOLERANCE
             # Once the cube has turned, forces along both axes act along a pad's normal.
@@ -248,7 +259,8 @@ class VirtualBench:
                 face = face[np.argsort(x[other, face])]
                 integral = face_weights(x[other, face], 2, start, stop)
                 mean = integral / (2 * half)
-                weights[pad, face] = axes[axis, along] * normal[axis] * mean
+                share = axes[axis, along] * normal[axis]
+                weights[pad, face] = share * mean
         return weights
 
     def without_cube(self) -> VirtualBench:
@@ -258,7 +270,8 @@ class VirtualBench:
         # The elastomer is softer than the cube.
         lam = np.full_like(material.lam, material.lam.min())
         mu = np.full_like(material.mu, material.mu.min())
-        bench.section = Section(self.section.mesh, Material(lam, mu, False))
+        elastomer = Material(lam, mu, False)
+        bench.section = Section(self.section.mesh, elastomer)
         return bench
 
     def free(self, step: LoadStep) -> Index:
@@ -280,11 +293,13 @@ class VirtualBench:
             stress: S (2, 2) in Pa, axes x and z.
             gradient: G (2, 2, 2) in Pa.
         """
-        section, mesh = self.section, self.section.mesh
+        section = self.section
+        mesh = self.section.mesh
         field = stress + np.einsum("ijk,epk->epij", gradient, section.points)
         force = section.forces(field)
         # Three unknowns stop the rigid motions; the loads balance, so they bear no force.
-        centre, side = section.node(0.0, 0.0), section.node(1.0, 0.0)
+        centre = section.node(0.0, 0.0)
+        side = section.node(1.0, 0.0)
         nodal_dofs = section.basis.nodal_dofs
         pinned = [*nodal_dofs[:, centre], nodal_dofs[1, side]]
         free = np.setdiff1d(np.arange(section.basis.N), pinned)
@@ -313,7 +328,8 @@ class VirtualBench:
 
     def _task(self, step: LoadStep, loose: Array) -> _Task:
         """Return a step as constraints; loose (dofs,) is the last position without a grip."""
-        basis, component = self.section.basis, self.section.component
+        basis = self.section.basis
+        component = self.section.component
         by_component = step.prescribed(self._half_side * basis.doflocs)
         prescribed = by_component[component, np.arange(basis.N)] / self._half_side
         if step.gripped:
@@ -387,8 +403,11 @@ class VirtualBench:
         nodal_dofs = self.section.basis.nodal_dofs
         left_node = self.section.node(-1.0, 0.0)
         right_node = self.section.node(1.0, 0.0)
-        along = u[nodal_dofs[:, right_node]] - u[nodal_dofs[:, left_node]]
-        return float(np.arctan2(along[1], 2.0 + along[0]))
+        right = u[nodal_dofs[:, right_node]]
+        left = u[nodal_dofs[:, left_node]]
+        # The undeformed line is 2 d0 long.
+        along_x, along_z = right - left
+        return float(np.arctan2(along_z, 2.0 + along_x))
 
     def _pad_stresses(self, u: Array) -> Array:
         """Return the mean normal stress (P,) of the pads in the rotated frame of the cube, in Pa.
@@ -399,15 +418,17 @@ class VirtualBench:
         stress = section.material.stress(section.deformation(u))
         force = -section.forces(stress, ~self.in_cube)
         angle = self._rotation(u) if self.finite else 0.0  # linear: no second-order terms
-        return np.asarray(self.pad_weights(self.layout, angle) @ force)
+        return self.pad_weights(self.layout, angle) @ force
 
     def _state(self, u: Array) -> Array:
         """Fit the seven plane modes to the Cauchy stress within d0/2 of the centre."""
-        points, section = self.section.points, self.section
+        points = self.section.points
+        section = self.section
         is_near = np.all(np.abs(points) < 0.5, axis=-1)
         stress = section.material.cauchy(section.deformation(u))[is_near]
         x = points[is_near]
-        design = np.column_stack([np.ones(len(x)), x])
+        ones = np.ones(len(x))
+        design = np.column_stack([ones, x])
         columns = stress[:, [0, 1, 0], [0, 1, 1]]  # xx, zz, zx
         # Of each component its value, its slope along x and its slope along z.
         fit = np.linalg.lstsq(design, columns, rcond=None)[0]
@@ -424,8 +445,10 @@ def _bench_mesh(
     size: float,
 ) -> skfem.MeshTri:
     """Return triangles of the section, in d0, refined at the cube and where rods press."""
-    half_side, half_pad = body.side / 2, layout.pad_size / 2
-    across = np.abs(layout.positions - layout.normals).max(axis=1)
+    half_side = body.side / 2
+    half_pad = layout.pad_size / 2
+    on_face = np.abs(layout.positions - layout.normals)
+    across = on_face.max(axis=1)
     edges = np.round([across - half_pad, across + half_pad], 9)
     stops = np.unique(edges)
     top = body.height / 2 / half_side
@@ -435,13 +458,21 @@ def _bench_mesh(
     quarter = _refine(quarter, lambda x, z: (z > top - 0.9) & (x < 6.0))
     # Rods stretch the surface most here.
     quarter = _refine(quarter, lambda x, z: (z > top - 0.25) & (x < 2.4))
+
+    def is_at_cube(x: Array, z: Array) -> Mask:
+        from_centre = np.maximum(x, z)
+        return np.abs(from_centre - 1.15) < 0.15
+
     for _ in range(CUBE_REFINEMENTS if cube else 0):
         # The ring of triangles from the faces of the cube to 0.3 d0 outside of it.
-        quarter = _refine(quarter, lambda x, z: np.abs(np.maximum(x, z) - 1.15) < 0.15)
+        quarter = _refine(quarter, is_at_cube)
     return mirror_quarter(quarter)
 
 
-def _refine(mesh: skfem.MeshTri, where: Callable[[Array, Array], Mask]) -> skfem.MeshTri:
+def _refine(
+    mesh: skfem.MeshTri,
+    where: Callable[[Array, Array], Mask],
+) -> skfem.MeshTri:
     """Cut the triangles in four for whose centroids `where` is true."""
     x, z = mesh.p[:, mesh.t].mean(axis=1)
     chosen = np.flatnonzero(where(x, z))

@@ -90,7 +90,8 @@ class FieldStudy:
         if not rising[0] < error < rising[-1]:
             return np.nan
         # Errors are nearly powers of the pitch.
-        log_error, log_pitches = np.log(rising), np.log(self.pitches)
+        log_error = np.log(rising)
+        log_pitches = np.log(self.pitches)
         return float(np.exp(np.interp(np.log(error), log_error, log_pitches)))
 
 
@@ -129,7 +130,8 @@ def flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
 def draw_force(random: np.random.Generator) -> Array:
     """Return the force (3,) of the ball in N, with its shear in a random direction."""
     angle = 2 * np.pi * random.random()
-    shear_x, shear_y = FRICTION * np.cos(angle), FRICTION * np.sin(angle)
+    shear_x = FRICTION * np.cos(angle)
+    shear_y = FRICTION * np.sin(angle)
     return FORCE * np.array([shear_x, shear_y, -1.0])
 
 
@@ -231,7 +233,8 @@ class _Trial:
             computed = surface.field(values).pressure[self._window]
             difference = computed - pressure
             square = (difference**2).mean() / (pressure**2).mean()
-            distance, force_error = WINDOW, -1.0
+            distance = WINDOW
+            force_error = -1.0
             contacts = surface.contacts(values, CONTACT_PRESSURE)
             if contacts:
                 distance = float(np.linalg.norm(contacts[0].position[:2] - centre))

@@ -191,7 +191,7 @@ class Bench:
         # A table of the layer under a ball's unit forces, or the closed form of a half space.
         if self._true_layer is not None:
             unit_fields = self._true_layer.field(points - centre, width / 2)
-            return np.asarray(unit_fields @ force)
+            return unit_fields @ force
         depth = self.setting.depth + self.setting.depth_error
         below = np.column_stack([points, np.full(len(points), -depth)])
         sources, forces = self.point_forces(width, force, centre)
@@ -212,7 +212,7 @@ class Bench:
         tree = cKDTree(inverse.points[:, :2])
         nearest = tree.query(sources[:, :2])[1]
         total = np.bincount(nearest, -forces[:, 2], len(inverse.points))
-        return np.asarray(total / inverse.area)
+        return total / inverse.area
 
     def point_forces(
         self,
@@ -222,7 +222,8 @@ class Bench:
         order: int = ORDER,
     ) -> tuple[Array, Array]:
         """Return the load as point forces: positions (S, 3) in m and forces (S, 3) in N."""
-        shape, radius = self.setting.shape, width / 2
+        shape = self.setting.shape
+        radius = width / 2
         if shape == "ball":
             return contact.hertz(radius, force, centre, order)
         if shape == "flat punch":
@@ -259,7 +260,8 @@ class Bench:
 
     def pads_in(self, field: Array) -> Array:
         """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 24) in the skin's frame."""
-        calibration, rotation = self.calibration, self.poses.rotation
+        calibration = self.calibration
+        rotation = self.poses.rotation
         # Tensors of the skin's frame become those of each cube's frame.
         stress = to_matrix(field[:, :6])
         stress = np.einsum("nai,nbj,nab->nij", rotation, rotation, stress)
@@ -348,7 +350,8 @@ class Bench:
         ]
 
         # Without a contact the force is off by all of it, and no deviation was predicted.
-        force_error, position_error = np.full(2, -1.0), np.full(2, WINDOW)
+        force_error = np.full(2, -1.0)
+        position_error = np.full(2, WINDOW)
         ratio = np.full((2, 2), np.nan)
         both: list[list[Any]] = [list(interpolated), list(tracked)]
         for k, contacts in enumerate(both):

@@ -169,7 +169,8 @@ def _shape_rows(results: Mapping[Setting, Sequence[Errors]]) -> list[list[Any]]:
 
 def _contact_cell(one: Errors) -> list[float]:
     """Return force error in % and position error in mm, each with its calibration ratio."""
-    force, position = 100 * one.force[1], 1e3 * one.position[1]
+    force = 100 * one.force[1]
+    position = 1e3 * one.position[1]
     force_ratio, position_ratio = one.ratio[1]
     digits = ((force, 1), (force_ratio, 1), (position, 2), (position_ratio, 1))
     return [round(float(value), count) for value, count in digits]

@@ -43,7 +43,9 @@ def draw_fingers(
     """
     values = np.full((len(poses.position), 15), np.nan)
     values[rows.cube] = np.concatenate([rows.stress, rows.gradient], axis=1)
-    parts, pressures, points = {}, {}, {}
+    parts = {}
+    pressures = {}
+    points = {}
     for name, cubes in fingers.items():
         parts[name] = CubePoses(*(column[cubes] for column in poses))
         surface = Surface(parts[name], depth, side=SURFACE_SIDE)
@@ -74,7 +76,8 @@ def _draw_pressure(
 ) -> Any:
     """Draw the pressure (M,) in kPa at points (M, 3) in m, from 0 to `top` kPa."""
     # The points are a grid in the order of the cubes' patches, not of rows.
-    across, up = points[:, 0].round(6), points[:, 2].round(6)
+    across = points[:, 0].round(6)
+    up = points[:, 2].round(6)
     order = np.lexsort((across, up))
     shape = (-1, len(np.unique(across)))
     x = 1e3 * points[order, 0].reshape(shape)
