@@ -21,7 +21,7 @@ from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..processes.stop_signals import stop_event
 
 MAX_CUBES = 4096
-"""Largest number of cubes of --cubes; one machine cannot simulate more in real time."""
+"""Largest number of cubes of --cubes."""
 
 PITCH = 0.012
 """Distance of neighbouring cubes of --cubes, in metres."""

@@ -24,13 +24,11 @@ from ..touch.surface import Contact, Surface
 from .verification import Arrivals, Comparison, compare, percentile
 
 MIN_TIMES_COMPARED = 500
-"""Number of sampling times from which on not all are compared with the load.
-
-Each costs the solution of a contact problem, and more times do not change the figures.
-"""
+"""Number of sampling times above which only some, at equal intervals, are compared with the load:
+each costs the solution of a contact problem."""
 
 RANGE_TIMES = 100
-"""Number of times of a script at which the range of the components that it applies is taken."""
+"""Number of times within a load script from which the range of each component is computed."""
 
 LOADED_SHARE = 0.2
 """Share of the largest force above which the skin counts as loaded. The centre of pressure of a

@@ -47,7 +47,7 @@ CROSS_HEIGHT = 1.2
 """Height of that cross above the centre of the cube, in half sides of the cube."""
 
 BARB_LENGTH = 0.25
-"""Length of the barbs of an arrow of lines, relative to the arrow."""
+"""Length of the barbs of an arrow that is drawn as lines, relative to the arrow."""
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,7 @@ def device_time_runs(transcript: Transcript) -> RuleResult:
     device_us = np.array([float(sample.device_us) for sample in transcript.frames(Sample, "start")])
     drift, unsure, jitter = drift_of(host_us - host_us[0], device_us - device_us[0])
     text = f"{1e6 * drift:+.0f} ± {1e6 * unsure:.0f} ppm against the host, jitter {jitter:.0f} µs"
-    # The driver gives up a hub whose clock runs further off.
+    # `MAX_DRIFT` is the largest drift that the driver's estimate of the clock allows.
     if abs(drift) - unsure > MAX_DRIFT:
         return failed(f"device time runs {text}")
     return passed(f"never back, {text}")

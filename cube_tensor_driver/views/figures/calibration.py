@@ -20,7 +20,7 @@ _VIEW = np.array([0.75, -1.0, 0.75])
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 """Corners of a square as a closed line."""
 
-MAX_ONE_COLUMN_PADS = 12
+MAX_TWO_COLUMN_PADS = 12
 """Number of pads whose legend fits into two columns."""
 
 
@@ -154,7 +154,7 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
         zorder=0,
     )
     left.set(xlabel="fitted pad stress / kPa", ylabel="measured pad stress / kPa")
-    left.legend(fontsize=7, ncol=2 if len(pads) <= MAX_ONE_COLUMN_PADS else 3)
+    left.legend(fontsize=7, ncol=2 if len(pads) <= MAX_TWO_COLUMN_PADS else 3)
     right.axhline(0, color="0.5", lw=0.8)
     right.set(xlabel="fitted pad stress / kPa", ylabel="measured − fitted / Pa")
     right.set_title(

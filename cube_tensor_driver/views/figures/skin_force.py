@@ -58,7 +58,6 @@ def draw_forces(
         xlabel="time / s", ylabel="centre of pressure / mm", xlim=panels["force"].get_xlim()
     )
 
-    # The x axis points up, as in the view of a person behind the skin.
     path = panels["path"]
     path.plot(MM * cubes[:, 1], MM * cubes[:, 0], "s", color="0.8", ms=3)
     path.plot(MM * centre[:, 1], MM * centre[:, 0], color="black", lw=1)
