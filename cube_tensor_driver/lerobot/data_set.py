@@ -100,7 +100,9 @@ class DataSet:
         self._skin = skin
         self._topics = topics
         self._image_keys = {topic.key for topic in topics if topic.msgtype in IMAGES}
-        self._statistics = {key: Statistics(width, samples) for key, width in self.widths.items()}
+        self._statistics = {}
+        for key, width in self.widths.items():
+            self._statistics[key] = Statistics(width, samples)
         self._tasks: list[str] = []
         self._calibrations: list[dict[str, Any]] = []
         self._writer: Any = None
@@ -119,8 +121,8 @@ class DataSet:
         if task not in self._tasks:
             self._tasks.append(task)
         # The size on disk lags behind by one row group, so files are a little larger.
-        is_full = self._writer is not None and self._path.stat().st_size >= MAX_FILE_MB << 20
-        if self._writer is None or is_full:
+        is_new = self._writer is None
+        if is_new or self._path.stat().st_size >= MAX_FILE_MB << 20:
             self._close_file()
             self._file_number += 1
         chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
@@ -136,7 +138,9 @@ class DataSet:
 
     def write(self, columns: dict[str, AnyArray | list[EncodedImage]]) -> None:
         """Write frames that follow each other, as one row group."""
-        arrays = {name: _column(values) for name, values in columns.items()}
+        arrays = {}
+        for name, values in columns.items():
+            arrays[name] = _column(values)
         table = pyarrow.table(arrays)
         if self._writer is None:
             # Measured numbers hardly repeat: a dictionary of them only costs time.

@@ -228,7 +228,8 @@ def _check_same_skin(plans: list[BagPlan]) -> Skin:
     """Return the skin of all bags, which must have the same cubes in the same places."""
 
     def places(plan: BagPlan) -> list[Any]:
-        return [(cube.name, cube.xyz, cube.rpy) for cube in plan.skin.cubes]
+        cubes = plan.skin.cubes
+        return [(cube.name, cube.xyz, cube.rpy) for cube in cubes]
 
     first = plans[0]
     expected = places(first)
@@ -254,12 +255,16 @@ def _write_bag(
     """Write all episodes of a bag."""
     with Bag(plan.path) as bag:
         reader = TopicReader(bag, topics)
-        waiting = [EpisodeWriter(data_set, plan, episode, reader) for episode in plan.episodes]
+        waiting = []
+        for episode in plan.episodes:
+            writer = EpisodeWriter(data_set, plan, episode, reader)
+            waiting.append(writer)
         total = sum(episode.rows for episode in plan.episodes)
         done = 0
         for rows in _stress_rows(data_set, plan, choices):
             # Rows of links that are late may belong to the episode before.
             done += sum(writer.add(rows) for writer in waiting)
+            # A data set has its episodes one after the other.
             while waiting and waiting[0].write():
                 waiting.pop(0)
             report(done, total, f"exporting {plan.path}")

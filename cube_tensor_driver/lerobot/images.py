@@ -85,7 +85,9 @@ class ImageStream:
         self._unread = self._read()
         self._next = next(self._unread, None)
         if shape is None:
-            shape = self._encode(self._next[1]).shape if self._next else (1, 1, 1)
+            shape = (1, 1, 1)
+            if self._next:
+                shape = self._encode(self._next[1]).shape
         self.shape = shape
         # Black stands in the frames before the first image.
         height, width, bands = shape
@@ -103,7 +105,8 @@ class ImageStream:
         Raises:
             BagError: An image cannot be read, or has another shape.
         """
-        return [self._newest_in(episode, frame) for frame in range(first, last)]
+        frames = range(first, last)
+        return [self._newest_in(episode, frame) for frame in frames]
 
     def _newest_in(self, episode: Episode, frame: int) -> EncodedImage:
         """Return the newest image before the end of a frame, reading the bag as far as needed."""

@@ -159,7 +159,8 @@ class Episode:
             )
         if n_frames > len(self.counts):
             # The number of frames is known only at the end: the table grows by half each time.
-            larger = np.zeros((3 * n_frames // 2, n_cubes), np.uint32)
+            room = 3 * n_frames // 2
+            larger = np.zeros((room, n_cubes), np.uint32)
             larger[: len(self.counts)] = self.counts
             self.counts = larger
         self.rows += len(cube)
@@ -208,7 +209,8 @@ def plan_bag(
     """
     with open_bag(path, choices.frequencies) as source:
         # Number of messages, for the report.
-        total = sum(one.msgcount for one in source.bag.connections if one.topic == source.topic)
+        counts = {one.topic: one.msgcount for one in source.bag.connections}
+        total = counts[source.topic]
         spans = [(MIN_NS, MAX_NS, choices.task)]
         if choices.marks is not None:
             spans = _marked_spans(source.bag, choices.marks)
@@ -328,9 +330,10 @@ def _marked_spans(bag: Bag, topic: str) -> list[tuple[int, int, str]]:
         text = bag.decode(entry).data.strip()
         marks.append((entry.time_ns, text))
     marks.append((MAX_NS, ""))
-    spans = [
-        (since_ns, until_ns, task) for (since_ns, task), (until_ns, _) in pairwise(marks) if task
-    ]
+    spans = []
+    for (since_ns, task), (until_ns, _) in pairwise(marks):
+        if task:
+            spans.append((since_ns, until_ns, task))
     if not spans:
         raise BagError(f"{bag.path}: no mark on {topic} begins an episode; publish its task there")
     return spans

@@ -55,10 +55,11 @@ class Statistics:
         self._mean += difference * count / both
         self._count += count
 
-        smallest = np.where(known, values, np.inf).min(axis=0)
-        largest = np.where(known, values, -np.inf).max(axis=0)
-        self._min = np.minimum(self._min, smallest)
-        self._max = np.maximum(self._max, largest)
+        # Values that are not known must not become a minimum or a maximum.
+        for_min = np.where(known, values, np.inf)
+        for_max = np.where(known, values, -np.inf)
+        self._min = np.minimum(self._min, for_min.min(axis=0))
+        self._max = np.maximum(self._max, for_max.max(axis=0))
         is_chosen = self._random.random(len(rows)) < self._share
         self._sample.append(values[is_chosen])
 
@@ -84,6 +85,9 @@ class Statistics:
             sample = self._mean[np.newaxis]
         columns = [column[np.isfinite(column)] for column in sample.T]
         for name, share in QUANTILES.items():
-            quantiles = [np.quantile(column, share) if len(column) else 0.0 for column in columns]
-            result[name] = np.array(quantiles)
+            quantiles = np.zeros(len(columns))
+            for number, column in enumerate(columns):
+                if len(column):
+                    quantiles[number] = np.quantile(column, share)
+            result[name] = quantiles
         return result

@@ -149,11 +149,16 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
             f"{', '.join(sorted(existing)) or 'none'}"
         )
     # Joint states may be without any joint.
-    used = {name: topic for name, topic in found.items() if topic.names or any(topic.shape)}
-    joints = [name for name, topic in used.items() if topic.msgtype == JOINTS]
+    used = {}
+    for name, described in found.items():
+        if described.names or any(described.shape):
+            used[name] = described
+    joints = [name for name in used if used[name].msgtype == JOINTS]
     # Of several robots only the user can tell whose state is meant.
     others = [name for name in joints if name != choices.action]
-    state = choices.state or (others[0] if len(others) == 1 else None)
+    state = choices.state
+    if state is None and len(others) == 1:
+        state = others[0]
     for name, described in used.items():
         dotted = name.strip("/").replace("/", ".")
         kind = "images" if described.msgtype in IMAGES else "topics"
@@ -213,6 +218,7 @@ def read_signal(
     shape = (len(messages), len(names))
     values = np.full(shape, np.nan, np.float32)
     for row, (_, numbers) in zip(values, messages, strict=True):
+        # Messages may name the joints in different orders.
         columns = [names[name] for name in numbers]
         row[columns] = list(numbers.values())
     # A message about some of the joints leaves the others as they were.
@@ -233,7 +239,8 @@ def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
     found = []
     for one in bag.connections:
         is_of_cube = one.topic.startswith(f"{skin}cubes/")
-        is_usable = one.msgtype in (JOINTS, *IMAGES) or _number_names(bag, one.msgtype)
+        is_known = one.msgtype in (JOINTS, *IMAGES)
+        is_usable = is_known or _number_names(bag, one.msgtype)
         if one.msgcount and is_usable and not is_of_cube:
             found.append((one.topic, one.msgtype))
     return sorted(found)

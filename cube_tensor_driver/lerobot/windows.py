@@ -110,7 +110,8 @@ class Windows:
 
         shape = (n_frames, self._depth, n_cubes)
         components = np.hstack([rows.stress, rows.gradient])
-        tactile = np.full((*shape, len(COMPONENTS)), np.nan, np.float32)
+        tactile = np.empty((*shape, len(COMPONENTS)), np.float32)
+        tactile[:] = np.nan
         tactile[place] = components[order]
         windows: dict[str, AnyArray] = {TACTILE: tactile}
         for name, kind in COLUMNS.items():
