@@ -221,7 +221,7 @@ def test_a_tare_of_another_load_is_found(tared):
     assert found(tared(50e-6, stayed_ns)) == {"wrong_tensors"}
 
 
-def test_what_a_tare_of_a_load_that_did_not_stay_gives_is_not_judged(tared):
+def test_what_a_tare_of_a_load_that_was_not_held_is_not_checked(tared):
     """It averages both loads, where they differ by less than noise does."""
     record, log = tared(50e-6, 1_000_000_000)
     assert found((record, log)) == set()
@@ -246,9 +246,9 @@ def test_a_tensor_that_the_reconstruction_counts_as_lost_is_not_missing(played):
     record, log = played
     stress = record.stress.rows
     rest = received(stress.select(stress.stamp_ns != stress.stamp_ns[ROW]))
-    for said, figures in ((0, {"missing_tensors"}), (1, set()), (2, {"miscounted"})):
-        said_so = replace(record, stress=rest, messages_lost=said)
-        assert {name for name in WRONG if check_all(said_so, log)[name]} == figures
+    for lost, figures in ((0, {"missing_tensors"}), (1, set()), (2, {"miscounted"})):
+        changed_record = replace(record, stress=rest, messages_lost=lost)
+        assert {name for name in WRONG if check_all(changed_record, log)[name]} == figures
 
 
 def test_what_comes_to_a_reconstruction_that_is_down_has_no_tensor(played):
@@ -271,15 +271,15 @@ def test_what_a_driver_counted_just_before_it_was_killed_is_not_known(played):
     stamp_ns = record.frequencies.rows.stamp_ns
     dead_ns = int(stamp_ns[-1]) + 1
     dead = Action(kind="restart driver", begin_ns=dead_ns, end_ns=dead_ns, succeeded=True)
-    for unsaid_ns, figures in ((1_400_000_000, set()), (1_600_000_000, {"miscounted"})):
-        unsaid = np.count_nonzero(stamp_ns > dead_ns - unsaid_ns)
-        counters = {**record.counters, "rows published": len(stamp_ns) - int(unsaid)}
+    for unreported_ns, figures in ((1_400_000_000, set()), (1_600_000_000, {"miscounted"})):
+        unreported = np.count_nonzero(stamp_ns > dead_ns - unreported_ns)
+        counters = {**record.counters, "rows published": len(stamp_ns) - int(unreported)}
         killed = replace(record, counters=counters, actions=(dead,))
         assert {name for name in WRONG if check_all(killed, log)[name]} == figures
 
 
-def test_what_did_not_come_here_is_nobodys_fault(played):
-    """DDS's numbers say that messages are missing: nothing is said of their rows."""
+def test_what_did_not_arrive_here_is_not_checked(played):
+    """The numbers of DDS show that messages are missing: their rows are not checked."""
     record, log = played
     rest = np.r_[0:4000, 4400:8000]
     frequencies = record.frequencies.rows

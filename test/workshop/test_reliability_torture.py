@@ -1,5 +1,5 @@
-"""A short torture: the whole chain in real processes under a mix of faults, judged to the last
-sample and bit; and mutations of it that the judge must find."""
+"""A short torture: the whole chain in real processes under a mix of faults, checked to the last
+sample and bit; and mutations of it that the checks must find."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def run(tmp_path, *arguments, seconds):
 def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(tmp_path, effort):
     duration = 10 * effort
     result, output = run(tmp_path, "--duration", str(duration), "--seed", "1", seconds=150 * effort)
-    # In 10 s one stall of a busy machine is a tenth of the stamps: only longer runs judge the tail.
+    # In 10 s one stall of a busy machine is a tenth of the stamps: only longer runs check the tail.
     tail = {"stamp_error_p90_ms", "stamp_error_p99_ms"} if effort == 1 else set()
     assert set(failures(result)) <= tail, output
     assert result["samples_sent"] > 32 * 300 * duration and result["counted"] > 0

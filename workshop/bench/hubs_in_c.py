@@ -88,6 +88,7 @@ def read_samples(path: Path, load: HubLoad) -> SampleTable:
     return SampleTable(
         start_time_ns=start_ns,
         link=taken["hub"].astype(np.int64),
+        # Hubs in C are not restarted, so their numbers do not begin again.
         number=taken["number"].astype(np.int64),
         time_ns=start_ns + 1000 * taken["device_us"].astype(np.int64),
         rows_per_sample=np.full(load.hubs, load.cubes_per_hub),

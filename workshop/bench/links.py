@@ -51,7 +51,7 @@ def bench_links(
     The figure `lost` counts rows that the hubs took and that did not become rows here.
 
     Args:
-        cubes: Number of cubes; a few more are measured if the hubs would differ.
+        cubes: Number of cubes, rounded up so that all hubs have the same number.
         rate: Samples per second of each cube.
         duration: Duration of the measurement, in seconds.
         json_path: File for the figures.

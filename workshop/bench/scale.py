@@ -65,6 +65,7 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
             xlabel="number of cubes",
             ylim=(0, None),
         )
+        # The numbers of cubes themselves, in place of powers of ten.
         axes.set_xticks(cubes, [str(count) for count in cubes])
         axes.xaxis.minorticks_off()
         axes.legend()

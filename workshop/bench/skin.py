@@ -139,7 +139,7 @@ def bench_skin(
     The load are hubs in C (`firmware/`), or the simulator where they cannot be built.
 
     Args:
-        cubes: Number of cubes; a few more are measured if the hubs would differ.
+        cubes: Number of cubes, rounded up so that all hubs have the same number.
         bench: Settings.
         json_path: File for the figures.
     """
@@ -192,6 +192,7 @@ def _measure_both(
     before = _measure_echo(cubes, bench, progress)
     skin = _measure_skin(cubes, bench, progress)
     after = _measure_echo(cubes, bench, progress)
+    # The mean of both, as the machine may have changed its speed meanwhile.
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     loads = [f"cpu_{load}_percent" for load in LOADS]
     # The load is not part of what a robot runs.
@@ -299,6 +300,7 @@ def _end_load(
         sample_log = end_simulator(children, log)
         return sample_log.table, sample_log.dropped
     children.end([executable])
+    # The program prints how many samples it took and dropped when it ends.
     dropped = re.findall(r" taken, (\d+) dropped", children.log(executable))
     return read_samples(log, load), sum(map(int, dropped))
 

@@ -119,6 +119,7 @@ class PictureCounter:
             for data in self._socket:
                 if not isinstance(data, bytes):
                     raise TypeError("a text from viser, which sends bytes only")
+                # viser puts the length in front of the compressed message.
                 length = int.from_bytes(data[8:16], "little")
                 self.pictures += b"/field" in zstandard.decompress(data[16 : 16 + length])
 
@@ -235,6 +236,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
                 counted["script"] = meter.script_seconds()
             return counted
 
+        # The first picture takes seconds, which are not measured.
         spin(SETTLE_S)
         before, start = read(), time.monotonic()
         spin(MEASURE_S)
@@ -250,6 +252,7 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
 def make_skin(folder: Path, cubes: int) -> Skin:
     """Make a grid that is as nearly square as the number of cubes allows."""
     nx = math.ceil(math.sqrt(cubes))
+    # The next larger divisor, so that all rows are full.
     while cubes % nx:
         nx += 1
     path = folder / "skin.yaml"

@@ -45,7 +45,8 @@ def check_counters(
     missing = int(frequencies.missing[is_countable].sum())
     # The driver counts on after the span that is checked.
     missing_at_end = int(frequencies.missing.sum())
-    lost_with_power = int(run.samples.row_count[_is_lost_with_power(run)].sum())
+    is_lost_with_power = _is_lost_with_power(run)
+    lost_with_power = int(run.samples.row_count[is_lost_with_power].sum())
 
     published, arrived = counters["rows published"], len(record.frequencies.rows)
     sent_ns = record.frequencies.sent_ns

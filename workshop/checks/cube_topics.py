@@ -24,7 +24,7 @@ def check_cube_topics(run: Run) -> Findings:
     record, skin = run.record, run.record.skin
     messages, rows = record.cube_messages, record.stress.rows
     rows = rows.select(np.flatnonzero(rows.cube == messages.cube))
-    pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float64)
+    pipeline = Pipeline(skin.calibrations, np.float64)
     cube = skin.cubes[messages.cube]
 
     def is_tensor_of(message: Tensor, row: int) -> bool:
@@ -42,7 +42,11 @@ def check_cube_topics(run: Run) -> Findings:
     def is_wrench_of(message: Wrench, row: int) -> bool:
         one = slice(row, row + 1)
         side = 2 * cube.calibration.half_side
-        force, torque = contact_wrench(rows.stress[one], rows.gradient[one], side)
+        force, torque = contact_wrench(
+            rows.stress[one],
+            rows.gradient[one],
+            side,
+        )
         wanted = np.concatenate([force[0], torque[0]])
         # A row without components gives no wrench.
         is_valid = rows.status[row] & INVALID == 0

@@ -7,7 +7,6 @@ a fault depends on the time alone, so that it can be computed again.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -147,7 +146,8 @@ class ExpectedReadings:
 
         millihertz = self._millihertz[instant, cube]
         is_warm = warmer != 0
-        millihertz[is_warm] = warmed(millihertz[is_warm], warmer[is_warm, np.newaxis])
+        warming_of_pads = warmer[is_warm, np.newaxis]
+        millihertz[is_warm] = warmed(millihertz[is_warm], warming_of_pads)
         return _SoundReadings(millihertz, warmer, instant, certain)
 
     def _break(
@@ -161,7 +161,8 @@ class ExpectedReadings:
         if fault.kind == "stuck":
             # It repeats what it would have read in the first sample of the fault.
             is_later = self._samples.time_ns >= fault.begin_ns
-            later = np.flatnonzero((self._samples.link == fault.link) & is_later)
+            is_later &= self._samples.link == fault.link
+            later = np.flatnonzero(is_later)
             cubes = np.array([fault.cube])
             sound = self._compute_sound(cubes, later[:1])
             first = int(sound.millihertz[0, fault.fault.pad])
@@ -213,7 +214,8 @@ class ExpectedReadings:
             # Within one life of a hub, each number occurs once.
             candidate = table.match(others, np.flatnonzero(boot == number))
             found = np.flatnonzero(candidate != NO_MATCH)
-            found = found[self._resembles(others.select(found), candidate[found])]
+            is_alike = self._resembles(others.select(found), candidate[found])
+            found = found[is_alike]
             taken_ns = table.time_ns[candidate[found]]
             distance_ns = np.abs(taken_ns - others.stamp_ns[found])
             is_nearer = distance_ns < best_ns[found]
@@ -239,37 +241,29 @@ def split_in_chunks(index: Index) -> list[Index]:
 
 
 def load_tables(skin: Skin, instants: int) -> tuple[Any, Array]:
-    """Compute readings (instants, cubes, pads) of sound pads in mHz, and components (instants,
-    cubes, 15). It takes some seconds, but only once for skins of the same cubes."""
-    return _compute_tables(_SkinKey(skin), instants)
+    """Compute what sound pads read, and the load.
+
+    It takes some seconds, but only once for skins of the same calibrations and poses.
+
+    Returns:
+        Readings (instants, cubes, pads) in mHz, and components (instants, cubes, 15).
+    """
+    cubes = [(cube.calibration.id, cube.xyz, cube.rpy) for cube in skin.cubes]
+    key = (instants, *cubes)
+    if key not in _tables:
+        # Only the tables of one skin are kept, because they are large.
+        _tables.clear()
+        _tables[key] = _compute_tables(skin, instants)
+    return _tables[key]
 
 
-class _SkinKey:
-    """Compares skins by calibrations and poses, as the key of a cache of tables."""
-
-    def __init__(self, skin: Skin) -> None:
-        self.skin = skin
-        self._key = tuple(
-            (
-                cube.calibration.id,
-                cube.xyz,
-                cube.rpy,
-            )
-            for cube in skin.cubes
-        )
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _SkinKey) and self._key == other._key
+_tables: dict[Any, tuple[Any, Array]] = {}
+"""Result of `load_tables` for the last skin."""
 
 
-@lru_cache(maxsize=1)
-def _compute_tables(key: _SkinKey, instants: int) -> tuple[Any, Array]:
-    skin = key.skin
+def _compute_tables(skin: Skin, instants: int) -> tuple[Any, Array]:
     load = Load(skin, default_script())
-    cubes = SimulatedCubes([cube.calibration for cube in skin.cubes])
+    cubes = SimulatedCubes(skin.calibrations)
     readings, truth = [], []
     for number in range(instants):
         stress, gradient = load.at(number * load.period / instants)

@@ -61,13 +61,15 @@ def check_frequencies(run: Run) -> FrequencyFindings:
 
     # One number for sample and cube tells which rows arrived more than once.
     n_cubes = len(record.skin.cubes)
-    arrived = np.unique(sample[known] * n_cubes + rows.cube[known])
+    keys = sample[known] * n_cubes + rows.cube[known]
+    arrived = np.unique(keys)
     received = np.bincount(arrived // n_cubes, minlength=len(samples))
     is_checked = record.contains(samples.time_ns)
     # Before the record begins, the driver was not active.
     is_recorded = samples.time_ns >= record.begin_ns
     missing = np.where(is_recorded, samples.row_count - received, 0)
-    lost = np.flatnonzero(is_checked & (missing > 0) & ~_may_be_missing(run))
+    is_lost = is_checked & (missing > 0) & ~_may_be_missing(run)
+    lost = np.flatnonzero(is_lost)
 
     figures = {
         "samples_sent": int(samples.row_count[is_checked].sum()),

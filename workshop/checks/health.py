@@ -95,10 +95,7 @@ def check_health(run: Run, sample: Index) -> Findings:
         permitted_status[may_be_flagged] |= np.uint16(bit | PERMITTED_STATUS)
 
         delay_ns = EDGE_NS if fault.kind in IMMEDIATE_FAULTS else DETECTION_NS
-        required = Span(
-            begin_ns=fault.begin_ns + delay_ns,
-            end_ns=fault.end_ns - EDGE_NS,
-        )
+        required = Span(fault.begin_ns + delay_ns, fault.end_ns - EDGE_NS)
         must_be_flagged = mine[required.contains(time_ns[mine])]
         # A short fault may be over before it must be flagged.
         if not len(must_be_flagged) or not evidence.suffices(fault):
@@ -141,7 +138,7 @@ class _Evidence:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._noise: list[Array] = []  # standard deviation of each pad's frequency, in Hz
-        for calibration in (cube.calibration for cube in run.record.skin.cubes):
+        for calibration in run.record.skin.calibrations:
             rest = calibration.rest_frequency
             slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
             self._noise.append(calibration.noise / slope)
@@ -153,7 +150,7 @@ class _Evidence:
             # No rows arrive while there is no driver, so the pad is released later.
             if fault.begin_ns < action.end_ns and action.begin_ns < end_ns:
                 end_ns += action.end_ns - action.begin_ns
-        return Span(begin_ns=fault.begin_ns - EDGE_NS, end_ns=end_ns)
+        return Span(fault.begin_ns - EDGE_NS, end_ns)
 
     def suffices(self, fault: HubFault) -> bool:
         """Return whether a fault is detectable.
@@ -163,8 +160,10 @@ class _Evidence:
         """
         if fault.kind in IMMEDIATE_FAULTS:
             return True
-        span = Span(begin_ns=fault.begin_ns, end_ns=fault.begin_ns + DETECTION_NS)
-        if self._is_disturbed(span) or not self._is_complete(fault.cube, span):
+        span = Span(fault.begin_ns, fault.begin_ns + DETECTION_NS)
+        if self._is_disturbed(span):
+            return False
+        if not self._is_complete(fault.cube, span):
             return False
         return fault.kind != "stuck" or self._moves(fault, span)
 
@@ -179,13 +178,13 @@ class _Evidence:
     def _is_complete(self, cube: int, span: Span) -> bool:
         """Return whether nearly all rows of a cube arrived in a span."""
         samples, rows = self._run.samples, self._run.record.stress.rows
-        arrived = count((rows.cube == cube) & span.contains(rows.stamp_ns))
-        begin = Span(begin_ns=span.begin_ns, end_ns=span.begin_ns)
+        has_arrived = (rows.cube == cube) & span.contains(rows.stamp_ns)
+        begin = Span(span.begin_ns, span.begin_ns)
         is_near = begin.contains(samples.time_ns, NOMINAL_PERIOD_S, NOMINAL_PERIOD_S)
         # The rate may change meanwhile, so the longest period counts.
         period_us = int(samples.period_us[is_near].max(initial=1))
         expected = (span.end_ns - span.begin_ns) / (1000 * period_us)
-        return arrived >= MIN_COMPLETENESS * expected
+        return count(has_arrived) >= MIN_COMPLETENESS * expected
 
     def _moves(self, fault: HubFault, span: Span) -> bool:
         """Return whether half of the pads of the cube move in every window of a span."""
@@ -196,12 +195,13 @@ class _Evidence:
         readings = self._run.expected.of(cubes, chosen)
         window_ns = round(NS_PER_S * WINDOW_S)
         for begin_ns in range(span.begin_ns, span.end_ns - window_ns, WINDOW_STEP_NS):
-            window = Span(begin_ns=begin_ns, end_ns=begin_ns + window_ns)
+            window = Span(begin_ns, begin_ns + window_ns)
             frequency = readings.frequency[window.contains(samples.time_ns[chosen])]
             if not len(frequency):
                 return False
             # The lower median: half of the pads move at least that much.
-            movement = np.sort(np.ptp(frequency, axis=0) / self._noise[fault.cube])
+            movement = np.ptp(frequency, axis=0) / self._noise[fault.cube]
+            movement.sort()
             if movement[(len(movement) - 1) // 2] < MIN_MOVEMENT:
                 return False
         return True

@@ -43,7 +43,7 @@ EARLIEST_NS = np.iinfo(np.int64).min
 LATEST_NS = np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Span:
     """A span of time from `begin_ns` to `end_ns` of the wall clock."""
 
@@ -105,7 +105,7 @@ class Received(Generic[AnyRows]):
             # Everything before the first row that arrived belongs to a gap at the beginning.
             if not row:
                 begin_ns = EARLIEST_NS // 2  # half of it, because a margin is subtracted
-            gap = Span(begin_ns=begin_ns, end_ns=int(after))
+            gap = Span(begin_ns, int(after))
             inside |= gap.contains(stamp_ns, GAP_MARGIN_S, GAP_MARGIN_S)
         return inside
 

@@ -24,8 +24,8 @@ TRANSPORT_S = 0.1
 is answered, the old or the new values may be in force."""
 
 RESTORE_S = 2.0
-"""Time, in seconds, after a restart until the tare is restored: the driver states the cubes once a
-second."""
+"""Time, in seconds, after a restart until the tare is restored. The reconstruction waits for the
+info of the driver, which is published once a second."""
 
 AVERAGED_S = 2.5
 """Age, in seconds, of the oldest data in a tare.
@@ -60,18 +60,19 @@ class RestHistory:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        calibrations = [cube.calibration for cube in run.record.skin.cubes]
+        calibrations = run.record.skin.calibrations
         calibrated = np.array([calibration.rest_frequency for calibration in calibrations])
-        self._calibrated = RestFrequencies(calibrated, np.ones(len(calibrations), bool))
+        all_known = np.ones(len(calibrations), bool)
+        self._calibrated = RestFrequencies(calibrated, all_known)
 
         current = self._calibrated
-        self._epochs = [(Span(begin_ns=0, end_ns=LATEST_NS), current)]
+        self._epochs = [(Span(0, LATEST_NS), current)]
         for action in self._changes():
             current = self._apply(action, current)
             # The change ends the span of the values before.
             last, rest = self._epochs[-1]
             self._epochs[-1] = (replace(last, end_ns=action.end_ns), rest)
-            following = Span(begin_ns=action.end_ns, end_ns=LATEST_NS)
+            following = Span(action.end_ns, LATEST_NS)
             self._epochs.append((following, current))
 
     def _changes(self) -> list[Action]:
@@ -83,11 +84,15 @@ class RestHistory:
             return self._calibrated
         # The load must have been held for all data that the tare averages.
         first_ns = action.begin_ns - round(NS_PER_S * AVERAGED_S)
-        averaged = Span(begin_ns=first_ns, end_ns=action.end_ns)
+        averaged = Span(first_ns, action.end_ns)
         cubes = list(action.cubes)
-        return current.tare(cubes, self._run.expected.find_held(cubes, averaged))
+        held = self._run.expected.find_held(cubes, averaged)
+        return current.tare(cubes, held)
 
-    def candidates(self, sent_ns: Times) -> Iterator[tuple[Mask, RestFrequencies]]:
+    def candidates(
+        self,
+        sent_ns: Times,
+    ) -> Iterator[tuple[Mask, RestFrequencies]]:
         """Yield all rest frequencies, with the rows (N,) that they may be in force for.
 
         Args:
@@ -102,8 +107,8 @@ class RestHistory:
         applies = np.zeros(len(cube), bool)
         ever_tared = np.zeros(len(self._calibrated.values), bool)
         for is_candidate, rest in self.candidates(sent_ns):
-            differs = (rest.values != self._calibrated.values).any(axis=1)
-            is_tared = ~rest.is_known | differs
+            is_tared = (rest.values != self._calibrated.values).any(axis=1)
+            is_tared |= ~rest.is_known
             applies |= is_candidate & ~is_tared[cube]
             ever_tared |= is_tared
         # While two values may be in force, a cube that is ever tared is not certain.

@@ -66,9 +66,10 @@ class Samples:
             for link, link_log in enumerate(log.links)
             for boot, number in link_log.damaged
         ]
-        columns = np.array(damaged, np.int64).reshape(-1, 3).T
+        damaged_keys = _join_keys(*np.array(damaged, int).reshape(-1, 3).T)
         self.is_damaged: Mask = np.isin(
-            _join_keys(self.link, self.boot, self.number), _join_keys(*columns)
+            _join_keys(self.link, self.boot, self.number),
+            damaged_keys,
         )
 
     def __len__(self) -> int:

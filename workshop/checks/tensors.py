@@ -88,16 +88,19 @@ def check_tensors(run: Run) -> TensorFindings:
     reference = _Reference(run)
     is_wrong, is_unknown = np.zeros((2, len(stress)), bool)
     for part in split_in_chunks(known):
-        made, measured = stress.select(part), frequencies.select(source[part])
+        made = stress.select(part)
+        measured = frequencies.select(source[part])
         sent_ns = record.stress.sent_ns[part]
         agrees = np.zeros(len(part), bool)
         # Where two changes are close, a row may agree with any of several rest frequencies.
         for is_candidate, rest in history.candidates(sent_ns):
             has_no_reference = ~rest.is_known[made.cube]
-            agrees |= is_candidate & (has_no_reference | reference.agrees(made, measured, rest))
+            is_right = reference.agrees(made, measured, rest)
+            agrees |= is_candidate & (has_no_reference | is_right)
             is_unknown[part] |= is_candidate & has_no_reference
         is_untared = history.is_calibrated(made.cube, sent_ns)
-        agrees &= reference.agrees_with_load(made, run.sample[source[part]], is_untared)
+        sample = run.sample[source[part]]
+        agrees &= reference.agrees_with_load(made, sample, is_untared)
         is_wrong[part] = ~agrees
 
     sent_ns = record.frequencies.sent_ns
@@ -156,14 +159,13 @@ class _Reference:
     """Computes the right tensors with the pipeline in double precision."""
 
     def __init__(self, run: Run) -> None:
-        calibrations = [cube.calibration for cube in run.record.skin.cubes]
-        self._pipeline = Pipeline(calibrations, np.float64)
+        self._pipeline = Pipeline(run.record.skin.calibrations, np.float64)
         self._expected = run.expected
         self._range = np.ptp(run.expected.truth, axis=(0, 1))
         # One limit for each possible number of degrees of freedom.
         degrees = range(1, self._pipeline.n_pads + 1)
-        limits = [np.sqrt(chi2_limit(degree, FALSE_ALARM) / degree) for degree in degrees]
-        self._limits = np.array(limits)
+        chi2_limits = [chi2_limit(degree, FALSE_ALARM) for degree in degrees]
+        self._limits = np.sqrt(np.array(chi2_limits) / degrees)
         self._deviations: dict[tuple[int, int], Array] = {}
 
     def agrees(

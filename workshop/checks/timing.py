@@ -68,22 +68,21 @@ def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
         is_after = samples.time_ns >= fault.end_ns
         times_ns = samples.time_ns[arrived & is_after & (samples.link == fault.link)]
         if len(times_ns):
-            gaps_s.append(float(times_ns.min() - fault.end_ns) / NS_PER_S)
+            gap_ns = times_ns.min() - fault.end_ns
+            gaps_s.append(float(gap_ns) / NS_PER_S)
     return gaps_s
 
 
 def count_wrong_periods(run: Run) -> int:
     """Count the hubs that did not sample at the rate that was asked for, over all changes."""
     record, samples = run.record, run.samples
-    disturbances = [action.begin_ns for action in record.actions_of("rate", *DRIVER_STOPS)]
+    disturbing = record.actions_of("rate", *DRIVER_STOPS)
+    disturbances = [action.begin_ns for action in disturbing]
     disturbances.append(record.end_ns)
     cuts = samples.faults(*CUT_FAULTS)
     wrong = 0
     for action in record.actions_of("rate"):
-        settled = Span(
-            begin_ns=action.end_ns,
-            end_ns=action.end_ns + round(NS_PER_S * RATE_CHANGE_S),
-        )
+        settled = Span(action.end_ns, action.end_ns + round(NS_PER_S * RATE_CHANGE_S))
         # A later change within this time would have changed the period again.
         is_disturbed = settled.contains(np.array(disturbances)).any()
         if not action.succeeded or is_disturbed:

@@ -32,8 +32,8 @@ MAX_ANSWER_S = 10.0
 """Longest time, in seconds, that is waited for one answer of a node."""
 
 ANSWER_TRIES = 4
-"""Number of requests until a node counts as silent. An answer is lost if the node has not yet
-discovered our client."""
+"""Maximum number of requests to a node that does not answer. An answer is lost if the node has not
+yet discovered our client."""
 
 MAX_TARE_S = 3.0
 """Time, in seconds, for which a tare is requested again, because it is refused while data have a

@@ -130,7 +130,7 @@ def play(
             stopped_ns = time.time_ns()
             actions.stop_driver()
             observer.spin(MAX_DRAIN_S, lambda: recorder.is_complete(stopped_ns))
-            record = recorder.finish(Span(begin_ns=begin_ns, end_ns=end_ns), actions.done)
+            record = recorder.finish(Span(begin_ns, end_ns), actions.done)
         logs_text = "".join(children.log(name) for name in processes)
         log = end_simulator(children, log_path)
     figures = {
