@@ -29,13 +29,17 @@ def pad_table(
     n_pads: int,
     fill: float,
 ) -> Array:
-    """Stack arrays of different lengths (P_i,) into a table (len(values), n_pads).
+    """Stack one array per cube into a table (cubes, n_pads).
 
-    Cubes of one skin may have different numbers of pads. The places of pads that a cube does not
-    have are set to `fill`.
+    Cubes of one skin may have different numbers of pads.
+
+    Args:
+        values: Values of the pads of each cube, arrays of different lengths up to `n_pads`.
+        n_pads: Number of columns, the largest number of pads of a cube.
+        fill: Value of the entries for pads that a cube does not have.
     """
     shape = (len(values), n_pads)
-    # The type is stated, because an integer as fill value would make integers of all values.
+    # The type is stated, because numpy would make a table of integers if `fill` is an integer.
     table = np.full(shape, fill, dtype=float)
     for row, value in zip(table, values, strict=True):
         row[: len(value)] = value

@@ -6,35 +6,40 @@ SURFACE_DEPTH = 4e-3
 """Distance from the centres of the cubes to the surface of the skin, in m."""
 
 CONTACT_PRESSURE = 300.0
-"""Pressure in the plane of the cubes, in Pa, above which a place counts as part of a contact."""
+"""Pressure in the plane of the cubes' centres, in Pa, above which a point of the plane counts as
+part of a contact."""
 
 CONTACT_METHODS = ("interpolation", "inverse")
-"""Names of the methods that find contacts.
+"""Names of the methods that find contacts on the skin.
 
-The first interpolates the pressure between the cubes. The second computes the traction on the
-surface from the elasticity of the layer above the cubes.
+"interpolation" interpolates the pressure between the cubes. "inverse" computes the traction (force
+per area) on the surface of the skin from the elasticity of the layer above the cubes.
 """
 
 YOUNGS_MODULUS = 0.3e6
-"""Young's modulus of the elastomer, in Pa; the value is typical of soft silicone."""
+"""Young's modulus of the elastomer around the cubes, in Pa; the value is typical of soft
+silicone."""
 
 POISSONS_RATIO = 0.48
-"""Poisson's ratio of the elastomer, which is nearly incompressible."""
+"""Poisson's ratio of the elastomer around the cubes, which is nearly incompressible."""
 
 HALF_SIDE = 2e-3
 """Half side d0 of a cube (half its edge length), in m."""
 
 REST_FREQUENCY = 100e3
-"""Frequency of a pad without load, in Hz."""
+"""Frequency of a pad's oscillator without load, in Hz."""
 
 BETA = 0.3
-"""Ratio of a pad's parasitic capacitance to the capacitance of its foam at rest.
+"""Ratio of a pad's parasitic capacitance to the capacitance of its foam without load.
 
-docs/physics.md, section 1, derives where it enters the pad law.
+docs/physics.md, section 1, derives how the stress on a pad depends on it.
 """
 
 FOAM_MODULUS = 0.3e6
-"""Modulus of a pad's foam, in Pa."""
+"""Elastic modulus of a pad's foam (stress per strain of its thickness), in Pa."""
 
 FREQUENCY_NOISE = 8e-6
-"""Relative standard deviation of a frequency whose periods are counted for 1 ms."""
+"""Standard deviation of a measured frequency, relative to the frequency.
+
+It holds for a hub that counts the periods of the oscillator for 1 ms.
+"""

@@ -29,7 +29,8 @@ class LinkError(CubeError):
     """A link cannot be opened, or it was lost.
 
     Attributes:
-        kind: One word for programs. The text of the error tells a person how to fix it.
+        kind: One word by which a program distinguishes the causes. The text of the error tells a
+            person how to fix it.
     """
 
     def __init__(self, message: str, kind: str) -> None:
@@ -38,7 +39,7 @@ class LinkError(CubeError):
 
 
 class ElasticError(CubeError):
-    """A body, mesh or contact load is outside the range of the elasticity code."""
+    """An elastic body, a mesh or a contact load is outside the range of the elasticity code."""
 
 
 class ConfigError(CubeError):
@@ -57,4 +58,7 @@ class BagError(CubeError):
 
 
 class TareError(CubeError):
-    """A tare is refused because a pad moves, is noisy, or is too far from its calibration."""
+    """A tare (taking the present frequencies as those without load) is refused.
+
+    The signal of a pad moves, is noisy, or is too far from the calibration.
+    """

@@ -12,26 +12,29 @@ from .rows import StressRows
 from .tensor import face_force, rotation_from_rpy
 
 TRACTION_COMPONENTS = [4, 3, 2]
-"""Columns of a stress that act on a face +z: zx, yz and zz."""
+"""Columns of a stress (N, 6) in the order xx, yy, zz, yz, zx, xy whose components act on the face
++z of a cube: zx, yz and zz."""
 
 
 class PlacedSkin(Protocol):
-    """A skin whose cubes have `xyz`, `rpy` and `calibration`."""
+    """A skin whose cubes have a position `xyz`, angles `rpy` (roll, pitch, yaw) and a
+    `calibration`."""
 
     @property
     def cubes(self) -> Sequence[Any]: ...
 
 
 class Forces:
-    """The force on the skin at each cube, in the parent frame of the skin, in N.
+    """Computes the force on the skin at each cube, in the parent frame of the skin, in N.
 
         F = R w² σ n
 
-    σ n is the traction on the face +z of the cube, w² the area that it acts on, and R the rotation
-    from the frame of the cube to the parent frame. A pressed skin has forces into the skin.
+    σ n is the traction (force per area) on the face +z of the cube, w² the area that the traction
+    acts on, and R the rotation from the frame of the cube to the parent frame. Where something
+    presses on the skin, the force points into the skin.
 
-    Components that are not observed count as 0. A row that observes no component of the traction
-    gives NaN.
+    Components of the traction that the pads do not determine count as 0. If none of the three is
+    determined, the force is NaN.
 
     Attributes:
         position: Positions of the cubes in the parent frame (cubes, 3), in m.
@@ -43,8 +46,9 @@ class Forces:
 
         Args:
             skin: The skin.
-            side: Side w for all cubes, in m. With the distance of neighbouring cubes, the sum of
-                the forces is the force on the whole skin. None stands for the side of each cube.
+            side: Side w of the square area of each cube, in m. If it is the distance of
+                neighbouring cubes, the squares cover the skin and the sum of the forces is the
+                force on the whole skin. None stands for the side of the cube itself.
         """
         cubes = skin.cubes
         positions = [cube.xyz for cube in cubes]
@@ -55,19 +59,22 @@ class Forces:
         self._rotation = np.array(rotations)
 
     def __call__(self, rows: StressRows) -> Array:
-        """Compute the force of each row (N, 3)."""
+        """Compute the force of each of N rows (N, 3), in N, in the parent frame of the skin."""
         side = self.side[rows.cube, None]
         rotation = self._rotation[rows.cube]
         in_cube_frame = face_force(rows.stress, side)
         force: Array = np.einsum("nij,nj->ni", rotation, in_cube_frame)
         traction = rows.stress[:, TRACTION_COMPONENTS]
-        # Zero would claim that nothing presses.
+        # `face_force` counts unknown components as 0, which would claim that nothing presses.
         is_unobserved = np.isnan(traction).all(axis=1)
         force[is_unobserved] = np.nan
         return force
 
     def of_skin(self, rows: StressRows) -> Array:
-        """Return the force of the last row of each cube (cubes, 3), NaN for cubes without a row."""
+        """Return the force of the last row of each cube (cubes, 3), in N.
+
+        Cubes without a row have NaN.
+        """
         force = np.full(self.position.shape, np.nan)
         # If a cube has several rows, numpy keeps the last assignment.
         force[rows.cube] = self(rows)

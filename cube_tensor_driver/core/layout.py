@@ -1,4 +1,4 @@
-"""Layouts: the positions of the pads of a cube.
+"""Layouts: the positions and face normals of the pads (capacitive sensors) of a cube.
 
 Frame of the cube: z points out of the skin, x and y lie along it, the origin is the centre of the
 cube. Lengths are in units of the half side d0 of the cube.
@@ -20,16 +20,19 @@ AXES = "xyz"
 """Names of the axes of the cube frame."""
 
 MAX_PADS = 32
-"""Maximum number of pads of a cube: a fault mask on the wire has 32 bits."""
+"""Maximum number of pads of a cube, because a hub sends the faults of pads as a mask of 32 bits."""
 
 PAD_OFFSET = 0.5
-"""Distance of a built-in layout's pads from the centre of their face, in units of d0."""
+"""Distance of a pad's centre from the centre of its face, in the layouts quad, planar and cube, in
+units of d0 (half the side of the cube)."""
 
 PAD_SIZE = 0.4
-"""Side of a square pad, in units of d0, if a layout does not state it."""
+"""Side of a square pad in a layout that does not state it, in units of d0 (half the side of the
+cube)."""
 
 TOLERANCE = 1e-9
-"""Largest difference, in units of d0, of coordinates that count as equal.
+"""Largest difference of two coordinates of pads that count as equal, in units of d0 (half the side
+of the cube).
 
 It is far above the rounding error of decimal numbers in a file, and far below any real distance.
 """
@@ -41,8 +44,10 @@ class Layout:
 
     Attributes:
         name: Name that calibration and configuration files use.
-        positions: Centres of the pads (P, 3), in units of d0.
-        normals: Outward normals of the pads' faces (P, 3), each plus or minus one axis.
+        positions: Centres of the P pads (P, 3), relative to the centre of the cube, in units of d0
+            (half the side of the cube).
+        normals: Outward normals of the faces that carry the pads (P, 3), each plus or minus one
+            axis.
         pad_size: Side of a square pad, in units of d0.
 
     Raises:
@@ -65,7 +70,8 @@ class Layout:
             self._refuse(f"pad_size {self.pad_size}; allowed is above 0, up to 2")
 
         positions.flags.writeable = normals.flags.writeable = False
-        # The class is frozen for its users; only here the checked values replace the given ones.
+        # A frozen dataclass refuses assignments, so the checked values replace the given ones by
+        # way of the base class.
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "normals", normals)
         object.__setattr__(self, "pad_size", float(self.pad_size))
@@ -73,7 +79,7 @@ class Layout:
             self._check_pad(number)
 
     def _check_pad(self, number: int) -> None:
-        """Raise LayoutError if a pad is not on its face, or coincides with an earlier one."""
+        """Raise LayoutError if a pad is not on its face, or coincides with a pad before it."""
         position, normal = self.positions[number], self.normals[number]
         pad = f"pad {number + 1}"
         if sorted(np.abs(normal)) != [0, 0, 1]:
@@ -104,10 +110,10 @@ class Layout:
 
     @cached_property
     def pads(self) -> tuple[str, ...]:
-        """Names of the pads: the face, then the side of the face, such as "+z-x".
+        """Names of the pads, such as "+z-x" for the pad on the face +z on the side of -x.
 
-        A second pad at the same side of a face is "+z-x#2". The names do not change if pads are
-        added at the end.
+        A second pad on the same side of a face is "+z-x#2". The names do not change if pads are
+        added at the end of the layout.
         """
         names: list[str] = []
         places: list[str] = []
@@ -128,7 +134,11 @@ class Layout:
         return not (is_off_plane or is_tilted)
 
     def index(self, pad: str) -> int:
-        """Return the number of a pad by its name. LayoutError: there is no such pad."""
+        """Return the number (from 0) of the pad with a name.
+
+        Raises:
+            LayoutError: The layout has no pad with this name.
+        """
         try:
             return self.pads.index(pad)
         except ValueError:
@@ -156,10 +166,10 @@ class Layout:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Layout:
-        """Construct a layout from plain types.
+        """Construct a layout from plain types, as a file holds them.
 
         Args:
-            data: name, positions, normals and, optionally, pad_size.
+            data: Table with the keys name, positions, normals and, optionally, pad_size.
 
         Raises:
             LayoutError: A key is missing or unknown, or a value is invalid.
@@ -189,7 +199,11 @@ class Layout:
 
 
 def find_layout(name: str) -> Layout:
-    """Return a built-in layout by its name. LayoutError: there is none of this name."""
+    """Return the built-in layout with a name.
+
+    Raises:
+        LayoutError: No built-in layout has this name.
+    """
     try:
         return LAYOUTS[name]
     except (KeyError, TypeError):
@@ -197,7 +211,15 @@ def find_layout(name: str) -> Layout:
 
 
 def _read_vectors(value: Any, name: str) -> Array:
-    """Return a list of [x, y, z] as an array (N, 3). LayoutError: it is something else."""
+    """Convert a list of N vectors [x, y, z] to an array (N, 3).
+
+    Args:
+        value: The list.
+        name: Name of the vectors, for the error message.
+
+    Raises:
+        LayoutError: The value is no such list, or a number is not finite.
+    """
     try:
         vectors = np.array(value, dtype=float)
     except (TypeError, ValueError):
@@ -214,7 +236,7 @@ def _read_vectors(value: Any, name: str) -> Array:
 
 
 def _name_axes(vector: Array) -> str:
-    """Return the directions of a vector's nonzero coordinates, such as "+z" or "-x+y"."""
+    """Return sign and axis of each nonzero coordinate of a vector, such as "+z" or "-x+y"."""
     return "".join(
         ("+" if coordinate > 0 else "-") + axis
         for coordinate, axis in zip(vector, AXES, strict=True)
@@ -230,7 +252,13 @@ def _parse_axis(text: str) -> Array:
 
 
 def _make_layout(name: str, pads: str) -> Layout:
-    """Construct a layout from the face and side of each pad, such as "+z-x +z+x"."""
+    """Construct a layout from the names of its pads.
+
+    Args:
+        name: Name of the layout.
+        pads: Names of the pads, such as "+z-x +z+x" for two pads on the face +z, on the sides of -x
+            and +x.
+    """
     names = pads.split()
     normals = np.array([_parse_axis(pad[:2]) for pad in names])
     sides = np.array([_parse_axis(pad[2:]) for pad in names])
@@ -240,9 +268,10 @@ def _make_layout(name: str, pads: str) -> Layout:
 
 
 _QUAD_PADS = "+z-x +z+x -z-x -z+x"
-_PLANAR_PADS = f"{_QUAD_PADS} +x-z +x+z -x-z -x+z"  # V1 to V8 of the paper, in its order
+# These are the pads V1 to V8 of Kiyota & Shinoda, in their order.
+_PLANAR_PADS = f"{_QUAD_PADS} +x-z +x+z -x-z -x+z"
 _NEXT_AXES = str.maketrans("xyz", "yzx")
-# The cube has the planar section three times: in the planes z-x, x-y and y-z.
+# The layout "cube" has the pads of "planar" in each of the planes z-x, x-y and y-z.
 _SECOND_SECTION = _PLANAR_PADS.translate(_NEXT_AXES)
 _THIRD_SECTION = _SECOND_SECTION.translate(_NEXT_AXES)
 
@@ -251,4 +280,5 @@ LAYOUTS = {
     "planar": _make_layout("planar", _PLANAR_PADS),
     "cube": _make_layout("cube", f"{_PLANAR_PADS} {_SECOND_SECTION} {_THIRD_SECTION}"),
 }
-"""Built-in layouts by name: four pads on two faces, eight on four, and 24 on all six faces."""
+"""Built-in layouts by name: quad has 4 pads on 2 faces, planar 8 pads on 4 faces, and cube 24 pads
+on all 6 faces."""

@@ -1,7 +1,7 @@
-"""Which row of one table is the same sample as a row of another.
+"""Search for the row of one table that is the same sample as a row of another table.
 
 A sample is identified by its cube and its sequence number. A hub that restarts gives the same
-numbers again; then the time stamp tells which of them is meant.
+numbers again; then the time stamps tell the samples apart.
 """
 
 from __future__ import annotations
@@ -13,14 +13,20 @@ import numpy as np
 from .arrays import AnyArray, Index
 
 NO_MATCH = -1
-"""Index that stands for a row without a partner."""
+"""Index in the result of `match_rows` that stands for "no known row is this sample"."""
 
 _SEQUENCE_BITS = 32
-"""Width of a sequence number; cube and number together fit one 64-bit key."""
+"""Number of bits of a sequence number.
+
+The number of a cube and a sequence number fit one 64-bit integer, which is the key of a sample.
+"""
 
 
 class SampleRows(Protocol):
-    """Columns (N,) that identify samples: `FrequencyRows`, `StressRows` or `SampleKeys`."""
+    """Table of N samples with the columns (N,) that identify them.
+
+    `FrequencyRows`, `StressRows` and `SampleKeys` have these columns.
+    """
 
     @property
     def cube(self) -> AnyArray: ...
@@ -33,12 +39,12 @@ class SampleRows(Protocol):
 
 
 class SampleKeys(NamedTuple):
-    """The identifying columns alone, for tables that are no rows of frequencies or stress.
+    """Only the columns that identify N samples, for tables without frequencies or stress.
 
     Attributes:
-        cube: (N,) index of the cube, or of whatever the numbers are counted for (such as a hub).
-        sequence: (N,) sequence number, which wraps at 2**32.
-        stamp_ns: (N,) time of the sample, in ns.
+        cube: Number of the cube (N,), or of the hub if each hub counts its samples.
+        sequence: Sequence number of the sample (N,), which wraps at 2**32.
+        stamp_ns: Time of the sample (N,), in ns since the epoch of the table's clock.
     """
 
     cube: AnyArray
@@ -54,9 +60,9 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
         wanted: N rows to find.
 
     Returns:
-        (N,) index into the known rows, or `NO_MATCH`. Where a cube has the same number several
-        times, the known row whose stamp is nearest is chosen. Compare the stamps afterwards if
-        they must be equal.
+        Index (N,) into the known rows, or `NO_MATCH`. Where a cube has the same sequence number
+        several times, the known row with the nearest time stamp is chosen. Time stamps need not be
+        equal; a caller that needs equal ones compares them afterwards.
     """
     known_keys, wanted_keys = _keys(known), _keys(wanted)
     order = np.argsort(known_keys, kind="stable")
@@ -67,7 +73,7 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
 
     found = np.full(len(wanted_keys), NO_MATCH, np.intp)
     found[has_match] = order[begin[has_match]]
-    # Further candidates exist only where numbers were given again after a restart.
+    # More than one known row has the same key only if a hub restarted and counted from 0 again.
     for repeat in range(1, int((end - begin).max(initial=0))):
         rows = np.flatnonzero(begin + repeat < end)
         candidate = order[begin[rows] + repeat]
@@ -79,7 +85,7 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
 
 
 def _keys(rows: SampleRows) -> AnyArray:
-    """Join cube and sequence number in one integer per row, (N,)."""
+    """Return one integer per row (N,) that holds the numbers of the cube and of the sample."""
     cube = rows.cube.astype(np.int64) << _SEQUENCE_BITS
     keys: AnyArray = cube | rows.sequence.astype(np.int64)
     return keys

@@ -5,9 +5,9 @@ centre of the cube and d0 its half side. Its amplitude is in Pa. The name of a m
 
     zz            uniform sigma_zz
     zz_x          sigma_zz that grows along x; the amplitude is d0 d(sigma_zz)/dx
-    xy_y-zx_z     two shear gradients with opposite divergences
+    xy_y-zx_z     sigma_xy that grows along y, and sigma_zx that falls along z by as much
 
-Sources: equilibrium, d(sigma_ij)/dx_j = 0; the plane modes are those of eq. 1 of the paper.
+Sources: equilibrium, d(sigma_ij)/dx_j = 0; the plane modes are those of Kiyota & Shinoda, eq. 1.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ COMPONENTS = STRESS + GRADIENT
 """Names of the 15 published components: six stresses, then nine gradients of normal stresses."""
 
 FIELD_SIZE = 9 + 27
-"""Number of entries of a linear stress field: the tensor S (3, 3) and the gradient G (3, 3, 3)."""
+"""Number of entries of a linear stress field: the stress S at the centre (3, 3) and its gradient G
+(3, 3, 3)."""
 
 _ROWS = [AXES.index(name[0]) for name in STRESS]
 _COLUMNS = [AXES.index(name[1]) for name in STRESS]
@@ -63,12 +64,13 @@ def to_voigt(matrix: NDArray[Float]) -> NDArray[Float]:
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """A set of M modes.
+    """A set of M modes: linear stress fields sigma_ij(x) = S_ij + G_ijk x_k / d0.
 
     Attributes:
         names: Names of the modes.
-        stress: Uniform parts S (M, 3, 3), per unit amplitude.
-        gradient: Linear parts G (M, 3, 3, 3), times d0, per unit amplitude.
+        stress: Stress S at the centre of the cube, per unit amplitude (M, 3, 3).
+        gradient: Gradient G, times d0 (half the side of the cube), per unit amplitude
+            (M, 3, 3, 3).
     """
 
     names: tuple[str, ...]
@@ -81,7 +83,7 @@ class Modes:
 
     @property
     def fields(self) -> Array:
-        """Modes as columns (36, M): 9 stresses, then 27 gradients, both in row-major order."""
+        """Fields of the modes as columns (36, M): 9 entries of S, then 27 of G, both row-major."""
         stress = self.stress.reshape(self.n_modes, 9)
         gradient = self.gradient.reshape(self.n_modes, 27)
         columns: Array = np.concatenate([stress, gradient], axis=1).T
@@ -89,7 +91,10 @@ class Modes:
 
     @cached_property
     def reading(self) -> Array:
-        """Matrix (M, 36) that reads the amplitudes off a field, so that reading @ fields = 1."""
+        """Matrix (M, 36) from a linear stress field to the amplitudes of the modes.
+
+        It is a left inverse of `fields`: reading @ fields is the identity.
+        """
         rows = np.zeros((self.n_modes, FIELD_SIZE))
         for row, name in zip(rows, self.names, strict=True):
             terms = _parse_terms(name)
@@ -100,10 +105,14 @@ class Modes:
 
     @property
     def components(self) -> Array:
-        """Matrix T (15, M) from a state to the components, in Pa; gradients are times d0."""
+        """Matrix T (15, M) from a state (amplitudes of the modes) to the published components.
+
+        The components are in Pa; gradients are multiplied by d0 (half the side of the cube).
+        """
         rows = np.zeros((len(COMPONENTS), FIELD_SIZE))
         for row, name in zip(rows, COMPONENTS, strict=True):
-            # The modes of `PAPER` keep sigma_zx and sigma_xz apart; published is their mean.
+            # The modes of `PAPER` have separate amplitudes for sigma_zx and sigma_xz. The published
+            # component is the mean of the two.
             transposed = name[1::-1] + name[2:]
             for entry in {name, transposed}:
                 _, place = _parse_terms(entry)[0]
@@ -113,14 +122,15 @@ class Modes:
         return result
 
     def state(self, stress: Array, gradient: Array | None = None) -> Array:
-        """Compute the amplitudes of the modes in given stress fields.
+        """Compute the states (amplitudes of the modes) of given stress fields.
 
-        Parts of a field that no mode expresses (out of equilibrium, or out of the plane of plane
-        modes) are ignored.
+        A part of a field that no mode expresses is ignored: one that violates equilibrium or, for
+        plane modes, one outside the plane.
 
         Args:
             stress: Stress at the centre of the cube, (N, 6) or (N, 3, 3), in Pa.
-            gradient: d(sigma_ij)/dx_k times d0, (N, 3, 3, 3), in Pa. None means zero.
+            gradient: Gradient d(sigma_ij)/dx_k times d0 (half the side of the cube),
+                (N, 3, 3, 3), in Pa. None means zero.
 
         Returns:
             Amplitudes (N, M), in Pa.
@@ -138,10 +148,14 @@ class Modes:
         return state
 
     def field(self, state: Array) -> tuple[Array, Array]:
-        """Compute the stress field of states, the inverse of `state`.
+        """Compute the stress fields of states, the inverse of `state`.
+
+        Args:
+            state: Amplitudes of the modes (N, M), in Pa.
 
         Returns:
-            Stress (N, 3, 3) and gradient times d0 (N, 3, 3, 3), both in Pa.
+            Stress at the centre of the cube (N, 3, 3), and gradient d(sigma_ij)/dx_k times d0
+            (N, 3, 3, 3), both in Pa.
         """
         amplitudes = np.asarray(state, dtype=float)
         flat = amplitudes.reshape(-1, self.n_modes) @ self.fields.T
@@ -163,7 +177,8 @@ class Modes:
                 modes that are rotated out of their plane.
         """
         r = np.asarray(rotation, dtype=float)
-        # Fields are stored row-major, so a rotation of all indices is a Kronecker product.
+        # A tensor stored row-major is rotated, in all its indices, by the Kronecker product of one
+        # rotation matrix per index.
         on_stress = np.kron(r, r)
         on_gradient = np.kron(on_stress, r)
         rotated = self.fields.copy()
@@ -179,7 +194,11 @@ class Modes:
         return action
 
     def index(self, names: Sequence[str]) -> list[int]:
-        """Return the columns of the named modes. SymmetryError: a name is unknown."""
+        """Return the numbers (from 0) of the modes with these names.
+
+        Raises:
+            SymmetryError: A name is unknown.
+        """
         for name in names:
             if name not in self.names:
                 raise SymmetryError(f"unknown mode {name!r}; the modes are {', '.join(self.names)}")
@@ -187,13 +206,18 @@ class Modes:
 
 
 def _split_fields(flat: Array) -> tuple[Array, Array]:
-    """Return stress (N, 3, 3) and gradient (N, 3, 3, 3) of flat fields (N, 36)."""
+    """Return stress (N, 3, 3) and gradient (N, 3, 3, 3) of fields (N, 36) of 9 + 27 entries."""
     stress, gradient = flat[:, :9], flat[:, 9:]
     return stress.reshape(-1, 3, 3), gradient.reshape(-1, 3, 3, 3)
 
 
 def _parse_terms(name: str) -> list[tuple[float, int]]:
-    """Return sign and place (among the 36 entries of a field) of each term of a mode's name."""
+    """Return the terms of a mode's name, such as "zz", "zz_x" or "xy_y-zx_z" with two terms.
+
+    Returns:
+        Sign of each term, and its index among the 36 entries of a field (9 of the stress, then 27
+        of the gradient).
+    """
     terms = []
     for number, part in enumerate(name.split("-")):
         i, j = AXES.index(part[0]), AXES.index(part[1])
@@ -215,8 +239,9 @@ def _make_modes(
 
     Args:
         names: Names of the modes.
-        axes: Axes of the space that the modes live in. A normal stress that grows along its own
-            axis is balanced by equal shear gradients along the other axes.
+        axes: Axes along which the stress may vary: "zx" for a plane, "xyz" for space. A normal
+            stress that grows along its own axis is balanced by equal shear gradients along the
+            other axes.
         symmetric: Whether sigma_ij and sigma_ji are equal.
     """
     flat = np.zeros((len(names), FIELD_SIZE))
@@ -226,7 +251,8 @@ def _make_modes(
     stress, gradient = _split_fields(flat)
 
     if symmetric:
-        # Only the entries that the names state are set so far; sigma_ji equals sigma_ij.
+        # So far, only the entry sigma_ij that stands in a mode's name is set, and not the equal
+        # entry sigma_ji.
         transposed_stress = stress.transpose(0, 2, 1)
         transposed_gradient = gradient.transpose(0, 2, 1, 3)
         stress = np.where(stress == 0, transposed_stress, stress)
@@ -235,7 +261,8 @@ def _make_modes(
     for g, name in zip(gradient, names, strict=True):
         if name not in GRADIENT or name[0] != name[3]:
             continue
-        # Equilibrium: the divergences of the shears cancel that of the normal stress.
+        # The normal stress grows along its own axis, which equilibrium allows only if shears along
+        # the other axes have the opposite divergence.
         i = AXES.index(name[0])
         for axis in axes.replace(name[0], ""):
             j = AXES.index(axis)
@@ -250,14 +277,23 @@ def _make_modes(
 _PLANE_GRADIENTS = ("zz_x", "zz_z", "xx_z", "xx_x")
 
 PLANE = _make_modes(("zz", "zx", "xx", *_PLANE_GRADIENTS), "zx")
-"""The seven modes of the plane z-x. Equilibrium in the plane adds sigma_zx = -x to the mode zz_z
-and sigma_zx = -z to the mode xx_x."""
+"""The seven modes of the plane z-x.
+
+Equilibrium requires that the mode zz_z (sigma_zz = z / d0) also has sigma_zx = -x / d0, and that
+the mode xx_x (sigma_xx = x / d0) also has sigma_zx = -z / d0.
+"""
 
 PAPER = _make_modes(("zz", "zx", "xx", "xz", *_PLANE_GRADIENTS), "zx", symmetric=False)
-"""The eight modes of the paper, which keep sigma_zx and sigma_xz apart; for comparison only."""
+"""The eight modes of Kiyota & Shinoda, eq. 1, with separate amplitudes for sigma_zx and sigma_xz.
+
+Moment equilibrium makes the two equal, so these modes serve only for comparison.
+"""
 
 _SHEAR_GRADIENTS = ("yz_x", "zx_y", "xy_z", "xy_y-zx_z", "yz_z-xy_x", "zx_x-yz_y")
 
 SPACE = _make_modes((*STRESS, *GRADIENT, *_SHEAR_GRADIENTS), "xyz")
-"""The 21 modes of space. A gradient ii_i is balanced half by each of the two shears, because then
-every element of the cube group acts on the modes as a signed permutation."""
+"""The 21 modes of space: all linear stress fields in equilibrium.
+
+The divergence of a mode such as zz_z is balanced half by sigma_zx and half by sigma_yz. With equal
+halves, every rotation or mirror of a cube acts on the modes as a signed permutation.
+"""

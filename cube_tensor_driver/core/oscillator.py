@@ -13,7 +13,8 @@ With u = r - 1 this is v = E (1 + beta) u / (1 - beta u).
 No thickness belongs to a frequency outside 0 < f < f0 (1 + beta) / beta; there the result is NaN.
 All functions broadcast their arguments.
 
-Source: eq. 6 of the paper, f = k d / (R (eps S + C' d)), solved for d relative to its rest value.
+Source: Kiyota & Shinoda, eq. 6, f = k d / (R (eps S + C' d)), solved for d relative to its value at
+rest.
 """
 
 from __future__ import annotations
@@ -35,12 +36,23 @@ def pad_stress(
     beta: Real,
     modulus: Real,
 ) -> Array:
-    """Compute normal stresses in Pa, tension positive, from frequencies in Hz."""
+    """Compute the normal stress on pads by the pad law, in Pa, tension positive.
+
+    Args:
+        frequency: Frequency of a pad's oscillator, in Hz.
+        rest_frequency: Frequency without load, in Hz.
+        beta: Ratio of the parasitic capacitance to the active capacitance at rest.
+        modulus: Modulus of the pad's foam, in Pa.
+
+    Returns:
+        Stresses; NaN for frequencies that the pad law excludes.
+    """
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
         # The difference is formed first, because f / f0 - 1 would lose digits in float32.
         u = (f - f0) / f0
-        # The foam is infinitely thick where this reaches zero.
+        # At the highest frequency that the pad law allows, the foam is infinitely thick and this
+        # is zero.
         denominator = 1 - beta * u
         v = modulus * (1 + beta) * u / denominator
         is_possible = (f > 0) & np.isfinite(f) & (denominator > 0)
@@ -53,9 +65,17 @@ def pad_frequency(
     beta: Real,
     modulus: Real,
 ) -> Array:
-    """Compute frequencies in Hz from stresses in Pa, the inverse of `pad_stress`.
+    """Compute the frequencies of pads, in Hz, from their stresses; the inverse of `pad_stress`.
 
-    The result is NaN at or below -E, where no thickness is left.
+    Args:
+        stress: Normal stress on a pad, in Pa, tension positive.
+        rest_frequency: Frequency without load, in Hz.
+        beta: Ratio of the parasitic capacitance to the active capacitance at rest.
+        modulus: Modulus of the pad's foam, in Pa.
+
+    Returns:
+        Frequencies; NaN if the stress is -modulus or less, which would press the foam to a
+        thickness of 0.
     """
     thickness = 1 + np.asarray(stress) / modulus
     with np.errstate(all="ignore"):
@@ -70,7 +90,10 @@ def stress_slope(
     beta: Real,
     modulus: Real,
 ) -> Array:
-    """Compute the derivative dv/df in Pa/Hz; at rest it is E (1 + beta) / f0."""
+    """Compute the derivative of a pad's stress v with respect to its frequency f, in Pa/Hz.
+
+    Without load it is E (1 + beta) / f0. The arguments are those of `pad_stress`.
+    """
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
         denominator = 1 - beta * (f - f0) / f0
@@ -80,9 +103,14 @@ def stress_slope(
 
 
 def highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
-    """Compute the frequency f0 (1 + beta) / beta of an infinitely thick pad, in Hz.
+    """Compute the upper limit f0 (1 + beta) / beta of a pad's frequency, in Hz.
 
-    It is infinite without parasitic capacitance.
+    The frequency approaches this limit when the foam becomes infinitely thick. Without parasitic
+    capacitance (beta = 0) the limit is infinite.
+
+    Args:
+        rest_frequency: Frequency f0 without load, in Hz.
+        beta: Ratio of the parasitic capacitance to the active capacitance at rest.
     """
     f0, beta = np.asarray(rest_frequency), np.asarray(beta, dtype=float)
     with np.errstate(divide="ignore", over="ignore"):
@@ -97,8 +125,8 @@ class TemperatureModel:
         f0(T) = f0 (1 + sum_d c_d (T - reference)^d),   d = 1, 2, ...
 
     Attributes:
-        reference: Temperature in °C at which the calibration states the rest frequencies.
-        coefficients: c_d of each pad (P, D), in 1/K^d, the linear term first.
+        reference: Temperature in °C at which the rest frequencies of the calibration hold.
+        coefficients: Coefficients c_d of each pad (P, D), in 1/K^d, the linear term first.
 
     Raises:
         CalibrationError: A value is not a finite number, or the shape is wrong.
@@ -128,7 +156,8 @@ class TemperatureModel:
         object.__setattr__(self, "coefficients", coefficients)
 
     def factor(self, temperature: ArrayLike) -> Array:
-        """Compute f0(T) / f0, (N, P), for temperatures (N,) in °C."""
+        """Compute the ratio (N, P) of the rest frequencies at temperatures T (N,), in °C, to those
+        at the reference temperature."""
         degree = self.coefficients.shape[1]
         t = np.asarray(temperature, dtype=float)
         difference = t[..., None] - self.reference
@@ -143,7 +172,11 @@ class TemperatureModel:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TemperatureModel:
-        """Construct a model from plain types. CalibrationError: a key is missing or unknown."""
+        """Construct a model from the plain types that `to_dict` returns.
+
+        Raises:
+            CalibrationError: A key is missing or unknown, or a value is invalid.
+        """
         if not isinstance(data, Mapping) or set(data) != {"reference", "coefficients"}:
             raise CalibrationError(
                 f"temperature: found {data!r}; it is a table of reference and coefficients"

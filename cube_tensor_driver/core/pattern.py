@@ -1,7 +1,7 @@
-"""Patterns of cube numbers in messages, and a cache of what is computed from them.
+"""Cache for quantities that depend only on the cube numbers of a message.
 
-A hub sends the same cubes in the same order in every sample, so the column of cube numbers of a
-message is one of a few. Whatever depends on this column alone is computed once per pattern.
+A hub sends the same cubes in the same order in every sample. So the column of cube numbers of a
+message (its pattern) is one of a few, and what depends on the pattern alone is computed only once.
 """
 
 from __future__ import annotations
@@ -14,18 +14,19 @@ import numpy as np
 from .arrays import AnyArray
 
 MAX_SKINS = 4
-"""Maximum number of rows in the cache, as a multiple of the number of cubes of the skin.
+"""Maximum number of cube numbers in all cached patterns, as a multiple of the cubes of the skin.
 
-This is enough for the pattern of the whole skin, of each hub, and of a few scans in one message.
+This is enough for the columns of cube numbers (patterns) of a message of the whole skin, of a
+message of each hub, and of a message of a few scans.
 """
 
 Computed = TypeVar("Computed")
 
 
 class PatternCache(Generic[Computed]):
-    """Cache of what a function computes from a column of cube numbers (N,).
+    """Cache of the results of a function of a column of cube numbers (N,).
 
-    If the cache is full, the least recently used patterns are removed.
+    If the cache is full, the columns that were not used for longest are removed.
     """
 
     def __init__(self, compute: Callable[[AnyArray], Computed], n_cubes: int) -> None:
@@ -35,12 +36,14 @@ class PatternCache(Generic[Computed]):
         self._rows = 0
 
     def get(self, cube: AnyArray) -> Computed:
-        """Return the result for a column of cube numbers (N,); compute it if it is not cached."""
-        # A short key finds the entry; its content decides, because other columns may share the key.
+        """Return the function's result for a column of cube numbers (N,), from the cache if
+        possible."""
+        # The key is short, so that the search is fast. Two columns may have the same key, so the
+        # cached column is compared with the given one below.
         key: tuple[int, ...] = (0,)
         if len(cube):
             key = (len(cube), int(cube[0]), int(cube[-1]))
-        # Bytes are compared in a fifth of the time that numbers are.
+        # Comparing two columns as bytes takes a fifth of the time of comparing their numbers.
         content = cube.tobytes()
         entry = self._entries.pop(key, None)
         if entry is None or entry[0] != content:
@@ -57,13 +60,16 @@ class PatternCache(Generic[Computed]):
         return entry[1]
 
     def clear(self) -> None:
-        """Remove all patterns."""
+        """Remove all results."""
         self._entries.clear()
         self._rows = 0
 
 
 def count_repeats(cube: AnyArray) -> int:
-    """Count the scans in a column of cube numbers (N,): the same rising numbers, repeated.
+    """Count the scans in a column of cube numbers (N,).
+
+    A scan is one row of each of some cubes. Several scans in a message are the same rising cube
+    numbers, repeated, such as 0 1 2 0 1 2.
 
     Returns:
         Number of scans; 0 if the column does not have this form.

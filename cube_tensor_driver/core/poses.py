@@ -11,10 +11,10 @@ from .tensor import quaternion_from_rotation
 
 
 class CubePoses(NamedTuple):
-    """Position, rotation and size of N cubes.
+    """Position, rotation and size of the N cubes of a skin.
 
     Attributes:
-        position: Centres in the parent frame (N, 3), in m.
+        position: Centres of the cubes in the parent frame of the skin (N, 3), in m.
         rotation: Rotations from the frame of each cube to the parent frame (N, 3, 3).
         half_side: Half sides (N,), in m.
     """
@@ -25,16 +25,17 @@ class CubePoses(NamedTuple):
 
     @property
     def pitch(self) -> float:
-        """Median distance of a cube to its nearest neighbour, in m, at least the side of a cube.
+        """Median distance of a cube to its nearest neighbour, in m.
 
-        Drawings use it as their unit of length. One cube alone has three times its side.
+        Drawings use it as their unit of length. It is at least the side of a cube; a skin of a
+        single cube has three times the side.
         """
         side = 2.0 * float(np.median(self.half_side))
         if len(self.position) < 2:
             return 3.0 * side
         square = (self.position**2).sum(axis=1)
         products = self.position @ self.position.T
-        # |a - b|² = a² + b² - 2 ab needs no array of all differences (N, N, 3).
+        # |a - b|² = a² + b² - 2 ab saves the memory of an array of all differences (N, N, 3).
         square_distance = square[:, None] + square - 2 * products
         np.fill_diagonal(square_distance, np.inf)
         nearest = np.median(square_distance.min(axis=1))
@@ -42,9 +43,10 @@ class CubePoses(NamedTuple):
 
 
 def quaternions(rotation: Array) -> Array:
-    """Return quaternions w, x, y, z (N, 4) of rotations (N, 3, 3).
+    """Return the quaternions w, x, y, z (N, 4) of rotation matrices (N, 3, 3).
 
-    The function loops over the cubes, so it should be called once per skin and not per picture.
+    The function loops over the matrices in Python, so it should be called once per skin and not
+    for every picture.
     """
     in_ros_order = [quaternion_from_rotation(matrix) for matrix in rotation]
     return np.roll(np.array(in_ros_order).reshape(-1, 4), 1, axis=1)

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 PAD_FAULT = 1
-"""Status bit: at least one pad was left out, because the device reports a fault or its frequency
-is impossible."""
+"""Status bit: at least one pad of the cube was not used for this row.
+
+The device reports a fault of the pad, the frequency of the pad is impossible, or the diagnosis of
+the pads found it stuck or noisy.
+"""
 
 RESIDUAL = 2
-"""Status bit: chi-square is above its false-alarm limit.
+"""Status bit: the residual (what the reconstructed stress leaves unexplained in the pads' signals)
+is larger than the noise of the pads makes it in all but one of a thousand rows.
 
 Either the load causes a stress field that the modes do not express, or a pad is broken.
 """
 
 INVALID = 4
-"""Status bit: no component was recovered, so all of them are NaN."""
+"""Status bit: no component of stress or gradient was recovered, so all of them are NaN."""
 
 TEMPERATURE = 8
-"""Status bit: the temperature that the calibration needs is unknown.
+"""Status bit: the calibration corrects for temperature, but the temperature is unknown.
 
 The reference temperature of the calibration was assumed instead.
 """
@@ -24,7 +28,8 @@ The reference temperature of the calibration was assumed instead.
 STAMP = 2048
 """Status bit: the time stamp is doubtful.
 
-The clock of the device seems to have been set, or the counter that it sends is not a clock.
+The clock of the device seems to have been set, or the time that the device sends does not advance
+like a clock.
 """
 
 STATUS = {
@@ -37,11 +42,12 @@ STATUS = {
 """Status bits by name, as messages and tables show them."""
 
 OPEN = 16
-"""Condition of a pad: its frequency is so high that its capacitor must be disconnected."""
+"""Condition of a pad: its frequency is so high that the capacitor must be disconnected."""
 SHORT = 32
-"""Condition of a pad: it has no frequency, as with a short circuit."""
+"""Condition of a pad: no frequency is measured (0 or NaN), as with a short circuit."""
 RANGE = 64
-"""Condition of a pad: its frequency stands for a strain that the elastomer does not survive."""
+"""Condition of a pad: by the pad law, its frequency means a strain that the foam would not
+survive."""
 STUCK = 128
 """Condition of a pad: its frequency does not change while the other pads of the cube move."""
 NOISY = 256
@@ -49,7 +55,8 @@ NOISY = 256
 REPORTED = 512
 """Condition of a pad: the hub reports a fault."""
 DRIFT = 1024
-"""Condition of a pad: its rest frequency moves away from those of the other pads of the cube."""
+"""Condition of a pad: while nothing moves, its frequency shifts relative to the other pads of the
+cube."""
 
 WORDS = {
     OPEN: "open",
@@ -60,10 +67,11 @@ WORDS = {
     REPORTED: "reported by the hub",
     DRIFT: "drifting",
 }
-"""Words for the conditions of a pad, as diagnostics and tables show them."""
+"""Text for each condition of a pad, as diagnostics and tables show it."""
 
 LEFT_OUT = OPEN | SHORT | RANGE | STUCK | NOISY | REPORTED
-"""Conditions with which a pad is left out of the reconstruction.
+"""Conditions with which the signal of a pad is not used in the reconstruction of the stress.
 
-A drifting pad is still used, because its error is small and a tare corrects it.
+A drifting pad is still used, because its error is small and a tare (taking the present frequencies
+as those without load) corrects it.
 """

@@ -1,10 +1,12 @@
 """Symmetry: the response matrices that a cube can have, given the symmetry of its surroundings.
 
-Every element R of the symmetry group permutes the pads (P(R)) and transforms the modes (M(R)). The
-response A satisfies A M(R) = P(R) A for all R. Both act as signed permutations, so the entries of A
-form orbits of equal magnitude. Each orbit is one coefficient, named after one of its entries.
+The response A (pads x modes) gives the stresses on the pads per amplitude of each mode (linear
+stress field). Every element R of the symmetry group permutes the pads (P(R)) and transforms the
+modes (M(R)), and A satisfies A M(R) = P(R) A for all R. Both P(R) and M(R) are signed permutations,
+so the entries of A form orbits (sets that the group maps onto each other) of equal magnitude. Each
+orbit is one coefficient, named after one of its entries.
 
-Source: the symmetry argument of the paper's section on eq. 1, applied to any layout.
+Source: Kiyota & Shinoda, the symmetry argument for eq. 1, applied to any layout.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from .layout import Layout
 from .modes import PLANE, SPACE, Modes
 
 POSITION_TOLERANCE = 1e-6
-"""Largest distance, in units of d0, of a rotated pad from the pad that it coincides with."""
+"""Largest distance between a rotated pad and another pad with which it counts as coincident, in
+units of d0 (half the side of the cube)."""
 
 _QUARTER_TURN_Z = (
     (0, -1, 0),
@@ -46,15 +49,16 @@ GENERATORS: dict[str, tuple[Matrix, ...]] = {
     "mirrors": _MIRRORS,
     "none": (),
 }
-"""Generators of each symmetry group, the largest group first.
+"""Generators (matrices whose products are the group) of each symmetry group, the largest group
+first. The symmetry is that of the cube with its surroundings.
 
 - full (48 elements): the cube is alone in a wide body.
-- slab (16): z differs from x and y, but up and down are alike.
+- slab (16): the direction z differs from x and y, but +z and -z are alike.
 - mirrors (8): the three axes differ from each other.
 - none (1): nothing is known, and every entry of the response is a coefficient of its own.
 """
 
-# The paper's letters stand for entries of the row of pad V1, with these signs.
+# Kiyota & Shinoda name the response of pad V1 to each mode by a letter with this sign (eq. 1).
 _LETTERS = {
     "zz": ("a", 1),
     "xx": ("b", -1),
@@ -68,7 +72,7 @@ _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
 
 
 def generate_group(generators: Sequence[Matrix]) -> Index:
-    """Return all products (G, 3, 3) of the generators, the identity first."""
+    """Return all G different products (G, 3, 3) of the generators, the identity first."""
     matrices = [np.array(generator, dtype=int) for generator in generators]
     identity = np.eye(3, dtype=int)
     found = {identity.tobytes(): identity}
@@ -98,9 +102,17 @@ def find_group(name: str) -> Index:
 
 
 def find_layout_group(layout: Layout, name: str) -> Index:
-    """Return the elements of a group that map a layout's space onto itself.
+    """Return the elements (G, 3, 3) of a symmetry group that apply to a layout.
 
-    For a planar layout these are the elements that keep the plane y = 0.
+    All pads of a planar layout lie in the plane y = 0. For it, only the elements that map this
+    plane onto itself are returned.
+
+    Args:
+        layout: Layout of the pads.
+        name: Name of the symmetry group.
+
+    Raises:
+        SymmetryError: There is no group of this name.
     """
     elements = find_group(name)
     if not layout.planar:
@@ -113,8 +125,12 @@ def find_layout_group(layout: Layout, name: str) -> Index:
 def map_pads(layout: Layout, rotation: Array | Index) -> Index:
     """Return, for each pad, the number of the pad onto which a rotation or mirror maps it (P,).
 
+    Args:
+        layout: Layout of the P pads.
+        rotation: Rotation or mirror matrix (3, 3).
+
     Raises:
-        SymmetryError: A pad is mapped to a place without a pad; the message names both.
+        SymmetryError: There is no pad at the position to which a pad is mapped.
     """
     r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
@@ -144,10 +160,10 @@ class Structure:
         layout: Layout of the P pads.
         modes: The M modes.
         symmetry: Name of the symmetry group.
-        names: Names of the K coefficients. A name such as "+z-x:zz" is the entry of that pad and
-            mode.
-        basis: Matrices (K, P, M) with entries 0, 1 and -1. Every entry of a response belongs to at
-            most one coefficient.
+        names: Names of the K coefficients. A name such as "+z-x:zz" means the entry of the response
+            for the pad "+z-x" and the mode "zz".
+        basis: One matrix per coefficient (K, P, M) with entries 0, 1 and -1. At each entry of the
+            response, at most one of the K matrices is not 0.
     """
 
     layout: Layout
@@ -165,7 +181,7 @@ class Structure:
         """Sets of pads that the symmetry maps onto each other."""
         elements = find_layout_group(self.layout, self.symmetry)
         images = np.array([map_pads(self.layout, element) for element in elements])
-        # Pads of one orbit have the same images, and each orbit is wanted once.
+        # All pads of one orbit have the same set of images, so each set is added only once.
         orbits: list[list[int]] = []
         for column in images.T:
             orbit = np.unique(column).tolist()
@@ -175,7 +191,7 @@ class Structure:
 
 
 def default_modes(layout: Layout) -> Modes:
-    """Return the modes of the plane for a planar layout, and those of space for all others."""
+    """Return the modes that a layout can measure: `PLANE` for pads in one plane, else `SPACE`."""
     return PLANE if layout.planar else SPACE
 
 
@@ -213,7 +229,8 @@ def _derive_structure(
     images_of_first = set(pad_images[:, 0])
     is_one_orbit = len(images_of_first) == layout.n_pads
     if is_one_orbit and layout.planar and layout.pads[0] == "+z-x":
-        # Every pad is an image of V1, so the paper's letters for its row name all entries.
+        # The group maps pad V1 onto every other pad, so the letters of Kiyota & Shinoda for the row
+        # of V1 name all entries.
         letters = _PAPER_LETTERS if "xz" in modes.names else _LETTERS
 
     is_assigned = np.zeros((layout.n_pads, modes.n_modes), dtype=bool)
@@ -226,7 +243,8 @@ def _derive_structure(
         is_assigned[rows, columns] = True
         is_same_entry = (rows == pad) & (columns == mode)
         if np.any(is_same_entry & (signs < 0)):
-            # An element keeps the pad and reverses the mode, so the entry must be zero.
+            # A group element maps the pad onto itself and reverses the sign of the mode. So the
+            # entry equals its own negative and must be zero.
             continue
         mode_name = modes.names[mode]
         own_name = (f"{layout.pads[pad]}:{mode_name}", 1)
@@ -245,7 +263,14 @@ def _derive_structure(
 
 
 def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
-    """Return the row of the nonzero entry in each column, and its sign, of matrices (G, M, M).
+    """Return the row number and the sign of the nonzero entry in each column of matrices.
+
+    Args:
+        matrices: G signed permutations (G, M, M): each column has one entry 1 or -1, all others are
+            0.
+
+    Returns:
+        Row numbers (G, M) and signs (G, M).
 
     Raises:
         SymmetryError: A matrix is not a signed permutation.
@@ -259,9 +284,11 @@ def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
 
 
 def coefficient_counts(layout: Layout) -> dict[str, int | None]:
-    """Count the coefficients under each symmetry, the largest group first.
+    """Count the coefficients of a layout's response under each symmetry group.
 
-    The count is None if the layout does not have the symmetry.
+    Returns:
+        Number of coefficients by the name of the group, the largest group first. The number is None
+        if the layout does not have the symmetry.
     """
     counts: dict[str, int | None] = {}
     for name in GENERATORS:
@@ -273,6 +300,7 @@ def coefficient_counts(layout: Layout) -> dict[str, int | None]:
 
 
 def largest_symmetry(layout: Layout) -> str:
-    """Return the largest symmetry of a layout whose response matrices are not all zero."""
+    """Return the name of the largest symmetry group under which a layout's response need not be
+    zero."""
     counts = coefficient_counts(layout)
     return next(name for name, count in counts.items() if count)
