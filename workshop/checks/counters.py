@@ -119,7 +119,8 @@ def _is_lost_with_power(run: Run) -> Mask:
             mine_arrived = mine[arrived[mine]]
             # Only a restart ends the reports of a hub about the samples that it has dropped.
             if boot != boots[-1]:
-                lost[mine[mine > mine_arrived.max(initial=-1)]] = True
+                last = mine_arrived.max(initial=-1)
+                lost[mine[mine > last]] = True
             if len(mine_arrived) and samples.number[mine[0]] > WRAPPED_NUMBER:
                 lost[mine[mine < mine_arrived[0]]] = True
     return lost

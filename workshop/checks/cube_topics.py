@@ -21,9 +21,12 @@ MAX_RELATIVE_ERROR = 1e-5
 
 def check_cube_topics(run: Run) -> Findings:
     """Count the messages, and those that agree with no row of their stamp."""
-    record, skin = run.record, run.record.skin
-    messages, rows = record.cube_messages, record.stress.rows
-    rows = rows.select(np.flatnonzero(rows.cube == messages.cube))
+    record = run.record
+    skin = record.skin
+    messages = record.cube_messages
+    rows = record.stress.rows
+    of_cube = np.flatnonzero(rows.cube == messages.cube)
+    rows = rows.select(of_cube)
     pipeline = Pipeline(skin.calibrations, np.float64)
     cube = skin.cubes[messages.cube]
 
@@ -63,7 +66,11 @@ def check_cube_topics(run: Run) -> Findings:
     # Where messages of `stress` are missing here, the row of a message may be missing, too.
     if not record.stress.gaps:
         wrong += agrees.count(False)
-    return Findings({"cube_messages": len(agrees), "wrong_cube_messages": wrong}, [])
+    figures = {
+        "cube_messages": len(agrees),
+        "wrong_cube_messages": wrong,
+    }
+    return Findings(figures, [])
 
 
 def _is_near(found: ArrayLike, wanted: ArrayLike) -> bool:

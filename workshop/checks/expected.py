@@ -230,7 +230,8 @@ class ExpectedReadings:
         for part in split_in_chunks(np.arange(len(rows))):
             expected = self.of(rows.cube[part], sample[part]).frequency
             # Pads that measure nothing do not tell samples apart.
-            is_equal = (expected == rows.frequency[part]) | np.isnan(expected)
+            is_equal = expected == rows.frequency[part]
+            is_equal |= np.isnan(expected)
             resembles[part] = is_equal.mean(axis=1) >= MIN_EQUAL_SHARE
         return resembles
 

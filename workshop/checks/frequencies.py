@@ -93,7 +93,8 @@ def _differs(rows: FrequencyRows, readings: Readings) -> Mask:
     """Find the rows (N,) of which a field is not what it must be."""
     certain = readings.is_certain
     changed_bits = (rows.pad_fault ^ readings.pad_fault)[:, np.newaxis]
-    differs_in_fault = changed_bits >> np.arange(certain.shape[1]) & 1 == 1
+    bit = np.arange(certain.shape[1])
+    differs_in_fault = changed_bits >> bit & 1 == 1
     differs_in_pad = ~_is_same(rows.frequency, readings.frequency) | differs_in_fault
     # The temperature changes together with the readings, so all pads are certain or none is.
     differs_in_temperature = ~_is_same(rows.temperature, readings.temperature)

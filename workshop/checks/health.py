@@ -88,9 +88,11 @@ def check_health(run: Run, sample: Index) -> Findings:
     examples, n_faults, n_unflagged = [], 0, 0
 
     for fault in run.samples.faults(*PAD_FAULTS):
-        pad, bit = fault.fault.pad, STATUS_OF_FAULT[fault.kind]
+        pad = fault.fault.pad
+        bit = STATUS_OF_FAULT[fault.kind]
         mine = np.flatnonzero(rows.cube == fault.cube)
-        may_be_flagged = mine[evidence.flagged_span(fault).contains(time_ns[mine])]
+        permitted = evidence.flagged_span(fault)
+        may_be_flagged = mine[permitted.contains(time_ns[mine])]
         permitted_pads[may_be_flagged] |= np.uint32(1 << pad)
         permitted_status[may_be_flagged] |= np.uint16(bit | PERMITTED_STATUS)
 
@@ -100,7 +102,8 @@ def check_health(run: Run, sample: Index) -> Findings:
         # A short fault may be over before it must be flagged.
         if not len(must_be_flagged) or not evidence.suffices(fault):
             continue
-        unflagged = must_be_flagged[~_is_flagged(rows.select(must_be_flagged), pad, bit)]
+        is_flagged = _is_flagged(rows.select(must_be_flagged), pad, bit)
+        unflagged = must_be_flagged[~is_flagged]
         n_faults += 1
         n_unflagged += len(unflagged)
         if len(unflagged):
@@ -171,13 +174,13 @@ class _Evidence:
         """Return whether the statistics began again in a span, as after a cut of any link."""
         cuts = self._run.samples.faults(*CUT_FAULTS)
         starts = self._run.record.actions_of(*NODE_STARTS)
-        return any(cut.overlaps(span, DISTURBANCE_S) for cut in cuts) or any(
-            start.overlaps(span, RESTART_S) for start in starts
-        )
+        is_cut = any(cut.overlaps(span, DISTURBANCE_S) for cut in cuts)
+        return is_cut or any(start.overlaps(span, RESTART_S) for start in starts)
 
     def _is_complete(self, cube: int, span: Span) -> bool:
         """Return whether nearly all rows of a cube arrived in a span."""
-        samples, rows = self._run.samples, self._run.record.stress.rows
+        samples = self._run.samples
+        rows = self._run.record.stress.rows
         has_arrived = (rows.cube == cube) & span.contains(rows.stamp_ns)
         begin = Span(span.begin_ns, span.begin_ns)
         is_near = begin.contains(samples.time_ns, NOMINAL_PERIOD_S, NOMINAL_PERIOD_S)
@@ -196,7 +199,8 @@ class _Evidence:
         window_ns = round(NS_PER_S * WINDOW_S)
         for begin_ns in range(span.begin_ns, span.end_ns - window_ns, WINDOW_STEP_NS):
             window = Span(begin_ns, begin_ns + window_ns)
-            frequency = readings.frequency[window.contains(samples.time_ns[chosen])]
+            is_within = window.contains(samples.time_ns[chosen])
+            frequency = readings.frequency[is_within]
             if not len(frequency):
                 return False
             # The lower median: half of the pads move at least that much.

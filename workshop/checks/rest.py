@@ -48,7 +48,8 @@ class RestFrequencies:
 
     def tare(self, cubes: list[int], held: Array | None) -> RestFrequencies:
         """Return them after a tare of cubes that read `held` (len(cubes), P), None if unknown."""
-        values, is_known = self.values.copy(), self.is_known.copy()
+        values = self.values.copy()
+        is_known = self.is_known.copy()
         is_known[cubes] = held is not None
         if held is not None:
             values[cubes] = held
@@ -71,7 +72,8 @@ class RestHistory:
             current = self._apply(action, current)
             # The change ends the span of the values before.
             last, rest = self._epochs[-1]
-            self._epochs[-1] = (replace(last, end_ns=action.end_ns), rest)
+            shortened = replace(last, end_ns=action.end_ns)
+            self._epochs[-1] = (shortened, rest)
             following = Span(action.end_ns, LATEST_NS)
             self._epochs.append((following, current))
 

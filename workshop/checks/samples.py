@@ -49,15 +49,18 @@ class Samples:
     """
 
     def __init__(self, log: SampleLog) -> None:
-        self.log, self.table = log, log.table
-        self.link, self.number = self.table.link, self.table.number
+        self.log = log
+        self.table = log.table
+        self.link = self.table.link
+        self.number = self.table.number
         self.time_ns = self.table.time_ns
         self.time_us = (self.time_ns - log.start_time_ns) // 1000
         self.row_count = self.table.rows_per_sample[self.link]
 
-        runs = [(len(run), run.boot, run.period_us) for link in log.links for run in link.runs]
+        runs = [run for link in log.links for run in link.runs]
+        values = [(len(run), run.boot, run.period_us) for run in runs]
         # One column each; the shape is stated because there may be no runs.
-        lengths, boots, periods_us = np.array(runs, int).reshape(-1, 3).T
+        lengths, boots, periods_us = np.array(values, int).reshape(-1, 3).T
         self.boot = np.repeat(boots, lengths)
         self.period_us = np.repeat(periods_us, lengths)
 
@@ -66,7 +69,8 @@ class Samples:
             for link, link_log in enumerate(log.links)
             for boot, number in link_log.damaged
         ]
-        damaged_keys = _join_keys(*np.array(damaged, int).reshape(-1, 3).T)
+        damaged_columns = np.array(damaged, int).reshape(-1, 3).T
+        damaged_keys = _join_keys(*damaged_columns)
         self.is_damaged: Mask = np.isin(
             _join_keys(self.link, self.boot, self.number),
             damaged_keys,

@@ -129,7 +129,8 @@ def _find_sources(frequencies: FrequencyRows, stress: StressRows) -> Index:
     """Find the row of frequencies with the cube, number and stamp of each row of stress (M,)."""
     source = match_rows(frequencies, stress)
     found = find_matched(source)
-    has_other_stamp = frequencies.stamp_ns[source[found]] != stress.stamp_ns[found]
+    source_stamp_ns = frequencies.stamp_ns[source[found]]
+    has_other_stamp = source_stamp_ns != stress.stamp_ns[found]
     source[found[has_other_stamp]] = NO_MATCH
     return source
 
@@ -150,7 +151,8 @@ def _find_missing(run: Run, has_tensor: Mask) -> Mask:
         before_ns = sent_ns[was_up].max(initial=0)
         is_missing &= (sent_ns <= before_ns) | (sent_ns > action.end_ns)
     # The rows of one message were sent at one time.
-    if len(np.unique(sent_ns[is_missing])) <= record.messages_lost:
+    messages = np.unique(sent_ns[is_missing])
+    if len(messages) <= record.messages_lost:
         is_missing[:] = False
     return is_missing
 

@@ -48,7 +48,8 @@ def measure_stamp_errors(run: Run) -> Array:
     rows = record.frequencies.rows
     first_cubes = [link.members[0] for link in samples.log.links]
     is_certain = rows.status & np.uint16(STAMP) == 0
-    chosen = np.flatnonzero(np.isin(rows.cube, first_cubes) & is_certain)
+    is_first = np.isin(rows.cube, first_cubes)
+    chosen = np.flatnonzero(is_first & is_certain)
     chosen = chosen[run.sample[chosen] != NO_MATCH]
     chosen = chosen[settled[run.sample[chosen]]]
     taken_ns = samples.time_ns[run.sample[chosen]]
@@ -66,7 +67,8 @@ def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
     gaps_s = []
     for fault in samples.faults("unplug", "rename"):
         is_after = samples.time_ns >= fault.end_ns
-        times_ns = samples.time_ns[arrived & is_after & (samples.link == fault.link)]
+        is_of_link = samples.link == fault.link
+        times_ns = samples.time_ns[arrived & is_after & is_of_link]
         if len(times_ns):
             gap_ns = times_ns.min() - fault.end_ns
             gaps_s.append(float(gap_ns) / NS_PER_S)
