@@ -212,13 +212,6 @@ class VirtualBench:
         rest = np.zeros(self.section.basis.N)
         return self._newton(rest, self._task(step, rest))
 
-    def unbalanced_forces(self, u: Array, rod: Rod) -> Array:
-        """Return the nodal forces (dofs,) on the body at u, which plates must hold."""
-        balance = self._balance(u, self.rod_contact(rod))
-        if balance is None:
-            raise ElasticError("an element is inside out; press less")
-        return balance.force
-
     def rod_pressure(self, step: LoadStep) -> tuple[Array, Array]:
         """Return positions (n,) in m along x and forces (n,) in N/m of the rod of a linear step."""
         u = self.solve(step)

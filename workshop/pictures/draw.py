@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,6 +68,8 @@ indenters:
 """
 """Load script of the browser view's picture. It presses beside the cube c05, whose numbers the view
 shows at first, and stays there."""
+ERROR_LEVELS = (0.1, 0.2, 0.3, 0.5)
+"""Relative errors of the pressure for which field.json tells how many cubes gradients save."""
 SHAKEN_S = 2.62
 """Time at which the acceleration of the gripper's box is largest, in s."""
 PHOTOGRAPH_S = 120.0
@@ -117,7 +120,12 @@ def make_pictures(folder: Path) -> None:
     save(draw_methods(field_example()), folder / "field.png")
     study = field_study()
     save(draw_field_study(study), folder / "field_error.png")
-    table = {name: column.tolist() for name, column in vars(study).items()}
+    table: dict[str, Any] = {name: column.tolist() for name, column in vars(study).items()}
+    for level in ERROR_LEVELS:
+        saved = study.cubes_saved(level)
+        # JSON knows no NaN, which stands for an error that no pitch reaches.
+        rows = [[value if value == value else None for value in row] for row in saved.tolist()]
+        table[f"cubes saved at an error of {level}"] = rows
     with atomic_write(folder / "field.json") as partial:
         partial.write_text(json.dumps(table) + "\n")
 
