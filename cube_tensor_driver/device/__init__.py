@@ -1,5 +1,6 @@
-"""From the bytes of hubs to `FrequencyRows`: protocol, links, clocks, accounts, scans.
+"""From the bytes of hubs to `FrequencyRows`: protocol, links, clocks, counting, scans.
 
-The live source (`open_links`) puts them together. Nothing here knows ROS, and nothing looks at what
-a frequency means.
+A hub is the microcontroller that samples one or more cubes and sends its samples over one link (a
+serial port or TCP). The live source (`open_links`) joins all steps. This folder does not import
+ROS, and it does not interpret the frequencies.
 """

@@ -1,7 +1,7 @@
-"""The chain from bytes to rows: reader, accounts, clocks and scans of all links of a skin.
+"""The chain from bytes to rows: reader, sample counters, clocks and scans of all links of a skin.
 
-It calls back in the reader's thread. The driver node publishes from there, and `live.py` puts a
-queue behind it.
+`LiveLinks` calls back with rows in the thread of the reader. The driver node publishes them in that
+thread; `live.py` puts them into a queue for a loop in Python.
 """
 
 from __future__ import annotations
@@ -30,22 +30,25 @@ from .wire.native import NOT_COMPILED, wire
 from .wire.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
 
 MAX_SCANS = 4
-"""Largest number of scans in one callback, unless the caller gathers more. Many scans wait after a
-pause, and the memory that is kept for rows need not hold all of them."""
+"""Largest number of scans (one sample of every cube) whose rows one callback receives. If the
+caller asks for n scans per call and n + 1 is larger, n + 1 is the limit. After a pause of the
+process many scans wait; the limit keeps the memory of one callback small."""
 MAX_EVENTS = 100
-"""Number of changes of state of one link that are kept until the next report."""
+"""Number of changes of state (open, silent, closed …) of one link that are kept for the next
+`LiveLinks.report`. If there are more, the oldest are discarded."""
 
 
 @dataclass(frozen=True)
 class LinkReport:
-    """State of one link.
+    """State of one link at the time of the report, and its problems since the report before.
 
     Attributes:
-        name: Name of the link.
-        hub_uid: Unique number of the hub; None before its first HELLO.
-        state: State now.
-        past_states: States other than open since the last report.
-        notes: What is wrong now, or was wrong since the last report, with the fix.
+        name: Name of the link in the skin file.
+        hub_uid: Unique number of the hub; None before its first HELLO frame.
+        state: State at the time of the report.
+        past_states: States other than OPEN that the link has had since the last report.
+        notes: Texts of the problems that exist now or existed since the last report, each with its
+            fix.
         values: Counters and clock values by name.
     """
 
@@ -59,16 +62,18 @@ class LinkReport:
 
 @dataclass
 class _LinkRecord:
-    """What `LiveLinks` knows of one link.
+    """Data that `LiveLinks` keeps for one link.
 
     Attributes:
-        account: Account of its samples.
-        clock: Clock of its hub.
-        problems: Cubes that do not fit the skin, in words.
-        account_errors: Errors of the account, in words.
-        events: States other than open since the last report, and the reason of each.
-        logged_version: Last other protocol version that was logged.
-        hub_changes: Number of times the hub reported other cubes than before, including the first.
+        account: Counters of the samples of the link: delivered, missing, duplicate.
+        clock: Conversion of the device times of the hub to host time.
+        problems: Texts about the cubes of the hub that do not fit the skin file.
+        account_errors: Texts about counters that contradict each other; empty if all is right.
+        events: States other than OPEN since the last report, and the reason of each.
+        logged_version: Protocol version, other than the driver's, that was logged last for this
+            link; None before.
+        hub_changes: Number of HELLO frames that reported other cubes than the one before; the first
+            HELLO counts, too.
         was_open: Whether the link has ever been open.
     """
 
@@ -86,16 +91,16 @@ class LiveLinks:
     """Reads the links of a skin and calls back with rows of frequencies.
 
     Args:
-        links: Place and identity of the hub of each link.
-        cubes: Place of each cube of the skin.
+        links: Port of each link, and the unique number of the hub that must answer there.
+        cubes: For each cube of the skin, the unique number or the link and index to find it by.
         on_rows: Called in the reader's thread with the rows of complete scans. If `make_rows`
-            returns the same memory again, they are valid only until the call returns.
-        rate: Sample rate to request of the hubs, in Hz; None leaves it to them.
-        scans_per_call: Number of scans that are gathered for one call.
+            returns the same memory again, the rows are valid only until the call returns.
+        rate: Sample rate to request from the hubs, in Hz; with None the hubs keep their own rate.
+        scans_per_call: Number of complete scans that one call of `on_rows` waits for.
         make_rows: Makes the arrays that rows are written into.
-        clock_ns: Clock of the stamps.
+        clock_ns: Clock of the time stamps, in ns since the Unix epoch.
         is_host_clock: Returns whether `clock_ns` is now the host's clock, not a simulated time.
-        log: Logger for events of the links; None for Python's logging.
+        log: Logger for events of the links; None stands for Python's logging.
         on_end: Called in the reader's thread when it ends, after `close` or because of an error.
     """
 
@@ -130,16 +135,19 @@ class LiveLinks:
             self._log.warning(NOT_COMPILED)
         self._loggers = [LinkLogger(config.name, self._log) for config in self._configs]
         self._rows = RowAccount(self._scans)
-        # Reports read accounts and clocks only while the reader's thread does not change them.
+        # The reader's thread holds this lock while it changes sample counters and clocks, and
+        # `report` holds it while it reads them from another thread.
         self._lock = threading.Lock()
         self._errors = 0
         self._reader: Reader | None = None
 
     def start(self) -> None:
-        """Open the links and start the hubs; also again after `close`.
+        """Start the thread that opens the links and starts the hubs.
+
+        It may be called again after `close`.
 
         Raises:
-            LinkError: `bad_port`: a port can never be opened.
+            LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
         """
         self._reader = Reader(
             self._configs,
@@ -152,12 +160,18 @@ class LiveLinks:
         self._reader.start()
 
     def close(self) -> None:
-        """Stop the hubs and close the links; a second call does nothing."""
+        """Send STOP to the hubs, close the links and end the reader's thread.
+
+        A second call does nothing.
+        """
         if self._reader is not None:
             self._reader.close()
 
     def set_rate(self, rate: float | None) -> None:
-        """Request another sample rate of the hubs, in Hz; None leaves it as it is."""
+        """Request another sample rate, in Hz, from all hubs.
+
+        With None nothing is sent, and after the next `start` the hubs keep their own rate.
+        """
         self._rate = rate
         period_us = _period_us(rate)
         if self._reader is None or period_us is None:
@@ -168,28 +182,32 @@ class LiveLinks:
 
     @property
     def failure(self) -> Exception | None:
-        """Error that ended the reader's thread; None if there was none."""
+        """Error that ended the reader's thread; None while it runs or if it ended by `close`."""
         return None if self._reader is None else self._reader.failure
 
     @property
     def callback_errors(self) -> int:
-        """Number of times a callback in the reader's thread has failed."""
+        """Number of exceptions raised in the reader's thread while frames were handled or rows
+        delivered."""
         in_reader = 0 if self._reader is None else self._reader.callback_errors
         return self._errors + in_reader
 
     @property
     def cube_uids(self) -> dict[int, int]:
-        """Unique number of each cube by its index in the skin, as the hubs report it."""
+        """Unique number of each cube, as its hub reports it, by the index of the cube in the skin.
+
+        A cube is missing until its hub has sent HELLO.
+        """
         return self._scans.cubes.uids
 
     def row_counts(self) -> RowCounts:
-        """Return the numbers of rows until now, by what happened to them."""
+        """Return how many rows have been delivered, left out for each reason, or lost so far."""
         return self._rows.counts
 
     def report(self) -> list[LinkReport]:
-        """Return the state of each link, and what happened since the last report.
+        """Return the state of each link, and its problems since the last call of this method.
 
-        Before `start` it is empty.
+        Before `start`, the list is empty.
         """
         if self._reader is None:
             return []
@@ -198,32 +216,40 @@ class LiveLinks:
             return [self._report(link, record, logger) for link, record, logger in links]
 
     def receive(self, received: Sequence[LinkFrames]) -> None:
-        """Handle frames of the links, and call back with the rows that they complete.
+        """Handle frames of the links, and call back with the rows of the scans they complete.
 
-        The reader's thread calls this once per wake-up.
+        The reader's thread calls this method once each time it has read data.
         """
         with self._lock:
             now_ns, step_ns = self._check_host_clock()
             for link, arrival_ns, frames, asked_ns in received:
                 if step_ns:
-                    # Bytes that were read just before the clock was set arrived in its old time.
+                    # The arrival of bytes that were read just before the host's clock was set is a
+                    # time of the old clock, and is moved by the step of the clock.
                     shifted_ns = arrival_ns + step_ns
                     is_old = abs(shifted_ns - now_ns) < abs(arrival_ns - now_ns)
                     arrival_ns = shifted_ns if is_old else arrival_ns
-                # All rows are counted first, so that an error in one frame hides no other.
+                # All rows are counted before any frame is handled, so that rows of the frames
+                # behind a frame that raises an error are counted, too.
                 for frame in frames:
                     if isinstance(frame, Sample):
                         self._rows.received += frame.shape[0]
                 try:
-                    # A round trip during which the clock was set gives no bound.
+                    # If the host's clock was set between a question for the hub's time and its
+                    # answer, the round trip says nothing about the hub's clock (0: not used).
                     self._handle_frames(link, arrival_ns, frames, 0 if step_ns else asked_ns)
-                except Exception as error:  # noqa: BLE001  (the rows of other links go on)
+                except Exception as error:  # noqa: BLE001  (other links must still be handled)
                     self._count_error(error)
         self._deliver()
         self._rows.check()
 
     def _check_host_clock(self) -> tuple[int, int]:
-        """Return the time and the step of the host's clock since the last call, both in ns."""
+        """Look for a step of the host's clock, and move the clocks of all hubs by it.
+
+        Returns:
+            Time of the host's clock, and how far it was set since the last call (0: not set), both
+            in ns.
+        """
         now_ns, step_ns = self._clock_watch.look()
         if not step_ns or not self._is_host_clock():
             return now_ns, 0
@@ -243,7 +269,15 @@ class LiveLinks:
         frames: Sequence[Frame],
         asked_ns: int,
     ) -> None:
-        """Count the frames of a link and add their samples to the scans."""
+        """Count the frames of a link and add their samples to the scans.
+
+        Args:
+            link: Index of the link.
+            arrival_ns: Host time at which the bytes of the frames arrived, in ns.
+            frames: The frames, in order.
+            asked_ns: Host time, in ns, of the question that a TIME frame among them answers; 0 if
+                the answer must not be used.
+        """
         record = self._records[link]
         samples: list[Sample] = []
         for frame in frames:
@@ -268,7 +302,13 @@ class LiveLinks:
         self._add_samples(link, arrival_ns, samples)
 
     def _add_samples(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
-        """Stamp samples that arrived together, and add them to the scans."""
+        """Convert the device times of samples to host time, and add the samples to the scans.
+
+        Args:
+            link: Index of the link.
+            arrival_ns: Host time at which all of these samples arrived, in ns.
+            samples: The samples, in order.
+        """
         if not samples:
             return
         clock = self._records[link].clock
@@ -279,18 +319,21 @@ class LiveLinks:
         self._scans.add(link, samples, stamps_ns, status)
 
     def _deliver(self) -> None:
-        """Call back with the rows of all complete scans; a scan without rows is discarded."""
+        """Call `on_rows` with the rows of all complete scans.
+
+        A scan that holds no cube of the skin has no rows and is discarded.
+        """
         while self._scans.is_complete(self._scans_per_call):
             try:
                 rows = self._scans.build(self._make_rows, self._max_scans)
                 if rows is not None:
                     self._on_rows(rows)
                     self._rows.delivered += len(rows)
-            except Exception as error:  # noqa: BLE001  (the next rows go on)
+            except Exception as error:  # noqa: BLE001  (later rows must still be delivered)
                 self._count_error(error)
 
     def _count_error(self, error: Exception) -> None:
-        """Count and log an error, and count the rows that it has lost."""
+        """Count and log an error, and count the rows that were lost because of it."""
         lost = self._rows.count_lost(error)
         self._errors += 1
         if self._errors in LOGGED_ERRORS:
@@ -300,7 +343,12 @@ class LiveLinks:
             )
 
     def _learn_cubes(self, link: int, hello: Hello) -> None:
-        """Learn the cubes of a hub, and log them if they are other than before."""
+        """Find the cubes of a hub in the skin, and log them if they have changed.
+
+        Args:
+            link: Index of the link.
+            hello: HELLO frame of the hub, which lists the unique numbers of its cubes.
+        """
         problems = self._scans.cubes.learn(link, hello)
         if problems is None:
             return
@@ -312,11 +360,18 @@ class LiveLinks:
             logger.error(problem)
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
-        """Handle a change of the state of a link or of its reason, and log it."""
+        """Log a change of the state of a link, and keep it for the next report.
+
+        Args:
+            link: Index of the link.
+            state: The new state.
+            error: Reason of the state; None if there is none.
+        """
         record = self._records[link]
         record.was_open |= state is LinkState.OPEN
         if state is not LinkState.OPEN:
-            # Without an error, a waiting link is about to be opened for the first time.
+            # A link that is WAITING without an error is about to be opened for the first time,
+            # which is no event to report.
             if error is not None or state is LinkState.CLOSED:
                 record.events.append((state, str(error or state.value)))
             self._scans.set_live(link, False)
@@ -329,11 +384,14 @@ class LiveLinks:
             logger.warning(f"{state.value}: {error}")
 
     def _is_port_expected(self, link: int) -> bool:
-        """Return whether a simulator has yet to make the port of a link."""
+        """Return whether the port of a link is still to be made by a simulator.
+
+        Then it is normal that the port does not exist yet.
+        """
         return self._configs[link].is_simulated and not self._records[link].was_open
 
     def _report(self, link: Link, record: _LinkRecord, logger: LinkLogger) -> LinkReport:
-        """Return the report of one link, and forget what happened since the last one."""
+        """Return the report of one link, and clear its problems and past states."""
         notes = [*record.problems, *record.account_errors]
         if link.error is not None:
             notes.insert(0, str(link.error))
@@ -348,11 +406,11 @@ class LiveLinks:
             )
             if other != record.logged_version:
                 record.logged_version = other
-                # It is logged once per report at most, so the rate needs no other limit.
+                # This line appears at most once per report, so it needs no limit of its rate.
                 self._log.error(f"link {link.config.name}: {notes[-1]}")
 
-        # The set is replaced and the events are removed one by one, because the reader's thread may
-        # add to both.
+        # The reader's thread may add problems and events at the same time. Replacing the set and
+        # removing single events are atomic in Python, so that nothing is lost.
         problems, record.clock.problems = record.clock.problems, set()
         notes += sorted(problems)
         past_states = []
@@ -372,7 +430,7 @@ class LiveLinks:
 
 
 def _period_us(rate: float | None) -> int | None:
-    """Return the sample period of a rate in Hz, in µs."""
+    """Return the sample period, in µs, for a sample rate in Hz; None for None."""
     return None if rate is None else round(1e6 / rate)
 
 
@@ -381,7 +439,10 @@ def _report_values(
     record: _LinkRecord,
     logger: LinkLogger,
 ) -> dict[str, object]:
-    """Return the counters and clock values of one link by name."""
+    """Return the counters of one link and its hub, and the values of its clock, by name.
+
+    The names carry the units. Values that are not known yet are "unknown".
+    """
     clock = record.clock
     bound_ns = clock.bound_ns
     delay_us: object = "unknown"

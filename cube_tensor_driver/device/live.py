@@ -1,4 +1,4 @@
-"""The live source: the links of a skin as an iterable of rows, without ROS."""
+"""The live source: an iterable of the rows that the hubs of a skin send, without ROS."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from .links.link import LinkConfig
 from .scans.cube_table import CubeAddress
 
 QUEUE_S = 2.0
-"""Time, in s, by which a consumer may be late. One that is further behind loses the oldest rows."""
+"""Longest time, in s, for which rows wait to be taken from a live source. Rows that have waited
+longer are dropped and counted, so that a slow consumer does not fill the memory."""
 MIN_RATE = 0.1
-"""Lowest sample rate that can be requested, in Hz."""
+"""Lowest sample rate that can be requested from a hub, in Hz."""
 MAX_RATE = 10_000.0
-"""Highest sample rate that can be requested, in Hz."""
+"""Highest sample rate that can be requested from a hub, in Hz."""
 
 
 def open_links(
@@ -37,17 +38,19 @@ def open_links(
             for rows in source:
                 ...
 
-    The source waits for a port that is not there yet.
+    A port that does not exist yet is tried again until it can be opened or the source is closed.
 
     Args:
-        skin: The skin.
-        rate: Sample rate to request of the hubs, 0.1 to 10000 Hz; None takes that of the skin file.
+        skin: The skin: its cubes and links, as read from the skin file.
+        rate: Sample rate to request from the hubs, 0.1 to 10000 Hz; None takes that of the skin
+            file.
         port: Port to use instead of the one in the skin file, for a skin with one link.
-        port_directory: Folder that holds the ports under the names of the links, as those of
-            simulated hubs.
+        port_directory: Folder in which the port of each link has the name of the link, such as the
+            folder of simulated hubs.
 
     Raises:
-        ConfigError: An argument cannot be used, or a port can never be opened.
+        ConfigError: `rate` is out of its range, `port` was given for several links, or a port is
+            neither a device path nor a TCP address.
     """
     if rate is not None and not MIN_RATE <= rate <= MAX_RATE:
         raise ConfigError(
@@ -62,15 +65,17 @@ def link_configs(
     port: str = "",
     port_directory: str | Path = "",
 ) -> list[LinkConfig]:
-    """Return the place of each link of a skin.
+    """Return the port, baud rate and expected hub of each link of a skin.
 
     Args:
-        skin: The skin.
-        port: Port to use instead of the one in the skin file.
-        port_directory: Folder that holds the ports under the names of the links.
+        skin: The skin, as read from the skin file.
+        port: Port to use instead of the one in the skin file; empty for that of the skin file.
+        port_directory: Folder in which the port of each link has the name of the link; empty for
+            the ports of the skin file. `port` takes precedence.
 
     Raises:
-        ConfigError: One port was given for several links, or a port can never be opened.
+        ConfigError: `port` was given for several links, or a port is neither a device path nor a
+            TCP address.
     """
     if port and len(skin.links) > 1:
         raise ConfigError(
@@ -91,7 +96,7 @@ def link_configs(
 
 
 def cube_addresses(skin: Skin) -> list[CubeAddress]:
-    """Return the place of each cube of a skin, in its order."""
+    """Return, for each cube of a skin in order, by which number or index it is found on a hub."""
     number_of = {link.name: number for number, link in enumerate(skin.links)}
     return [
         CubeAddress(
@@ -106,18 +111,19 @@ def cube_addresses(skin: Skin) -> list[CubeAddress]:
 
 
 class LinkSource:
-    """Source of the rows that the links of a skin deliver, from now on until it is closed.
+    """Source of the rows that the hubs of a skin send, from construction until `close`.
 
-    Each iteration gives the rows of complete scans, or waits for them. A consumer that is more than
-    `QUEUE_S` late loses the oldest rows; `statistics` counts them.
+    Each step of an iteration returns the rows of complete scans (one sample of every cube), and
+    waits until there are some. Rows that wait for longer than `QUEUE_S` are dropped, the oldest
+    first; `statistics` counts them.
 
     Args:
-        skin: The skin.
-        links: Place of each link.
-        rate: Sample rate to request of the hubs, in Hz; None leaves it to them.
+        skin: The skin: its cubes and links, as read from the skin file.
+        links: Port, baud rate and expected hub of each link.
+        rate: Sample rate to request from the hubs, in Hz; with None they keep their own.
 
     Raises:
-        LinkError: `bad_port`: a port can never be opened.
+        LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
     """
 
     def __init__(
@@ -127,7 +133,8 @@ class LinkSource:
         rate: float | None,
     ) -> None:
         self._skin = skin
-        self._queue: deque[tuple[float, FrequencyRows]] = deque()  # with their arrival
+        # Each entry holds the monotonic time, in s, at which its rows were queued.
+        self._queue: deque[tuple[float, FrequencyRows]] = deque()
         self._changed = threading.Condition()
         self._closed = False
         self._ended = False
@@ -140,21 +147,21 @@ class LinkSource:
 
     @property
     def skin(self) -> Skin:
-        """The skin."""
+        """The skin (cubes and links) whose rows this source yields."""
         return self._skin
 
     @property
     def is_live(self) -> bool:
-        """True: rows come as they are measured."""
+        """True, because the rows of this source are measured now, not read from a recording."""
         return True
 
     def statistics(self) -> dict[str, object]:
         """Return the numbers of rows, and the state, notes and counters of each link.
 
-        Received rows were given to the consumer, wait for it, were dropped because it was too slow,
-        came twice, were lost by an error of the driver, or were left out because the skin does not
-        have their cube or has it with another number of pads. The notes of a link include what
-        happened since the last call.
+        Every received row is counted once: given to the consumer, waiting for it, dropped because
+        the consumer was too slow, a duplicate, lost by an error of the driver, or left out because
+        the skin does not have the cube or has it with another number of pads. The notes of a link
+        include the problems since the last call.
         """
         counts = self._links.row_counts()
         links = {
@@ -180,14 +187,21 @@ class LinkSource:
             }
 
     def close(self) -> None:
-        """Stop the hubs, close the links and end every iteration; a second call does nothing."""
+        """Send STOP to the hubs, close the links and end every iteration over this source.
+
+        A second call does nothing.
+        """
         with self._changed:
             self._closed = True
             self._changed.notify_all()
         self._links.close()
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        """Yield rows. An error that ends the reader's thread is raised after the rows before it."""
+        """Yield rows until the source is closed.
+
+        If an error has ended the reader's thread, the rows that wait are yielded first, then the
+        error is raised.
+        """
         while True:
             rows = self._get()
             if rows is None:
@@ -201,7 +215,10 @@ class LinkSource:
         self.close()
 
     def _put(self, rows: FrequencyRows) -> None:
-        """Queue rows, in the reader's thread."""
+        """Queue rows, and drop those that have waited for more than `QUEUE_S`.
+
+        It is called in the reader's thread.
+        """
         now = time.monotonic()
         with self._changed:
             self._queue.append((now, rows))
@@ -211,13 +228,13 @@ class LinkSource:
             self._changed.notify()
 
     def _on_end(self) -> None:
-        """Wake up the consumer, because the reader's thread ends."""
+        """Wake up a consumer that waits for rows, because the reader's thread has ended."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
     def _get(self) -> FrequencyRows | None:
-        """Return the next rows; None if the source is closed."""
+        """Wait for the next rows and return them; return None once the source is closed."""
         with self._changed:
             while not self._closed:
                 if self._queue:

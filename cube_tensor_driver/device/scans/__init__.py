@@ -1,1 +1,1 @@
-"""Samples of all links, counted and put together into scans."""
+"""Samples of all links are counted here and joined into scans (one sample of every cube)."""

@@ -1,4 +1,4 @@
-"""Whole scans, and averages over time, of the rows of a live source."""
+"""Conversion of the rows of a live source to scans (one row of every cube) and to averages."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from ...core.rows import FrequencyRows
 
 
 def split_into_scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
-    """Arrange rows by scan and cube.
+    """Arrange rows by scan (one row of every cube) and cube.
 
     Args:
-        rows: Rows of a live source; those of one scan are in order of the cubes.
+        rows: Rows of a live source. Within a scan, the index of the cube increases.
         n_cubes: Number of cubes of the skin.
 
     Returns:
-        Frequencies (S, n_cubes, P) in Hz of the S scans, NaN where a cube has no row, and the stamp
-        (S,) in s of the first row of each scan.
+        Frequencies (S, n_cubes, P) in Hz of S scans and P pads per cube, NaN where a cube has no
+        row; and the time stamps (S,) of the first rows of the scans, in s since the Unix epoch.
     """
-    # A scan begins where the index of the cube does not increase.
+    # Within a scan the index of the cube increases, so a row whose index does not is the first
+    # row of the next scan.
     cube = rows.cube.astype(int)
     is_first = np.diff(cube, prepend=n_cubes) <= 0
     scan = np.cumsum(is_first) - 1
@@ -38,10 +39,16 @@ def average_over_time(
     n_cubes: int,
     duration_s: float,
 ) -> Iterator[Array]:
-    """Yield the mean frequency of each pad over successive durations.
+    """Yield the mean frequency of each pad over successive intervals of time.
+
+    Args:
+        source: Source of rows, for example a live source.
+        n_cubes: Number of cubes of the skin.
+        duration_s: Minimum length of each interval, in s of the time stamps of the rows.
 
     Yields:
-        Frequencies (n_cubes, P) in Hz; NaN for a pad without a measurement.
+        Mean frequencies (n_cubes, P) in Hz of P pads per cube; NaN for a pad that was not measured
+        in the interval.
     """
     parts: list[Array] = []
     begin_s: float | None = None

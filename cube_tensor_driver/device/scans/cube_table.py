@@ -1,7 +1,8 @@
-"""Table that finds the cubes of the skin in the samples of the hubs, from what HELLO reports.
+"""Table that tells which cube of the skin each row of a hub's sample belongs to.
 
-Rows of cubes that the skin does not have, or has with another number of pads, are left out and
-counted.
+The HELLO frame of a hub lists the unique numbers (uids) of its cubes, and the skin file names each
+cube by its uid, or by its link and its index on the hub. Rows of cubes that are not in the skin
+file, or have another number of pads there, are left out and counted.
 """
 
 from __future__ import annotations
@@ -15,28 +16,30 @@ from numpy.typing import NDArray
 from ..wire.protocol import Hello, Sample
 
 MAX_NAMES = 8
-"""Number of cubes that a message names; the number of the others follows."""
+"""Largest number of cubes that one log message lists by name. If there are more, the message ends
+with their number ("and 3 more")."""
 ABSENT = -1
-"""Index of a cube that the skin does not have."""
+"""Value that stands for the index in the skin of a hub's cube that is not in the skin file."""
 _OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
 
 
 HubIndex = NDArray[np.int32]
-"""Index in the skin of each cube of a hub (n_cubes,), or `ABSENT`."""
+"""Array (n_cubes,) with the index in the skin of each cube of a hub; `ABSENT` for a cube that is
+not in the skin file."""
 RowIndex = NDArray[np.uint16]
-"""Index in the skin of the cube of each row of a sample (n_cubes,)."""
+"""Array (n_cubes,) with the index in the skin of the cube that each row of a sample belongs to."""
 
 
 @dataclass(frozen=True)
 class CubeAddress:
-    """Place of a cube, as the skin file gives it: by uid, or by link and index.
+    """How to find one cube of the skin file on a hub: by its uid, or by its link and index.
 
     Attributes:
-        name: Name of the cube.
-        link: Index of the link; None if the cube may be on any link.
-        index: Index of the cube on the hub; None if it is found by uid.
-        uid: Unique number of the cube; None if it is found by index.
-        n_pads: Number of pads of its layout.
+        name: Name of the cube in the skin file.
+        link: Index of the link whose hub has the cube; None if the hub of any link may have it.
+        index: Index of the cube on its hub; None if the cube is found by its uid.
+        uid: Unique number of the cube; None if the cube is found by its index.
+        n_pads: Number of pads of the cube's layout in the skin file.
     """
 
     name: str
@@ -52,15 +55,18 @@ class CubeAddress:
 
 @dataclass
 class _HubCubes:
-    """The cubes of the hub of one link.
+    """The cubes of the hub of one link, as its last HELLO frame lists them.
 
     Attributes:
-        hello: Last HELLO; None before the first.
+        hello: Last HELLO frame; None before the first.
         is_present: Whether HELLO has come since the link was last closed or silent.
-        waits_for_cube: Whether another hub has a cube of the same uid, which this one takes over
-            when the other is gone.
-        cubes: Index in the skin (n_cubes,), or `ABSENT`.
-        complete: The same with the shape of a sample, if every cube of the hub is in the skin.
+        waits_for_cube: Whether a cube of this hub is not used because the hub of another link has a
+            cube of the same uid. If that link is closed or silent at the next HELLO of this hub
+            (once a second), the cube of this hub is used.
+        cubes: Index in the skin of each cube of the hub (n_cubes,); `ABSENT` for cubes that are not
+            in the skin file.
+        complete: The indices as uint16 and the shape (n_cubes, n_pads) of a sample of all cubes of
+            the hub, if every one of them is in the skin; else None.
     """
 
     hello: Hello | None = None
@@ -71,11 +77,11 @@ class _HubCubes:
 
 
 class CubeTable:
-    """Finds the cubes of a skin in the samples of its hubs.
+    """Table that tells which cube of the skin each row of a hub's sample belongs to.
 
     Args:
         n_links: Number of links.
-        addresses: Places of the cubes of the skin.
+        addresses: For each cube of the skin, the uid, or the link and index, to find it by.
 
     Attributes:
         n_pads: Largest number of pads of a cube of the skin.
@@ -95,10 +101,15 @@ class CubeTable:
         self._hubs = [_HubCubes() for _ in range(n_links)]
 
     def learn(self, link: int, hello: Hello) -> list[str] | None:
-        """Learn the cubes of a link.
+        """Store which cubes the hub of a link has, from its HELLO frame.
+
+        Args:
+            link: Index of the link.
+            hello: HELLO frame of the hub, which lists the uids of its cubes.
 
         Returns:
-            What does not fit the skin, in words; None if nothing has changed.
+            One text for each kind of cube that does not fit the skin file, with the fix; None if
+            nothing has changed since the last HELLO.
         """
         hub = self._hubs[link]
         is_same = hub.hello is not None and _has_same_cubes(hub.hello, hello)
@@ -121,25 +132,35 @@ class CubeTable:
         known_uids = hello.cube_uids[is_known].tolist()
         uids = dict(self.uids)
         uids.update(zip(cubes[is_known].tolist(), known_uids, strict=True))
-        # The table is replaced in one step, because other threads read it.
+        # Other threads read this dictionary at any time, so it is replaced in one step and never
+        # changed in place.
         self.uids = uids
         return problems
 
     def forget(self, link: int) -> None:
-        """Let other links take over the cubes of a link, because it was closed or is silent."""
+        """Mark the hub of a link as absent, because the link was closed or is silent.
+
+        If the hub of another link then reports the uid of one of its cubes in HELLO, the rows of
+        that hub are used.
+        """
         self._hubs[link].is_present = False
 
     def find(self, link: int, sample: Sample) -> tuple[RowIndex, Sample] | None:
-        """Find the cubes of the skin in a sample.
+        """Find the cube of the skin for each row of a sample, and leave out rows without one.
+
+        Args:
+            link: Index of the link that the sample came from.
+            sample: The sample, with one row for each cube of the hub.
 
         Returns:
-            Index in the skin of each cube, and the sample without all other rows; None if no row is
-            left.
+            Index in the skin of the cube of each kept row, and the sample with only these rows;
+            None if no row is left.
         """
         if not sample.n_cubes:
             return None
         hub = self._hubs[link]
-        # The usual sample holds all cubes of the hub, and all of them are in the skin.
+        # Usually a sample holds all cubes of the hub and all of them are in the skin, so that the
+        # indices stored by `learn` can be returned without a search.
         if hub.complete is not None and sample.first_cube == 0:
             cubes, shape = hub.complete
             if sample.shape == shape:
@@ -151,7 +172,15 @@ class CubeTable:
         hub: _HubCubes,
         sample: Sample,
     ) -> tuple[RowIndex, Sample] | None:
-        """Find the cubes of the skin in a sample that also has other rows, and count those."""
+        """Select the rows of a sample whose cubes are in the skin, and count the other rows.
+
+        Args:
+            hub: The cubes of the hub that sent the sample.
+            sample: The sample, which may hold cubes that the skin does not have.
+
+        Returns:
+            See `find`.
+        """
         end = sample.first_cube + sample.n_cubes
         cubes = hub.cubes[sample.first_cube : end]
         is_known = cubes != ABSENT
@@ -159,7 +188,7 @@ class CubeTable:
         if len(cubes) == sample.n_cubes and fits.all():
             return cubes.astype(np.uint16), sample
 
-        # A sample may also hold more cubes than the hub has reported; they are unknown, too.
+        # Cubes of a sample beyond the number that HELLO has reported also count as unknown.
         n_known = int(is_known.sum())
         n_fitting = int(fits.sum())
         self.unknown_cube += sample.n_cubes - n_known
@@ -178,7 +207,16 @@ class CubeTable:
         return cubes[rows].astype(np.uint16), kept
 
     def _match(self, link: int, hello: Hello) -> tuple[HubIndex, list[str]]:
-        """Return the index in the skin of each cube of a hub, and what does not fit, in words."""
+        """Find each cube of a hub in the skin.
+
+        Args:
+            link: Index of the link of the hub.
+            hello: HELLO frame of the hub, which lists the uids of its cubes.
+
+        Returns:
+            Index in the skin of each cube of the hub (n_cubes,), and one text for each kind of cube
+            that does not fit the skin file.
+        """
         uids = hello.cube_uids.tolist()
         index_of_uid: dict[int, int] = {}
         for index, uid in enumerate(uids):
@@ -186,7 +224,8 @@ class CubeTable:
 
         claimed = self._claimed_by_others(link)
         cubes = np.full(hello.n_cubes, ABSENT, np.int32)
-        names: dict[str, list[str]] = {}  # of the cubes of the skin, by what is wrong with them
+        # The keys are the texts of problems, the values the names of the cubes that have them.
+        names: dict[str, list[str]] = {}
         for number, address in enumerate(self._addresses):
             is_claimed = number in claimed
             found, problem = _locate(address, link, hello, index_of_uid, is_claimed)
@@ -196,11 +235,13 @@ class CubeTable:
                 names.setdefault(problem, []).append(str(address))
         self._hubs[link].waits_for_cube = _OTHER_LINK_HAS_IT in names
         problems = [
-            _join_names("cube", group, text)  # one line for all cubes with the same problem
+            # All cubes with the same problem share one line of the log.
+            _join_names("cube", group, text)
             for text, group in names.items()
         ]
 
-        # The other cubes of the hub are not in the skin, or their uid is not unique.
+        # The hub's cubes without an index in the skin are not in the skin file, or repeat the uid
+        # of an earlier cube of the hub.
         repeated: list[str] = []
         unknown: list[str] = []
         for index in np.flatnonzero(cubes == ABSENT).tolist():
@@ -217,7 +258,7 @@ class CubeTable:
         return cubes, problems
 
     def _claimed_by_others(self, link: int) -> set[int]:
-        """Return the cubes of the skin that present hubs of other links have."""
+        """Return the indices in the skin of the cubes on the present hubs of all other links."""
         claimed: set[int] = set()
         for other, hub in enumerate(self._hubs):
             if other != link and hub.is_present:
@@ -226,7 +267,7 @@ class CubeTable:
 
 
 def _has_same_cubes(one: Hello, other: Hello) -> bool:
-    """Return whether two HELLOs report the same cubes."""
+    """Return whether two HELLO frames list the same cube uids and the same number of pads."""
     if one.n_pads != other.n_pads:
         return False
     return np.array_equal(one.cube_uids, other.cube_uids)
@@ -242,15 +283,15 @@ def _locate(
     """Find one cube of the skin on a hub.
 
     Args:
-        address: Place of the cube, as the skin file gives it.
-        link: Index of the link.
-        hello: HELLO of the hub.
-        index_of_uid: Index on the hub of each uid.
-        is_claimed: Whether a hub of another link has the cube.
+        address: The uid, or the link and index, by which the skin file names the cube.
+        link: Index of the link of the hub.
+        hello: HELLO frame of the hub.
+        index_of_uid: Index on the hub of each of its cubes, by uid.
+        is_claimed: Whether a present hub of another link has the cube.
 
     Returns:
-        Index on the hub, None if the cube is not there or another hub has it; and what is wrong, in
-        words.
+        Index of the cube on the hub, None if the cube is not there or is used from another hub; and
+        the text of the problem, empty if there is none.
     """
     if address.uid is None:
         index = address.index if address.link == link else None
@@ -273,7 +314,13 @@ def _locate(
 
 
 def _join_names(what: str, names: Sequence[str], text: str) -> str:
-    """Return one line about several cubes, of which the first few are named."""
+    """Return one line about several cubes, which lists the first `MAX_NAMES` names.
+
+    Args:
+        what: Noun of the cubes, in the singular.
+        names: Names of the cubes.
+        text: What is the same for all of these cubes.
+    """
     plural = "s" if len(names) > 1 else ""
     listed = ", ".join(names[:MAX_NAMES])
     more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""

@@ -1,7 +1,8 @@
-"""The account of rows: how many were received, delivered, and left out for each reason.
+"""Counting of rows: how many were received, delivered, and left out for each reason.
 
-A row is counted as received from its frame, before anything else is done with it. So nothing that
-happens later, an error included, can hide a lost row.
+A row (one sample of one cube) is counted as received as soon as its frame is decoded, before
+anything else is done with it. So a row that is lost later, for example by an error, is noticed as
+the difference of the counters.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ class RowCounts:
     """Numbers of received rows by what happened to them.
 
     Attributes:
-        delivered: Rows given to the callback, which returned.
-        unknown_cube: Rows left out because the skin does not have the cube.
-        wrong_pads: Rows left out because the skin has the cube with another number of pads.
-        unaccounted: Rows in none of the other numbers that do not wait for their scan; always 0
-            unless the driver loses rows.
+        delivered: Rows passed to the callback, which returned without an error.
+        unknown_cube: Rows left out because their cube is not in the skin file.
+        wrong_pads: Rows left out because the skin file gives their cube another number of pads.
+        unaccounted: Received rows that are in none of the other numbers and do not wait for the
+            rest of their scan. It is 0 unless the driver has a defect.
         duplicate: Rows left out because they had come before.
-        lost: Rows lost by an error in the driver.
-        lost_reason: Text of the last such error.
+        lost: Rows lost by an exception in the driver or in the callback.
+        lost_reason: Text of the last such exception; empty if there was none.
     """
 
     delivered: int = 0
@@ -36,15 +37,15 @@ class RowCounts:
 
 
 class RowAccount:
-    """Counts the rows of all links, in the reader's thread.
+    """Counts the rows of all links. It is used in the reader's thread only.
 
     Args:
-        scans: Builder of the scans, which knows the rows that wait or were left out.
+        scans: Builder of the scans, which counts the rows that wait or were left out.
 
     Attributes:
-        received: Rows received; increased by the caller.
-        delivered: Rows delivered; increased by the caller.
-        duplicate: Rows that had come before; increased by the caller.
+        received: Number of rows received; the caller increases it.
+        delivered: Number of rows delivered; the caller increases it.
+        duplicate: Number of rows that had come before; the caller increases it.
     """
 
     def __init__(self, scans: ScanBuilder) -> None:
@@ -58,7 +59,7 @@ class RowAccount:
 
     @property
     def counts(self) -> RowCounts:
-        """Numbers of rows at the last `check`."""
+        """Numbers of rows until now; `unaccounted` is that of the last call of `check`."""
         return RowCounts(
             delivered=self.delivered,
             unknown_cube=self._scans.cubes.unknown_cube,
@@ -70,9 +71,12 @@ class RowAccount:
         )
 
     def count_lost(self, error: Exception) -> int:
-        """Count the rows that are missing since the last `check` as lost by an error.
+        """Count all rows that have become unaccounted for since the last `check` as lost.
 
-        It must be called before further rows are received.
+        It must be called before further rows are counted as received.
+
+        Args:
+            error: The exception by which the rows were lost.
 
         Returns:
             Number of rows lost.
@@ -83,11 +87,11 @@ class RowAccount:
         return lost
 
     def check(self) -> None:
-        """Check that all received rows were delivered, wait, or are counted as left out."""
+        """Store how many received rows were neither delivered nor left out and do not wait."""
         self._unaccounted = self._missing()
 
     def _missing(self) -> int:
-        """Return the number of received rows that are nowhere."""
+        """Return how many received rows were neither delivered, left out nor lost, nor wait."""
         cubes = self._scans.cubes
         left_out = cubes.unknown_cube + cubes.wrong_pads + self.duplicate
         accounted = self.delivered + left_out + self._lost + self._scans.rows_waiting()

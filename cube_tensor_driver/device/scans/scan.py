@@ -1,6 +1,7 @@
-"""Gathering of the samples of all links into scans, and conversion of scans to rows.
+"""Joining of the samples of all links into scans, and conversion of scans to rows.
 
-A scan holds one sample of each link that delivers. Nothing here looks at a measured value.
+A scan holds one sample of each link that delivers samples, taken at about the same time. The
+measured values play no part in this.
 """
 
 from __future__ import annotations
@@ -20,28 +21,32 @@ from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample, join
 from .cube_table import CubeAddress, CubeTable, RowIndex
 
 MAX_SCANS_AHEAD = 4
-"""Number of scans that one link may be ahead of another. Beyond it all scans are built as they
-are."""
+"""Number of scans (one sample of each link) by which one link may be ahead of the slowest one. If
+it is ahead by more, all scans are built without the missing samples."""
 MAX_SPAN_NS = 2_000_000_000
-"""Longest time, in ns, between the first and the last row that are built together. A message stores
-times that reach up to 2.1 s after its stamp."""
+"""Longest time, in ns, between the earliest and the latest row that one call of
+`ScanBuilder.build` returns. These rows become one message, whose 32-bit offsets in ns reach up to
+2.1 s after its time stamp."""
 CACHED_SHAPES = 4
-"""Number of shapes (rows, pads) whose memory is kept for the next rows."""
-MIN_PERIODS_EARLIER = 0.75
-"""Part of a sample period. A pending scan that is earlier than a sample by more is too early for
-it. Less than one period is needed because hubs sample at different phases and stamps jitter."""
+"""Number of different shapes (rows, pads) for which a buffer is kept and used again."""
+MAX_PERIODS_EARLIER = 0.75
+"""Largest time, in sample periods, by which a scan that waits for samples may be earlier than a
+sample that joins it. It is less than one period, so that a sample does not join the scan before its
+own, and well above 0, because the hubs do not sample at the same instant."""
 
-# Temperature, in °C, of each of the 65536 bit patterns of a SAMPLE.
+# This table holds the temperature, in °C, for each of the 65536 bit patterns that a SAMPLE frame
+# may contain, so that the conversion is one look-up.
 _PATTERNS = np.arange(1 << 16, dtype=np.uint16)
 _CELSIUS = _PATTERNS.view(np.int16) * np.float32(0.01)
 _CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
 
 MakeRows = Callable[[int, int], FrequencyRows]
-"""Makes rows to be filled, from the number of rows and the number of pads."""
+"""Function that makes rows for the caller to fill. Its arguments are the number of rows and the
+largest number of pads of a cube."""
 
 
 def empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
-    """Return new rows to be filled."""
+    """Return new rows in uninitialised memory, for the caller to fill."""
     return FrequencyRows(
         cube=np.empty(n_rows, np.uint16),
         sequence=np.empty(n_rows, np.uint32),
@@ -54,12 +59,12 @@ def empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
 
 
 class StampedSample(NamedTuple):
-    """A sample with its stamp.
+    """A sample of one hub with its host time.
 
     Attributes:
         sample: The sample.
-        stamp_ns: Time at which it was taken, in the clock of the rows.
-        status: Status bits of all its rows.
+        stamp_ns: Host time at which the sample was taken, in ns since the Unix epoch.
+        status: Status bits of all rows of the sample (core/status.py).
     """
 
     sample: Sample
@@ -68,13 +73,13 @@ class StampedSample(NamedTuple):
 
 
 class _SampleRows(NamedTuple):
-    """The rows of one sample.
+    """The rows of one sample, each with the index of its cube.
 
     Attributes:
         cubes: Index in the skin of each cube of the sample (n_cubes,).
-        sample: The sample, without the rows that the skin does not have.
-        stamp_ns: Time at which it was taken.
-        status: Status bits of all rows.
+        sample: The sample, without the rows of cubes that are not in the skin.
+        stamp_ns: Host time at which the sample was taken, in ns since the Unix epoch.
+        status: Status bits of all rows of the sample (core/status.py).
     """
 
     cubes: RowIndex
@@ -84,31 +89,41 @@ class _SampleRows(NamedTuple):
 
 
 class ScanBuilder:
-    """Gathers samples of all links until a scan is complete, and builds its rows.
+    """Collects one sample of each link into a scan, and converts complete scans to rows.
 
     Args:
         n_links: Number of links.
-        addresses: Places of the cubes of the skin.
+        addresses: For each cube of the skin, the uid, or the link and index, to find it by.
 
     Attributes:
-        cubes: Table that finds the cube of each row.
+        cubes: Table that tells which cube of the skin each row of a sample belongs to.
     """
 
     def __init__(self, n_links: int, addresses: Sequence[CubeAddress]) -> None:
         self.cubes = CubeTable(n_links, addresses)
         self._live: set[int] = set()
-        # Scans that are not built yet: the sample of each link, and the time of the first sample.
+        # The scans that were not built yet, oldest first. Each has the samples by link in
+        # _pending, and the host time of the sample that was added first in _pending_ns.
         self._pending: list[dict[int, StampedSample]] = []
         self._pending_ns: list[int] = []
-        self._n_pending = [0] * n_links  # number of pending scans up to the newest sample of a link
-        self._deferred: list[_SampleRows] = []  # beyond MAX_SPAN_NS of the last rows; built next
-        self._holds_back = False  # the pending scans wait for the next samples
-        self._built_ns = [0] * n_links  # time of the newest sample of a link that was built
-        # The same few shapes come again and again, and new memory would cost more than the copy.
+        # For each link, the number of pending scans up to the one with its newest sample.
+        self._n_pending = [0] * n_links
+        # Rows that were too late (MAX_SPAN_NS) for the last call of `build`; the next returns them.
+        self._deferred: list[_SampleRows] = []
+        # Whether no scan counts as complete until the next sample is added.
+        self._holds_back = False
+        # For each link, the host time, in ns, of its newest sample that was built.
+        self._built_ns = [0] * n_links
+        # Buffers are kept, because the same few shapes come again and again and allocating memory
+        # would take longer than copying the rows.
         self._columns_of = lru_cache(maxsize=CACHED_SHAPES)(_Columns)
 
     def set_live(self, link: int, live: bool) -> None:
-        """Set whether a link delivers samples, so that scans wait for it."""
+        """Set whether a link delivers samples.
+
+        Scans wait for a sample of each link that does. The cubes of a link that does not may be
+        used from the hub of another link.
+        """
         self._holds_back = False
         if live:
             self._live.add(link)
@@ -123,19 +138,20 @@ class ScanBuilder:
         stamps_ns: Sequence[int],
         status: int = 0,
     ) -> None:
-        """Add samples of one link.
+        """Add samples of one link to the scans of the same time.
 
         Args:
             link: Index of the link.
             samples: The samples, in order.
-            stamps_ns: Time at which each was taken.
-            status: Status bits of all their rows, see `status.py`.
+            stamps_ns: Host time at which each sample was taken, in ns since the Unix epoch.
+            status: Status bits of all rows of the samples (core/status.py).
         """
         self._live.add(link)
         self._holds_back = False
         for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
-            # A link that began later or lost samples leaves gaps. If its samples were only counted,
-            # they would stay behind those of the other links for as long as it delivers.
+            # A link that started later or lost samples has no sample in some scans. Its next sample
+            # joins the scan of its own time, not merely the next scan; otherwise this link would
+            # stay behind the others for good.
             scan = self._n_pending[link]
             if len(self._pending) > 1:
                 scan = max(scan, self._first_scan_at(stamp_ns))
@@ -146,10 +162,14 @@ class ScanBuilder:
             self._n_pending[link] = scan + 1
 
     def is_complete(self, n_scans: int = 1) -> bool:
-        """Return whether it is time to build rows.
+        """Return whether rows can be built now.
 
-        It is time when every live link has given `n_scans` samples, or one link has given one more.
-        A single scan is also complete if it only holds samples that are late for the last one.
+        They can if every link that delivers has given `n_scans` samples, or one link has given one
+        more than that. If `n_scans` is 1, rows can also be built if the only pending scan has a
+        sample that came too late for the scan built last.
+
+        Args:
+            n_scans: Number of scans to wait for.
         """
         if self._deferred:
             return True
@@ -159,7 +179,7 @@ class ScanBuilder:
             return True
         if len(self._pending) < n_scans:
             return False
-        # The last scan lacks the samples of these links.
+        # These links deliver samples, but have none in the last pending scan yet.
         missing = self._live - self._pending[-1].keys()
         if not missing:
             return True
@@ -170,21 +190,23 @@ class ScanBuilder:
         make_rows: MakeRows = empty_rows,
         max_scans: int | None = None,
     ) -> FrequencyRows | None:
-        """Build the rows of the oldest scans.
+        """Convert the oldest scans that every link has reached to rows, and remove these scans.
 
         Args:
             make_rows: Makes the rows to fill, for example in the memory of a message.
-            max_scans: Largest number of scans to build; `is_complete` tells whether there are more.
+            max_scans: Largest number of scans to convert; None for all. Afterwards, `is_complete`
+                tells whether there are more.
 
         Returns:
-            The rows; None if the skin has none of them.
+            The rows; None if no cube of these scans is in the skin.
         """
         taken = self._deferred or self._take_scans(max_scans)
         parts, self._deferred = _split_by_span(taken)
         if not parts:
             return None
         rows = make_rows(sum(_n_rows(parts)), self.cubes.n_pads)
-        # Usually all cubes have the same number of pads, and then nothing needs to be selected.
+        # Usually all cubes have the same number of pads, and one step fills all rows. Otherwise
+        # successive samples with the same number of pads are filled together.
         if len({part.sample.n_pads for part in parts}) == 1:
             _fill(rows, parts, self._columns_of)
             return rows
@@ -198,14 +220,18 @@ class ScanBuilder:
         return rows
 
     def rows_waiting(self) -> int:
-        """Return the number of rows that were added and neither built nor left out yet."""
+        """Return how many rows wait here: they were added, but not built or left out yet."""
         waiting = sum(len(part.cubes) for part in self._deferred)
         for scan in self._pending:
             waiting += sum(stamped.sample.n_cubes for stamped in scan.values())
         return waiting
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
-        """Remove the oldest scans, and find the cubes of the skin in them."""
+        """Remove the oldest scans, and find the cube of the skin for each of their rows.
+
+        Args:
+            max_scans: Largest number of scans to remove; None for all that can be built.
+        """
         if len(self._pending) - self._n_reached() > 1:
             self._align_by_order()
             self._holds_back = True
@@ -214,7 +240,8 @@ class ScanBuilder:
             n_scans = max_scans
             self._holds_back = False
 
-        # They are removed before anything can fail, so that an error does not repeat for ever.
+        # The scans are removed first. If an error is raised below, the next call does not meet the
+        # same scans and the same error again.
         scans = self._pending[:n_scans]
         del self._pending[:n_scans]
         del self._pending_ns[:n_scans]
@@ -232,11 +259,15 @@ class ScanBuilder:
         return parts
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
-        """Return whether the pending scan holds a sample that belongs to the scan built last.
+        """Return whether the only pending scan holds a sample that came too late for the last one.
 
-        A link that comes late must not wait for the next samples of the others, or it would stay
-        one sample behind from then on. Its sample is late if every link that has given nothing
-        since has a built sample that is nearer to it in time than its own last one.
+        Such a sample belongs to the scan that was built last. If it waited for the next samples of
+        the other links, its link would stay one sample behind from then on. A sample counts as late
+        if the newest built sample of every missing link is nearer to it in time than the last
+        sample of its own link.
+
+        Args:
+            missing: Links that deliver but have no sample in the pending scan.
         """
         limits_ns: list[float] = []
         for link, stamped in self._pending[0].items():
@@ -244,15 +275,17 @@ class ScanBuilder:
             if stamp_ns > last_ns:
                 limits_ns.append((stamp_ns + last_ns) / 2)
             else:
-                limits_ns.append(0.0)  # another frame of the sample that was built last
+                # This is a further frame of the sample that was built last, so it is late.
+                limits_ns.append(0.0)
         built_ns = [self._built_ns[link] for link in missing]
         return min(built_ns) > min(limits_ns)
 
     def _n_scans_to_build(self) -> int:
-        """Return the number of scans that every live link has reached.
+        """Return how many of the oldest pending scans are to be built now.
 
-        It is the number of all scans if a live link has given nothing, or one has given far more
-        than another. The other scans wait, or a link that was late once would stay a sample behind.
+        Usually these are the scans that every delivering link has reached; the later ones wait for
+        the missing samples. All scans are built if a delivering link has no sample in them, or if
+        one link is more than `MAX_SCANS_AHEAD` scans ahead of another.
         """
         reached = self._n_reached()
         if not reached or len(self._pending) - reached > MAX_SCANS_AHEAD:
@@ -260,15 +293,19 @@ class ScanBuilder:
         return reached
 
     def _n_reached(self) -> int:
-        """Return the number of scans that every live link has reached."""
+        """Return the number of pending scans that every delivering link has reached.
+
+        A link has reached a scan if it has a sample in this scan or in a later one.
+        """
         return min((self._n_pending[link] for link in self._live), default=0)
 
     def _align_by_order(self) -> None:
         """Put the first pending samples of all links into one scan, the second ones into the next.
 
-        The links are late by more than one scan and by different times, because this process cannot
-        keep up. Parts of scans, in more messages than scans, would cost it even more time. With
-        this step it keeps up with 1260 cubes at 1 kHz, where it lost a third of them before.
+        It is called when one link is more than one scan ahead of another, because this process
+        cannot keep up with its input. If scans were then built in parts, there would be more
+        messages, which cost even more time. With this step the process keeps up with 1260 cubes at
+        1 kHz; without it, a third of their rows were lost.
         """
         queues: dict[int, list[StampedSample]] = {}
         for scan in self._pending:
@@ -287,18 +324,25 @@ class ScanBuilder:
         self._n_pending = [len(queues.get(link, ())) for link in range(n_links)]
 
     def _first_scan_at(self, stamp_ns: int) -> int:
-        """Return the first of several pending scans that is not clearly earlier than a sample."""
+        """Return the index of the first pending scan that is not too early for a sample.
+
+        A scan is too early if it is earlier than the sample by more than `MAX_PERIODS_EARLIER`
+        sample periods. At least two scans must be pending, because their distance is the period.
+
+        Args:
+            stamp_ns: Host time of the sample, in ns.
+        """
         times = self._pending_ns
         n_periods = len(times) - 1
         period = (times[-1] - times[0]) / n_periods
-        tolerance = MIN_PERIODS_EARLIER * period
+        tolerance = MAX_PERIODS_EARLIER * period
         return bisect_left(times, stamp_ns - tolerance)
 
 
 def _split_by_span(
     parts: list[_SampleRows],
 ) -> tuple[list[_SampleRows], list[_SampleRows]]:
-    """Return the samples within `MAX_SPAN_NS` of the earliest, and the others."""
+    """Split samples into those at most `MAX_SPAN_NS` later than the earliest, and the others."""
     if not parts:
         return [], []
     stamps_ns = [part.stamp_ns for part in parts]
@@ -318,6 +362,11 @@ def _fill(
     """Write samples with the same number of pads into rows.
 
     Frequencies of pads that a cube does not have become NaN.
+
+    Args:
+        rows: Rows to fill, one for each cube of the samples.
+        parts: The samples.
+        columns_of: Returns the buffer for a number of rows and of pads.
     """
     np.concatenate([part.cubes for part in parts], out=rows.cube)
     rows.status[:] = 0
@@ -337,12 +386,20 @@ def _fill(
 
 
 class _Columns:
-    """Memory for the columns of rows that `wire.place_rows` writes one after the other."""
+    """Buffer for the columns of rows, which `wire.place_rows` (in C) writes one after the other.
+
+    Args:
+        n_rows: Number of rows.
+        n_pads: Number of pads of a row.
+
+    Attributes:
+        memory: The bytes of all columns.
+    """
 
     def __init__(self, n_rows: int, n_pads: int) -> None:
         bytes_per_row = 8 + 4 + 4 + 4 + 4 * n_pads
         self.memory = bytearray(n_rows * bytes_per_row)
-        # The positions and types are those of `wire.place_rows`.
+        # The order, offsets and types of the columns are those that `wire.place_rows` writes.
         self._stamp_ns = self._view(0, n_rows, np.int64)
         self._sequence = self._view(8 * n_rows, n_rows, np.uint32)
         self._pad_fault = self._view(12 * n_rows, n_rows, np.uint32)
@@ -351,11 +408,11 @@ class _Columns:
         self._frequency = frequency.reshape(n_rows, n_pads)
 
     def _view(self, offset: int, count: int, dtype: type[np.generic]) -> AnyArray:
-        """Return a part of the memory as an array."""
+        """Return `count` values of a type, from byte `offset` of the buffer on, as an array."""
         return np.frombuffer(self.memory, dtype, count, offset)
 
     def copy_to(self, rows: FrequencyRows) -> None:
-        """Copy the columns into rows of the same shape."""
+        """Copy the columns of the buffer into rows of the same shape."""
         rows.stamp_ns[:] = self._stamp_ns
         rows.sequence[:] = self._sequence
         rows.pad_fault[:] = self._pad_fault
@@ -369,7 +426,7 @@ def _n_rows(parts: Sequence[_SampleRows]) -> list[int]:
 
 
 def _fill_in_python(rows: FrequencyRows, parts: Sequence[_SampleRows]) -> None:
-    """Write the values of samples into rows, without the wire module in C."""
+    """Write the values of samples into rows, for installations without the wire module in C."""
     samples = [part.sample for part in parts]
     counts = _n_rows(parts)
     numbers = [sample.sequence for sample in samples]
@@ -384,7 +441,8 @@ def _fill_in_python(rows: FrequencyRows, parts: Sequence[_SampleRows]) -> None:
 
     width = frequency.shape[1]
     measured = rows.frequency[:, :width]
-    # The product is computed in double precision, as float32 cannot resolve 1 mHz of 100 kHz.
+    # The sample has frequencies in mHz as integers. They are converted to Hz in double precision
+    # and rounded once, because float32 cannot represent 1 mHz of 100 kHz.
     np.multiply(frequency, 1e-3, out=measured, casting="same_kind")
     rows.frequency[:, width:] = np.nan
     if frequency.size and frequency.min() == NOT_MEASURED:

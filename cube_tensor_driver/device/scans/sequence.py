@@ -1,5 +1,4 @@
-"""The account of one link's samples: which are new, late or duplicate, and where others were
-lost."""
+"""Counting of one link's samples by their numbers: new, late, duplicate and missing ones."""
 
 from __future__ import annotations
 
@@ -11,25 +10,28 @@ from enum import Enum
 from ..wire.protocol import Sample, Stats
 
 MAX_DISORDER = 64
-"""Number of samples that are remembered. A sample that comes later than this many others is taken
-for the first one of a hub that restarted."""
+"""Number of the newest samples of a hub whose numbers are kept in memory. A sample whose number is
+further behind than this is taken for the first one after a restart of the hub."""
 MAX_GAP = 1 << 20
-"""Longest gap in the numbers (17 minutes at 1 kHz) that counts as lost samples. A longer one means
-that the hub restarted."""
+"""Largest gap in the numbers of successive samples (17 minutes at 1 kHz) that is counted as lost
+samples. A larger gap is taken for a restart of the hub."""
 RESTART_US = 1_000_000
-"""Largest difference of device time, in µs, between the newest sample and a late one with a number
-below the first. If it is larger, the hub restarted."""
+"""Largest difference of device time, in µs, between the newest sample of a hub and a late sample
+from before the first counted one. If the difference is larger, the late sample is taken for the
+first one after a restart of the hub."""
 _WRAP = 1 << 32
 
 
 class Arrival(str, Enum):
     """Class of a sample by its number.
 
-    NEW: the next sample, or the first after a gap. LATE: a sample out of order, which was counted
-        as
-    missing until now. DUPLICATE: a sample that has come before and must not be delivered. RESET:
-    the first sample of a hub that restarted. SET_BACK: the next sample, but its device time went
-    back.
+    Attributes:
+        NEW: The next sample, or the first one after a gap in the numbers.
+        LATE: A sample that comes after one with a larger number; it was counted as missing before.
+        DUPLICATE: A sample that has come before and must not be delivered again.
+        RESET: The first sample after a restart of the hub.
+        SET_BACK: The next sample, or the first after a gap, with an earlier device time than the
+            sample before, because the hub's clock was set back.
     """
 
     NEW = "new"
@@ -41,18 +43,18 @@ class Arrival(str, Enum):
 
 @dataclass(slots=True)
 class SequenceCounters:
-    """Numbers of samples of one hub.
+    """Numbers of samples of one hub, by what happened to them.
 
-    Samples taken since the first one seen = delivered + missing. Samples received = delivered +
-    duplicate. After a restart, the samples since power-up that did not come count as missing; the
-    last samples before the restart are unknown and not counted.
+    The hub has taken delivered + missing samples since the first received one, and delivered +
+    duplicate samples were received. If the hub restarts, its samples since power-up that did not
+    come count as missing. Samples that were lost just before the restart cannot be counted.
 
     Attributes:
         delivered: Samples to deliver, including those out of order.
-        missing: Samples that did not come.
+        missing: Samples that have not come, according to the gaps in the numbers.
         duplicate: Samples that had come before.
-        out_of_order: Samples that came after a later one.
-        resets: Restarts of the hub, and steps back of its clock.
+        out_of_order: Samples that came after one with a larger number.
+        resets: Restarts of the hub, plus steps back of its clock.
     """
 
     delivered: int = 0
@@ -67,17 +69,19 @@ class SequenceCounters:
 
 
 class SequenceTracker:
-    """Classifies and counts samples by their 32-bit numbers.
+    """Classifies samples of one hub as new, late or duplicate by their numbers, and counts them.
 
     Attributes:
-        counters: Numbers of samples.
+        counters: Numbers of delivered, missing and duplicate samples.
     """
 
-    # Numbers are unwrapped here: they continue beyond 2**32.
+    # The 32-bit numbers of samples wrap to 0. In the attributes below they are unwrapped, so that
+    # they continue beyond 2**32.
 
     def __init__(self) -> None:
         self.counters = SequenceCounters()
-        self._seen: deque[tuple[int, int]] = deque(maxlen=MAX_DISORDER)  # number, device time
+        # Each entry is the number and the device time, in µs, of one of the newest samples.
+        self._seen: deque[tuple[int, int]] = deque(maxlen=MAX_DISORDER)
         self._first = 0
         self._next = 0
         self._newest_us = 0
@@ -87,10 +91,10 @@ class SequenceTracker:
         """Classify and count one sample in constant time.
 
         Args:
-            sequence: Number of the sample, u32.
+            sequence: Number of the sample, 32 bits, which wraps to 0.
             device_us: Device time of the sample, in µs.
         """
-        # The next number is the usual case and is handled first, for speed.
+        # Almost every sample has the next number, so this case is handled first, for speed.
         if sequence == self._next % _WRAP and device_us >= self._newest_us:
             self._seen.append((self._next, device_us))
             self._next += 1
@@ -121,7 +125,8 @@ class SequenceTracker:
             return self._restart(sequence, device_us)
 
         if number < self._first:
-            # The account begins with an earlier sample than it did until now.
+            # This late sample is older than the first one that was counted. It becomes the first,
+            # and the samples between the two count as missing.
             self.counters.missing += self._first - number - 1
             self._first = number
         else:
@@ -130,10 +135,11 @@ class SequenceTracker:
         return self._deliver(number, device_us, Arrival.LATE)
 
     def count_missing(self, taken: int) -> None:
-        """Count the samples that have not come by now as missing.
+        """Count samples as missing that the hub has taken but that have not arrived.
 
         Args:
-            taken: Number of samples that the hub has taken, u32.
+            taken: Number of samples that the hub reports to have taken since power-up, 32 bits,
+                which wraps to 0.
         """
         ahead = self._ahead(taken)
         if self._seen and 0 < ahead <= MAX_GAP:
@@ -142,20 +148,28 @@ class SequenceTracker:
 
     @property
     def first(self) -> int:
-        """Number of the first sample since the restart that is counted."""
+        """Number of the first counted sample since the start or the last restart of the hub."""
         return self._first
 
     def _ahead(self, sequence: int) -> int:
-        """Return the distance of a number (u32) from the next one; negative if it is behind."""
+        """Return by how many samples a 32-bit number is ahead of the next expected number.
+
+        The result is negative if the number is behind.
+        """
         half = _WRAP // 2
         distance = (sequence - self._next) % _WRAP
         return distance if distance < half else distance - _WRAP
 
     def _fits_run(self, number: int, device_us: int) -> bool:
-        """Return whether a late sample belongs to the current run of the hub.
+        """Return whether a late sample was taken since the last restart of the hub.
 
-        It does if its device time lies between those of its neighbours. Where the clock was set
-        back, only the neighbours on the same side of the step count.
+        This is so if its device time lies between those of the samples with the next smaller and
+        larger numbers. If the hub's clock was set back, only samples on the same side of that step
+        are compared.
+
+        Args:
+            number: Unwrapped number of the sample.
+            device_us: Device time of the sample, in µs.
         """
         if any(other == number for other, _ in self._seen):
             return False
@@ -171,11 +185,12 @@ class SequenceTracker:
         last_before, _ = max(before)
         if number < last_before:
             return fits_before
-        # The sample lies between the last one before the step and the first one after it.
+        # The sample lies between the last one before the hub's clock was set back and the first one
+        # after that, and may have been taken with the old or the new time.
         return fits_before or fits_after
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
-        """Begin again with a sample of a hub that restarted."""
+        """Begin a new count with the first sample after a restart of the hub."""
         self.counters.resets += 1
         self._seen.clear()
         arrival = self._begin(sequence, device_us, Arrival.RESET)
@@ -186,21 +201,27 @@ class SequenceTracker:
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
-        """Begin a new count with this sample."""
+        """Begin a new count with this sample, and return `arrival`."""
         self._first = self._set_back = sequence
         self._next = sequence + 1
         self._newest_us = device_us
         return self._deliver(sequence, device_us, arrival)
 
     def _deliver(self, number: int, device_us: int, arrival: Arrival) -> Arrival:
-        """Count and remember a sample that is to be delivered."""
+        """Count a sample as delivered and keep its number and time, and return `arrival`."""
         self.counters.delivered += 1
         self._seen.append((number, device_us))
         return arrival
 
 
 def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -> bool:
-    """Return whether a sample fits those seen: device times must grow with the numbers."""
+    """Return whether device times still grow with the numbers if this sample is added.
+
+    Args:
+        number: Unwrapped number of the sample.
+        device_us: Device time of the sample, in µs.
+        seen: Numbers and device times of other samples.
+    """
     for other, other_us in seen:
         is_wrong = other_us > device_us if other < number else other_us < device_us
         if is_wrong:
@@ -209,25 +230,26 @@ def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -
 
 
 class SampleAccount:
-    """Account of the samples of one link.
+    """Counters of the samples of one link.
 
     Each sample that the hub took was delivered, dropped in the hub, or lost on the way. A hub with
     many cubes spreads a sample over several frames, and each frame counts as one sample.
 
     Attributes:
-        received: Number of frames received.
-        stats_frame: Last STATS of the hub; None before the first.
+        received: Number of SAMPLE frames received.
+        stats_frame: Last STATS frame (counters of the hub); None before the first.
     """
 
     def __init__(self) -> None:
         self.received = 0
         self.stats_frame: Stats | None = None
-        self._trackers: dict[int, SequenceTracker] = {}  # by first_cube
+        # One tracker for each part of a sample, by the index of the first cube in its frame.
+        self._trackers: dict[int, SequenceTracker] = {}
         self._dropped = 0
         self._dropped_before = 0
 
     def sample(self, frame: Sample) -> Arrival:
-        """Classify and count one SAMPLE."""
+        """Classify one SAMPLE frame by its number (new, late, duplicate …), and count it."""
         tracker = self._trackers.get(frame.first_cube)
         if tracker is None:
             tracker = self._trackers[frame.first_cube] = SequenceTracker()
@@ -235,15 +257,19 @@ class SampleAccount:
         return tracker.update(frame.sequence, frame.device_us)
 
     def stats(self, frame: Stats) -> None:
-        """Compare the account with the counters of the hub."""
+        """Take over how many samples the hub has taken and dropped, from its STATS frame.
+
+        Samples that the hub has taken but that have not arrived are then counted as missing.
+        """
         last, self.stats_frame = self.stats_frame, frame
         joined_late = all(tracker.first for tracker in self._trackers.values())
         if last is None and joined_late:
-            # Samples that the hub dropped before the first one received are not part of the
-            # account.
+            # This driver connected while the hub was already sampling. Samples that the hub had
+            # dropped before are not counted.
             self._dropped_before = frame.dropped
         elif last is not None and frame.uptime_ms < last.uptime_ms:
-            # The hub restarted, perhaps before a sample after the restart has come.
+            # The hub has restarted. Its sample counter began again at 0 and must not be compared
+            # with the last sample, which may be from before the restart.
             self._dropped_before = 0
             return
         dropped = (frame.dropped - self._dropped_before) % _WRAP
@@ -254,23 +280,24 @@ class SampleAccount:
 
     @property
     def resets(self) -> int:
-        """Number of restarts of the hub and steps back of its clock."""
+        """Number of restarts of the hub, plus steps back of its clock."""
         return sum(tracker.counters.resets for tracker in self._trackers.values())
 
     def counters(self) -> dict[str, int]:
         """Return the numbers of samples by name.
 
-        taken = delivered + dropped_in_hub + lost_on_the_way; received = delivered + duplicate.
+        Two sums hold: taken = delivered + dropped_in_hub + lost_on_the_way, and received =
+        delivered + duplicate.
         """
-        # The copy is necessary because another thread may add a tracker.
+        # The list is a copy, because the reader's thread may add a tracker during the loop.
         parts = [tracker.counters for tracker in list(self._trackers.values())]
         total = SequenceCounters().as_dict()
         for part in parts:
             for name, value in part.as_dict().items():
                 total[name] += value
         missing = total.pop("missing")
-        # A sample dropped in the hub counts as lost on the way until the next STATS, but no sample
-        # lost on the way ever counts as dropped.
+        # The hub reports dropped samples only in STATS. Until then they count as lost on the way;
+        # a sample that was lost on the way never counts as dropped.
         dropped = min(self._dropped, missing)
         return {
             "taken": total["delivered"] + missing,
@@ -280,7 +307,10 @@ class SampleAccount:
         }
 
     def contradictions(self) -> list[str]:
-        """Return errors of the account in words; empty unless the driver lost count."""
+        """Return one text if received differs from delivered + duplicate.
+
+        Otherwise the list is empty; the text shows a defect of the driver.
+        """
         counters = self.counters()
         delivered, duplicate = counters["delivered"], counters["duplicate"]
         if self.received == delivered + duplicate:
