@@ -1,1 +1,1 @@
-"""Serial ports and TCP connections: opened, read, and the conversation with the hub behind each."""
+"""Serial ports and TCP connections are opened and read here, and the hub behind each is started."""

@@ -1,6 +1,7 @@
-"""Reading and decoding of all links that are ready, in one step.
+"""Reading and decoding of all links that have data, in one step.
 
-With the wire module in C it is a single call for all links, during which other threads run.
+With the wire module in C, a single call reads and decodes all links without Python's global
+interpreter lock, so that other threads can run meanwhile.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from ..wire.protocol import Frame
 from .link import Link
 
 ReadResult = list[Frame] | LinkError | None
-"""Result of reading one link: the frames that its bytes complete, the error by which the link is
-lost, or None if there were no bytes."""
+"""Result of reading one link once: the frames that the read bytes complete, the error that shows
+that the link is lost, or None if there were no bytes to read."""
 
 
 def read_links(
@@ -26,11 +27,12 @@ def read_links(
     """Read each link once and decode its bytes.
 
     Args:
-        links: Links that are ready to be read.
-        clock_ns: The clock of arrivals.
+        links: Links that have data to read.
+        clock_ns: Clock of the arrival times, in ns.
 
     Returns:
-        The time after reading, which no byte came after, and the result of each link.
+        Arrival time of the bytes, in ns, which is read from the clock after the last byte; and the
+        result of each link, in order.
     """
     pairs = [
         (link.decoder.wire, link.fileno())
@@ -56,7 +58,7 @@ def _read_in_python(
     links: Sequence[Link],
     clock_ns: Callable[[], int],
 ) -> tuple[int, list[ReadResult]]:
-    """Read each link once and decode its bytes, without the wire module in C."""
+    """Read each link once and decode its bytes in Python; see `read_links`."""
     reads: list[bytes | LinkError] = []
     for link in links:
         try:
@@ -64,7 +66,8 @@ def _read_in_python(
         except LinkError as error:
             reads.append(error)
 
-    # The clock is read before decoding, which takes time, and after the last byte has come.
+    # The clock is read after all links, so that no byte arrives after this time, and before the
+    # decoding, which would delay it.
     arrival_ns = clock_ns()
     results: list[ReadResult] = []
     for link, data in zip(links, reads, strict=True):

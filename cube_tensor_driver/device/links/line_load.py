@@ -1,4 +1,4 @@
-"""Check whether the serial line of a link can carry what its cubes send."""
+"""Check whether the baud rate of a serial line suffices for the samples of its cubes."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ from ...config.skin import Skin
 from ..wire.protocol import sample_bytes
 
 BITS_PER_BYTE = 10
-"""Bits on the line for each byte: a start bit, eight data bits, a stop bit."""
+"""Number of bits on a serial line for each byte: a start bit, eight data bits, a stop bit."""
 PORTS_WITHOUT_BAUD = (TCP, "/dev/ttyACM")
-"""First characters of ports that have no baud rate: TCP, and USB devices that are no adapters."""
+"""Beginnings of the names of ports whose baud rate has no effect: TCP addresses, and hubs that are
+USB devices themselves (not a serial line behind a USB adapter)."""
 
 
 def line_doubts(skin: Skin) -> Iterator[str]:
-    """Yield one line for each link whose cubes send more than its baud rate allows.
+    """Yield one warning for each link whose cubes send more bytes than its baud rate allows.
 
-    A skin that leaves the rate to its hubs cannot be checked.
+    There is no warning if the skin file sets no sample rate, because the hubs' own is unknown.
+
+    Args:
+        skin: The skin: its cubes, links and sample rate, as read from the skin file.
     """
     if skin.rate is None:
         return
@@ -25,7 +29,7 @@ def line_doubts(skin: Skin) -> Iterator[str]:
         cubes = [cube for cube in skin.cubes if cube.link == link.name]
         if not cubes or link.port.startswith(PORTS_WITHOUT_BAUD):
             continue
-        # All cubes of a hub have the same number of pads.
+        # All cubes of a hub have the same number of pads, so that of the first one is enough.
         n_pads = cubes[0].calibration.layout.n_pads
         wanted = sample_bytes(len(cubes), n_pads) * skin.rate
         carried = link.baud / BITS_PER_BYTE

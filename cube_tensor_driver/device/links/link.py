@@ -1,8 +1,8 @@
 """One link: a byte stream to and from a hub over a serial port, a pseudo-terminal or TCP.
 
-Nothing here blocks, starts a thread or knows frames; `session.py` controls a link. pyserial opens
-serial ports by their path, and ``os.read`` reads them, up to 4 kB per call. Every failure is a
-`LinkError`, whose `kind` is one word and whose text names the fix:
+A link moves bytes without blocking and without a thread; `session.py` decides what is sent on it.
+pyserial opens serial ports by their path, and ``os.read`` reads them, up to 4 kB per call. Every
+failure is a `LinkError`, whose `kind` is one word and whose text names the fix:
 
     no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
     refused  no_answer  unreachable  unresolved                       opening a TCP link
@@ -33,20 +33,22 @@ from ..wire.protocol import Hello
 from .tcp import TcpConnection
 
 READ_CHUNK = 1 << 16
-"""Largest number of bytes read from one link at a time, so that a link that sends without pause
-does not hold up the others."""
+"""Largest number of bytes that one call reads from one link. The limit keeps a link with much data
+from delaying the reading of the other links."""
 MAX_UNSENT = 4096
-"""Largest number of bytes that may wait to be sent. They only accumulate if a hub does not read."""
+"""Largest number of bytes that may wait to be sent on one link. Bytes wait only if the hub does not
+read; at the limit the link is closed and opened again."""
 MIN_PAUSE_S = 0.25
-"""Pause after the first failed attempt to open a link. It doubles with each further attempt."""
+"""Pause after the first failed attempt to open a link, in s. Each further failure doubles it."""
 MAX_PAUSE_S = 5.0
-"""Longest pause between two attempts to open a serial port. Its device file announces a hub that is
-plugged in again, and then the pause is over at once."""
+"""Longest pause between two attempts to open a serial port, in s. If the device file of the port
+appears or changes, because a hub was plugged in, the next attempt follows without this pause."""
 MAX_TCP_PAUSE_S = 1.5
-"""Longest pause between two attempts to open a TCP link. Nothing announces that a TCP peer is back,
-and a link should be back within 2 s."""
+"""Longest pause between two attempts to open a TCP link, in s. Unlike a device file, a TCP peer
+gives no sign when it can be reached again, and a link should be open again within 2 s."""
 END_OF_STREAM = OSError(errno.EIO, "end of stream")
-"""Error of a read that returned no byte, although the port was ready."""
+"""Error for a read that returned no byte although the port was ready: the other end was unplugged
+or has closed the connection."""
 
 _NO_PERMISSION = (
     "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
@@ -68,16 +70,19 @@ _OPEN_ERRORS = {
     errno.EISDIR: ("not_serial", _NOT_SERIAL),
     errno.ENOTDIR: ("not_serial", _NOT_SERIAL),
 }
-"""Kind and fix of the errors of opening a serial port."""
+"""Kind of the LinkError and text of the fix for each errno with which opening a serial port
+fails."""
 
 
 class LinkState(str, Enum):
     """State of a link.
 
-    CLOSED: it is not in use. WAITING: it is not open, and the next attempt to open it follows.
-        OPEN:
-    the port is open. SILENT: the port is open, but there was no sample for max(3 sample periods,
-    0.2 s) although samples were requested.
+    Attributes:
+        CLOSED: The link is not in use.
+        WAITING: The port is not open; it is tried again after a pause of at most 5 s.
+        OPEN: The port is open.
+        SILENT: The port is open, but no sample has come for max(3 sample periods, 0.2 s) although
+            samples were requested.
     """
 
     CLOSED = "closed"
@@ -88,17 +93,17 @@ class LinkState(str, Enum):
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """Place and identity of a hub.
+    """Port of a link, and the hub that is expected there.
 
     Attributes:
         name: Name of the link in the skin file.
         port: Device path or ``socket://host:port``; other URLs are refused. A device path may be a
             pattern such as ``/dev/ttyACM*``: its matches are tried one after the other, which finds
-            a hub that comes back under another name.
+            a hub that comes back under another device name.
         baud: Baud rate of a serial adapter. USB and TCP ignore it.
-        hub_uid: Unique number of the hub that must answer; None for any.
-        is_simulated: Whether a simulator makes the port, perhaps later. Then a port that has never
-            existed is not logged as missing.
+        hub_uid: Unique number of the hub that must answer; None accepts any hub.
+        is_simulated: Whether a simulator makes the port, perhaps after this link was started. Then
+            a port that has never existed is not logged as missing.
     """
 
     name: str
@@ -109,22 +114,24 @@ class LinkConfig:
 
 
 class Link:
-    """One link, which can be opened and closed many times.
+    """Byte stream to and from one hub, which can be opened and closed many times.
 
     Args:
-        config: Place and identity of the hub.
+        config: Port of the link, and the hub that is expected there.
 
     Attributes:
-        state: State, which the session sets.
-        error: Reason of the state, which the session sets; None if there is none.
-        period_problem: What is wrong with the sample period of the hub, in words; set by the
-            session.
-        decoder: Decoder of the received bytes, kept when the link is reopened.
-        hello: Last HELLO of the hub, kept when the link is reopened; None before the first.
-        path: Path of the port that was opened last, one match if the port is a pattern.
+        state: State of the link; `Session` sets it.
+        error: Reason of the state; None if there is none. `Session` sets it.
+        period_problem: Text about a sample period of the hub that differs from the requested one;
+            empty if they agree. `Session` sets it.
+        decoder: Decoder of the received bytes. Its counters continue when the link is reopened.
+        hello: Last HELLO frame of the hub, kept when the link is reopened; None before the first.
+        path: Path of the port that was tried last. If the configured port is a pattern, it is the
+            match that was tried.
+        is_pattern: Whether the configured port is a pattern such as ``/dev/ttyACM*``.
 
     Raises:
-        LinkError: `bad_port`: the port is neither a device path nor a TCP address.
+        LinkError: With the kind `bad_port`: the port is neither a device path nor a TCP address.
     """
 
     def __init__(self, config: LinkConfig) -> None:
@@ -147,7 +154,7 @@ class Link:
         self._fd = -1
         self._out = bytearray()
         self._pause = MIN_PAUSE_S
-        self._first_match = 0  # index of the match of the pattern to try first
+        self._first_match = 0  # index, among the paths that match the pattern, of the next to try
         problem = port_problem(config.port)
         if problem:
             raise LinkError(f"link {config.name!r}: port: {problem}", "bad_port")
@@ -156,8 +163,9 @@ class Link:
     def counters(self) -> dict[str, int]:
         """Counters of the decoder and of the link by name.
 
-        opened, lost, silences: number of times the link was opened, lost, and became silent.
-        before_hello: samples that were not delivered because the hub had not identified itself.
+        `opened`, `lost` and `silences` count how often the link was opened, lost, and became
+        silent. `before_hello` counts samples that were discarded because the hub had not sent HELLO
+        since the port was opened. `bytes_out` counts the sent bytes.
         """
         return {
             **self.decoder.counters.as_dict(),
@@ -175,7 +183,7 @@ class Link:
 
     @property
     def unsent(self) -> bool:
-        """Whether bytes wait here because the kernel's buffer is full."""
+        """Whether bytes wait to be sent because the kernel does not accept more at the moment."""
         return bool(self._out)
 
     def fileno(self) -> int:
@@ -183,13 +191,15 @@ class Link:
         return self._fd
 
     def open(self) -> bool:
-        """Take one step towards an open link.
+        """Open the port, or take the next step of a TCP connection. It does not block.
 
         Returns:
-            Whether the link is open; if not, a TCP connection is under way: call again.
+            Whether the link is open. If not, a TCP connection is being made, and the caller must
+            call again later.
 
         Raises:
-            LinkError: This attempt failed.
+            LinkError: The serial port could not be opened, or no TCP connection was made. The kind
+                tells why (see the head of this file).
         """
         if self._tcp:
             self._open_tcp()
@@ -204,11 +214,11 @@ class Link:
     def read(self) -> bytes:
         """Return the bytes of one system call, at most `READ_CHUNK`; empty if there are none.
 
-        A serial port gives 4 kB at a time. A second call at once would wait until the kernel has
-        fetched the next 4 kB, which it does while the other links are read.
+        A serial port gives at most 4 kB at a time. This method does not read a second time, because
+        the kernel fetches the next 4 kB while the other links are read.
 
         Raises:
-            LinkError: `lost`: the other end is gone.
+            LinkError: With the kind `lost`: the other end was unplugged or closed the connection.
         """
         try:
             data = os.read(self._fd, READ_CHUNK)
@@ -221,15 +231,20 @@ class Link:
         return data
 
     def read_error(self, number: int) -> LinkError:
-        """Return the LinkError for a read that failed with this errno; 0: the stream ended."""
+        """Return the LinkError for a failed read.
+
+        Args:
+            number: The errno of the read; 0 if it returned no byte because the stream ended.
+        """
         return self._lost(OSError(number, os.strerror(number)) if number else END_OF_STREAM)
 
     def write(self, data: bytes) -> None:
-        """Send without blocking. Bytes that the kernel does not accept now wait for `flush`.
+        """Send bytes without blocking. Those that the kernel does not accept now wait for `flush`.
 
         Raises:
-            LinkError: `overflow`: more than `MAX_UNSENT` bytes would wait, because the hub does not
-                read. `lost`: the other end is gone.
+            LinkError: With the kind `overflow`: more than `MAX_UNSENT` bytes would wait, because
+                the hub does not read. With the kind `lost`: sending failed, because the other end
+                was unplugged or closed the connection.
         """
         if len(self._out) + len(data) > MAX_UNSENT:
             raise LinkError(
@@ -241,10 +256,11 @@ class Link:
         self.flush()
 
     def flush(self) -> None:
-        """Send the bytes that wait, as many as the kernel accepts.
+        """Send as many of the waiting bytes as the kernel accepts, without blocking.
 
         Raises:
-            LinkError: `lost`: the other end is gone.
+            LinkError: With the kind `lost`: sending failed, because the other end was unplugged or
+                closed the connection.
         """
         try:
             while self._out:
@@ -257,7 +273,10 @@ class Link:
             raise self._lost(error) from error
 
     def is_draining(self) -> bool:
-        """Return whether bytes have not yet left this machine's serial port."""
+        """Return whether written bytes still wait in this process or in the kernel's serial driver.
+
+        For TCP the result is False, because the kernel sends the rest after closing.
+        """
         if self._tcp or self._stream is None:
             return False
         try:
@@ -268,16 +287,18 @@ class Link:
         return bool(self._out) or waiting > 0
 
     def close(self) -> None:
-        """Close at once, in any state; a second call does nothing.
+        """Close the port at once, in any state of the link; a second call does nothing.
 
-        An unfinished frame counts as `framing`.
+        A frame that was received in part is discarded and increases the decoder's counter
+        `framing`.
         """
         if self._connecting is not None:
             self._connecting.close()
             self._connecting = None
         if self._stream is not None:
             if self.is_draining():
-                # Without the flush, closing waits for up to 30 s until the hub has read the bytes.
+                # The bytes that the hub has not read are discarded. Otherwise the kernel would
+                # block in close for up to 30 s to send them.
                 with contextlib.suppress(termios.error):
                     termios.tcflush(self._fd, termios.TCOFLUSH)
             with contextlib.suppress(OSError):
@@ -288,36 +309,49 @@ class Link:
         self._out.clear()
 
     def increase_pause(self) -> float:
-        """Return the time until the next attempt, in s, and double it: 0.25, 0.5 … 5 (TCP: 1.5)."""
+        """Return the pause before the next attempt to open the link, and double it for later.
+
+        The pauses are 0.25, 0.5, 1 … at most 5 s (serial) or 1.5 s (TCP).
+        """
         pause = self._pause
         self._pause = min(2 * pause, MAX_TCP_PAUSE_S if self._tcp else MAX_PAUSE_S)
         return pause
 
     def reset_pause(self) -> None:
-        """Begin with the shortest pause after the next loss, because the hub answered."""
+        """Set the pause before the next attempt to open the link to the shortest one.
+
+        It is called when the hub has answered or the device file of the port has changed.
+        """
         self._pause = MIN_PAUSE_S
 
     def skip_match(self) -> None:
-        """Begin with the next match of the pattern, because the opened port is the wrong one."""
+        """Make the next attempt begin with the next path that matches the pattern of the port.
+
+        It is called when the path that is open now does not lead to the expected hub.
+        """
         self._first_match += 1
 
     def identify_ports(self) -> tuple[object, ...]:
-        """Return which files the path of the port leads to now.
+        """Return the identities (path, inode, device, permissions) of the files at the port's path.
 
-        After a change of them it is useful to try again at once.
+        If they differ from those of an earlier call, a hub was plugged in or the permissions were
+        changed, and the port is worth trying at once. For TCP the result is empty.
         """
         if self._tcp:
             return ()
         return tuple(_identify_file(path) for path in self._matches())
 
     def _matches(self) -> list[str]:
-        """Return the paths that match the port."""
+        """Return the paths that match the configured port: one, unless it is a pattern."""
         if not self.is_pattern:
             return [self.config.port]
         return sorted(glob.glob(self.config.port))  # noqa: PTH207  (Path.glob takes no absolute pattern)
 
     def _open_serial(self) -> None:
-        """Open the first match that can be opened, beginning with `_first_match`."""
+        """Open the first matching path that can be opened, beginning with number `_first_match`.
+
+        If none can be opened, the error of the last one is raised.
+        """
         paths = self._matches()
         error = LinkError(
             f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port"
@@ -333,7 +367,7 @@ class Link:
         raise error
 
     def _open_tcp(self) -> None:
-        """Begin or continue a TCP connection."""
+        """Begin or continue a TCP connection; `_stream` is set once it is made."""
         if self._connecting is None:
             self._connecting = TcpConnection(self.config.port)
         try:
@@ -345,7 +379,7 @@ class Link:
             self._connecting = None
 
     def _lost(self, error: OSError) -> LinkError:
-        """Return the LinkError for a connection that broke."""
+        """Return the LinkError of the kind `lost` for an error of reading or writing."""
         reason = error.strerror or str(error)
         return LinkError(
             f"{self.path}: connection lost ({reason}): replug the hub, "
@@ -355,10 +389,16 @@ class Link:
 
 
 def explain_open_error(path: str, error: BaseException) -> LinkError:
-    """Return the LinkError for a failed attempt to open `path`."""
+    """Return the LinkError, with its fix, for a failed attempt to open a serial port.
+
+    Args:
+        path: Path of the port.
+        error: The exception that opening raised.
+    """
     code = getattr(error, "errno", None)
     for source in (error, error.__context__):
-        # pyserial passes on some errors of termios, and hides the number of others.
+        # Some errors of termios, which have no attribute `errno`, come from pyserial unchanged;
+        # others are the context of an error of pyserial.
         if code is None and isinstance(source, termios.error):
             code = source.args[0]
     if code in _OPEN_ERRORS:
@@ -368,10 +408,10 @@ def explain_open_error(path: str, error: BaseException) -> LinkError:
 
 
 def _open_port(path: str, baud: int) -> serial.Serial:
-    """Open and lock one serial port; raise LinkError if that fails."""
+    """Open one serial port for this process only; raise LinkError if that fails."""
     try:
-        # inter_byte_timeout=0 sets VMIN to 1. Then reading an empty port fails with EAGAIN, and an
-        # empty result always means that the hub was unplugged.
+        # inter_byte_timeout=0 makes pyserial set the terminal's VMIN to 1. Then reading a port
+        # without data fails with EAGAIN, and an empty result always means an unplugged hub.
         port = serial.Serial(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
     except (OSError, termios.error) as error:
         raise explain_open_error(path, error) from error
@@ -386,11 +426,11 @@ def _open_port(path: str, baud: int) -> serial.Serial:
 
 
 def _identify_file(path: str) -> tuple[object, ...] | None:
-    """Return path, inode, device and permissions of a file; None if it does not exist."""
+    """Return path, inode, device number and permissions of a file; None if it does not exist."""
     try:
         status = Path(path).stat()
     except OSError:
         return None
-    # The permissions belong to it, because a change of them may allow to open the port.
+    # Permissions are included, because after a change of them the port may be allowed to open.
     permissions = status.st_mode, status.st_uid, status.st_gid
     return path, status.st_ino, status.st_rdev, permissions

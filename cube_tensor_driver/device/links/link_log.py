@@ -1,5 +1,7 @@
-"""Log lines about one link, limited in rate, because a hub can cause a thousand of them per
-second."""
+"""Logging of lines about one link at a limited rate.
+
+A faulty hub can cause a thousand lines per second.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +10,14 @@ from collections.abc import Callable
 from typing import Protocol
 
 MAX_BURST = 20
-"""Number of lines that may be logged at once. A link that opens, is lost, or does not fit the skin
-logs a few lines together."""
+"""Number of lines about one link that may be logged without a pause between them. For example, a
+link that is opened and whose cubes do not fit the skin file logs a few lines together."""
 LINE_PERIOD_S = 1.0
-"""Period of the lines after a burst, in s."""
+"""Period, in s, at which lines about one link may be logged after `MAX_BURST` lines together."""
 
 
 class Log(Protocol):
-    """The methods used of a logger, which may be that of Python or of ROS."""
+    """Methods of a logger that this package calls; the loggers of Python and of ROS have them."""
 
     def info(self, message: str, /) -> object: ...
 
@@ -52,26 +54,26 @@ class LinkLogger:
         self._updated_at = clock()
         self._reported_left_out = 0
 
-    # Each severity has its own call here, because a logger of ROS accepts only one severity for
-    # each place of the call.
+    # There is one method for each severity, because a logger of ROS raises an error if the same
+    # line of code logs with different severities.
 
     def info(self, message: str, /) -> None:
-        """Log news."""
+        """Log an event of the link that is no problem, for example that it was opened."""
         if self._is_allowed():
             self._log.info(self._line(message))
 
     def warning(self, message: str, /) -> None:
-        """Log a problem that may pass by itself."""
+        """Log a problem that may pass without help, for example a lost connection."""
         if self._is_allowed():
             self._log.warning(self._line(message))
 
     def error(self, message: str, /) -> None:
-        """Log a problem that somebody must solve."""
+        """Log a problem that a person must solve, for example a cube missing in the skin file."""
         if self._is_allowed():
             self._log.error(self._line(message))
 
     def _is_allowed(self) -> bool:
-        """Return whether a line may be logged now, and count it."""
+        """Return whether a line may be logged now, and count it as logged or left out."""
         now = self._clock()
         earned = (now - self._updated_at) / LINE_PERIOD_S
         self._allowed = min(MAX_BURST, self._allowed + earned)
@@ -83,7 +85,7 @@ class LinkLogger:
         return True
 
     def _line(self, message: str) -> str:
-        """Return the line for a message."""
+        """Return the log line for a message: link, message, number of lines left out before."""
         omitted = self.left_out - self._reported_left_out
         self._reported_left_out = self.left_out
         note = f" ({omitted} lines about this link were left out before)" if omitted else ""

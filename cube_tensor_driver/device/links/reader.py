@@ -1,9 +1,9 @@
 """The thread that reads all links of a skin.
 
-It opens and reopens the links, decodes their bytes, and calls back once per wake-up. No link waits
-for another: ports are read and TCP connections are made without blocking, and bytes that a link
-    does
-not accept wait in a bounded buffer of its own. `session.py` decides what is sent on a link.
+The thread opens and reopens the links, decodes their bytes, and calls back once each time it has
+read data. No link waits for another: ports are read and TCP connections are made without blocking,
+and each link has a bounded buffer for bytes that could not be sent yet. `session.py` decides what
+is sent on a link.
 """
 
 from __future__ import annotations
@@ -26,33 +26,34 @@ from .link import Link, LinkConfig, LinkState
 from .session import TICK_S, Session
 
 MAX_WAIT_PERIODS = 0.2
-"""Longest wait for the hubs that have not delivered yet, as a part of the sample period. Hubs
-sample together, but their bytes arrive one after the other; after a short wait all come in one
-callback."""
+"""Longest time, in sample periods, for which the reader waits for the other hubs after the first
+one has delivered a sample. Hubs sample at the same time, but their bytes arrive one after the
+other; the wait lets one callback receive them all."""
 MAX_WAIT_S = 1e-3
-"""Longest wait for the hubs that have not delivered yet, in s."""
+"""Longest time, in s, for which the reader waits for the other hubs after the first one has
+delivered a sample; `MAX_WAIT_PERIODS` is the limit at high sample rates."""
 WAIT_STEP_S = 2e-4
-"""Period, in s, at which the reader checks for data while it waits for further hubs. Waking up for
-each hub would cost more. Arrivals may be later than true by this time."""
+"""Period, in s, at which the reader checks for data while it waits for the other hubs. Waking up
+for each hub would take more processor time. Arrival times may be late by up to this period."""
 MIN_SELECT_S = 5e-5
-"""Duration of a wait for data, in s, below which the data were already there. Then this thread is
-late and does not wait for more."""
+"""Shortest wait for data, in s, after which the reader also waits for the other hubs. If the wait
+was shorter, data had arrived before it, so the thread is behind and must not wait longer."""
 DRAIN_S = 0.05
-"""Time for which closing waits until the last requests have left the serial ports, in s."""
+"""Longest time, in s, that closing waits until the STOP requests have left the serial ports."""
 LOGGED_ERRORS = (1, 10, 100, 1000, 10_000)
-"""Numbers of errors of a callback at which the error is logged. At 1 kHz all of them would fill the
-log."""
+"""The 1st, 10th, 100th … exception of a callback is logged. At a sample rate of 1 kHz, logging all
+of them would fill the log."""
 CLOSE_S = 1.5
-"""Time for which closing waits for the end of the thread, in s."""
+"""Longest time, in s, for which closing waits for the end of the reader's thread."""
 
 
 class LinkRead(NamedTuple):
-    """Result of one read of a link.
+    """Result of reading one link once.
 
     Attributes:
         link: Index of the link.
-        arrival_ns: Arrival of the bytes.
-        result: The decoded frames, or the error by which the link is lost.
+        arrival_ns: Host time, in ns, at which the bytes had arrived.
+        result: The decoded frames, or the error that shows that the link is lost.
     """
 
     link: int
@@ -61,13 +62,14 @@ class LinkRead(NamedTuple):
 
 
 class LinkFrames(NamedTuple):
-    """Frames to deliver, which one read of a link completed.
+    """Frames of one link that were completed by reading it once, for the callback.
 
     Attributes:
         link: Index of the link.
-        arrival_ns: Arrival of the bytes.
-        frames: The frames.
-        asked_ns: Time of the question that a TIME among the frames answers; 0 if there is none.
+        arrival_ns: Host time, in ns, at which the bytes of the frames had arrived.
+        frames: The frames, in order.
+        asked_ns: Host time, in ns, at which the hub was asked for its time, if the answer (a TIME
+            frame) may be among the frames; 0 if no answer is expected.
     """
 
     link: int
@@ -83,29 +85,29 @@ _log = logging.getLogger(__name__)
 
 
 class Reader:
-    """Reads all links in one thread.
+    """Opens, reads and reopens all links of a skin in one thread.
 
-    Both callbacks run in the reader's thread and must return soon. If one raises, the error is
-    logged and the reader goes on.
+    The callbacks run in this thread and must return soon. If one raises an exception, the exception
+    is logged and reading continues.
 
     Args:
-        links: Place and identity of the hub of each link.
-        on_frames: Called once per wake-up with a list of `LinkFrames`, in order of arrival per
-            link.
-        on_state: Called with the index of a link, its state and the error that is the reason, when
-            one of them changes.
-        clock_ns: The clock of arrivals. It is read after the bytes, so that no arrival is earlier
-            than true.
-        period_us: Sample period to set on every hub, in µs; None leaves the hub's own.
-        on_end: Called last of all in the reader's thread, however it ends.
+        links: Port of each link, and the hub that is expected there.
+        on_frames: Called with a list of `LinkFrames` each time data were read. The frames of each
+            link are in the order of their arrival.
+        on_state: Called when the state of a link or its reason changes, with the index of the link,
+            the state, and the error that is the reason (None if there is none).
+        clock_ns: Clock of the arrival times, in ns. It is read after the bytes, so that no arrival
+            time is earlier than the true one.
+        period_us: Sample period to set on every hub, in µs; with None the hubs keep their own.
+        on_end: Called in this thread as its last step, also after an error.
 
     Attributes:
-        links: The links.
-        failure: Error that ended the thread; None while it runs and after `close`.
-        callback_errors: Number of times a callback raised.
+        links: The links, in the order of the argument.
+        failure: Exception that ended the thread; None while it runs or if it ended by `close`.
+        callback_errors: Number of exceptions that the callbacks have raised.
 
     Raises:
-        LinkError: `bad_port`: a port can never be opened.
+        LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
     """
 
     def __init__(
@@ -135,10 +137,10 @@ class Reader:
         self._wake_write = -1
 
     def start(self) -> None:
-        """Start the thread.
+        """Start the thread. A reader can be started only once.
 
         Raises:
-            LinkError: `closed`: the reader was started before; it runs once.
+            LinkError: With the kind `closed`: the reader was started before.
         """
         if self._thread is not None:
             raise LinkError("a reader starts once: make a new Reader", "closed")
@@ -151,13 +153,18 @@ class Reader:
         self._thread.start()
 
     def send(self, link: int, request: Request) -> None:
-        """Send a request; callable from any thread.
+        """Let the reader's thread send a request to a hub. Any thread may call this method.
 
-        START, STOP and SET_PERIOD are remembered and sent again after each reopening, so they may
-        be given while the link is not open.
+        START, STOP and SET_PERIOD are stored and sent again each time the link is opened, so they
+        are accepted while the link is not open.
+
+        Args:
+            link: Index of the link.
+            request: The request.
 
         Raises:
-            LinkError: `closed`: another request was given while the link is not open.
+            LinkError: With the kind `closed`: the link is not open and the request is none of these
+                three.
         """
         target = self.links[link]
         remembered = request.request in (Command.START, Command.STOP, Command.SET_PERIOD)
@@ -170,12 +177,18 @@ class Reader:
         self._wake()
 
     def forget_questions(self) -> None:
-        """Ignore the answers to all requests TIME sent until now; callable from `on_frames`."""
+        """Ignore the answers to all TIME requests (for the hub's time) that were sent until now.
+
+        It is called in the reader's thread, from `on_frames`, after the host's clock was set.
+        """
         for session in self._sessions:
             session.asked_ns = None
 
     def close(self) -> None:
-        """Stop the hubs, close all links and end the thread within `CLOSE_S`; idempotent."""
+        """Send STOP to the hubs, close all links, and wait up to `CLOSE_S` for the thread to end.
+
+        A second call does nothing. If the thread does not end in time, an error is logged.
+        """
         self._stopping = True
         self._wake()
         thread = self._thread
@@ -187,15 +200,20 @@ class Reader:
                 )
 
     def _wake(self) -> None:
-        """Wake up the reader's thread."""
-        # Without the lock, a late call could write to a file descriptor that was closed and reused.
+        """Wake up the reader's thread if it waits for data."""
+        # Without the lock, this thread could write to the pipe just after the reader's thread has
+        # closed it, when its file descriptor may already belong to another file.
         with self._wake_lock:
             if self._wake_write >= 0:
                 with contextlib.suppress(BlockingIOError):
                     os.write(self._wake_write, b"\0")
 
     def _run(self, wake_read: int) -> None:
-        """Run the thread until the end."""
+        """Read the links until `close` is called or an error is raised, then close them.
+
+        Args:
+            wake_read: File descriptor of the pipe by which other threads wake up this one.
+        """
         try:
             self._selector.register(wake_read, selectors.EVENT_READ, None)
             self._loop(wake_read)
@@ -223,7 +241,8 @@ class Reader:
             received, failed = self._handle_reads(reads)
             if received:
                 self._call(self._on_frames, received)
-            # Links are closed only now, because delivering the frames of a link marks it as live.
+            # Failed links are closed only after the callback, which marks every link whose frames
+            # it receives as delivering; in the other order it would undo the closing.
             for i, error in failed.items():
                 self._drop(i, error)
             if self._requests:
@@ -239,7 +258,12 @@ class Reader:
         ready: list[tuple[selectors.SelectorKey, int]],
         wake_read: int,
     ) -> list[LinkRead]:
-        """Read and decode all links that are ready, and send the bytes that wait."""
+        """Read and decode all links that have data, and send bytes that wait on links.
+
+        Args:
+            ready: The keys and events that the selector has returned.
+            wake_read: File descriptor of the pipe by which other threads wake up this one.
+        """
         reads: list[LinkRead] = []
         readable: list[int] = []
         for key, events in ready:
@@ -267,13 +291,13 @@ class Reader:
         self,
         reads: list[LinkRead],
     ) -> tuple[list[LinkFrames], dict[int, LinkError]]:
-        """Handle all reads of a wake-up.
+        """Pass the frames of several reads to the sessions of their links.
 
-        They are handled together, because after each wait Python's code and data have left the
-        caches of the processor.
+        All reads since the last callback are handled together. One by one they would take longer,
+        because after each wait Python's code and data have left the caches of the processor.
 
         Returns:
-            The frames to deliver, and the reason to close a link by its index.
+            The frames to deliver; and, by index, the links that must be closed with their errors.
         """
         received: list[LinkFrames] = []
         failed: dict[int, LinkError] = {}
@@ -301,7 +325,14 @@ class Reader:
         return received, failed
 
     def _waiting_time(self, reads: list[LinkRead]) -> float:
-        """Return how long to wait, in s, for links that should deliver but have not yet."""
+        """Return how long to wait for the links that should deliver a sample but have not yet.
+
+        Args:
+            reads: Results of reading since the last callback.
+
+        Returns:
+            Time in s, at most `MAX_WAIT_S`; 0 if there is no such link, or nothing was delivered.
+        """
         delivered = {read.link for read in reads if isinstance(read.result, list) and read.result}
         if not delivered or len(delivered) == len(self.links):
             return 0.0
@@ -312,12 +343,13 @@ class Reader:
         ]
         if not periods_us:
             return 0.0
-        # The fastest of the other hubs would deliver its next sample first.
+        # The wait is limited by the shortest sample period of the missing hubs, because a hub must
+        # not deliver its next sample during the wait.
         period_s = 1e-6 * min(periods_us)
         return min(MAX_WAIT_PERIODS * period_s, MAX_WAIT_S)
 
     def _send_requests(self) -> None:
-        """Send the requests of other threads."""
+        """Send the requests that other threads have given to `send`."""
         while self._requests:
             i, request = self._requests.popleft()
             try:
@@ -327,7 +359,12 @@ class Reader:
                 self._drop(i, error)
 
     def _check_timers(self, i: int, now: float) -> None:
-        """Check the timers of one link, and open it if it is time."""
+        """Check the timers of one open link; open a closed one if its pause is over.
+
+        Args:
+            i: Index of the link.
+            now: Monotonic time, in s.
+        """
         session = self._sessions[i]
         try:
             if session.link.is_open:
@@ -340,7 +377,7 @@ class Reader:
             self._drop(i, error)
 
     def _drop(self, i: int, error: LinkError) -> None:
-        """Close one link because of an error; it is opened again later."""
+        """Close link number `i` because of an error; it is opened again after a pause."""
         link = self.links[i]
         if link.is_open:
             link.lost += 1
@@ -348,7 +385,10 @@ class Reader:
         self._sessions[i].close(error)
 
     def _watch(self, i: int) -> None:
-        """Make the selector wake up for writing while bytes wait to be sent, and only then."""
+        """Make the selector report when link number `i` can be written, while bytes wait for it.
+
+        Without waiting bytes it must not, because a port can almost always be written.
+        """
         link = self.links[i]
         if not link.is_open:
             return
@@ -357,7 +397,7 @@ class Reader:
             self._selector.modify(link, events, i)
 
     def _call(self, callback: Callable[..., None], *arguments: object) -> None:
-        """Call back; log and count an error."""
+        """Call a callback; if it raises an exception, log and count the exception."""
         try:
             callback(*arguments)
         except Exception:  # noqa: BLE001  (whatever a callback raises, the links go on)
@@ -366,7 +406,11 @@ class Reader:
                 _log.exception("callback failed (%d so far); reading goes on", self.callback_errors)
 
     def _close_all(self, wake_read: int) -> None:
-        """Stop all hubs, wait until the requests have left, and close all links."""
+        """Send STOP to all hubs, wait up to `DRAIN_S` until it has left, and close all links.
+
+        Args:
+            wake_read: File descriptor of the pipe by which other threads wake up this one.
+        """
         for link in self.links:
             if link.is_open:
                 with contextlib.suppress(LinkError):

@@ -1,4 +1,4 @@
-"""Search for the serial ports of this machine and for the hubs behind them."""
+"""Search for the serial ports of this machine, and for the hubs connected to them."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from ..wire.protocol import Command, Hello, Request, encode
 from .link import Link, LinkConfig
 
 ANSWER_S = 1.0
-"""Time that a hub may take to identify itself, in s."""
+"""Longest time, in s, to wait for the answer of a hub to the request HELLO (identify yourself)."""
 DEMO_PORTS = "cube_demo_*/ports/*"
-"""Pattern of the pseudo-terminals of running demos, in the folder for temporary files."""
+"""Pattern of the paths of the simulated serial ports of running demos, relative to the system's
+folder for temporary files."""
 
 
 @dataclass
 class Port:
-    """A port of this machine.
+    """A serial port of this machine, and the hub that answered there.
 
     Attributes:
         path: Device path.
-        description: Description by the system; empty if there is none.
-        hello: Answer of the hub; None if there was none.
-        problem: Why the port could not be asked; empty if it could.
+        description: Description by the operating system; empty if there is none.
+        hello: HELLO frame by which the hub identified itself; None without an answer.
+        problem: Text of the error if the port could not be opened, read or written; else empty.
     """
 
     path: str
@@ -38,24 +39,27 @@ class Port:
 
 
 def find_ports() -> list[Port]:
-    """Return the serial ports of the machine and of running demos, without opening any."""
+    """Return the serial ports of this machine, and the simulated ports of running demos.
+
+    No port is opened.
+    """
     ports: list[Port] = []
     for found in list_ports.comports():
         has_description = found.description not in (None, "n/a")
         ports.append(Port(found.device, found.description if has_description else ""))
     folder = Path(tempfile.gettempdir())
     for path in sorted(folder.glob(DEMO_PORTS)):
-        # Simulated hubs put symbolic links to their pseudo-terminals there.
+        # A simulated hub makes a symbolic link to its pseudo-terminal. Other files are no ports.
         if path.is_symlink():
             ports.append(Port(str(path), "demo"))
     return ports
 
 
 def ask_ports(ports: list[Port]) -> None:
-    """Send the request HELLO to all ports at once and wait for the answers.
+    """Send the request HELLO to all ports, and wait up to `ANSWER_S` in total for the answers.
 
     Args:
-        ports: The ports, to which the answers and problems are added.
+        ports: The ports. The attribute `hello` or `problem` of each is set to the result.
     """
     links: dict[int, tuple[Link, Port]] = {}
     question = encode(Request(Command.HELLO))
@@ -75,7 +79,11 @@ def ask_ports(ports: list[Port]) -> None:
 
 
 def _listen(links: dict[int, tuple[Link, Port]]) -> None:
-    """Wait until every link has answered, for at most `ANSWER_S`."""
+    """Read the links until a HELLO has come from each, for at most `ANSWER_S`.
+
+    Args:
+        links: Each open link and its port, by file descriptor.
+    """
     until = time.monotonic() + ANSWER_S
     waiting = set(links)
     while waiting and (left := until - time.monotonic()) > 0:

@@ -1,11 +1,12 @@
-"""The conversation with one hub, which continues when its port is reopened.
+"""Requests to one hub and handling of its answers, each time its port is opened.
 
-After each opening, the hub is asked for HELLO; on HELLO it receives its settings (sample period,
-start or stop). A hub that restarts behind an open port becomes silent, and its next HELLO starts it
-again. A hub that delivers samples is asked for its time about once a second.
+After each opening, the hub is asked for HELLO; when HELLO has come, the hub is sent its settings
+(sample period, START or STOP). A hub that restarts while its port stays open sends no samples until
+its next HELLO, on which it is started again. A hub that delivers samples is asked for its time
+about once a second.
 
-Nothing here waits or starts a thread: the reader passes on the frames and the time. Times are those
-of time.monotonic() in s, unless they end in _ns.
+A session does not wait and has no thread: the reader passes it the frames and the time. Times are
+those of time.monotonic() in s, unless their names end in _ns.
 """
 
 from __future__ import annotations
@@ -18,42 +19,46 @@ from ..wire.protocol import Ack, Command, Frame, Hello, Request, Result, Sample,
 from .link import Link, LinkState
 
 SILENT_S = 0.2
-"""Time without a sample, in s, after which a link is silent. Three sample periods count if they are
-longer."""
+"""Time without a sample, in s, after which the state of an open link becomes SILENT. The limit is
+three sample periods if they are longer."""
 TICK_S = 0.02
-"""Period at which the reader checks the timers of all links (silence, retries, questions), in s."""
+"""Period, in s, at which the reader checks the timers of all links: for silence, for the next
+attempt to open the port, and for the next request to the hub."""
 HELLO_S = 1.0
-"""Period at which a hub that does not answer is asked for HELLO again, in s."""
+"""Period, in s, at which the request HELLO is repeated while a hub is silent or has not sent HELLO
+since its port was opened."""
 ASK_TIME_S = 0.983
-"""Period at which a hub is asked for its time, in s. It is not a multiple of usual sample periods,
-so that the questions are spread over all times between two samples."""
+"""Period, in s, at which a hub is asked for its time. It is not a multiple of usual sample periods,
+so that the requests fall on all phases of the sample period in turn."""
 REOPEN_S = 5.0
-"""Time without a single byte, in s, after which a link is reopened. Hubs send HELLO every
-second."""
+"""Time without a received byte, in s, after which a link is closed and opened again. A working hub
+sends at least HELLO every second, so its port no longer leads to it."""
 CHECK_PORT_S = 0.25
-"""Period at which a waiting link checks, in s, whether its port has come back."""
+"""Period, in s, at which a link whose port is not open checks whether the device file of the port
+has appeared or changed."""
 PERIOD_TOLERANCE = 0.01
-"""Relative deviation from the requested sample period, because of rounding in the hub, above which
-a note is given."""
+"""Largest relative difference between the sample period that a hub reports and the requested one
+that is accepted as rounding in the hub. A larger difference is reported as a problem."""
 
 OnState = Callable[[LinkState, LinkError | None], None]
 
 
 class Session:
-    """Starts the hub of one link after each opening, and keeps the state of the link.
+    """Starts the hub of one link each time the link is opened, and sets the state of the link.
 
     Args:
         link: The link.
-        period_us: Sample period to request, in µs; None leaves the hub's own.
-        clock_ns: The clock of arrivals.
-        on_state: Called when the state of the link, or its reason, changes.
+        period_us: Sample period to set on the hub, in µs; with None the hub keeps its own.
+        clock_ns: Clock of the arrival times, in ns.
+        on_state: Called with the state of the link and its reason when one of them changes.
 
     Attributes:
         link: The link.
-        actual_us: Sample period in force, in µs, as the hub reports it; 0 before that.
-        last_byte: Time of the last received byte.
-        asked_ns: Time of `clock_ns` at which the hub was asked for its time; None if no answer is
-            expected.
+        actual_us: Sample period of the hub, in µs, as it reports it. Before its first report, the
+            requested period, or 0 if there is none.
+        last_byte: Monotonic time, in s, at which bytes were received last.
+        asked_ns: Time of `clock_ns` at which the hub was last asked for its time; None if no answer
+            is expected.
     """
 
     def __init__(
@@ -69,28 +74,32 @@ class Session:
         self.asked_ns: int | None = None
         self._clock_ns, self._on_state = clock_ns, on_state
         self._period_us = period_us
-        self._answered_us: int | None = None  # the hub's answer to the requested period
-        self._is_started = True  # samples are requested
-        self._has_hello = False  # HELLO has come since the port was opened
+        # Sample period, in µs, in the hub's answer to the last SET_PERIOD; None before the answer.
+        self._answered_us: int | None = None
+        self._is_started = True  # whether the hub is to send samples: START, not STOP
+        self._has_hello = False  # whether HELLO has come since the port was opened
         self._opened_at = self._last_sample = 0.0
         self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
-        self._knows_time = True  # the hub has not refused the request TIME
+        self._knows_time = True  # False once the hub has answered TIME by an ACK: it has no TIME
         self._question = 0  # number of the last request TIME
         self._ports: tuple[object, ...] = ()
 
     @property
     def is_delivering(self) -> bool:
-        """Whether samples are expected."""
+        """Whether samples are expected: the link is open, HELLO has come, the hub is started."""
         return self.link.state is LinkState.OPEN and self._has_hello and self._is_started
 
     def open(self, now: float) -> bool:
-        """Open the link if it is time to try.
+        """Open the link if the pause after the last attempt is over or its device file changed.
+
+        Args:
+            now: Monotonic time, in s.
 
         Returns:
             Whether the link is open.
 
         Raises:
-            LinkError: The link cannot be opened.
+            LinkError: The attempt to open the link failed.
         """
         link = self.link
         if now >= self._check_port_at:
@@ -113,16 +122,19 @@ class Session:
         return True
 
     def begin(self) -> None:
-        """Ask the hub for HELLO, because the link was opened.
+        """Set the state OPEN and ask the hub for HELLO, because the link was opened.
 
         Raises:
-            LinkError: The link must be closed.
+            LinkError: Sending failed.
         """
         self.set_state(LinkState.OPEN)
         self._ask_hello(time.monotonic())
 
     def close(self, error: LinkError) -> None:
-        """Close the link because of an error; it is opened again later."""
+        """Close the link because of an error, and set the state WAITING.
+
+        `open` tries again after a pause, or as soon as the device file of the port changes.
+        """
         link = self.link
         link.close()
         self._ports = link.identify_ports()
@@ -130,12 +142,12 @@ class Session:
         self.set_state(LinkState.WAITING, error)
 
     def send(self, request: Request) -> None:
-        """Send a request.
+        """Send a request if the link is open.
 
-        The period, START and STOP are remembered and sent again after each opening.
+        SET_PERIOD, START and STOP are also stored and sent again each time the link is opened.
 
         Raises:
-            LinkError: The link must be closed.
+            LinkError: Sending failed, so the link must be closed.
         """
         if request.request == Command.SET_PERIOD:
             self._period_us = request.argument
@@ -148,21 +160,23 @@ class Session:
             self.link.write(encode(request))
 
     def take(self, frame: Frame) -> bool:
-        """Handle what a frame means for the link itself.
+        """Update the state of the link from one received frame.
 
         Returns:
-            Whether to deliver the frame.
+            Whether to deliver the frame. Samples before HELLO and answers to no pending TIME
+            request are not delivered.
 
         Raises:
-            LinkError: The link must be closed.
+            LinkError: HELLO shows another hub than the skin file asks for, or sending its settings
+                failed. The link must be closed.
         """
         link = self.link
         if isinstance(frame, Sample):
             self._last_sample = self.last_byte
             if link.state is not LinkState.OPEN or link.error is not None:
                 self.set_state(LinkState.OPEN)
-            # After a replug the port may lead to another hub. Its samples must not be taken for
-            # those of the hub before.
+            # After cables were swapped, the port may lead to another hub. Until its HELLO has
+            # come, its samples would be assigned to the cubes of the previous hub.
             link.before_hello += not self._has_hello
             return self._has_hello
         if isinstance(frame, Hello):
@@ -180,10 +194,14 @@ class Session:
         return True
 
     def check_timers(self, now: float) -> None:
-        """Check the timers of the open link.
+        """Check the open link for silence, and send the next request to the hub if it is due.
+
+        Args:
+            now: Monotonic time, in s.
 
         Raises:
-            LinkError: The link must be closed.
+            LinkError: No byte has come for `REOPEN_S`, or no HELLO from a port given as a pattern,
+                or sending failed. The link must be closed.
         """
         link = self.link
         self._check_silence(now)
@@ -203,12 +221,16 @@ class Session:
         if link.state is LinkState.SILENT or not self._has_hello:
             if now >= self._hello_at:
                 self._ask_hello(now)
-        # The answer is compared with samples, so it is useless before the first one.
+        # The hub's time is compared with the times of its samples, so the first request follows
+        # the first sample.
         elif self._knows_time and self._last_sample > self._opened_at and now >= self._ask_time_at:
             self._ask_time(now)
 
     def set_state(self, state: LinkState, error: LinkError | None = None) -> None:
-        """Set the state and its reason, and call back if they have changed."""
+        """Set the state of the link and its reason; call `on_state` if one of them has changed.
+
+        Two errors of the same kind count as the same reason.
+        """
         link = self.link
         before = link.state, link.error and link.error.kind
         link.state, link.error = state, error
@@ -216,7 +238,11 @@ class Session:
             self._on_state(state, error)
 
     def _handle_hello(self, frame: Hello) -> None:
-        """Check the identity and the period of the hub, and start it if necessary."""
+        """Check the unique number and the sample period of a hub, and send its settings if needed.
+
+        Raises:
+            LinkError: The hub is not the one that the skin file asks for, or sending failed.
+        """
         link = self.link
         wanted = link.config.hub_uid
         if wanted is not None and frame.hub_uid != wanted:
@@ -229,7 +255,8 @@ class Session:
         link.hello = frame
         link.reset_pause()
         self.actual_us = frame.period_us
-        # A hub may round the period or refuse it. Once it has answered, it is not asked again.
+        # A hub may round the requested period or refuse it. The period of its answer is then
+        # expected, so that the request is not repeated at every HELLO.
         expected = (self._period_us, self._answered_us)
         has_other_period = self._period_us is not None and frame.period_us not in expected
         if not self._has_hello or link.state is LinkState.SILENT or has_other_period:
@@ -237,7 +264,7 @@ class Session:
             self._configure()
 
     def _configure(self) -> None:
-        """Send the hub its sample period and START or STOP."""
+        """Send the hub the requested sample period, if there is one, and START or STOP."""
         self._knows_time = True
         if self._period_us is not None:
             self.link.write(encode(Request(Command.SET_PERIOD, self._period_us)))
@@ -247,7 +274,14 @@ class Session:
             self.set_state(LinkState.OPEN)
 
     def _check_silence(self, now: float) -> None:
-        """Set the state SILENT if the last sample is too long ago."""
+        """Set the state SILENT if no sample has come for the time limit.
+
+        The limit is `SILENT_S` or three sample periods, whichever is longer, less one period of the
+        timer check.
+
+        Args:
+            now: Monotonic time, in s.
+        """
         link = self.link
         silence = now - self._last_sample
         limit = max(3e-6 * self.actual_us, SILENT_S) - TICK_S
@@ -266,22 +300,28 @@ class Session:
         self.set_state(LinkState.SILENT, error)
 
     def _ask_hello(self, now: float) -> None:
-        """Ask the hub for HELLO."""
+        """Send the request HELLO (identify yourself), and set the time of the next one."""
         self._hello_at = now + HELLO_S
         self.link.write(encode(Request(Command.HELLO)))
 
     def _ask_time(self, now: float) -> None:
-        """Ask the hub for its time."""
+        """Send the request TIME (report your clock), and set the time of the next one."""
         self._ask_time_at = now + ASK_TIME_S
         self._question = (self._question + 1) % (1 << 32)
         request = encode(Request(Command.TIME, self._question))
-        self.asked_ns = self._clock_ns()  # before the write, so that it is not later than true
+        # The clock is read before the request is written, so that the time of asking is not later
+        # than the true one.
+        self.asked_ns = self._clock_ns()
         self.link.write(request)
 
 
 def _period_problem(asked_us: int | None, answer: Ack) -> str:
-    """Return what is wrong with the hub's answer to SET_PERIOD, and the fix; empty if it is
-    right."""
+    """Return a text with the fix if the hub's sample period is not the requested one; else empty.
+
+    Args:
+        asked_us: Requested sample period, in µs; None if none was requested.
+        answer: Answer of the hub to SET_PERIOD, with the period in force as its argument.
+    """
     if asked_us is None:
         return ""
     in_force = f"the hub samples every {answer.argument} µs, asked for were {asked_us} µs"

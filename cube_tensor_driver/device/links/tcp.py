@@ -1,7 +1,7 @@
 """TCP connections that are made without blocking the caller.
 
-The ``socket://`` of pyserial blocks for up to 5 s while it looks up the name and connects, which
-would hold up all other links of the reader's thread.
+pyserial could open ``socket://`` URLs, too, but blocks for up to 5 s while it looks up the name of
+the host and connects. One thread reads all links, and would not read the others in this time.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from ...config.port import port_problem, tcp_address
 from ...core.errors import LinkError
 
 CONNECT_TIMEOUT_S = 2.0
-"""Time for each address of the host, in s. A host that is switched off does not answer at all."""
+"""Longest time, in s, to wait for a connection to each address of the host. A host that is switched
+off does not even refuse the connection."""
 
 
 def parse_url(url: str) -> tuple[str, int]:
-    """Return host and port of ``socket://host:port``; IPv6 hosts stand in brackets.
+    """Return host and port number of ``socket://host:port``; an IPv6 host stands in brackets.
 
     Raises:
-        LinkError: `bad_port`: the text is not such a URL.
+        LinkError: With the kind `bad_port`: the text is not such a URL.
     """
     address = tcp_address(url)
     if address is None:
@@ -34,13 +35,16 @@ def parse_url(url: str) -> tuple[str, int]:
 
 
 class TcpConnection:
-    """One attempt to connect. `poll` is called until it returns the socket.
+    """One attempt to connect. The caller repeats `poll` until it returns the socket or raises.
 
-    A name is looked up in a thread of its own, because the resolver of the system can block for
-    half a minute and cannot be cancelled. Numeric hosts need no thread.
+    The name of the host is looked up in a thread of its own, because the resolver of the system can
+    block for half a minute and cannot be cancelled. Numeric hosts need no thread.
 
     Args:
         url: ``socket://host:port``.
+
+    Raises:
+        LinkError: With the kind `bad_port`: the text is not such a URL.
     """
 
     def __init__(self, url: str) -> None:
@@ -58,10 +62,11 @@ class TcpConnection:
             ).start()
 
     def poll(self) -> socket.socket | None:
-        """Return the connected, non-blocking socket; None while the attempt is under way.
+        """Return the connected, non-blocking socket; None while the connection is being made.
 
         Raises:
-            LinkError: No address of the host answers.
+            LinkError: The name of the host was not found, or none of its addresses accepted the
+                connection within `CONNECT_TIMEOUT_S`.
         """
         if self._addresses is None:
             if self._error:
@@ -88,19 +93,26 @@ class TcpConnection:
                     return None
 
     def close(self) -> None:
-        """Give the attempt up; a second call does nothing."""
+        """Close the socket of the attempt; a second call does nothing."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def _look_up(self, flags: int) -> list[Any]:
-        """Return the addresses of the host."""
+        """Return the addresses of the host, as `socket.getaddrinfo` gives them.
+
+        Args:
+            flags: Flags of `socket.getaddrinfo`; with AI_NUMERICHOST no name server is asked.
+        """
         return list(
             socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=flags)
         )
 
     def _resolve(self) -> None:
-        """Look up the name of the host, in a thread of its own."""
+        """Look up the name of the host and store its addresses or the error.
+
+        This method runs in a thread of its own, because the look-up can block.
+        """
         try:
             self._addresses = self._look_up(0)
         except (OSError, UnicodeError) as error:
@@ -111,7 +123,7 @@ class TcpConnection:
             )
 
     def _start(self, address: Any) -> None:
-        """Begin to connect to one address."""
+        """Begin to connect to one address, an entry of `socket.getaddrinfo`."""
         family, kind, protocol, _, target = address
         try:
             self._socket = socket.socket(family, kind | socket.SOCK_NONBLOCK, protocol)
@@ -123,13 +135,17 @@ class TcpConnection:
             self._fail(code)
 
     def _is_connected(self) -> bool:
-        """Return whether the socket has a peer."""
+        """Return whether the connection has been made, so that the socket has a peer address."""
         with contextlib.suppress(OSError):
             return self._socket is not None and bool(self._socket.getpeername())
         return False
 
     def _fail(self, code: int) -> None:
-        """Give one address up, because of this errno; the next one is tried."""
+        """Close the socket to one address and store the error; `poll` tries the next address.
+
+        Args:
+            code: The errno with which the connection failed.
+        """
         self.close()
         if code == errno.ECONNREFUSED:
             kind, fix = "refused", "start the bridge there or correct the port"
