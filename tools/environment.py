@@ -208,7 +208,7 @@ def has_sourced_ros() -> bool:
         SetupError: One is, but modules are missing.
     """
     distro = os.environ.get("ROS_DISTRO", "")
-    # Some machines set the name alone, in a profile.
+    # A distribution is sourced only if its paths are set as well.
     if not distro or not os.environ.get("AMENT_PREFIX_PATH"):
         return False
     if distro < OLDEST_DISTRO:

@@ -187,12 +187,12 @@ def _measure_both(
     bench: Bench,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Measure the echo, the chain and the echo again, because the machine gets warm."""
+    """Measure the echo before and after the chain, and compare the chain with their mean."""
     cubes = HubLoad.of(cubes).cubes
     before = _measure_echo(cubes, bench, progress)
     skin = _measure_skin(cubes, bench, progress)
     after = _measure_echo(cubes, bench, progress)
-    # The mean of both, as the machine may have changed its speed meanwhile.
+    # The speed of the machine may have changed meanwhile.
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     loads = [f"cpu_{load}_percent" for load in LOADS]
     # The load is not part of what a robot runs.

@@ -25,17 +25,16 @@ from .record import LATEST_NS, Span
 from .samples import HubFault, Samples
 
 EDGE_NS = 5_000_000
-"""Time, in nanoseconds, around the begin and the end of a fault in which it may be present or not.
-
-The simulator carries a fault out late now and then.
-"""
+"""Time, in nanoseconds, before and after the begin and the end of a fault in which a sample may
+have the fault or not. The simulator carries faults out late now and then."""
 
 MIN_EQUAL_SHARE = 0.5
 """Smallest share of a row's pads that must have the expected reading. With fewer, the row is taken
 for another sample of the same number."""
 
 CHUNK = 100_000
-"""Number of rows that are compared at a time, so that memory stays below 1 GB."""
+"""Maximum number of rows that are compared at a time, so that the memory for intermediate results
+does not grow with the duration of a torture."""
 
 MILLIHERTZ = 1e-3
 

@@ -34,11 +34,13 @@ PERMITTED_STATUS = NOISY | RANGE | DRIFT
 """Status bits that any broken pad may cause as well: it jumps when its fault begins and ends."""
 
 IMMEDIATE_FAULTS = ("open", "short", "report")
-"""Faults that the row itself shows."""
+"""Faults of a pad that a single row shows, without statistics."""
 
 DETECTION_NS = round(NS_PER_S * (2 * WINDOW_S + 0.1))
-"""Time, in nanoseconds, after which the other faults must be flagged: two windows, and the scan
-that shows that the second one is over."""
+"""Time, in nanoseconds, from the begin of a fault that needs statistics until it must be flagged.
+
+It is two windows, and the scan that shows that the second one is over.
+"""
 
 RELEASE_S = 6.0
 """Time, in seconds, for which a pad that works again may still be left out.
@@ -60,7 +62,8 @@ RESTART_S = 2.0
 """Time, in seconds, around a start of a node in which the statistics are not complete."""
 
 NOMINAL_PERIOD_S = 1.5
-"""Time, in seconds, around a fault within which the period of the hubs is looked up."""
+"""Time, in seconds, before and after the begin of a fault in which the periods of the hubs are
+looked up."""
 
 WINDOW_STEP_NS = 100_000_000
 """Step, in nanoseconds, between the windows in which movement is looked for."""

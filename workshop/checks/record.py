@@ -28,13 +28,14 @@ NODE_STARTS = (*RECONSTRUCTION_STOPS, *DRIVER_KILLS)
 """Actions after which a node begins without a memory of what was before."""
 
 UNFLUSHED_S = 0.5
-"""Time, in seconds, before a driver is killed, in which its messages may not arrive any more.
+"""Length, in seconds, of the span before a driver is killed whose messages may be lost.
 
-They wait in its queues, and a busy host empties them late.
+They wait in its queues, which a busy host empties late.
 """
 
 ROWS_AROUND_GAP = 100
-"""Number of rows before and after a gap in a topic whose stamps tell the time of the gap."""
+"""Number of rows before and after a gap in a topic from whose stamps the time of the gap is
+taken."""
 
 GAP_MARGIN_S = 0.05
 """Largest time, in seconds, between a row in a missing message and the rows around the gap."""

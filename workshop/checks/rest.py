@@ -24,8 +24,8 @@ TRANSPORT_S = 0.1
 is answered, the old or the new values may be in force."""
 
 RESTORE_S = 2.0
-"""Time, in seconds, after a restart until the tare is restored. The reconstruction waits for the
-info of the driver, which is published once a second."""
+"""Time, in seconds, after a restart until the tare is restored. The reconstruction waits until
+the driver has stated which cubes there are."""
 
 AVERAGED_S = 2.5
 """Age, in seconds, of the oldest data in a tare.

@@ -34,14 +34,15 @@ MAX_ERROR_OF_LOAD = 1e-3
 """Largest error of a component against the load, as a share of the component's range."""
 
 MAX_NOISE_SHARE = 0.1
-"""Additional error as a share of the standard deviation that the pads' noise gives a component:
-where few pads are left, rounding is amplified as noise is."""
+"""Error of a component that is allowed in addition to `MAX_ERROR`, as a share of its standard
+deviation from the noise of the pads. Where few pads are left, rounding is amplified as noise is."""
 
 MAX_RESIDUAL_ERROR = 0.05
-"""Largest absolute error of a residual: rounding to mHz gives 1e-3."""
+"""Largest error of a residual, which has no unit. Rounding to mHz gives 1e-3."""
 
 MAX_RELATIVE_RESIDUAL_ERROR = 1e-3
-"""Largest further error of a residual, as a share of the residual."""
+"""Error of a residual that is allowed in addition to `MAX_RESIDUAL_ERROR`, as a share of the
+residual."""
 
 LIMIT_MARGIN = 0.01
 """Relative distance from its false-alarm limit at which a residual may be above it or not."""

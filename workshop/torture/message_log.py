@@ -33,8 +33,8 @@ MESSAGES_PER_SAMPLE = 8
 """Number of messages of a single cube of which one is kept."""
 
 MAX_CUBE_MESSAGES = 4000
-"""Number of messages of a single cube after which its topics are left. To receive all of them
-would take a third of the machine."""
+"""Number of messages of a single cube after which its topics are unsubscribed. To receive all of
+them would take a third of the machine."""
 
 MAX_MESSAGES_TAKEN = 300
 """Largest number of messages taken at a time, so that this process does other things, too."""

@@ -63,11 +63,11 @@ its period.
 """
 
 FIRST_ROUND_ONLY = ("restart reconstruction", "restart driver")
-"""Actions of the first round only, because the growth of memory is measured while a process
-runs."""
+"""Actions of the first round only. They end the life of a process, over which the growth of its
+memory is measured."""
 
 HELD_HUB = 0
-"""Hub whose load is held for the tare, and that has no other fault then."""
+"""Hub whose load is held for the tare. It has no other fault meanwhile."""
 
 HELD_CUBES = tuple(range(HELD_HUB * CUBES_PER_HUB, (HELD_HUB + 1) * CUBES_PER_HUB))
 """Cubes of that hub, which are tared."""
@@ -82,7 +82,8 @@ OPENING_HUB = 2
 """Hub on which each fault of a pad occurs once at the beginning, before the first cut."""
 
 OPENING_CUBES = (3, 4, 2, 5, 1)
-"""Cubes of these faults. The load moves them enough for a stuck pad to be found."""
+"""Cubes of `OPENING_HUB` whose pads have these faults. The load moves them enough for a stuck pad
+to be found."""
 
 FIRST_CUT_S = 3.5
 """Time, in seconds, of the earliest cut of a link."""

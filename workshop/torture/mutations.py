@@ -144,7 +144,7 @@ def _change_stress(change: Callable[[StressRows], StressRows]) -> Patch:
     return _wrap("ros.nodes.stress_publisher:StressPublisher", "publish", publish)
 
 
-def _columns(**changes: Callable[[Any], Any]) -> Callable[[Rows], Rows]:
+def _make_column_change(**changes: Callable[[Any], Any]) -> Callable[[Rows], Rows]:
     """Change columns of rows, each by a function of its old values."""
 
     def change(rows: Rows) -> Rows:
@@ -157,17 +157,17 @@ def _columns(**changes: Callable[[Any], Any]) -> Callable[[Rows], Rows]:
     return change
 
 
-def _frequencies(**changes: Callable[[Any], Any]) -> Patch:
+def _change_frequency_columns(**changes: Callable[[Any], Any]) -> Patch:
     """Change columns of each message of frequencies."""
-    return _change_frequencies(_columns(**changes))
+    return _change_frequencies(_make_column_change(**changes))
 
 
-def _stress(**changes: Callable[[Any], Any]) -> Patch:
+def _change_stress_columns(**changes: Callable[[Any], Any]) -> Patch:
     """Change columns of each message of stress."""
-    return _change_stress(_columns(**changes))
+    return _change_stress(_make_column_change(**changes))
 
 
-def _stale(name: str) -> Callable[[Rows], Rows]:
+def _make_stale(name: str) -> Callable[[Rows], Rows]:
     """Give one of `MESSAGES_PER_CHANGE` messages a column of the message before."""
     numbers = count()
     last: list[Any] = []
@@ -329,52 +329,64 @@ DRIVER: dict[str, tuple[str, Patch]] = {
     ),
     "swapped pads": (
         "two pads of each cube are swapped",
-        _frequencies(frequency=_swap_pads),
+        _change_frequency_columns(frequency=_swap_pads),
     ),
     "swapped cubes": (
         "the readings of two cubes are swapped",
         _change_frequencies(_swap_cubes),
     ),
-    "swapped hubs": ("the cubes of two hubs are swapped", _frequencies(cube=_swap_hubs)),
+    "swapped hubs": (
+        "the cubes of two hubs are swapped",
+        _change_frequency_columns(cube=_swap_hubs),
+    ),
     "scaled": (
         "frequencies are 1 ppm too high",
-        _frequencies(frequency=lambda f: f * np.float32(1 + 1e-6)),
+        _change_frequency_columns(frequency=lambda f: f * np.float32(1 + 1e-6)),
     ),
-    "millihertz": ("frequencies are in mHz", _frequencies(frequency=lambda f: 1000 * f)),
-    "rounded": ("frequencies are rounded to 1 Hz", _frequencies(frequency=np.rint)),
+    "millihertz": (
+        "frequencies are in mHz",
+        _change_frequency_columns(frequency=lambda f: 1000 * f),
+    ),
+    "rounded": ("frequencies are rounded to 1 Hz", _change_frequency_columns(frequency=np.rint)),
     "stale": (
         "1 of 200 messages has the frequencies of the one before",
-        _change_frequencies(_stale("frequency")),
+        _change_frequencies(_make_stale("frequency")),
     ),
     "zero": (
         "a pad that was not measured reads 0 Hz",
-        _frequencies(frequency=np.nan_to_num),
+        _change_frequency_columns(frequency=np.nan_to_num),
     ),
-    "late stamps": ("stamps are 0.8 ms late", _frequencies(stamp_ns=lambda t: t + 800_000)),
-    "early stamps": ("stamps are 1 ms early", _frequencies(stamp_ns=lambda t: t - 1_000_000)),
+    "late stamps": (
+        "stamps are 0.8 ms late",
+        _change_frequency_columns(stamp_ns=lambda t: t + 800_000),
+    ),
+    "early stamps": (
+        "stamps are 1 ms early",
+        _change_frequency_columns(stamp_ns=lambda t: t - 1_000_000),
+    ),
     "arrival stamps": (
         "stamps are the time of sending",
-        _frequencies(stamp_ns=lambda t: np.full_like(t, time.time_ns())),
+        _change_frequency_columns(stamp_ns=lambda t: np.full_like(t, time.time_ns())),
     ),
     "sequence": (
         "sequence numbers are one too high",
-        _frequencies(sequence=lambda sequence: sequence + np.uint32(1)),
+        _change_frequency_columns(sequence=lambda sequence: sequence + np.uint32(1)),
     ),
     "warm": (
         "the temperature is 10 °C too high",
-        _frequencies(temperature=lambda celsius: celsius + np.float32(10)),
+        _change_frequency_columns(temperature=lambda celsius: celsius + np.float32(10)),
     ),
     "no temperature": (
         "the temperature is unknown",
-        _frequencies(temperature=lambda celsius: np.full_like(celsius, np.nan)),
+        _change_frequency_columns(temperature=lambda celsius: np.full_like(celsius, np.nan)),
     ),
     "no pad fault": (
         "the faults of pads that the hub reports are omitted",
-        _frequencies(pad_fault=np.zeros_like),
+        _change_frequency_columns(pad_fault=np.zeros_like),
     ),
     "other pad fault": (
         "the faults of pads that the hub reports are given to the next cube",
-        _frequencies(pad_fault=lambda bits: np.roll(bits, 1)),
+        _change_frequency_columns(pad_fault=lambda bits: np.roll(bits, 1)),
     ),
     "duplicates": (
         "samples that came twice are delivered twice",
@@ -431,11 +443,11 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
     ),
     "no stuck bit": (
         "the status does not state that a pad is stuck",
-        _stress(status=lambda status: status & ~np.uint16(STUCK)),
+        _change_stress_columns(status=lambda status: status & ~np.uint16(STUCK)),
     ),
     "open is short": (
         "the status states short for open, and open for short",
-        _stress(status=_swap_open_and_short),
+        _change_stress_columns(status=_swap_open_and_short),
     ),
     "for ever": (
         "a pad is never used again",
@@ -445,62 +457,68 @@ RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
         "windows of statistics last 2 s",
         _replace("core.health.health", "WINDOW_NS", lambda _: 2_000_000_000),
     ),
-    "no mask": ("left_out is 0", _stress(left_out=np.zeros_like)),
+    "no mask": ("left_out is 0", _change_stress_columns(left_out=np.zeros_like)),
     "other mask": (
         "left_out names the next pad",
-        _stress(left_out=lambda mask: mask << np.uint32(1)),
+        _change_stress_columns(left_out=lambda mask: mask << np.uint32(1)),
     ),
     "mask unused": (
         "left-out pads are used",
         _wrap("core.pipeline:Pipeline", "process", _use_bad_pads),
     ),
-    "no residual": ("the residual is 0", _stress(residual=np.zeros_like)),
-    "residual doubled": ("the residual is doubled", _stress(residual=lambda value: 2 * value)),
+    "no residual": ("the residual is 0", _change_stress_columns(residual=np.zeros_like)),
+    "residual doubled": (
+        "the residual is doubled",
+        _change_stress_columns(residual=lambda value: 2 * value),
+    ),
     "no residual bit": (
         "the status states nothing about residuals",
-        _stress(status=lambda status: status & ~np.uint16(RESIDUAL)),
+        _change_stress_columns(status=lambda status: status & ~np.uint16(RESIDUAL)),
     ),
     "swapped components": (
         "xx and zz are swapped",
-        _stress(stress=lambda stress: stress[:, [2, 1, 0, 3, 4, 5]]),
+        _change_stress_columns(stress=lambda stress: stress[:, [2, 1, 0, 3, 4, 5]]),
     ),
     "shear sign": (
         "zx has the other sign",
-        _stress(stress=lambda stress: stress * [1, 1, 1, 1, -1, 1]),
+        _change_stress_columns(stress=lambda stress: stress * [1, 1, 1, 1, -1, 1]),
     ),
     "pressure positive": (
         "compression is positive",
-        _stress(stress=np.negative, gradient=np.negative),
+        _change_stress_columns(stress=np.negative, gradient=np.negative),
     ),
-    "kilopascal": ("stress is in kPa", _stress(stress=lambda stress: stress / 1e3)),
-    "per millimetre": ("gradients are in Pa/mm", _stress(gradient=lambda value: value / 1e3)),
+    "kilopascal": ("stress is in kPa", _change_stress_columns(stress=lambda stress: stress / 1e3)),
+    "per millimetre": (
+        "gradients are in Pa/mm",
+        _change_stress_columns(gradient=lambda value: value / 1e3),
+    ),
     "gradient transposed": (
         "gradients have columns for rows",
-        _stress(gradient=_transpose),
+        _change_stress_columns(gradient=_transpose),
     ),
     "unknown is zero": (
         "components that are not observed are 0",
-        _stress(stress=np.nan_to_num, gradient=np.nan_to_num),
+        _change_stress_columns(stress=np.nan_to_num, gradient=np.nan_to_num),
     ),
     "stale stress": (
         "1 of 200 messages has the stress of the one before",
-        _change_stress(_stale("stress")),
+        _change_stress(_make_stale("stress")),
     ),
     "swapped tensors": (
         "the tensors of neighbours are swapped",
-        _stress(stress=lambda stress: stress[::-1]),
+        _change_stress_columns(stress=lambda stress: stress[::-1]),
     ),
     "stress stamps": (
         "stress has stamps 1 ms later than its frequencies",
-        _stress(stamp_ns=lambda stamp_ns: stamp_ns + 1_000_000),
+        _change_stress_columns(stamp_ns=lambda stamp_ns: stamp_ns + 1_000_000),
     ),
     "stress sequence": (
         "stress has sequence numbers one higher",
-        _stress(sequence=lambda sequence: sequence + np.uint32(1)),
+        _change_stress_columns(sequence=lambda sequence: sequence + np.uint32(1)),
     ),
     "observed": (
         "a component that is observed is marked as not observed",
-        _stress(observed=lambda observed: observed & ~np.uint16(1)),
+        _change_stress_columns(observed=lambda observed: observed & ~np.uint16(1)),
     ),
     "wrong tare": (
         "a tare gives rest frequencies 100 ppm too high",

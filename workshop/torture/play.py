@@ -94,7 +94,7 @@ def play(
     ports, log_path = folder / "ports", folder / "log.json"
     skin_path = _write_skin(folder, ports)
     skin = read_skin(skin_path)
-    # The tables are computed before the skin runs, because they take seconds of both processors.
+    # The tables take seconds, which would disturb the skin later.
     load_tables(skin, INSTANTS)
     processes = _make_processes(skin_path, ports, log_path, mutation)
 
