@@ -1,4 +1,8 @@
-"""A single cube on one port: skin.launch.py, with all its arguments, for the skin file of one."""
+"""Starts a single cube on one port.
+
+It includes skin.launch.py and takes the same arguments; the default of `config` is the skin file of
+a single cube.
+"""
 
 from launch import LaunchDescription
 from launch.actions import IncludeLaunchDescription
@@ -10,7 +14,7 @@ from cube_tensor_driver.ros.launching import SINGLE_CUBE, SKIN_LAUNCH, declare_t
 def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
-            declare_text("config", "Skin file (YAML) with one link.", str(SINGLE_CUBE)),
+            declare_text("config", "Path of a skin file (YAML) with one link.", str(SINGLE_CUBE)),
             IncludeLaunchDescription(PythonLaunchDescriptionSource(str(SKIN_LAUNCH))),
         ]
     )

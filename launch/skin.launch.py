@@ -1,6 +1,7 @@
-"""All cubes of a skin file, on real or simulated hubs.
+"""Starts all cubes of a skin file, on real or simulated hubs.
 
-Starts driver and reconstruction, and on demand what shows and records the skin.
+It starts the nodes `driver` and `reconstruction`. Arguments of the launch file add the nodes
+`contacts` and `markers`, RViz, the frames of the cubes and a recording.
 """
 
 from typing import Any
@@ -28,26 +29,52 @@ from cube_tensor_driver.ros.launching import (
 PACKAGE = "cube_tensor_driver"
 
 RESPAWN_DELAY_S = 2.0
-"""Time, in seconds, after which a node that has ended by itself starts again."""
+"""Time, in seconds, between the unexpected end of a node and its new start (`respawn:=true`)."""
 
 ARGUMENTS = (
-    declare_text("config", "Skin file (YAML); empty with simulate:=true: the demo skin."),
-    declare_text("namespace", "Namespace of the nodes and their topics, below any that is pushed."),
-    declare_text("port", "Port of the hub instead of the file's, for a skin with one link."),
-    declare_text("rate", "Samples per second; empty: as the parameter says."),
     declare_text(
-        "publish_period", "Time that one message covers, s; empty: as the parameter says."
+        "config",
+        "Path of the skin file (YAML). If it is empty and simulate is true, the demo skin is used.",
     ),
-    declare_switch("simulate", "Simulate the skin's hubs instead of opening its ports."),
-    declare_text("load", "Load script (YAML) for a simulated skin.", str(DEMO_LOAD)),
-    declare_switch("composed", "Driver and reconstruction in one process: less CPU and latency."),
-    declare_switch("autostart", "Nodes configure and activate themselves (lifecycle).", ""),
-    declare_switch("respawn", "Start a node again that has ended by itself.", "true"),
-    declare_switch("contacts", "Publish where and how hard the skin is touched on `contacts`."),
-    declare_switch("markers", "Publish the skin as a MarkerArray on `markers`."),
-    declare_switch("state_publisher", "Publish the cubes' frames (robot_state_publisher)."),
-    declare_switch("record", "Record the skin with ros2 bag into a new folder here (mcap)."),
-    declare_switch("rviz", "Show the skin in RViz; starts markers and state_publisher too."),
+    declare_text(
+        "namespace",
+        "Namespace of the nodes and their topics, relative to the namespace that an including "
+        "launch file has pushed.",
+    ),
+    declare_text("port", "Port that replaces the one in the skin file, which has a single link."),
+    declare_text("rate", "Sampling rate in Hz. If it is empty, the parameter rate is not set."),
+    declare_text(
+        "publish_period",
+        "Time, in s, whose scans are sent in one message. If it is empty, the parameter "
+        "publish_period is not set.",
+    ),
+    declare_switch("simulate", "Simulate the hubs of the skin instead of opening its ports."),
+    declare_text(
+        "load",
+        "Path of the load script (YAML) that states the forces on a simulated skin.",
+        str(DEMO_LOAD),
+    ),
+    declare_switch(
+        "composed",
+        "Run driver and reconstruction in one process, which takes less CPU and latency.",
+    ),
+    declare_switch(
+        "autostart",
+        "Let the nodes configure and activate themselves (lifecycle). If it is empty, the "
+        "parameter autostart is not set.",
+        "",
+    ),
+    declare_switch("respawn", "Start a node again after it has ended unexpectedly.", "true"),
+    declare_switch("contacts", "Publish position, size and force of contacts on `contacts`."),
+    declare_switch("markers", "Publish a picture of the skin (MarkerArray) on `markers`."),
+    declare_switch("state_publisher", "Publish the frames of the cubes (robot_state_publisher)."),
+    declare_switch(
+        "record",
+        "Record the skin with ros2 bag (mcap) into a new folder in the current directory.",
+    ),
+    declare_switch(
+        "rviz", "Show the skin in RViz. This also starts markers and robot_state_publisher."
+    ),
 )
 
 
@@ -82,14 +109,25 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def if_any(argument: str, other: str | None = None) -> IfCondition:
-    """Return the condition that one of these launch arguments is true."""
+    """Return the condition that at least one of these launch arguments is true.
+
+    Args:
+        argument: Name of a launch argument.
+        other: Name of a second launch argument; None: there is only one.
+    """
     first, second = LaunchConfiguration(argument), LaunchConfiguration(other or argument)
     return IfCondition(OrSubstitution(first, second))
 
 
 def make_node(executable: str, parameters: Any, condition: Any) -> Node:
-    """Return a node of this package."""
-    # The process `composed` holds several nodes, which keep their own names.
+    """Return the launch action that starts a node of this package.
+
+    Args:
+        executable: Name of the executable.
+        parameters: Parameters of the node, as a file or a mapping.
+        condition: Condition under which the node starts.
+    """
+    # A name would be given to both nodes of the process `composed`; they keep their own names.
     name = None if executable == "composed" else executable
     return Node(
         package=PACKAGE,
@@ -106,7 +144,7 @@ def make_node(executable: str, parameters: Any, condition: Any) -> Node:
 
 
 def make_state_publisher() -> Node:
-    """Return the node that publishes the frames of the cubes."""
+    """Return the action that starts robot_state_publisher, which publishes the cubes' frames."""
     urdf = ParameterValue(FromSkin(skin_urdf), value_type=str)
     return Node(
         package="robot_state_publisher",
@@ -119,7 +157,7 @@ def make_state_publisher() -> Node:
 
 
 def make_simulator() -> ExecuteProcess:
-    """Return the process of the skin's simulated hubs, which is no ROS node."""
+    """Return the launch action of the simulator of the hubs, a process that is no ROS node."""
     return ExecuteProcess(
         cmd=[
             ExecutableInPackage("simulator", PACKAGE),

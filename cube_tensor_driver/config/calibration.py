@@ -14,15 +14,17 @@ from .yaml import read_yaml, to_yaml, write_yaml
 
 
 def find_calibration(name: str, folder: Path) -> Path:
-    """Return the path of the calibration file that a name means.
+    """Return the path of the calibration file that a skin file names.
 
     Args:
-        name: Name of one of the calibrations in the package, or else a path relative to `folder`.
-            The shipped name comes first, because a folder may well have a program called cube.
+        name: Name of a calibration in the package such as "cube", or a path relative to `folder`.
+            The package is searched first, so that a file which happens to be called cube in the
+            folder (the executable of a checkout, for example) is not taken for a calibration.
         folder: The folder of the skin file that contains the name.
 
     Raises:
-        ConfigError: There is neither. The message lists the shipped names.
+        ConfigError: The package has no calibration of this name and the path leads to no file. The
+            message lists the names in the package.
     """
     shipped = package_data() / "config" / "calibration"
     for path in (shipped / f"{name}.yaml", folder / name):
@@ -52,7 +54,7 @@ def write_calibration(path: Path, calibration: Calibration, header: str = "") ->
     Args:
         path: The file, which is replaced if it exists.
         calibration: The calibration.
-        header: Lines for a comment at the top of the file.
+        header: Lines of text that are written as a YAML comment at the top of the file.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -61,15 +63,18 @@ def write_calibration(path: Path, calibration: Calibration, header: str = "") ->
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """Return the text of a calibration file."""
+    """Return a calibration as YAML text, with the same keys as a calibration file."""
     return to_yaml(calibration.to_dict())
 
 
 def named_layout(name: str) -> Layout:
-    """Return a built-in layout by its name, or the layout in a YAML file.
+    """Return a layout (number, faces and shapes of the pads of a cube).
+
+    Args:
+        name: Name of a built-in layout, or path of a YAML file if it ends in .yaml or .yml.
 
     Raises:
-        LayoutError: There is no built-in layout of this name, or the file holds none.
+        LayoutError: There is no built-in layout of this name, or the file holds no valid layout.
         ConfigError: The file cannot be read.
     """
     path = Path(name)
@@ -79,14 +84,16 @@ def named_layout(name: str) -> Layout:
 
 
 def shipped_calibration(layout: Layout) -> Calibration | None:
-    """Return the computed calibration of a built-in layout with no mode neglected.
+    """Return the calibration that the package contains for a built-in layout.
 
-    Other layouts have none, and give None.
+    It was computed with finite elements, not measured. In the returned copy no mode (component of
+    stress or gradient) is neglected. A layout that is not built in has none, and gives None.
     """
-    # A file may hold another layout under the name of a built-in one.
+    # A layout that was read from a file may have the name of a built-in one but other pads.
     built_in = LAYOUTS.get(layout.name)
     if built_in is None or not built_in.same_as(layout):
         return None
     path = package_data() / "config" / "calibration" / f"{layout.name}.yaml"
-    # What a user neglects is a decision about a calibration of his own.
+    # Which modes may be neglected depends on the application, so the user states it in his own
+    # calibration file and the list in the package's file is dropped.
     return replace(read_calibration(path), neglect=())

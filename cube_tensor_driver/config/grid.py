@@ -7,10 +7,11 @@ from typing import Any
 from ..core.errors import ConfigError
 
 MAX_CUBES = 1 << 16
-"""Maximum number of cubes of a skin. Messages number cubes with 16 bits."""
+"""Maximum number of cubes of a skin. Messages give the index of a cube as a 16-bit integer."""
 
 LINK_NUMBER = "{}"
-"""Placeholder in a port that stands for the number of the link."""
+"""Placeholder in the text of a port, as in /dev/ttyACM{}, which is replaced by the number of the
+link, from 0 up."""
 
 
 def grid(
@@ -27,22 +28,25 @@ def grid(
 ) -> dict[str, Any]:
     """Return the content of a skin file with nx × ny cubes in the x-y plane of the parent frame.
 
-    The grid is centred on the frame's origin, and x runs fastest.
+    The grid is centred on the origin of the frame. Cubes are numbered row by row: the x coordinate
+    changes from one cube to the next, the y coordinate after every nx cubes.
 
     Args:
         name: Name of the skin.
         nx: Number of cubes along x.
         ny: Number of cubes along y.
-        pitch: Distance of neighbours, in m.
-        rate: Samples per second.
-        links: Number of links. They carry equally many cubes, or one more, in order.
-        calibration: Calibration of the cubes, a file or a name; None: the package's for the layout.
-        layout: Layout of the cubes.
+        pitch: Distance between the centres of neighbouring cubes, in m.
+        rate: Sampling rate of each cube, in Hz.
+        links: Number of links. The cubes are divided among them in order, and the numbers of cubes
+            of two links differ by at most one.
+        calibration: Calibration of all cubes: a file, or the name of one in the package. None
+            takes the calibration in the package that has the name of the layout.
+        layout: Name of the layout of all cubes.
         port: Port of each link, where {} stands for the number of the link.
 
     Raises:
         ConfigError: A number is not greater than 0, there are more links than cubes or more cubes
-            than `MAX_CUBES`, or all links would have one port.
+            than `MAX_CUBES`, or several links would have the same port.
     """
     n_cubes = nx * ny
     _check_numbers(
@@ -59,20 +63,20 @@ def grid(
             f"grid: {nx} x {ny} are {n_cubes} cubes, a skin has at most {MAX_CUBES}: "
             "make several skins"
         )
-    # Two links on one port would take the bytes from each other.
+    # Two links that read the same port would each receive only a part of its bytes.
     if links > 1 and LINK_NUMBER not in port:
         raise ConfigError(
             f"grid: the port {port!r} is that of all {links} links; write {LINK_NUMBER} where the "
             "number of the link belongs"
         )
 
-    # Names sort in the order of the cubes: c00, c01 and so on.
+    # Leading zeros (c00, c01, ...) make the alphabetical order of names that of the cubes.
     digits = len(str(n_cubes - 1))
     cubes = []
     for number in range(n_cubes):
-        # Integer arithmetic deals the cubes evenly, whatever the numbers are.
+        # Integer division gives every link n_cubes / links cubes, rounded down or up.
         link = number * links // n_cubes
-        first_of_link = -(-link * n_cubes // links)  # rounded up
+        first_of_link = -(-link * n_cubes // links)  # number of its first cube, rounded up
         x = (number % nx - (nx - 1) / 2) * pitch
         y = (number // nx - (ny - 1) / 2) * pitch
         cube = {

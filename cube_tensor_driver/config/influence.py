@@ -1,4 +1,8 @@
-"""Names of influence functions in parameters and options: shipped ones, or files."""
+"""Files of influence functions, found by the name that a parameter or an option gives.
+
+Influence functions state what each pad measures of a unit force at points of the skin's surface;
+they are tables computed with finite elements.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +13,16 @@ from .package_data import package_data
 
 
 def find_influence(name: str) -> Path:
-    """Return the path of the influence functions that a name means.
+    """Return the path of a file (.npz) of influence functions.
 
     Args:
-        name: Name of a shipped file, or else a path.
+        name: Name of such a file in the package, without its suffix, or a path.
 
     Raises:
-        ConfigError: There is neither. The message lists the shipped names.
+        ConfigError: The package has no file of this name and the path leads to no file. The message
+            lists the names in the package.
     """
-    # A shipped name comes first, as for calibrations.
+    # The package is searched before the file system, as for calibrations.
     shipped = package_data() / "config" / "influence"
     for path in (shipped / f"{name}.npz", Path(name)):
         if path.is_file():
@@ -30,7 +35,7 @@ def find_influence(name: str) -> Path:
 
 
 def influence_problem(name: str) -> str:
-    """Return why `find_influence` finds nothing for a name, or an empty text if it does."""
+    """Return the error message of `find_influence` for a name, or "" if it finds a file."""
     try:
         find_influence(name)
     except ConfigError as error:

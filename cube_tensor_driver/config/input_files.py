@@ -1,4 +1,4 @@
-"""Input files of any kind, read only if they are regular files and up to a maximum size."""
+"""Reads input files of any format, and refuses devices, pipes and files above a maximum size."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from ..core.errors import ConfigError
 
 
 def check_regular(path: Path) -> None:
-    """Raise ConfigError if the path leads to a device, a pipe or a socket.
+    """Check that a path leads to a regular file, before it is opened.
 
-    A device such as /dev/zero has no end, and opening a pipe waits for a writer.
+    Reading a device such as /dev/zero would never end, and opening a named pipe blocks until
+    another process opens it for writing.
 
     Raises:
-        OSError: Nothing is there, it is a folder, or it cannot be looked at.
+        ConfigError: The path leads to a device, a pipe or a socket.
+        OSError: The path does not exist, is a folder, or may not be accessed.
     """
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
@@ -31,15 +33,16 @@ def read_bounded(path: Path, limit: int, purpose: str) -> bytes:
     Args:
         path: The file.
         limit: Maximum size, in bytes.
-        purpose: What the file should be, for the error message.
+        purpose: What the file should be, such as "configuration file", for the error message.
 
     Raises:
         ConfigError: The path leads to no regular file, or the file is larger than the limit.
-        OSError: Nothing is there, or it cannot be read.
+        OSError: The file does not exist or cannot be read.
     """
     check_regular(path)
     with path.open("rb") as file:
-        # The size that the system states is 0 for files of /proc, so one byte more is asked for.
+        # stat() states a size of 0 for files below /proc, so the size is checked by reading: one
+        # byte more than the limit shows that the file is too large.
         data = file.read(limit + 1)
     if len(data) > limit:
         raise ConfigError(f"{path}: too large, the limit is {limit} bytes: this is no {purpose}")

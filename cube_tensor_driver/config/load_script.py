@@ -1,6 +1,6 @@
-"""Load scripts: what indenters do to a simulated skin over time.
+"""Load scripts: YAML files that state which forces indenters exert on a simulated skin over time.
 
-docs/simulation.md describes the keys.
+An indenter is a rigid disc or sphere. docs/simulation.md describes the keys of a script.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ from .schema import NAME, TRIPLE, JsonSchema, Schema, integer, list_of, mapping,
 from .yaml import read_yaml
 
 MAX_TAPS = 1000
-"""Maximum number of taps of one action."""
+"""Maximum number of taps (short presses) that one action `tap` of a load script may ask for."""
 
 SLIP_TOLERANCE = 1e-9
-"""Relative amount by which shear may exceed friction times force, for rounding errors."""
+"""Relative amount by which the tangential force of an indenter may exceed the coefficient of
+friction times its normal force without an error, to allow for rounding."""
 
 FRICTION_SAMPLES = 1001
-"""Number of instants of an action at which shear is compared with friction."""
+"""Number of equidistant instants of an action at which the tangential force is compared with the
+limit of friction (coefficient of friction times normal force)."""
 
 _TIME = real("a time in s from 0 up", minimum=0)
 _PEAK_FORCE = real("a force in N greater than 0", exclusiveMinimum=0)
@@ -57,7 +59,12 @@ _PATH = list_of(TRIPLE, "places [x, y, z]", 2)
 
 
 def _action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSchema:
-    """Return the schema of an action: its times, and these required and optional keys."""
+    """Return the JSON schema of an action of an indenter.
+
+    Args:
+        optional: Optional keys and the schemas of their values.
+        required: Required keys besides `from` and `to` (the times of begin and end).
+    """
     needed: JsonSchema = {
         "from": _TIME,
         "to": _TIME,
@@ -72,7 +79,7 @@ _ACTIONS: JsonSchema = {
     "roll": _action_schema({"shear": _SHEAR}, path=_PATH, force=_FORCE),
     "tap": _action_schema({"times": _TIMES}, at=TRIPLE, force=_PEAK_FORCE),
 }
-# An action is a mapping with one key, its kind.
+# In YAML an action is a mapping with a single key, its kind: {press: {from: 0, to: 1, ...}}.
 _ACTION = mapping((), _ACTIONS) | {
     "minProperties": 1,
     "maxProperties": 1,
@@ -105,19 +112,19 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class Action:
-    """One thing that an indenter does.
+    """One action of an indenter: it presses, slides, rolls or taps.
 
-    The values of each array stand at equal intervals of time; `interpolate_knots` gives the values
-    between them.
+    The values of each array belong to instants at equal intervals from `start` to `end`;
+    `interpolate_knots` gives the values between them.
 
     Attributes:
         kind: press, slide, roll or tap.
-        start: When it begins, in s.
-        end: When it ends, in s.
-        path: Positions of the indenter, (P, 3).
-        force: Normal force, (K,), in N.
-        shear: Tangential force on the skin, (K, 3) or (1, 3), in N. A single one is in proportion
-            to the normal force.
+        start: Time at which it begins, in s from the begin of the script.
+        end: Time at which it ends, in s from the begin of the script.
+        path: Positions of the indenter, (P, 3), in the unit that `Script.relative` states.
+        force: Normal force on the skin, (K,), in N.
+        shear: Tangential force on the skin, in N. Either (K, 3), or (1, 3) for the value at the
+            largest normal force; then the tangential force is proportional to the normal force.
     """
 
     kind: str
@@ -130,14 +137,14 @@ class Action:
 
 @dataclass(frozen=True)
 class Indenter:
-    """A rigid disc or sphere with its actions in order of time.
+    """A rigid disc or sphere that acts on the skin.
 
     Attributes:
-        name: Its name.
+        name: Name of the indenter, which errors and logs show.
         shape: disc or sphere.
-        radius: Radius in m.
-        friction: Maximum ratio of tangential to normal force.
-        actions: What it does, one after the other.
+        radius: Radius of the disc or sphere, in m.
+        friction: Coefficient of friction: maximum ratio of tangential to normal force.
+        actions: Its actions, sorted by their start; they do not overlap in time.
     """
 
     name: str
@@ -149,16 +156,16 @@ class Indenter:
 
 @dataclass(frozen=True)
 class Script:
-    """A load script.
+    """The content of a load script, which states the forces on a simulated skin over time.
 
     Attributes:
-        period: Time after which it begins again, in s; None: it runs once.
-        depth: Distance from the cubes' centres to the surface of the skin, in m.
-        young: Young's modulus of the skin, in Pa.
-        poisson: Poisson's ratio of the skin.
-        relative: Whether positions are multiples of the skin's half extents, measured from its
-            centre. Otherwise they are in m in its parent frame.
-        indenters: What presses on the skin.
+        period: Time, in s, after which the script starts from its begin again; None: it runs once.
+        depth: Depth of the cubes' centres below the surface of the skin, in m.
+        young: Young's modulus of the elastomer of the skin, in Pa.
+        poisson: Poisson's ratio of the elastomer of the skin.
+        relative: Whether positions are relative to the skin: (0, 0) is its centre, and 1 is half
+            its extent along each axis. Otherwise they are in m in the parent frame of the skin.
+        indenters: The indenters that press on the skin, possibly at the same time.
     """
 
     period: float | None
@@ -170,7 +177,7 @@ class Script:
 
     @property
     def end(self) -> float:
-        """Time when the last action is over, in s."""
+        """Time at which the last action ends, in s from the begin of the script."""
         return max(indenter.actions[-1].end for indenter in self.indenters)
 
 
@@ -178,7 +185,8 @@ def read_script(path: Path) -> Script:
     """Read and check a load script.
 
     Raises:
-        ConfigError: The first mistake: file, key, what was found and what is allowed.
+        ConfigError: The file cannot be read or has a mistake. The message names the file, the key
+            of the first mistake, the value found there and the values that are allowed.
     """
     data = read_yaml(path)
     for _, mistake in _SCHEMA.mistakes(data):
@@ -199,19 +207,19 @@ def read_script(path: Path) -> Script:
 
 
 def interpolate_knots(knots: Array, when: float | Array) -> Array:
-    """Return values between knots that stand at equal intervals of time.
+    """Interpolate between knots (given values) at equal intervals of time.
 
-    From each knot to the next the value follows half a cosine. So it is smooth, level at each knot,
-    and never beyond the two knots around it.
+    From each knot to the next the value follows half a period of a cosine. So the curve is smooth,
+    its derivative is 0 at each knot, and it never exceeds the values of the two knots around it.
 
     Args:
-        knots: The values at the knots, (K, ...).
-        when: Time from 0 at the first knot to 1 at the last one.
+        knots: The values at the knots, (K, ...), with K of at least 2.
+        when: Normalised time, from 0 at the first knot to 1 at the last one; a number or an array.
     """
     position = np.clip(when, 0.0, 1.0) * (len(knots) - 1)
     first = np.minimum(np.floor(position).astype(int), len(knots) - 2)
     part = 0.5 - 0.5 * np.cos(np.pi * (position - first))
-    # The values may be vectors: the share holds for each component.
+    # If the knots are vectors, the same weight applies to each component.
     part = part.reshape(part.shape + (1,) * (knots.ndim - 1))
     value: Array = knots[first] + part * (knots[first + 1] - knots[first])
     return value
@@ -219,7 +227,7 @@ def interpolate_knots(knots: Array, when: float | Array) -> Array:
 
 def _make_indenter(item: dict[str, Any]) -> Indenter:
     actions = [_make_action(kind, keys) for does in item["does"] for kind, keys in does.items()]
-    # People may write the actions of an indenter in any order.
+    # In the file the actions of an indenter may stand in any order.
     actions.sort(key=lambda action: action.start)
     return Indenter(
         name=item["name"],
@@ -238,15 +246,19 @@ def _make_action(kind: str, item: dict[str, Any]) -> Action:
         # Each tap rises from 0 to the peak and falls to 0.
         force = np.array([0.0, *[peak, 0.0] * item.get("times", 1)])
     elif force.ndim == 0:
-        # A single force rises in the first third of the time and falls in the last one.
+        # A single value is the maximum: the force rises from 0 to it in the first third of the
+        # action and falls to 0 in the last third.
         force = np.array([0.0, force, force, 0.0])
     shear = np.atleast_2d(np.array(item.get("shear", [0.0, 0.0, 0.0]), float))
     return Action(kind, float(item["from"]), float(item["to"]), path, force, shear)
 
 
 def _find_contradictions(script: Script) -> Iterator[str]:
-    """Yield what a schema cannot say: values of several keys that do not fit together."""
-    # Errors and logs name indenters, so two of one name could not be told apart.
+    """Yield a line for each mistake that involves several keys, which a JSON schema cannot find.
+
+    Examples are an action that ends before it begins and two indenters with the same name.
+    """
+    # Errors and logs identify indenters by name, so two of the same name would be ambiguous.
     names = [indenter.name for indenter in script.indenters]
     for number, indenter in enumerate(script.indenters):
         key = f"indenters[{number}] ({indenter.name})"
@@ -284,12 +296,12 @@ def _max_shear_ratio(action: Action) -> float:
     if len(action.shear) == 1:
         return float(np.linalg.norm(action.shear) / action.force.max())
 
-    # At the very ends both forces may be 0.
+    # The first and last instants are left out: both forces may be 0 there, and so the ratio 0/0.
     when = np.linspace(0, 1, FRICTION_SAMPLES)[1:-1]
     force = interpolate_knots(action.force, when)
     shear = np.linalg.norm(interpolate_knots(action.shear, when), axis=-1)
     without_force = np.where(shear > 0, np.inf, 0.0)
-    # Shear without a normal force would slip, however small it is: its ratio is infinite.
+    # An indenter with a tangential but no normal force slips, so that ratio is infinite.
     ratio = np.divide(
         shear,
         force,

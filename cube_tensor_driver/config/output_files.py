@@ -1,4 +1,4 @@
-"""Output files: written completely or not at all, and checked before any work is done."""
+"""Output files: written completely or not at all, and checked before a command starts its work."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from typing import Any
 from ..core.errors import ConfigError
 
 YAML_SUFFIXES = (".yaml", ".yml")
+"""Suffixes by which a path is recognised as that of a YAML file."""
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Give a temporary file to write to, which replaces `path` when the block ends.
+    """Yield the path of a temporary file, which replaces `path` when the `with` block ends.
 
-    If the block fails, the temporary file is removed and `path` stays as it was.
+    If the block raises an error, the temporary file is removed and `path` stays as it was.
 
     Raises:
         ConfigError: The file cannot be written, or `path` is a folder or a device.
@@ -33,24 +34,25 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def check_writable(path: Path) -> None:
     """Raise ConfigError if `atomic_write` could not write this file.
 
-    It tries to write, because permissions alone do not tell this to root or below /proc.
+    A temporary file is made beside it and removed. The permissions would not suffice: root passes
+    every check of permissions, also below /proc and on read-only file systems.
     """
     with _temporary_file(path) as temporary:
         temporary.touch()
 
 
 def check_outputs(paths: dict[str, Path | None]) -> None:
-    """Check the output files of a command before it does any work.
+    """Check that all output files of a command can be written, before it starts its work.
 
     Args:
-        paths: Option of the command -> the file that it names, or None.
+        paths: Option of the command -> the file that the option names; None: it was not given.
 
     Raises:
         ConfigError: A file cannot be written, or two options name the same file.
     """
     given = {option: path for option, path in paths.items() if path is not None}
     for option, path in given.items():
-        # The file that is written last would replace the other one.
+        # If two options named one file, the output written last would replace the other.
         for other, other_path in given.items():
             if other != option and other_path.resolve() == path.resolve():
                 raise ConfigError(f"{option} and {other} both name {path}; name two files")
@@ -61,10 +63,18 @@ def check_outputs(paths: dict[str, Path | None]) -> None:
 
 
 def check_folder(option: str, path: Path | None) -> None:
-    """Raise ConfigError if the folder cannot be made, or no file in it. Nothing is made yet."""
+    """Check that a folder can be made and files be made in it, without making the folder.
+
+    Args:
+        option: Option of the command that names the folder, for the error message.
+        path: The folder, which need not exist; None: the option was not given.
+
+    Raises:
+        ConfigError: The folder cannot be made, or no file can be made in it.
+    """
     if path is None:
         return
-    # The folder itself may still have to be made.
+    # The test file is made in the closest parent that exists.
     existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
     problem = "is no folder"
     if existing.is_dir():
@@ -78,7 +88,10 @@ def check_folder(option: str, path: Path | None) -> None:
 
 
 def check_yaml(option: str, path: Path | None) -> None:
-    """Raise ConfigError if a file that is to hold YAML has another suffix."""
+    """Raise ConfigError if the output file of `option` should be YAML but has another suffix.
+
+    None as path means that the option was not given, and passes.
+    """
     if path is not None and path.suffix not in YAML_SUFFIXES:
         suffixes = " or ".join(YAML_SUFFIXES)
         raise ConfigError(f"{option} {path}: a YAML file ends in {suffixes}; name one")
@@ -91,17 +104,25 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def temporary_folder(prefix: str) -> Path:
-    """Make a folder that is removed, with all that is in it, when this process ends."""
+    """Make a temporary folder that is removed, with its content, when this process exits.
+
+    Args:
+        prefix: Text with which the name of the folder begins.
+    """
     folder = Path(tempfile.mkdtemp(prefix=prefix))
-    # Nodes of a launch use the folder as long as the launch lives.
+    # At exit and not earlier: nodes that a launch file starts read files of the folder until then.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 
 @contextmanager
 def _temporary_file(path: Path) -> Iterator[Path]:
-    """Name a file in the folder of `path`, which does not exist any more when the block ends."""
-    # In the same folder, because a file is renamed atomically only within a file system.
+    """Yield the path of a file in the folder of `path`; it is removed when the block ends.
+
+    Raises:
+        ConfigError: An error of the operating system occurred in the block, or `path` is no file.
+    """
+    # A rename is atomic only within one file system, so the file lies in the same folder.
     temporary = path.parent / f"{path.name}.part"
     try:
         if path.exists() and not path.is_file():

@@ -1,4 +1,5 @@
-"""The folder of the files that the package brings along: skins, calibrations, launch files."""
+"""The folder of the data files that are installed with the package: skins, calibrations, launch
+files."""
 
 from __future__ import annotations
 
@@ -12,13 +13,15 @@ _NAME = "cube_tensor_driver"
 def package_data() -> Path:
     """Return the folder that holds config/ and launch/.
 
-    In a checkout it is the checkout itself, after an installation share/cube_tensor_driver.
+    In a checkout of the repository it is the top folder of the checkout, after an installation it
+    is share/cube_tensor_driver below the prefix of the installation.
 
     Raises:
-        ConfigError: There is neither, which means that the installation is broken.
+        ConfigError: Neither folder exists, which means that the installation is incomplete.
     """
     for parent in Path(__file__).parents:
-        # config/ alone does not tell: this module lies in a folder of that name.
+        # The search also passes the folder cube_tensor_driver, whose subfolder config/ holds this
+        # module and not the data. Only the folder of the data contains package.xml, too.
         for folder in (parent, parent / "share" / _NAME):
             if (folder / "package.xml").is_file() and (folder / "config").is_dir():
                 return folder

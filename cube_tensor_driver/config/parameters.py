@@ -1,7 +1,7 @@
 """Parameters of the nodes, as tables of plain data.
 
-The nodes declare them, commands without ROS take some of them as options, and docs/parameters.md
-lists them.
+The nodes declare these ROS parameters, commands that run without ROS take some of them as options,
+and docs/parameters.md lists them.
 """
 
 from __future__ import annotations
@@ -15,21 +15,22 @@ from .influence import influence_problem
 from .port import port_problem
 
 QUANTITIES = ("pressure", "shear", "gradient", *STRESS, "residual")
-"""Names of the quantities that colours can show; `views.scene` draws them."""
+"""Names of the quantities that the colours of the cubes can show in RViz and Foxglove."""
 
 
 class Parameter(NamedTuple):
-    """A parameter of a node.
+    """Declaration of a ROS parameter of a node.
 
     Attributes:
-        name: Its name.
-        default: Its default, of the parameter's type.
-        description: What `ros2 param describe` says.
-        span: Lowest and highest value of a number.
-        choices: Allowed texts, separated by commas.
-        live: Whether it may change while the node is configured.
-        minimum: Lowest value of a number other than 0.
-        problem: Function that returns what is wrong with a text, or an empty text if nothing is.
+        name: Name of the parameter.
+        default: Default value; its Python type is the type of the parameter.
+        description: Text that `ros2 param describe` shows.
+        span: Smallest and largest allowed value of a number, both included; None: no limits.
+        choices: Allowed values of a text, separated by ", "; empty: any text.
+        live: Whether the value may change while the node is configured.
+        minimum: Smallest allowed value of a number other than 0, where 0 has a meaning of its own.
+        problem: Function that takes the value of a text and returns an error message, or "" if the
+            value is valid. It is not called for an empty text.
     """
 
     name: str
@@ -43,32 +44,38 @@ class Parameter(NamedTuple):
 
 
 AUTOSTART = Parameter(
-    "autostart", True, "Configure and activate at once; false waits for lifecycle transitions."
+    "autostart",
+    True,
+    "With true the node configures and activates itself when it starts. With false it waits for "
+    "lifecycle transitions.",
 )
 RELIABILITY = Parameter(
     "qos_reliability",
     "reliable",
-    "Reliability of the batch topics.",
+    "Reliability (quality of service) of the topics `frequencies`, `stress` and `forces`.",
     choices="reliable, best_effort",
 )
 DRIVER = (
     AUTOSTART,
-    Parameter("config", "", "Skin file (YAML)."),
+    Parameter("config", "", "Path of the skin file (YAML). It is required."),
     Parameter(
         "port",
         "",
-        "Port instead of the one in the skin file, for a skin with one link.",
+        "Port that replaces the one in the skin file, which must have a single link. An empty text "
+        "keeps the ports of the skin file.",
         problem=port_problem,
     ),
     Parameter(
         "port_directory",
         "",
-        "Folder with the links' ports under the links' names: simulated hubs.",
+        "Folder in which simulated hubs make their ports, each under the name of its link. These "
+        "ports replace those in the skin file. An empty text keeps the ports of the skin file.",
     ),
     Parameter(
         "rate",
         0.0,
-        "Samples per second to ask of the hubs; 0: as the skin file says.",
+        "Sampling rate of each cube, in Hz, that the driver asks of the hubs. With 0 it is the "
+        "rate in the skin file.",
         span=(0.0, 10_000.0),
         live=True,
         minimum=0.1,
@@ -76,7 +83,8 @@ DRIVER = (
     Parameter(
         "publish_period",
         0.0,
-        "Time that one message covers, s; 0: a message for each scan.",
+        "Time, in s, whose scans are sent together in one message. With 0 every scan is a message "
+        "of its own. A scan is one sample of every cube.",
         span=(0.0, 1.0),
     ),
     RELIABILITY,
@@ -86,83 +94,110 @@ RECONSTRUCTION = (
     Parameter(
         "config",
         "",
-        "Skin file (YAML), or a bag: then replayed frequencies give the recorded stress.",
+        "Path of the skin file (YAML), or of a bag. From the bag the node takes the skin, the "
+        "tares and the drift of the recording, so that replayed frequencies give the recorded "
+        "stress. It is required.",
     ),
     Parameter(
         "wrench_side",
         0.0,
-        "Side of the face that wrenches and forces refer to, m; 0: the cube's own.",
+        "Side, in m, of the square face over which stress is integrated to wrenches and forces. "
+        "With 0 it is the side of the cube itself.",
         span=(0.0, 10.0),
     ),
-    Parameter("forces", False, "Publish one force per cube on `forces`, as a point cloud."),
+    Parameter(
+        "forces",
+        False,
+        "With true the node publishes one force per cube as a point cloud on `forces`.",
+    ),
     Parameter(
         "publish_period",
         0.0,
-        "The driver's parameter of this name, s; queue depths follow from it.",
+        "Value of the driver's parameter publish_period, in s. The node computes the depths of its "
+        "queues and the limit for the size of a message from it.",
         span=(0.0, 1.0),
     ),
     RELIABILITY,
     Parameter(
         "tare_duration",
         1.0,
-        "Time that ~/tare averages unless the request says another, s.",
+        "Time, in s, over which the service ~/tare averages frequencies if the request states no "
+        "duration.",
         span=(0.5, 10.0),
         live=True,
     ),
     Parameter(
         "tare_folder",
         "",
-        "Where tares are kept, by uid; empty: ~/.ros/cube_tensor_driver/tare.",
+        "Folder in which tares are stored, one file per uid of a cube. An empty text stands for "
+        "~/.ros/cube_tensor_driver/tare.",
     ),
     Parameter(
         "drift_time",
         0.0,
-        "Time constant with which rest frequencies follow slow drift while nothing touches "
-        "a cube, s; 0: never.",
+        "Time constant, in s, with which the rest frequencies (frequencies without load) of a cube "
+        "follow slow drift while nothing touches it. With 0 they do not follow drift.",
         span=(0.0, 1e6),
         live=True,
     ),
 )
 SKIN_SUBSCRIBER = (
     AUTOSTART,
-    Parameter("rate", 20.0, "Maximum number of messages per second.", span=(0.1, 100.0)),
+    Parameter(
+        "rate",
+        20.0,
+        "Maximum rate, in Hz, at which the node computes and publishes its messages.",
+        span=(0.1, 100.0),
+    ),
 )
 MARKERS = (
     *SKIN_SUBSCRIBER,
-    Parameter("quantity", "pressure", "What the colours mean.", choices=", ".join(QUANTITIES)),
+    Parameter(
+        "quantity",
+        "pressure",
+        "Quantity that the colours of the cubes show.",
+        choices=", ".join(QUANTITIES),
+    ),
     Parameter(
         "range",
         0.0,
-        "Top of the colours' range, SI; 0: it follows the values.",
+        "Value of the quantity, in SI units, at the upper end of the colour scale. With 0 the "
+        "scale adapts to the values.",
         span=(0.0, 1e9),
     ),
-    Parameter("crosses", False, "Draw the principal stresses of each cube as a cross."),
+    Parameter(
+        "crosses",
+        False,
+        "With true the principal stresses of each cube are drawn as three crossing lines.",
+    ),
 )
 CONTACTS = (
     *SKIN_SUBSCRIBER,
     Parameter(
         "depth",
         SURFACE_DEPTH,
-        "Distance from the cubes' centres to the skin's surface, m.",
+        "Depth, in m, of the centres of the cubes below the surface of the skin.",
         span=(1e-5, 1.0),
     ),
     Parameter(
         "least",
         CONTACT_PRESSURE,
-        "Pressure at the cubes that counts as contact, Pa.",
+        "Minimum pressure, in Pa, in the plane of the cubes that counts as contact.",
         span=(0.0, 1e9),
     ),
     Parameter(
         "method",
         CONTACT_METHODS[0],
-        "How contacts are found: from the pressure interpolated between the cubes, or from the "
-        "surface's traction through the elastomer, which is published on `traction`, too.",
+        "Method that finds contacts. The method interpolation interpolates the pressure between "
+        "the cubes. The method inverse computes the traction (force per area) on the surface from "
+        "the elasticity of the skin, and publishes it on `traction`, too.",
         choices=", ".join(CONTACT_METHODS),
     ),
     Parameter(
         "thickness",
         0.0,
-        "Thickness of the elastomer over rigid ground, m, for the method inverse; 0: a half space.",
+        "Thickness, in m, of the elastomer on a rigid base, for the method inverse. With 0 the "
+        "elastomer is taken as infinitely thick (a half space).",
         span=(0.0, 1.0),
     ),
     Parameter(
@@ -174,9 +209,11 @@ CONTACTS = (
     Parameter(
         "influence",
         "",
-        "For the method inverse, what the pads measure of forces on the surface: the name of a "
-        "shipped table, or a file of `./cube fem MODEL --surface`. Then depth, thickness and "
-        "poisson are those of the table. Empty: cubes count as points.",
+        "Table of influence functions (response of each pad to a unit force at points of the "
+        "surface), for the method inverse. It is the name of a table in the package, or a file "
+        "made by `./cube fem MODEL --surface`. The table then replaces the parameters depth, "
+        "thickness and poisson. With an empty text each cube is taken as a point in a homogeneous "
+        "elastomer.",
         problem=influence_problem,
     ),
 )

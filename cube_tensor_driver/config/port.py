@@ -1,19 +1,23 @@
-"""Texts that say where a hub is: device paths, patterns of them, and TCP addresses."""
+"""Ports: texts that state where a hub is connected.
+
+A port is a device path, a pattern of device paths such as /dev/ttyACM*, or a TCP address.
+"""
 
 from __future__ import annotations
 
 from urllib.parse import urlsplit
 
 TCP = "socket://"
-"""Prefix of a TCP address, as in pyserial."""
+"""Prefix of a TCP address, the same as in pyserial."""
 
 ALLOWED = "a device path, a pattern such as /dev/ttyACM*, or socket://host:port"
+"""Description of a valid port, for error messages."""
 
 
 def tcp_address(url: str) -> tuple[str, int] | None:
-    """Return host and port of ``socket://host:port``, or None if the text is something else.
+    """Return host and port number of ``socket://host:port``, or None if the text has another form.
 
-    IPv6 hosts stand in brackets.
+    An IPv6 address must be written in brackets, as in ``socket://[::1]:7000``.
     """
     try:
         parts = urlsplit(url)
@@ -21,7 +25,7 @@ def tcp_address(url: str) -> tuple[str, int] | None:
     except ValueError:
         return None
 
-    # A path or a user name shows that something else was meant.
+    # A URL with a path, a query or a user name is not the address of a hub.
     has_more = parts.path.strip("/") or parts.query or parts.fragment or "@" in parts.netloc
     if not url.startswith(TCP) or not host or not port or has_more:
         return None
@@ -29,10 +33,10 @@ def tcp_address(url: str) -> tuple[str, int] | None:
 
 
 def port_problem(port: str) -> str:
-    """Return what is wrong with a port and what is allowed, or an empty text if nothing is wrong.
+    """Return an error message for the text of a port, or "" if it is valid.
 
-    Other URLs that pyserial knows are refused: some of them write files, or connect to a host that
-    the skin file does not name.
+    URLs of pyserial other than socket:// are refused, because some of them write files or connect
+    to a host that the skin file does not name.
     """
     if not port.strip() or not port.isprintable():
         return f"found {port!r}, allowed: {ALLOWED}"

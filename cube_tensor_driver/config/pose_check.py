@@ -1,4 +1,4 @@
-"""Doubts about the poses of a skin: they can be read, but are most likely a slip of the hand."""
+"""Warnings about poses in a skin file that are valid YAML but most likely typing errors."""
 
 from __future__ import annotations
 
@@ -10,29 +10,33 @@ from ..core.arrays import Array
 from .skin import Skin
 
 MAX_DISTANCE_M = 5.0
-"""Largest credible distance, in m, of a cube from the origin of the parent frame along an axis.
+"""Largest credible coordinate, in m, of a cube in the parent frame of the skin.
 
-Cubes are millimetres wide, so a skin that reaches farther was most likely typed in mm.
+Cubes are millimetres wide, so a larger coordinate was most likely typed in mm instead of m.
 """
 
 MAX_SPACING_M = 1.0
-"""Largest credible distance, in m, between the two closest cubes of a skin."""
+"""Largest credible distance, in m, between the two closest cubes of a skin. A larger one suggests
+that the positions were typed in mm instead of m."""
 
 MIN_SPACED_CUBES = 3
-"""Minimum number of cubes for which their spacing is checked. Two may well be far apart."""
+"""Minimum number of cubes of a skin for which `MAX_SPACING_M` is checked. Two cubes alone may well
+be mounted far apart."""
 
 MAX_SPACED_CUBES = 500
-"""Maximum number of cubes for which their spacing is checked, as every pair is compared."""
+"""Maximum number of cubes of a skin for which `MAX_SPACING_M` is checked. Every pair of cubes is
+compared, so time and memory grow with the square of the number."""
 
 POSITION_RESOLUTION_M = 1e-6
-"""Cubes closer than this, in m, count as being at one position."""
+"""Grid, in m, to which positions are rounded. Cubes with the same rounded position are reported as
+being at one place."""
 
 MAX_NAMES = 4
-"""Maximum number of cubes at one position that a message names."""
+"""Maximum number of cubes with the same position that a warning names; the others are counted."""
 
 
 def pose_doubts(skin: Skin) -> Iterator[str]:
-    """Yield one line for each doubt about the poses of the cubes."""
+    """Yield a warning (one line) for each pose of a cube that is most likely a typing error."""
     positions = np.array([cube.xyz for cube in skin.cubes])
     yield from _find_shared_positions(skin, positions)
     if _seems_in_millimetres(positions):
@@ -45,7 +49,12 @@ def pose_doubts(skin: Skin) -> Iterator[str]:
 
 
 def _find_shared_positions(skin: Skin, positions: Array) -> Iterator[str]:
-    """Yield a line for each position with several cubes, because at most one can be there."""
+    """Yield a warning for each position that several cubes share.
+
+    Args:
+        skin: The skin.
+        positions: Positions of the cubes in the parent frame, (cubes, 3), in m.
+    """
     rounded = np.round(positions / POSITION_RESOLUTION_M)
     _, group, count = np.unique(
         rounded,
@@ -53,7 +62,7 @@ def _find_shared_positions(skin: Skin, positions: Array) -> Iterator[str]:
         return_inverse=True,
         return_counts=True,
     )
-    group = group.reshape(-1)  # numpy 2.0 alone gives it a second axis
+    group = group.reshape(-1)  # numpy 2.0, but no other version, returns shape (cubes, 1)
     for number in np.flatnonzero(count > 1).tolist():
         members = [skin.cubes[member] for member in np.flatnonzero(group == number)]
         names = ", ".join(repr(cube.name) for cube in members[:MAX_NAMES])
@@ -63,13 +72,15 @@ def _find_shared_positions(skin: Skin, positions: Array) -> Iterator[str]:
 
 
 def _seems_in_millimetres(positions: Array) -> bool:
+    """Return whether positions (cubes, 3), which should be in m, are most likely in mm."""
     if np.abs(positions).max() > MAX_DISTANCE_M:
         return True
-    # A skin in mm near the origin betrays itself only by the distance of its cubes.
+    # Typed in mm, a small skin near the origin passes the limit of coordinates, but its cubes seem
+    # to be metres apart.
     if not MIN_SPACED_CUBES <= len(positions) <= MAX_SPACED_CUBES:
         return False
     distance = np.linalg.norm(positions[:, np.newaxis] - positions, axis=2)
-    # A cube is no neighbour of itself.
+    # The distance of a cube from itself, 0, must not count as the smallest one.
     np.fill_diagonal(distance, np.inf)
     return bool(distance.min() > MAX_SPACING_M)
 

@@ -1,4 +1,4 @@
-"""The configuration of RViz for a skin."""
+"""The configuration file of RViz, adapted to the frame and the size of a skin."""
 
 from __future__ import annotations
 
@@ -11,27 +11,31 @@ from .skin import Skin
 from .yaml import read_yaml
 
 CAMERA_DISTANCE = 1.5
-"""Distance of the camera from the skin, in diagonals of the skin with its legend."""
+"""Distance of RViz's camera from the skin, divided by the diagonal of the box around the skin and
+its legend."""
 
 MIN_CAMERA_DISTANCE_M = 0.05
-"""Minimum distance of the camera, in m. A single cube has no diagonal."""
+"""Minimum distance of RViz's camera from the skin, in m. It serves skins of a single cube: the
+diagonal between the centres of their cubes is 0."""
 
 LEGEND_HEIGHT = 0.8
-"""Height of the legend of `markers`, which is drawn below the skin, in widths of the skin."""
+"""Height (along y) of the legend that the node `markers` draws beside the skin, divided by the
+width of the skin (along x)."""
 
 
 def rviz_view(skin: Skin) -> dict[str, Any]:
-    """Return the content of rviz/skin.rviz, fitted to a skin.
+    """Return the content of rviz/skin.rviz, adapted to a skin, as plain values for `write_yaml`.
 
-    It has the skin's parent frame, a view of the whole skin, and the wrench of its central cube.
+    The fixed frame is the parent frame of the skin, the camera shows the whole skin and its legend,
+    and the wrench of the cube closest to the centre is displayed.
     """
     positions = np.array([cube.xyz for cube in skin.cubes])
     low, high = positions.min(axis=0), positions.max(axis=0)
-    # The wrench of one cube is shown; the central one is most likely touched.
+    # RViz shows the wrench of one cube only; the central one is the most likely to be touched.
     to_centre = np.linalg.norm(positions - (low + high) / 2, axis=1)
     central_cube = skin.cubes[int(to_centre.argmin())]
 
-    # The legend stands beside the skin, towards -y.
+    # `markers` draws the legend beside the skin in the direction -y, so the box grows there.
     low[1] -= LEGEND_HEIGHT * (high[0] - low[0])
     diagonal = float(np.linalg.norm(high - low))
     focal_point = (low + high) / 2

@@ -1,7 +1,7 @@
-"""Checks of plain values against a JSON schema.
+"""Checks of plain values (the content of a YAML file) against a JSON schema.
 
-Each mistake becomes one line that names the key, what was found and what is allowed. What is
-allowed is the `description` of the schema at that key.
+Each mistake becomes one line that names the key, the value found there and the values that are
+allowed. The text for the allowed values is the `description` of the schema at that key.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ from typing import Any
 import jsonschema
 
 KeyPath = tuple[str | int, ...]
-"""Keys and list indices from the top level down to a value."""
+"""Position of a value in nested mappings and lists: the keys and list indices that lead to it from
+the top level, as in ("cubes", 3, "pose")."""
 
 JsonSchema = dict[str, Any]
 """A JSON schema, draft 7."""
 
 MAX_SHOWN_CHARACTERS = 60
-"""Maximum length of a value in an error message, in characters."""
+"""Maximum number of characters of a wrong value that an error message quotes."""
 
-# Names become topics and frames. ROS allows 247 characters including the namespace.
+# Names of skins and cubes become parts of topics and frame ids. ROS allows 247 characters for a
+# topic including its namespace, so 64 per name leave room.
 NAME: JsonSchema = {
     "type": "string",
     "pattern": r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z",
@@ -46,7 +48,12 @@ _NUMBER_WORDS = {1: "one", 2: "two"}
 
 
 def mapping(required: Iterable[str], properties: JsonSchema) -> JsonSchema:
-    """Return the schema of a mapping that may have the keys of `properties` and no others."""
+    """Return the JSON schema of a mapping.
+
+    Args:
+        required: Keys that the mapping must have.
+        properties: All keys that the mapping may have -> the schema of the value.
+    """
     return {
         "type": "object",
         "required": list(required),
@@ -61,7 +68,7 @@ def list_of(item: JsonSchema, what: str, minimum: int = 1) -> JsonSchema:
 
     Args:
         item: Schema of an item.
-        what: What the items are, in the plural.
+        what: Noun for the items in the plural, such as "links", for error messages.
         minimum: Minimum number of items, 1 or 2.
     """
     return {
@@ -73,7 +80,12 @@ def list_of(item: JsonSchema, what: str, minimum: int = 1) -> JsonSchema:
 
 
 def real(description: str, **limits: float) -> JsonSchema:
-    """Return the schema of a number, with limits such as `minimum` and `exclusiveMinimum`."""
+    """Return the JSON schema of a number.
+
+    Args:
+        description: The allowed values in words, for error messages.
+        limits: Limits under their names in JSON schema, such as `minimum` or `exclusiveMinimum`.
+    """
     return {
         "type": "number",
         "description": description,
@@ -82,7 +94,13 @@ def real(description: str, **limits: float) -> JsonSchema:
 
 
 def integer(minimum: int, maximum: int, description: str) -> JsonSchema:
-    """Return the schema of an integer from `minimum` to `maximum`."""
+    """Return the JSON schema of an integer from `minimum` to `maximum`, both included.
+
+    Args:
+        minimum: Smallest allowed value.
+        maximum: Largest allowed value.
+        description: The allowed values in words, for error messages.
+    """
     limits = {"minimum": minimum, "maximum": maximum}
     return {
         "type": "integer",
@@ -92,7 +110,7 @@ def integer(minimum: int, maximum: int, description: str) -> JsonSchema:
 
 
 class Schema:
-    """A JSON schema that values can be checked against. Its numbers are finite."""
+    """Checks plain values against a JSON schema. NaN and infinity do not pass as numbers."""
 
     def __init__(self, schema: JsonSchema) -> None:
         base = jsonschema.Draft7Validator
@@ -100,8 +118,13 @@ class Schema:
         self._validator = jsonschema.validators.extend(base, type_checker=number)(schema)
 
     def mistakes(self, data: Any) -> list[tuple[KeyPath, str]]:
-        """Return the place and the line of every mistake, sorted by key."""
-        # A set, because jsonschema reports each missing key of a mapping by itself.
+        """Return all mistakes in `data`, sorted by key.
+
+        Returns:
+            For each mistake, the path of keys to the wrong value and the error message (one line).
+        """
+        # jsonschema reports each missing key of a mapping as an error of its own, but the messages
+        # here name all missing keys. The set keeps one of these equal messages.
         found = {
             (tuple(error.absolute_path), _describe(error))
             for error in self._validator.iter_errors(data)
@@ -110,20 +133,28 @@ class Schema:
 
 
 def _is_finite_number(_: Any, value: Any) -> bool:
-    """Return whether a value is a number that a float can hold. YAML has .nan and .inf."""
+    """Return whether a value is a number in the range of a float.
+
+    NaN and infinity, which YAML writes as .nan and .inf, are not. jsonschema passes itself as the
+    first argument, which is not needed.
+    """
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    # NaN compares false. math.isfinite would raise OverflowError for a huge integer.
+    # The comparison is false for NaN. math.isfinite would raise OverflowError for an integer above
+    # the range of a float.
     return is_number and abs(value) <= sys.float_info.max
 
 
 def _sort_key(mistake: tuple[KeyPath, str]) -> list[tuple[bool, str | int]]:
-    """Return a key that puts indices before names: Python does not compare numbers with texts."""
+    """Return a sort key for a mistake: list indices sort before keys at the same level.
+
+    Python cannot compare numbers with texts, so each part is paired with whether it is a text.
+    """
     path, _ = mistake
     return [(isinstance(part, str), part) for part in path]
 
 
 def _key_name(path: Iterable[str | int]) -> str:
-    """Return a path of keys as people write it: cubes[3].pose."""
+    """Return a path of keys in the notation of error messages, as in cubes[3].pose."""
     parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in path]
     return "".join(parts).lstrip(".") or "top level"
 

@@ -1,4 +1,4 @@
-"""Skin files: the links of a skin, the cubes that they carry, their poses and calibrations.
+"""Skin files: links (connections to hubs) of a skin, and its cubes with poses and calibrations.
 
 docs/config.md describes the keys.
 """
@@ -24,14 +24,15 @@ from .schema import NAME, TEXT, TRIPLE, JsonSchema, Schema, integer, list_of, ma
 from .yaml import read_yaml
 
 BAUD = 921_600
-"""Bits per second of a serial port for which the skin file gives no number."""
+"""Default baud rate of a serial port, in bits per second, if the skin file states none."""
 
 _FRAME: JsonSchema = {
     "type": "string",
     "pattern": r"^[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z",
     "description": "a frame id of letters, digits, _ and /, a letter first",
 }
-# Labels on cubes give uids in hexadecimal, so a text such as 0x1f is allowed.
+# The labels on cubes show the uid (unique number) in hexadecimal, so the skin file accepts a text
+# such as 0x1f, too.
 _UID: JsonSchema = {
     "anyOf": [
         {
@@ -82,13 +83,13 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class SkinLink:
-    """A link of a skin.
+    """A link of a skin: the connection to one hub, which reads some of the cubes.
 
     Attributes:
-        name: Its name.
-        port: Device path, pattern of device paths, or socket://host:port.
-        baud: Bits per second of a serial port.
-        hub_uid: Uid of the hub that must answer at the port; None: any hub may.
+        name: Name of the link.
+        port: Device path, pattern of device paths such as /dev/ttyACM*, or socket://host:port.
+        baud: Baud rate of a serial port, in bits per second.
+        hub_uid: Uid (unique number) of the hub that must answer at the port; None: any hub may.
     """
 
     name: str
@@ -99,16 +100,16 @@ class SkinLink:
 
 @dataclass(frozen=True)
 class SkinCube:
-    """A cube of a skin, recognised by its uid, or by its link and its index in the hub.
+    """A cube of a skin, identified either by its uid or by its link and its index in the hub.
 
     Attributes:
-        name: Its name.
-        link: Name of its link; None: any link.
-        index: Its index among the cubes of its hub; None: the uid tells.
-        uid: Its uid; None: link and index tell.
-        xyz: Position of its centre in the parent frame of the skin, in m.
+        name: Name of the cube.
+        link: Name of the link of the cube; None: the cube is searched by its uid on all links.
+        index: Index of the cube among the cubes of its hub; None: the uid identifies the cube.
+        uid: Uid (unique number) of the cube; None: `link` and `index` identify the cube.
+        xyz: Position of the centre of the cube in the parent frame of the skin, in m.
         rpy: Rotations about the fixed axes x, y and z of the parent frame (REP 103), in rad.
-        calibration: Its calibration.
+        calibration: Calibration of the cube.
     """
 
     name: str
@@ -122,14 +123,15 @@ class SkinCube:
 
 @dataclass(frozen=True, repr=False)
 class Skin:
-    """All cubes of one skin file.
+    """The content of a skin file.
 
     Attributes:
-        name: Its name.
-        parent_frame: The frame that poses refer to.
-        rate: Samples per second to ask of the hubs; None leaves it to them.
+        name: Name of the skin.
+        parent_frame: Frame id of the frame in which the poses of the cubes are given.
+        rate: Sampling rate of each cube, in Hz, that the driver asks of the hubs; None: the hubs
+            choose the rate.
         links: The links, in the order of the file.
-        cubes: The cubes, in the order of the file. Rows and messages number them in this order.
+        cubes: The cubes, in the order of the file. Index 0 in rows and messages is the first one.
     """
 
     name: str
@@ -146,7 +148,7 @@ class Skin:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name of each cube."""
+        """Name of each cube, in the order of `cubes`."""
         return tuple(cube.name for cube in self.cubes)
 
     @property
@@ -156,7 +158,7 @@ class Skin:
 
     @property
     def poses(self) -> CubePoses:
-        """Poses of the cubes in the parent frame."""
+        """Positions, rotations and half sides of the cubes, in the parent frame."""
         half_sides = [calibration.half_side for calibration in self.calibrations]
         return CubePoses(
             position=np.array([cube.xyz for cube in self.cubes]),
@@ -166,30 +168,30 @@ class Skin:
 
     @property
     def n_pads(self) -> int:
-        """Width of a row: the largest number of pads of a cube."""
+        """Largest number of pads of a cube, which is the number of columns of frequency arrays."""
         return max(calibration.layout.n_pads for calibration in self.calibrations)
 
     def frame(self, cube: SkinCube) -> str:
-        """Return the frame id of a cube."""
+        """Return the frame id of a cube: the names of skin and cube, joined by an underscore."""
         return f"{self.name}_{cube.name}"
 
 
 def read_skin(path: str | Path) -> Skin:
     """Read a skin file (YAML) with the calibrations that it names, and check both.
 
-    docs/config.md describes the keys. Ports are only names here: nothing is opened.
+    docs/config.md describes the keys. No port is opened.
 
     Args:
-        path: The skin file. Calibration files are looked up relative to its folder, then among
-            those of the package.
+        path: The skin file. A calibration that it names is searched among those of the package
+            first, then as a file relative to the folder of the skin file.
 
     Returns:
         The links and cubes in the order of the file.
 
     Raises:
         ConfigError: The file cannot be read or has mistakes. The message names the file, the key of
-            the first mistake, what was found and what is allowed, and how many more mistakes there
-            are; `check_skin` gives them all.
+            the first mistake, the value found there, the allowed values, and the number of further
+            mistakes. `check_skin` returns all of them.
     """
     path = Path(path)
     skin, mistakes = check_skin(path)
@@ -201,9 +203,12 @@ def read_skin(path: str | Path) -> Skin:
 
 
 def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
-    """Return the skin of a file and no mistakes, or None and all mistakes, one line each.
+    """Read a skin file and report all its mistakes.
 
-    Entries beside a malformed one are checked as well.
+    An entry of the list of links or cubes is checked even if another entry is malformed.
+
+    Returns:
+        The skin and an empty list, or None and the mistakes, one line each.
 
     Raises:
         ConfigError: The file cannot be read or is not YAML.
@@ -212,20 +217,20 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
 
 
 def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
-    """Check the content of a skin file as `check_skin` does.
+    """Check the content of a skin file, with the same result as `check_skin`.
 
     Args:
-        data: The content, as plain values.
-        folder: The folder in which the file is or will be.
+        data: The content of the file, as plain values (mappings, lists, numbers, texts).
+        folder: The folder in which the file is or will be. Calibrations are named relative to it.
     """
     schema_mistakes = _SCHEMA.mistakes(data)
     mistakes = [line for _, line in schema_mistakes]
     if not isinstance(data, dict):
         return None, mistakes
-    # Without both lists there is nothing more to check.
+    # Further checks go through the entries of both lists, so both must be lists.
     if not isinstance(data.get("links"), list) or not isinstance(data.get("cubes"), list):
         return None, mistakes
-    # ("cubes", 3) stands for a mistake anywhere in cubes[3].
+    # The first two keys of a path identify the entry: ("cubes", 3) for any mistake in cubes[3].
     malformed = {where[:2] for where, _ in schema_mistakes}
 
     links = tuple(
@@ -235,10 +240,12 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     )
     mistakes += _find_link_mistakes(links)
 
-    # Where a link is malformed its name is unknown, so no cube can be blamed for naming it.
+    # The name of a malformed link is unknown. A cube may name just that link, so that names of
+    # links are checked only if all links could be read.
     all_links_known = len({link.name for link in links}) == len(data["links"])
     reader = _CubeReader(folder, [link.name for link in links] if all_links_known else None)
-    # Entries beside a malformed one are checked, so that all mistakes show at once.
+    # Malformed entries are skipped instead of ending the check, so that the user sees the mistakes
+    # of all entries at once.
     for number, item in enumerate(data["cubes"]):
         if ("cubes", number) not in malformed:
             reader.read(number, item)
@@ -249,21 +256,26 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
 
     if mistakes:
         return None, mistakes
-    # YAML makes an integer of 100.
+    # A rate that is written as 100 is an integer in YAML.
     rate = None if data.get("rate") is None else float(data["rate"])
     return Skin(data["name"], data["parent_frame"], rate, links, cubes), []
 
 
 class _CubeReader:
-    """Makes cubes of the entries of a skin file, and reads each calibration once.
+    """Makes cubes from the entries of a skin file, and reads each calibration file only once.
 
     Attributes:
-        cubes: The cubes so far.
-        mistakes: The mistakes so far, one line each.
+        cubes: The cubes that were read so far.
+        mistakes: The mistakes that were found so far, one line each.
     """
 
     def __init__(self, folder: Path, links: list[str] | None) -> None:
-        """Make a reader for a file in `folder`; `links` is None if some names are unknown."""
+        """Make a reader.
+
+        Args:
+            folder: The folder of the skin file, in which calibration files are searched.
+            links: Names of all links of the file; None: not all are known, as a link is malformed.
+        """
         self.cubes: list[SkinCube] = []
         self.mistakes: list[str] = []
         self._folder = folder
@@ -271,7 +283,10 @@ class _CubeReader:
         self._calibrations: dict[str, Calibration | None] = {}
 
     def read(self, number: int, item: dict[str, Any]) -> None:
-        """Add the cube of the entry `cubes[number]`, or the mistakes in it."""
+        """Read the entry `item`, which is `cubes[number]` of the file.
+
+        The cube is added to `cubes`, and mistakes are added to `mistakes`.
+        """
         calibration = self._read_calibration(number, item["calibration"])
         if calibration is None:
             return
@@ -290,7 +305,11 @@ class _CubeReader:
         self.cubes.append(cube)
 
     def _read_calibration(self, number: int, name: str) -> Calibration | None:
-        """Return None after an error, which is reported once, with the first cube that names it."""
+        """Return the calibration of this name, or None if it cannot be read.
+
+        The error is added to `mistakes` only once, for the first cube (of index `number`) that
+        names the calibration.
+        """
         if name not in self._calibrations:
             try:
                 self._calibrations[name] = read_calibration(find_calibration(name, self._folder))
@@ -302,9 +321,15 @@ class _CubeReader:
     def _find_contradictions(
         self, item: dict[str, Any], uid: int | None, calibration: Calibration
     ) -> Iterator[str]:
-        """Yield keys of one cube that contradict each other or the rest of the file."""
+        """Yield a mistake for each key of a cube that contradicts another key or the calibration.
+
+        Args:
+            item: The entry of the cube in the skin file.
+            uid: Uid of the cube; None: the entry has none.
+            calibration: Calibration that the entry names.
+        """
         link, index = item.get("link"), item.get("index")
-        # A cube without a link is looked for on all links, by its uid.
+        # An entry may leave out the link; then the cube is searched by its uid on all links.
         if link is not None and self._links is not None and link not in self._links:
             allowed = ", ".join(sorted(self._links))
             yield f".link: found {link!r}, allowed: one of the links {allowed}"
@@ -313,7 +338,7 @@ class _CubeReader:
                 ": found neither uid nor both link and index, which say where the cube is; "
                 "add one of them"
             )
-        # Cubes are exchanged, and then the file would be wrong without a warning.
+        # After a cube was exchanged, its uid and the index in the file would mean different cubes.
         if uid is not None and index is not None:
             yield ": found both uid and index; keep one, they might contradict each other"
         if item["layout"] != calibration.layout.name:
@@ -321,7 +346,8 @@ class _CubeReader:
                 f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
                 f"is for the layout {calibration.layout.name!r}"
             )
-        # A measured calibration belongs to one cube, a computed one to all of a layout.
+        # A calibration with a uid was measured on that cube. A computed one has none and is valid
+        # for all cubes of its layout.
         if calibration.uid is not None and uid != calibration.uid:
             found = "not given" if uid is None else hex(uid)
             yield (
@@ -336,10 +362,10 @@ def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
         if problem:
             yield f"links: port of {link.name}: {problem}"
     yield from _find_repeated("links", "name", [repr(link.name) for link in links])
-    # In hexadecimal, as labels on hubs have them.
+    # The labels on hubs show the uid in hexadecimal, so the error message does, too.
     hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
     yield from _find_repeated("links", "hub_uid", hub_uids)
-    # Each match of a pattern is tried, so two links may share a pattern.
+    # Two links may have the same pattern of device paths: the driver tries all devices that match.
     ports = [repr(link.port) for link in links if "://" in link.port or not has_magic(link.port)]
     yield from _find_repeated("links", "port", ports)
 
@@ -353,7 +379,10 @@ def _find_cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:
 
 
 def _find_pad_mistakes(links: tuple[SkinLink, ...], cubes: tuple[SkinCube, ...]) -> Iterator[str]:
-    """Yield links with different cubes: a frame of a hub has equally many pads for each cube."""
+    """Yield a mistake for each link whose cubes differ in their number of pads.
+
+    The protocol of the hubs requires this: a frame of data has the same number of pads per cube.
+    """
     for link in links:
         pads = {cube.calibration.layout.n_pads for cube in cubes if cube.link == link.name}
         if len(pads) > 1:

@@ -1,4 +1,8 @@
-"""Tare files: the rest frequencies of one cube, named by its uid, with the calibration in use."""
+"""Tare files: the measured rest frequencies (frequencies without load) of one cube each.
+
+The name of a file is the uid (unique number) of the cube; the file also names the calibration under
+which the tare was measured.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +20,17 @@ from .schema import TEXT, JsonSchema, Schema, mapping
 from .yaml import read_yaml, write_yaml
 
 SCHEMA_VERSION = 1
-"""Version of the format of tare files."""
+"""Version of the format of tare files. Files with another version are refused."""
 
 _HEADER = "Rest frequencies in Hz that ~/tare measured; ~/clear_tare removes it."
 
 
 class StoredTare(NamedTuple):
-    """The tare of one cube, as it was read from its file.
+    """The content of a tare file.
 
     Attributes:
-        rest_frequency: Frequency of each pad without load, (P,), in Hz.
-        created: When it was measured, with time zone.
+        rest_frequency: Frequency of each pad without load, (pads,), in Hz.
+        created: Date and time at which the tare was measured, with time zone.
     """
 
     rest_frequency: Array
@@ -48,17 +52,17 @@ def write_tare(
     """Write the tare of a cube, completely or not at all.
 
     Args:
-        folder: The folder of all tares, which is made if it is missing.
-        uid: Uid of the cube.
+        folder: Folder of the tare files of all cubes. It is made if it does not exist.
+        uid: Uid (unique number) of the cube.
         calibration: Calibration under which the tare was measured.
-        rest_frequency: Frequency of each pad without load, (P,), in Hz.
-        created: When it was measured, with time zone.
+        rest_frequency: Frequency of each pad without load, (pads,), in Hz.
+        created: Date and time at which the tare was measured, with time zone.
 
     Raises:
-        ConfigError: The folder cannot be written.
+        ConfigError: The folder cannot be made, or the file in it cannot be written.
     """
     try:
-        # The folder is below the home of ROS, and nobody makes it by hand.
+        # By default the folder is below ~/.ros, and no user would make it by hand.
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(
@@ -75,16 +79,16 @@ def write_tare(
 
 
 def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | None:
-    """Return the tare of a cube, or None if it has none.
+    """Return the stored tare of a cube, or None if there is no file for it.
 
     Args:
-        folder: The folder of all tares.
-        uid: Uid of the cube.
-        calibration: Calibration of the cube now.
+        folder: Folder of the tare files of all cubes.
+        uid: Uid (unique number) of the cube.
+        calibration: Calibration that the cube has now.
 
     Raises:
         ConfigError: The file is damaged, belongs to another cube, or was measured under another
-            calibration. The message says which of these it is, and what to do.
+            calibration. The message states which of these it is, and asks for a new tare.
     """
     path = tare_path(folder, uid)
     if not path.exists():
@@ -93,12 +97,13 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
     for _, mistake in _tare_schema(calibration.layout.n_pads).mistakes(data):
         raise ConfigError(f"{path}: {mistake}; tare again")
 
-    # Somebody has renamed or copied the file.
+    # The two differ if somebody has renamed the file or copied it for another cube.
     if int(data["uid"], 16) != uid:
         raise ConfigError(
             f"{path}: uid is {data['uid']!r}, the file's name says {uid:#x}; tare again"
         )
-    # Rest frequencies contain what the calibration says about temperature.
+    # Rest frequencies are stored corrected to the reference temperature with the coefficients of
+    # the calibration, so they are not valid under another one.
     if data["calibration_id"] != calibration.id:
         raise ConfigError(
             f"{path}: measured under calibration {data['calibration_id']!r}, "
@@ -109,10 +114,18 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
 
 
 def remove_tare(folder: Path, uid: int) -> None:
-    """Remove the tare of a cube if it has one. Raises ConfigError if it cannot be removed."""
+    """Remove the tare file of a cube, if there is one.
+
+    Args:
+        folder: Folder of the tare files of all cubes.
+        uid: Uid (unique number) of the cube.
+
+    Raises:
+        ConfigError: The file cannot be removed.
+    """
     path = tare_path(folder, uid)
     try:
-        # Clearing a tare twice is no error.
+        # A missing file is no error, so that clearing a tare twice succeeds.
         path.unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from None
@@ -138,7 +151,8 @@ def _tare_schema(n_pads: int) -> Schema:
             "description": "a uid in hexadecimal as in 0x1f",
         },
         "calibration_id": TEXT,
-        # YAML makes a datetime of it, or leaves a text, depending on how it is written.
+        # Any value passes here: depending on its notation YAML yields a datetime or a text, and
+        # `_parse_time` checks both.
         "created": {},
         "rest_frequency": frequencies,
     }
@@ -146,7 +160,11 @@ def _tare_schema(n_pads: int) -> Schema:
 
 
 def _parse_time(path: Path, value: Any) -> datetime:
-    """Return the time when a tare was measured. ConfigError: it is no time with a zone."""
+    """Return the value of the key `created` of a tare file as a datetime.
+
+    Raises:
+        ConfigError: The value is no date and time, or has no time zone.
+    """
     try:
         time = datetime.fromisoformat(value) if isinstance(value, str) else value
     except ValueError:

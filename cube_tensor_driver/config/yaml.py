@@ -1,4 +1,8 @@
-"""YAML files: plain values only, bounded in size, and with no key twice in a mapping."""
+"""Reads and writes YAML files, and refuses unsafe or ambiguous ones.
+
+Refused are tags other than those of plain values (numbers, texts, lists, mappings), files above a
+maximum size, deeply nested values, and mappings in which a key appears twice.
+"""
 
 from __future__ import annotations
 
@@ -12,36 +16,41 @@ from .input_files import read_bounded
 from .output_files import atomic_write
 
 MAX_BYTES = 16 << 20
-"""Maximum size of a YAML file, in bytes.
+"""Maximum size of a YAML file that is read, in bytes.
 
-The largest skin, of 65536 cubes on a grid, has 9 MB. A bag or a disk image that is named by mistake
-has more.
+The skin file of the largest skin, a grid of 65536 cubes, has 9 MB. The limit refuses bags and disk
+images that were named by mistake.
 """
 
 MAX_DEPTH = 100
-"""Maximum number of lists and mappings within each other.
+"""Maximum number of nested lists and mappings in a YAML text.
 
-PyYAML's loader in C recurses once per level, so a text of brackets alone would overflow the stack
-and kill the process. Texts also come from other hosts, inside of SkinInfo messages.
+PyYAML's loader in C recurses once per level, so a text of many opening brackets would overflow the
+stack and kill the process. YAML texts also come from other hosts, inside of SkinInfo messages.
 """
 
 _MERGE_TAG = "tag:yaml.org,2002:merge"
+"""Tag that YAML gives to the key ``<<``, which copies the keys of another mapping."""
 
 _INVALID_VALUE_ERRORS = (ValueError, TypeError, ArithmeticError, LookupError, AttributeError)
-"""Errors that PyYAML raises itself where a value does not fit its tag, as in ``!!bool maybe``."""
+"""Exceptions that PyYAML lets escape if a value does not fit its tag, as in ``!!bool maybe``.
+
+They do not derive from yaml.YAMLError.
+"""
 
 _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The safe loader, in C where it is installed, which refuses a key that appears twice.
+    """PyYAML's safe loader (in C where installed) that refuses a key that appears twice.
 
-    PyYAML would silently take the last one, and half of a copied cube would be lost.
+    PyYAML itself silently keeps the last value, so that a cube with a duplicated key, as after
+    copying lines of a skin file, would lose the first one.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        # The call also merges "<<" into the node. Merged keys may be overridden, so the keys that
-        # stand in the mapping itself are listed before.
+        # The call below inserts the keys that "<<" copies into the node. Overriding such a key is
+        # allowed, so only the keys written in the mapping itself are compared; they are listed now.
         own_keys = [key for key, _ in node.value if key.tag != _MERGE_TAG]
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         seen: set[Any] = set()
@@ -59,11 +68,12 @@ def parse_yaml(text: str | bytes, origin: str) -> Any:
 
     Args:
         text: The YAML text.
-        origin: What error messages call the text, such as the path of its file.
+        origin: Name of the text in error messages, such as the path of its file.
 
     Raises:
         ConfigError: The text is not YAML, has a key twice in a mapping, a tag other than those of
-            plain values, or too many levels. The message names the line where one is known.
+            plain values, or more than `MAX_DEPTH` levels. The message names the line, except for a
+            value that does not fit its tag.
     """
     try:
         _check_depth(text)
@@ -73,15 +83,16 @@ def parse_yaml(text: str | bytes, origin: str) -> Any:
         where = f"{origin}, line {mark.line + 1}, column {mark.column + 1}" if mark else origin
         raise ConfigError(f"{where}: {error.problem or 'not YAML'}") from None
     except (yaml.YAMLError, *_INVALID_VALUE_ERRORS) as error:
-        # PyYAML explains itself in several lines, and an error here is one.
+        # The messages of PyYAML have several lines; errors of this package have one.
         first_line = (str(error) or type(error).__name__).splitlines()[0]
         raise ConfigError(f"{origin}: not YAML: {first_line}") from None
 
 
 def _check_depth(text: str | bytes) -> None:
-    """Raise MarkedYAMLError if the text has more than `MAX_DEPTH` levels.
+    """Raise MarkedYAMLError if lists and mappings are nested more than `MAX_DEPTH` deep.
 
-    Events are read one after the other without recursion, whatever the text is.
+    PyYAML parses a text into a sequence of events without recursion, so that this check cannot
+    overflow the stack itself.
     """
     depth = 0
     for event in yaml.parse(text, _Loader):
@@ -99,8 +110,8 @@ def read_yaml(path: Path) -> Any:
     """Return the plain Python value of a YAML file.
 
     Raises:
-        ConfigError: There is no regular file, it cannot be read, it is larger than `MAX_BYTES`, or
-            `parse_yaml` refuses its text.
+        ConfigError: The path leads to no regular file, the file cannot be read or is larger than
+            `MAX_BYTES`, or `parse_yaml` refuses its text.
     """
     try:
         data = read_bounded(path, MAX_BYTES, "configuration file")
@@ -110,7 +121,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def to_yaml(value: Any) -> str:
-    """Return plain values as YAML text, with the keys in the order of their mapping."""
+    """Return plain values as YAML text. Keys keep the order that they have in their mapping."""
     text: str = yaml.dump(
         value,
         Dumper=_Dumper,
@@ -127,8 +138,8 @@ def write_yaml(path: Path, value: Any, header: str = "") -> None:
 
     Args:
         path: The file, which is replaced if it exists.
-        value: The plain values.
-        header: Lines for a comment at the top of the file.
+        value: The plain values (numbers, texts, lists, mappings).
+        header: Lines of text that are written as a YAML comment at the top of the file.
 
     Raises:
         ConfigError: The file cannot be written.

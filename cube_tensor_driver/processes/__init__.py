@@ -1,4 +1,4 @@
-"""Which processes a skin needs, and child processes that are started, watched and ended.
+"""The list of processes that a skin needs, and the code that starts, watches and ends them.
 
-Nothing here imports ROS: nodes are started as commands. What a node does is in ros/.
+Nothing in this folder imports ROS: nodes are started as commands. The nodes are in ros/nodes/.
 """

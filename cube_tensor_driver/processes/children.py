@@ -1,4 +1,4 @@
-"""The processes of a skin as child processes: started, watched, and ended in every case."""
+"""Starts and watches the processes of a skin as child processes, and ends them in every case."""
 
 from __future__ import annotations
 
@@ -17,33 +17,41 @@ from .domain import check_domain
 from .skin_processes import Process, Value
 
 END_S = 1.2
-"""Time, in seconds, that a process has to end when asked.
+"""Maximum time, in seconds, between SIGTERM and the end of a child process.
 
-Then it is killed, because a rclpy that hangs ignores SIGTERM.
+A process that still runs afterwards is killed (SIGKILL), because a process whose rclpy hangs does
+not react to SIGTERM.
 """
 
 POLL_PERIOD_S = 0.05
-"""Time, in seconds, between two looks into a log file."""
+"""Time, in seconds, between two reads of a log file while a certain line is awaited."""
 
 SHOWN_LINES = 10
-"""Number of lines at the end of a log that an error message shows."""
+"""Number of lines from the end of a process's log that the message of a `ChildError` quotes."""
 
 HAS_SETPRIV = shutil.which("setpriv") is not None
-"""Whether the program setpriv is there. It is part of util-linux."""
+"""Whether the program setpriv (part of util-linux) is installed. It ends a child process when its
+parent is killed."""
 
 
 class ChildError(CubeError):
-    """A process ended by itself, or did not come up in time."""
+    """A child process ended unexpectedly, or did not write an expected line in time."""
 
 
 class Children:
-    """Child processes by the name of their executable; a context manager that ends them all."""
+    """The child processes of a skin; a context manager that ends all of them at its exit.
+
+    Methods identify a process by the name of its executable, such as "driver".
+    """
 
     def __init__(self, logs: Path) -> None:
-        """Write the output of each process to a file in the folder `logs`.
+        """Make an empty set of child processes.
+
+        Args:
+            logs: Folder of the log files. Each process writes its output to one of them.
 
         Raises:
-            ConfigError: ROS_DOMAIN_ID is no domain.
+            ConfigError: The environment variable ROS_DOMAIN_ID is no valid DDS domain.
         """
         check_domain()
         self._logs = logs
@@ -56,12 +64,13 @@ class Children:
         self.end(list(self._processes))
 
     def start(self, process: Process) -> None:
-        """Start a process, in a session of its own.
+        """Start a process in a session of its own.
 
-        So Ctrl-C does not reach it directly: it is ended by `end`, after what depends on it.
+        The terminal sends SIGINT (Ctrl-C) only to the session of this process. So `end` decides in
+        which order the children end.
         """
         program = [process.program] if process.program else [sys.executable, "-m", process.module]
-        # A demo that is killed must not leave a driver that holds the ports.
+        # If a demo was killed and its driver went on, the ports would stay in use.
         command = [*end_with_parent(), *program, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]
@@ -75,36 +84,41 @@ class Children:
             )
 
     def kill(self, executable: str) -> None:
-        """End a process by force, as a crash would."""
+        """End a process with SIGKILL, as a crash would end it, and wait for its end."""
         process = self._processes.pop(executable)
         _signal_session(process, signal.SIGKILL)
         process.wait()
 
     def pause(self, executable: str) -> None:
-        """Stop a process where it is, until `resume`."""
+        """Suspend a process (SIGSTOP) until `resume` is called."""
         _signal_session(self._processes[executable], signal.SIGSTOP)
 
     def resume(self, executable: str) -> None:
-        """Let a stopped process go on."""
+        """Let a process that `pause` has suspended run again (SIGCONT)."""
         _signal_session(self._processes[executable], signal.SIGCONT)
 
     def names(self) -> list[str]:
-        """Return the names of the processes that were started and not ended."""
+        """Return the names of the processes that were started and that `end` has not ended yet."""
         return list(self._processes)
 
     def pid(self, executable: str) -> int:
-        """Return the id of a process."""
+        """Return the process id of a child."""
         return self._processes[executable].pid
 
     def log(self, executable: str) -> str:
-        """Return what a process has written so far."""
+        """Return the text that a process has written to its log file so far."""
         return self._log_file(executable).read_text(errors="replace")
 
     def wait_for_line(self, executable: str, text: str, seconds: float) -> str:
-        """Return the first line of a log that contains `text`, once it is there.
+        """Wait until a process writes a line that contains `text`, and return that line.
+
+        Args:
+            executable: Name of the process.
+            text: Text that the line contains.
+            seconds: Maximum time to wait, in seconds.
 
         Raises:
-            ChildError: A process has ended before, or it takes longer than `seconds`.
+            ChildError: One of the processes has ended, or no such line came in time.
         """
         until = time.monotonic() + seconds
         while True:
@@ -121,24 +135,24 @@ class Children:
                 self._processes[executable].wait(POLL_PERIOD_S)
 
     def check(self) -> None:
-        """Raise ChildError, with the end of its log, if a process has ended."""
+        """Raise ChildError, with the end of its log, if any of the processes has ended."""
         for executable, process in self._processes.items():
             if process.poll() is not None:
-                # The last lines usually name the reason.
+                # The last lines of a log usually state why the process ended.
                 end_of_log = "\n".join(self.log(executable).splitlines()[-SHOWN_LINES:])
                 raise ChildError(
                     f"the {executable} ended with code {process.returncode}:\n{end_of_log}"
                 )
 
     def end(self, executables: Iterable[str]) -> None:
-        """End processes: ask all of them first, kill after `END_S` what is still there."""
+        """End processes: send SIGTERM to all of them, and SIGKILL to those left after `END_S`."""
         ending = [self._processes.pop(name) for name in executables]
         for process in ending:
             _signal_session(process, signal.SIGTERM)
         until = time.monotonic() + END_S
         for process in ending:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                # All have the same time to end, as all were asked at once.
+                # The deadline is common to all, as SIGTERM was sent to all at the same time.
                 process.wait(timeout=max(0.0, until - time.monotonic()))
         for process in ending:
             if process.poll() is None:
@@ -150,20 +164,25 @@ class Children:
 
 
 def ros_arguments(parameters: dict[str, Value]) -> list[str]:
-    """Return `-p name:=value` for each parameter."""
+    """Return the command-line arguments `-p name:=value` that set parameters of a ROS node.
+
+    Args:
+        parameters: Name of a parameter -> its value.
+    """
     words = []
     for name, value in parameters.items():
-        # ROS reads a value as YAML, in which a text in quotes stays a text.
+        # ROS parses the value as YAML. Without the quotes, a text such as 12 would be a number.
         written = f"'{value}'" if isinstance(value, str) else str(value).lower()
         words += ["-p", f"{name}:={written}"]
     return words
 
 
 def end_with_parent() -> list[str]:
-    """Return words in front of a command that end it when this process ends, even by SIGKILL.
+    """Return a prefix for a command line that ends the command when this process ends.
 
-    The kernel does that. The command does not start at all if this process has ended before the
-    kernel was asked.
+    It uses setpriv: the kernel sends SIGTERM to the command when its parent dies, even by SIGKILL.
+    If this process ended before the kernel was told, the command does not start at all. Without
+    setpriv the prefix is empty, and the command goes on after a SIGKILL of this process.
     """
     if not HAS_SETPRIV:
         return []
@@ -172,6 +191,9 @@ def end_with_parent() -> list[str]:
 
 
 def _signal_session(process: subprocess.Popen[bytes], number: int) -> None:
-    """Send a signal to all processes of a child's session."""
+    """Send a signal to a child and to all processes that the child has started.
+
+    Nothing happens if they have ended already.
+    """
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)

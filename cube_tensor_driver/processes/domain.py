@@ -1,4 +1,4 @@
-"""The DDS domain of this process and of those that it starts."""
+"""The DDS domain (number that separates groups of ROS nodes) of this process and its children."""
 
 from __future__ import annotations
 
@@ -10,34 +10,38 @@ from contextlib import contextmanager
 from ..core.errors import ConfigError
 
 VARIABLE = "ROS_DOMAIN_ID"
-"""Environment variable with the number of the domain."""
+"""Environment variable with the number of the DDS domain."""
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-"""Environment variable that says how far nodes look for each other."""
+"""Environment variable that states where ROS nodes search for each other, such as LOCALHOST."""
 
 MAX_DOMAIN = 232
-"""Highest domain. The UDP ports of higher ones do not exist."""
+"""Largest number of a DDS domain. The UDP ports of larger ones would exceed 65535."""
 
 MAX_OWN_DOMAIN = 100
-"""Highest domain that `own_domain` takes. The system gives the ports of higher ones to anybody."""
+"""Largest number of a DDS domain that `own_domain` chooses. Linux assigns the UDP ports of higher
+domains (from 32768 up) to any program that asks for a free port."""
 
 FIRST_PORT = 7400
-"""First UDP port of domain 0 (DDSI-RTPS 9.6.2)."""
+"""First UDP port of DDS domain 0 (DDSI-RTPS 2.2, section 9.6.2)."""
 
 PORTS_PER_DOMAIN = 250
-"""Number of UDP ports of a domain (DDSI-RTPS 9.6.2)."""
+"""Number of consecutive UDP ports of each DDS domain (DDSI-RTPS 2.2, section 9.6.2)."""
 
 FREE_OFFSET = 5
-"""Offset, within a domain's ports, of one that DDS never uses."""
+"""Offset, from the first UDP port of a DDS domain, of a port that DDS does not use. Binding this
+port reserves the domain among processes of this package."""
 
 PARTICIPANT_OFFSET = 10
-"""Offset, within a domain's ports, of the one that DDS binds for its first participant."""
+"""Offset, from the first UDP port of a DDS domain, of the port that the first DDS participant (ROS
+process) in the domain binds. If the port is taken, a node runs in the domain."""
 
 
 def check_domain() -> None:
-    """Raise ConfigError if ROS_DOMAIN_ID names no DDS domain.
+    """Raise ConfigError if the environment variable ROS_DOMAIN_ID is no number of a DDS domain.
 
-    The middleware would fail later, and not say why.
+    Without this check the middleware would fail later, with a message that does not name the
+    variable.
     """
     text = os.environ.get(VARIABLE, "")
     try:
@@ -50,15 +54,19 @@ def check_domain() -> None:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Give this process and those that it starts a DDS domain that nobody on this host uses.
+    """Set, for a `with` block, a DDS domain that no other process on this host uses.
 
-    The domain is kept to this host.
+    It holds for this process and for those started in the block. Nodes are not visible to other
+    hosts.
+
+    Yields:
+        The number of the domain.
 
     Raises:
-        ConfigError: All domains are in use.
+        ConfigError: All domains up to `MAX_OWN_DOMAIN` are in use.
     """
     domain, claim = _claim_domain()
-    # The domain holds for the block, so the variables are restored.
+    # The values are saved, so that the end of the block can restore them.
     before = {name: os.environ.get(name) for name in (VARIABLE, RANGE_VARIABLE)}
     os.environ.update({VARIABLE: str(domain), RANGE_VARIABLE: "LOCALHOST"})
     try:
@@ -72,13 +80,17 @@ def own_domain() -> Iterator[int]:
 
 
 def _claim_domain() -> tuple[int, socket.socket]:
-    """Return a domain without nodes, and the socket that keeps others of us out of it."""
+    """Return a DDS domain without nodes, and the socket that reserves it while it is open.
+
+    Raises:
+        ConfigError: All domains up to `MAX_OWN_DOMAIN` are in use.
+    """
     for domain in range(MAX_OWN_DOMAIN, 0, -1):
         claim = _bind(domain, FREE_OFFSET)
-        # Another process of ours has claimed the domain.
+        # The port is taken: another process of this package has reserved the domain.
         if claim is None:
             continue
-        # Where a node runs, it has bound the port of the first participant.
+        # Any node that runs in the domain has bound the port of the first participant.
         participant = _bind(domain, PARTICIPANT_OFFSET)
         if participant is not None:
             participant.close()
@@ -88,7 +100,12 @@ def _claim_domain() -> tuple[int, socket.socket]:
 
 
 def _bind(domain: int, offset: int) -> socket.socket | None:
-    """Return a socket on one UDP port of a domain, or None if somebody has the port."""
+    """Return a socket bound to a UDP port of a DDS domain, or None if the port is in use.
+
+    Args:
+        domain: Number of the domain.
+        offset: Offset of the port from the first one of the domain.
+    """
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         bound.bind(("", FIRST_PORT + PORTS_PER_DOMAIN * domain + offset))

@@ -1,6 +1,6 @@
-"""The processes that a skin needs, as `./cube demo` starts them.
+"""The processes that a skin needs, with their arguments, as `./cube demo` starts them.
 
-launch/skin.launch.py has the same processes as actions.
+launch/skin.launch.py starts the same processes with ROS launch.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 Value = str | float | bool
-"""Value of a parameter."""
+"""Value of a ROS parameter of a node."""
 
 RECORDED = ("frequencies", "stress", "info", "driver/info", "/diagnostics")
-"""The topics of a recording.
+"""Topics of a skin that `./cube record` and the demo record.
 
-`frequencies` and `info` are enough to reconstruct everything again, `driver/info` where no
-reconstruction runs; `stress` is what was published at the time, `/diagnostics` what the nodes
-reported about links and cubes.
+From `frequencies` and `info` the stress can be computed again; `driver/info` replaces `info` while
+no reconstruction runs. `stress` is recorded to keep the published results, and `/diagnostics` to
+keep the reports about links and cubes.
 """
 
 
@@ -25,12 +25,12 @@ class Process:
     """One process of a running skin.
 
     Attributes:
-        executable: Its name in the package.
-        module: The module that `python -m` runs.
-        node: Whether it is a ROS node, which takes parameters. Other processes take arguments.
-        parameters: Name of a parameter -> its value.
+        executable: Name of the executable in the ROS package, which also names the process.
+        module: Python module that runs as `python -m module`.
+        node: Whether the process is a ROS node. Only nodes take `parameters`.
+        parameters: Name of a ROS parameter -> its value.
         arguments: Arguments of the command line.
-        program: Path of a program that runs in the place of the module; empty: the module.
+        program: Path of a program that is started instead of the module; empty: the module is.
     """
 
     executable: str
@@ -43,17 +43,19 @@ class Process:
 
 @dataclass(frozen=True)
 class SimulatedHubs:
-    """The simulator that takes the place of the real hubs.
+    """Options of the simulator, a process that replaces the real hubs of a skin.
 
     Attributes:
-        ports: Folder for its pseudo-terminals.
-        load: Its load script; None: the one in the package.
-        mujoco: A MuJoCo scene instead of a load script; None: none.
-        sample_log: File for a record of every sample that it sends; None: none.
-        instants: Number of instants of the load that it computes in advance, see
-            `simulation.simulator.Simulator`; None: its default.
-        noise: Noise of the pads, relative to their frequencies; None: as the calibrations state.
-        imperfections: File of what else is wrong with the pads; None: nothing.
+        ports: Folder in which the simulator makes a pseudo-terminal (virtual serial port) per link.
+        load: Load script (YAML) that states the forces on the skin; None: the one in the package.
+        mujoco: MuJoCo scene that replaces the load script; None: the load script is used.
+        sample_log: File to which every sent sample is written; None: no file is written.
+        instants: Number of instants of the load that are computed in advance, see
+            `simulation.simulator.Simulator`; None: the default of the simulator.
+        noise: Standard deviation of the frequencies of the pads, divided by the frequency; None:
+            the noise that the calibrations state.
+        imperfections: File (YAML) with deviations of the pads from their calibration; None: the
+            pads are as the calibration states.
     """
 
     ports: Path
@@ -65,7 +67,7 @@ class SimulatedHubs:
     imperfections: Path | None = None
 
     def process(self, config: Path) -> Process:
-        """Return the simulator of the skin file `config`."""
+        """Return the process that simulates the hubs of the skin file `config`."""
         options = {
             "--config": config,
             "--ports": self.ports,
@@ -76,7 +78,7 @@ class SimulatedHubs:
             "--noise": self.noise,
             "--imperfections": self.imperfections,
         }
-        # An option that is not given leaves the simulator its default.
+        # Options that are None are left out, so that the simulator uses its defaults.
         given = {name: str(value) for name, value in options.items() if value is not None}
         arguments = tuple(word for option in given.items() for word in option)
         module = "cube_tensor_driver.simulation.main"
@@ -99,19 +101,20 @@ def skin_processes(
     contacts: bool = False,
     simulated: SimulatedHubs | None = None,
 ) -> list[Process]:
-    """Return the processes of a skin file, in the order in which they start.
+    """Return the processes of a skin, in the order in which they must be started.
 
     Args:
         config: The skin file.
-        port: Port instead of the one in the file, for a skin with one link.
-        rate: Samples per second; 0: as the file says.
-        publish_period: Time that one message covers, in s; 0: one message per scan.
-        composed: Whether one process holds driver and reconstruction.
-        markers: Whether the node `markers` runs, too.
-        contacts: Whether the node `contacts` runs, too.
-        simulated: Simulated hubs instead of real ones.
+        port: Port that replaces the one in the skin file, which must have a single link; empty:
+            the ports of the file.
+        rate: Sampling rate of each cube, in Hz; 0: the rate in the skin file.
+        publish_period: Time, in s, whose scans are sent in one message; 0: one message per scan.
+        composed: Whether driver and reconstruction run in one process.
+        markers: Whether the node `markers` (picture for RViz) runs, too.
+        contacts: Whether the node `contacts` (contacts on the skin) runs, too.
+        simulated: Options of simulated hubs; None: the hubs are real.
     """
-    # Queue depths of both nodes follow from the publish period.
+    # Both nodes get the publish period, because they compute the depths of their queues from it.
     common: dict[str, Value] = {"config": str(config), "publish_period": publish_period}
     port_directory = str(simulated.ports) if simulated else ""
     driver = {
@@ -126,7 +129,7 @@ def skin_processes(
     if composed:
         processes.append(_node("composed", driver))
     else:
-        # The reconstruction subscribes first, so that it misses no rows of the driver.
+        # The reconstruction starts first, so that it has subscribed before the driver publishes.
         processes += [_node("reconstruction", common), _node("driver", driver)]
     if markers:
         processes.append(_node("markers", {}))

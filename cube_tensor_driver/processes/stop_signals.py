@@ -7,19 +7,23 @@ import threading
 from collections.abc import Callable
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Ctrl-C, the request of another process, and the end of the terminal."""
+"""Signals that ask this process to end: SIGINT comes from Ctrl-C, SIGTERM from another process, and
+SIGHUP when the terminal is closed."""
 
 
 def on_stop_signal(stop: Callable[[], None]) -> None:
-    """Call `stop` for each signal that asks this process to end, instead of ending at once."""
+    """Have `stop` called at each signal of `STOP_SIGNALS`, instead of ending the process at once.
+
+    Must be called in the main thread, as Python requires for handlers of signals.
+    """
     for number in STOP_SIGNALS:
-        # nohup has the end of the terminal ignored, and that stays.
+        # A command started with nohup ignores SIGHUP; a handler here would undo that.
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: stop())
 
 
 def stop_event() -> threading.Event:
-    """Return an event that is set by the signals that ask this process to end."""
+    """Return an event that is set when a signal of `STOP_SIGNALS` comes."""
     event = threading.Event()
     on_stop_signal(event.set)
     return event
