@@ -173,8 +173,10 @@ class _Mix:
             value=5.0,
             seconds=1.0,
         )
+        # A temperature lasts until the next one.
         self._add(4.5, kind="temperature", link="hub1", value=0.0)
         rounds = range(1 + int(self._duration))
+        # More than enough: a cut is always followed by seconds without one.
         self._cuts = [
             kind for _ in rounds for kind in self._random.permutation(CUT_FAULTS).tolist()
         ]
@@ -195,6 +197,7 @@ class _Mix:
             elif kind == "step":
                 fault["value"] = round(random.uniform(-0.5, 5.0), 3)
             elif kind == "wrap":
+                # The numbers of the samples begin again at 0 after so many.
                 fault["count"] = int(random.integers(100, 3000))
             self._add_quietly(at, **fault)
             # A link that was cut delivers for a while before the next cut.

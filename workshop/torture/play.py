@@ -109,6 +109,7 @@ def play(
             )
             actions.start_driver(ports / FAULT_PIPE)
             began_s, begin_ns = time.monotonic(), time.time_ns()
+            # Faults begin only when every cube delivers.
             observer.spin(
                 MAX_START_S,
                 lambda: stress.count_cubes() == len(skin.cubes),
@@ -121,12 +122,14 @@ def play(
             threads = memory.count_threads()
             _carry_out(observer, actions, ports / FAULT_PIPE, schedule(duration, seed), duration)
             observer.spin(SETTLE_S - ARRIVAL_S)
+            # The last samples may still be on their way, so they are not checked.
             end_ns = time.time_ns() - round(NS_PER_S * UNCHECKED_S)
             observer.spin(ARRIVAL_S)
             leaked = Counter(memory.count_threads())
             leaked.subtract(threads)
             growth = memory.growth_mb_per_min()
 
+            # Once it is deactivated, the driver still reports the final counters.
             stopped_ns = time.time_ns()
             actions.stop_driver()
             observer.spin(MAX_DRAIN_S, lambda: recorder.is_complete(stopped_ns))
