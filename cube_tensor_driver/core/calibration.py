@@ -1,4 +1,4 @@
-"""Calibration: the frozen values that turn the frequencies of a cube into stress, with an id."""
+"""Calibration: the values that turn the frequencies of a cube into stress, with an id."""
 
 from __future__ import annotations
 
@@ -21,39 +21,42 @@ from .response import illustrative_coefficients, response
 from .symmetry import Structure, default_modes, find_structure
 
 SCHEMA = 1
-"""Version of the format of calibration files."""
+"""Version of the format of calibration files, which each file states under the key "schema"."""
 
 MAX_UID = 2**64 - 1
-"""Largest unique id of a cube: the protocol carries 8 bytes."""
+"""Largest unique id of a cube, because a hub sends the id in 8 bytes."""
 
 PAD_QUANTITIES = ("rest_frequency", "noise", "modulus", "gain", "beta")
-"""Names of the attributes that have one value per pad."""
+"""Names of the attributes of a calibration that have one value per pad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Properties of one cube, or of all cubes of a kind.
 
-    One number may be given for an attribute (P,); it then holds for all P pads.
+    For an attribute of shape (P,), a single number may be given; it then holds for all P pads.
 
     Attributes:
         layout: Layout of the pads.
-        rest_frequency: Frequency without load (P,), in Hz, at the reference of `temperature`.
+        rest_frequency: Frequency without load (P,), in Hz, at the reference temperature of the
+            model `temperature`.
         noise: Standard deviation of a pad's stress (P,), in Pa.
         modulus: Modulus E of a pad's foam (P,), in Pa.
         half_side: Half side d0 of the cube, in m.
         symmetry: Name of the symmetry group that the coefficients respect.
-        coefficients: Values by name, in Pa per Pa, see `symmetry.Structure`.
-        matrix: Response (P, M) without gains, in Pa per Pa. Exactly one of `coefficients` and
-            `matrix` is given.
+        coefficients: Values of the K coefficients of the response matrix by name, in Pa per Pa, see
+            `symmetry.Structure`.
+        matrix: Response matrix (P, M) from modes to pads without gains, in Pa per Pa. Exactly one
+            of `coefficients` and `matrix` is given.
         gain: Sensitivity of a pad relative to the symmetric response (P,), 1 on average.
-        beta: Ratio of the parasitic to the active capacitance at rest (P,).
+        beta: Ratio of the parasitic to the active capacitance of a pad without load (P,).
         covariance: Covariance (K, K) of the coefficients, if it is known.
         temperature: Model of the rest frequency over temperature, if it is known.
-        neglect: Names of modes that are stated to be zero, so that fewer pads determine the others.
+        neglect: Names of modes whose amplitude is assumed to be zero. The pads then determine more
+            of the other modes.
         uid: Unique id of the cube. None means that the calibration holds for any cube.
         created: Time of creation, ISO 8601.
-        source: Origin of the values.
+        source: Origin of the values, such as a file or "illustrative".
 
     Raises:
         CalibrationError: A value is invalid; the message names it.
@@ -98,11 +101,15 @@ class Calibration:
         return f"Calibration({self.id}, layout {self.layout.name!r}, {owner}, {source})"
 
     def _set(self, name: str, value: Any) -> None:
-        """Replace a given value by the checked one, although the class is frozen for its users."""
+        """Replace a given value by the checked one; a frozen dataclass refuses an assignment."""
         object.__setattr__(self, name, value)
 
     def _read_pad_quantity(self, name: str) -> Array:
-        """Return a quantity with one value per pad (P,), checked and read-only."""
+        """Return an attribute of `PAD_QUANTITIES` as a read-only array (P,).
+
+        Raises:
+            CalibrationError: The shape is wrong, or a value is negative or 0.
+        """
         n_pads = self.layout.n_pads
         array = _read_array(getattr(self, name), None, name)
         if array.shape not in ((), (n_pads,)):
@@ -110,7 +117,7 @@ class Calibration:
                 f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n_pads} pads: "
                 f"give one number or {n_pads}"
             )
-        # Only the parasitic capacitance may be absent; all other quantities divide or are divided.
+        # A pad may have no parasitic capacitance (beta = 0). All other quantities must be positive.
         lowest = array.min()
         may_be_zero = name == "beta"
         if lowest < 0 or (lowest == 0 and not may_be_zero):
@@ -121,7 +128,14 @@ class Calibration:
         return per_pad
 
     def _read_response(self, structure: Structure) -> None:
-        """Check coefficients, matrix and covariance against the structure of the response."""
+        """Check coefficients, matrix and covariance, and store them as read-only values.
+
+        Args:
+            structure: Structure of the response, which states names and shapes.
+
+        Raises:
+            CalibrationError: Names or shapes differ from those of the structure.
+        """
         if (self.coefficients is None) == (self.matrix is None):
             found = "neither" if self.matrix is None else "both"
             raise CalibrationError(
@@ -161,17 +175,22 @@ class Calibration:
 
     @property
     def modes(self) -> Modes:
-        """The M modes of the layout."""
+        """The M modes (linear stress fields) that the response of the layout refers to."""
         return default_modes(self.layout)
 
     @property
     def structure(self) -> Structure:
-        """The response matrices that the symmetry allows."""
+        """Structure (names of coefficients, basis matrices) of the responses that the symmetry
+        allows."""
         return find_structure(self.layout, self.symmetry)
 
     @cached_property
     def response(self) -> Array:
-        """Response (P, M) including the gains, in Pa per Pa: pad stresses are response @ state."""
+        """Response matrix (P, M) including the gains, in Pa per Pa.
+
+        The stresses on the pads are response @ state, where the state holds the amplitudes of the
+        modes.
+        """
         if self.coefficients is not None:
             matrix = response(self.structure, self.coefficients)
         else:
@@ -183,7 +202,8 @@ class Calibration:
     @cached_property
     def id(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 hash of the content in canonical JSON."""
-        # Sorted keys and fixed separators: equal content must give equal text on every machine.
+        # Sorted keys and fixed separators give the same text, and so the same id, for the same
+        # content on every machine.
         text = json.dumps(
             self._content(),
             sort_keys=True,
@@ -200,7 +220,7 @@ class Calibration:
             uid: Unique id of the cube, if it is known.
 
         Raises:
-            CalibrationError: It was made for another layout or another cube.
+            CalibrationError: The calibration was made for another layout or another cube.
         """
         if layout is not None and not self.layout.same_as(layout):
             raise CalibrationError(
@@ -215,14 +235,14 @@ class Calibration:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the calibration in plain types, the id first; `from_dict` reads them."""
+        """Return the calibration in types that JSON has, the id first; `from_dict` reads them."""
         return {"id": self.id, **self._content()}
 
     def _content(self) -> dict[str, Any]:
-        """Return everything but the id in plain types; values that are not given are left out."""
+        """Return all attributes that have a value, in types that JSON has, without the id."""
         built_in = LAYOUTS.get(self.layout.name)
         is_built_in = built_in is not None and built_in.same_as(self.layout)
-        # A built-in layout is stated by its name, so that files stay short and comparable.
+        # The name of a built-in layout is enough to find its pads, and keeps files short.
         content: dict[str, Any] = {
             "schema": SCHEMA,
             "layout": self.layout.name if is_built_in else self.layout.to_dict(),
@@ -237,10 +257,10 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Calibration:
-        """Construct a calibration from plain types.
+        """Construct a calibration from types that JSON has, as a file holds them.
 
-        An id must match the content. Content without an id is accepted, so that a calibration can
-        be started by hand.
+        If the data have an id, it must be the hash of the content. Data without an id are accepted,
+        so that a person can write a calibration.
 
         Raises:
             CalibrationError: A key, type, shape or the id is wrong; the message names it.
@@ -270,7 +290,8 @@ class Calibration:
                 raise CalibrationError(f"calibration: {key} is {values[key]!r}; it must be text")
 
         calibration = cls(**values)
-        # The id is computed from the checked values, so 1 and 1.0 in a file are the same.
+        # The id is computed from the checked values (floats), so that a file with 1 instead of 1.0
+        # has the same id.
         if data.get("id", calibration.id) != calibration.id:
             raise CalibrationError(
                 f"calibration: the id says {data['id']!r} but the content gives "
@@ -290,12 +311,13 @@ def illustrative(
     It is for demonstrations: its values are plausible, but no cube was measured for them.
 
     Args:
-        layout_name: Name of the layout.
-        neglect: Names of modes that are stated to be zero.
+        layout_name: Name of the layout: quad, planar or cube.
+        neglect: Names of modes whose amplitude is assumed to be zero.
         uid: Unique id of the cube; None means any cube.
     """
     layout = find_layout(layout_name)
-    # The four pads of quad lie on two opposite faces, so z differs from x and y.
+    # The pads of the layout quad lie only on the faces +z and -z, so they do not have the symmetry
+    # that exchanges z with x or y.
     symmetry = "slab" if layout_name == "quad" else "full"
     structure = find_structure(layout, symmetry)
     return Calibration(
@@ -308,14 +330,20 @@ def illustrative(
         rest_frequency=np.array(REST_FREQUENCY),
         beta=np.array(BETA),
         modulus=np.array(FOAM_MODULUS),
-        # An error of the frequency, times the slope E (1 + beta) / f0, is an error of the stress.
+        # Noise of the stress is noise of the frequency times the slope dv/df = E (1 + beta) / f0 of
+        # the pad law at rest.
         noise=np.array(FOAM_MODULUS * (1 + BETA) * FREQUENCY_NOISE),
         source="illustrative",
     )
 
 
 def _check_keys(data: Mapping[str, Any], attributes: set[str]) -> None:
-    """Raise CalibrationError if keys are missing or unknown, or the schema is another."""
+    """Raise CalibrationError if keys are missing or unknown, or the schema is not `SCHEMA`.
+
+    Args:
+        data: Calibration as a file holds it.
+        attributes: Names of the attributes of `Calibration`.
+    """
     allowed = attributes | {"id", "schema"}
     required = {"layout", "rest_frequency", "noise", "modulus", "half_side", "schema"}
     unknown, missing = set(data) - allowed, required - set(data)
@@ -331,7 +359,12 @@ def _check_keys(data: Mapping[str, Any], attributes: set[str]) -> None:
 
 
 def _to_plain(value: Any, is_per_pad: bool) -> Any:
-    """Return an attribute in types that JSON has."""
+    """Return the value of an attribute in types that JSON has.
+
+    Args:
+        value: The value.
+        is_per_pad: Whether it is an array with one value per pad; equal values become one number.
+    """
     if is_per_pad and not np.ptp(value):
         return float(value[0])
     if isinstance(value, np.ndarray):
@@ -360,13 +393,18 @@ def _read_array(
     shape: tuple[int, ...] | None,
     name: str,
 ) -> Array:
-    """Return numbers as a read-only array of a shape (None: of any shape).
+    """Return numbers as a read-only array.
+
+    Args:
+        value: Number, or nested list of numbers.
+        shape: Shape that the array must have; None allows any shape.
+        name: Name of the value, for the error message.
 
     Raises:
-        CalibrationError: There is something else than finite numbers, or the shape is another.
+        CalibrationError: The value is not of finite numbers, or has another shape.
     """
     if not isinstance(value, np.ndarray):
-        # numpy converts texts and truth values to numbers; in a file they are mistakes.
+        # numpy would convert texts and truth values to numbers, but in a file they are mistakes.
         items = np.asarray(value, dtype=object).ravel()
         if any(isinstance(item, (str, bool)) or item is None for item in items):
             raise CalibrationError(

@@ -1,15 +1,16 @@
-"""Inversion of a response by weighted least squares, and the residual that tells broken pads.
+"""Inversion of a response by weighted least squares, and the residual that shows broken pads.
 
-With W = diag(1 / noise) and the singular value decomposition W A = U1 S V1', of which only singular
-values above `RANK_TOLERANCE` of the largest are kept:
+The pads measure the stresses v = A s, where A is the response (pads x modes) and the state s holds
+the amplitudes of the modes. With W = diag(1 / noise) and the singular value decomposition
+W A = U1 S V1', of which only singular values above `RANK_TOLERANCE` of the largest are kept:
 
     components    T V1 S^-1 U1' W v           T takes a state to components, see Modes.components
     covariance    T V1 S^-2 V1' T'
     chi-square    |U2' W v|^2                 U2 completes U1 to a basis of the pads; its number of
                                               columns is the number of degrees of freedom
 
-Source: eqs. 2 to 5 of the paper are the closed forms for one layout; docs/physics.md corrects eqs.
-4 and 5.
+Source: Kiyota & Shinoda, eqs. 2 to 5, are the closed forms for one layout; docs/physics.md corrects
+their eqs. 4 and 5.
 """
 
 from __future__ import annotations
@@ -27,40 +28,48 @@ from .modes import Modes
 from .symmetry import Structure
 
 RANK_TOLERANCE = 1e-4
-"""Smallest singular value of the whitened response, relative to the largest, that counts.
+"""Smallest singular value, relative to the largest, that is used to invert the response of a cube.
 
-A combination of modes below it moves the pads so little that its amplitude would be mostly noise.
+The response (pads x modes) is first divided by the noise of the pads. The pads respond so little to
+a combination of modes with a smaller singular value that its amplitude would be mostly noise.
 """
 
 LEAK_TOLERANCE = 1e-3
-"""Largest relative part of an observed component that may be invisible to the pads.
+"""Largest part of a component that may be invisible to the pads, relative to the whole component.
 
-A component is a sum of modes. The part of the sum that lies along combinations of modes to which no
-pad responds cannot be measured.
+A component of stress or gradient is a sum of modes. Its part along combinations of modes to which
+no pad responds cannot be measured. If this part is larger, the component is not observed (NaN).
 """
 
 FALSE_ALARM = 1e-3
-"""Probability that pads with nothing but their stated noise set the residual bit."""
+"""Probability that a row of a cube without fault is reported with a high residual, only because of
+the noise that its calibration states."""
 
 SUSPECT_MARGIN = 2 * math.log(100)
-"""Difference of chi-square that corresponds to odds of 100 to 1.
+"""Difference of two values of chi-square at which one explanation is 100 times as likely as the
+other.
 
-A pad is no suspect if another pad explains the residual better by more than this.
+If leaving out another pad lowers chi-square by this much more, a pad is not suspected.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Linear maps for one response, one noise and one set of present pads.
+    """Linear maps from the stresses on the pads to the estimated quantities and to the residual.
+
+    They hold for one response, one noise and one set of usable pads. The T targets are the
+    quantities to estimate, usually the 15 components of stress and gradient.
 
     Attributes:
-        matrix: Map (T, P) from pad stresses to targets. Rows of unobserved targets are NaN, columns
-            of missing pads are 0.
-        observed: Which targets the pads determine (T,).
-        covariance: Covariance of the targets (T, T), NaN in rows and columns of unobserved ones.
-        null: Whitened rows (D, P); chi-square is the sum of squares of null @ v.
-        limit: Chi-square that noise alone exceeds with probability `FALSE_ALARM`; NaN without
-            redundancy.
+        matrix: Map (T, P) from pad stresses to targets. Rows of targets that the pads do not
+            determine are NaN, columns of pads that are left out are 0.
+        observed: Whether the pads determine each target (T,).
+        covariance: Covariance of the targets (T, T), NaN in the rows and columns of targets that
+            the pads do not determine.
+        null: Map (D, P) from pad stresses to D combinations that only noise makes differ from 0,
+            each with the standard deviation 1. Chi-square is the sum of their squares.
+        limit: Chi-square that noise alone exceeds with probability `FALSE_ALARM`; NaN if there are
+            no more pads than determined modes (D = 0).
         rank: Number of combinations of modes that the pads determine.
         noise: Standard deviation of the pads' stresses (P,), in Pa.
     """
@@ -75,17 +84,17 @@ class Estimator:
 
     @property
     def dof(self) -> int:
-        """Number of degrees of freedom of chi-square."""
+        """Number D of degrees of freedom of chi-square."""
         return len(self.null)
 
     def suspects(self, pad_stress: Array) -> Mask:
-        """Find the pads that, broken alone, explain a high chi-square.
+        """Find the pads that explain a high chi-square if just this one pad is broken.
 
-        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, with z = null v and u_p the
-        column of U2' of the pad. A row has suspects if its chi-square is above the limit, and
-        without the best pad below the limit for one degree of freedom less. Suspects are the best
-        pad and all pads that explain as much within `SUSPECT_MARGIN`. If these are all pads, none
-        is a suspect.
+        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, with z = null v and
+        u_p = noise_p times column p of `null`. A row has suspects if its chi-square is above the
+        limit, and falls below the limit for one degree of freedom less when the best pad (the one
+        that lowers it most) is left out. The suspects are the best pad and all pads that lower
+        chi-square as much within `SUSPECT_MARGIN`. If these are all pads, none is a suspect.
 
         Two pads that are opposite each other through the centre of a symmetric cube are always
         suspects together, because a gradient absorbs their difference.
@@ -102,7 +111,8 @@ class Estimator:
         z = v @ self.null.T
         columns = self.null * self.noise
         size = np.sum(columns**2, axis=0)
-        # A pad without redundancy could show anything and leave no residual.
+        # If a pad is needed to determine the modes, any value of it leaves the residual unchanged,
+        # so it cannot be checked.
         is_checked = size > LEAK_TOLERANCE**2
         safe_size = np.where(is_checked, size, 1)
         reduction = (z @ columns) ** 2 / safe_size
@@ -111,7 +121,8 @@ class Estimator:
         chi2 = np.sum(z**2, axis=1)
         best = drop.max(axis=1)
         is_similar = drop > best[:, None] - SUSPECT_MARGIN
-        # Without the broken pad only noise remains, with one degree of freedom less.
+        # After leaving out the broken pad, chi-square is that of noise alone, with one degree of
+        # freedom less.
         limit_without = chi2_limit(self.dof - 1, FALSE_ALARM)
         is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
         is_specific = is_similar.sum(axis=1) < is_checked.sum()
@@ -133,9 +144,11 @@ def make_estimator(
         response: Response (P, M), in Pa per Pa.
         noise: Standard deviation of each pad's stress (P,), in Pa.
         modes: The M modes.
-        missing: Numbers of pads that are left out.
-        neglect: Names of modes that are stated to be zero; they are unobserved themselves.
-        targets: Map (T, M) from a state to the quantities to estimate; by default the components.
+        missing: Numbers of pads that are not used.
+        neglect: Names of modes whose amplitude is assumed to be zero. Components with a part along
+            these modes count as not observed.
+        targets: Map (T, M) from a state (amplitudes of the modes) to the quantities to estimate; by
+            default the 15 components of stress and gradient.
     """
     response = np.asarray(response, dtype=float)
     noise = np.asarray(noise, dtype=float)
@@ -150,7 +163,8 @@ def make_estimator(
     # Dividing by the noise gives all pads the standard deviation 1, so that the sum of squared
     # residuals is chi-square.
     whitened = response[np.ix_(present, kept)] / noise[present, None]
-    # The full matrix u is needed: its last columns give the residual.
+    # The full matrix u is needed, because its last columns are orthogonal to the response of every
+    # mode and so give the residual.
     u, s, vt = np.linalg.svd(whitened, full_matrices=True)
     rank = 0
     if s.size and s[0] > 0:
@@ -160,8 +174,8 @@ def make_estimator(
     kept_targets = targets[:, kept]
     projected = (kept_targets @ v1) @ v1.T
     unseen = np.linalg.norm(kept_targets - projected, axis=1)
-    # Neglected modes are stated to be zero, not measured: a target with a part along them is
-    # unobserved.
+    # Neglected modes are assumed to be zero and not measured, so a target with a part along them
+    # counts as not observed.
     neglected_targets = np.delete(targets, kept, axis=1)
     neglected = np.linalg.norm(neglected_targets, axis=1)
     size = np.linalg.norm(targets, axis=1)
@@ -193,21 +207,24 @@ def summarize_response(
     response: Array,
     neglect: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Summarise, in plain types, which modes a response determines and how well.
+    """Summarise which modes a response determines, and how well, in types that JSON has.
 
     Args:
         structure: Layout and modes of the response.
         response: Response (P, M), in Pa per Pa.
-        neglect: Names of modes that are stated to be zero.
+        neglect: Names of modes whose amplitude is assumed to be zero.
 
     Returns:
         A table with the keys
 
-        - pads, modes, n_coefficients: names and numbers of the structure;
-        - rank_uniform, rank_gradient: ranks of the columns of uniform and of gradient modes;
-        - condition_uniform, condition_gradient: condition numbers of these columns;
+        - pads, modes, n_coefficients: names of the pads and of the modes, and the number of
+          coefficients of a response;
+        - rank_uniform, rank_gradient: ranks of the columns of the response for modes of uniform
+          stress, and of those for modes with a gradient;
+        - condition_uniform, condition_gradient: condition numbers of the same columns;
         - unobservable: names of modes that the pads do not determine;
-        - noise: standard deviation of each mode per unit of pad noise.
+        - noise: standard deviation of each mode's amplitude if every pad's stress has the standard
+          deviation 1.
 
         None stands for a value that does not exist.
     """
@@ -252,8 +269,9 @@ def summarize_response(
 def chi2_tail(x: float, dof: int) -> float:
     """Compute the probability that chi-square of `dof` degrees of freedom exceeds x.
 
-    The regularised gamma function Q(dof/2, x/2) follows from Q(1/2, h) = erfc(sqrt(h)) or
-    Q(1, h) = exp(-h) by the recurrence Q(a + 1, h) = Q(a, h) + h^a exp(-h) / Gamma(a + 1).
+    It is the regularised upper incomplete gamma function Q(dof/2, x/2), which follows from
+    Q(1/2, h) = erfc(sqrt(h)) or Q(1, h) = exp(-h) by the recurrence
+    Q(a + 1, h) = Q(a, h) + h^a exp(-h) / Gamma(a + 1).
     """
     if x <= 0:
         return 1.0
@@ -263,7 +281,8 @@ def chi2_tail(x: float, dof: int) -> float:
     else:
         a, tail = 1.0, math.exp(-h)
     while a < dof / 2:
-        # In logarithms, because h^a alone overflows for many degrees of freedom.
+        # The product h^a exp(-h) / Gamma(a + 1) is computed by logarithms, because h^a alone
+        # overflows for many degrees of freedom.
         tail += math.exp(a * math.log(h) - h - math.lgamma(a + 1))
         a += 1
     return tail
@@ -271,16 +290,18 @@ def chi2_tail(x: float, dof: int) -> float:
 
 @lru_cache
 def chi2_limit(dof: int, probability: float) -> float:
-    """Compute the value that chi-square of `dof` degrees of freedom exceeds with a probability.
+    """Compute the value that chi-square exceeds with a given probability.
 
-    It is NaN without degrees of freedom.
+    Args:
+        dof: Number of degrees of freedom; the result is NaN if it is 0.
+        probability: Probability of a larger chi-square.
     """
     if dof < 1:
         return math.nan
     low, high = 0.0, 1.0
     while chi2_tail(high, dof) > probability:
         high *= 2
-    # A hundred bisections reach the last bit of a float, whatever the interval.
+    # A float has 53 bits of precision, so a hundred bisections find the value to its last bit.
     for _ in range(100):
         centre = (low + high) / 2
         if chi2_tail(centre, dof) > probability:

@@ -1,6 +1,9 @@
-"""Response matrix A of a cube (pads x modes, Pa per Pa): the stresses on the pads are v = A s.
+"""Response matrix A of a cube (pads x modes, Pa per Pa).
 
-Source: eq. 1 of the paper.
+The stresses on the pads are v = A s, where s holds the amplitudes of the modes (linear stress
+fields, see `modes.py`).
+
+Source: Kiyota & Shinoda, eq. 1.
 """
 
 from __future__ import annotations
@@ -22,9 +25,10 @@ ILLUSTRATIVE = {
     "g": -1.4,
     "h": 0.3,
 }
-"""Illustrative coefficients of the layouts quad and planar, in Pa per Pa.
+"""Illustrative coefficients of the response matrix of the layouts quad and planar, in Pa per Pa.
 
-They are neither computed nor measured; a calibration that is fitted or computed replaces them.
+The names are the letters of Kiyota & Shinoda, eq. 1. The values are chosen freely for
+demonstrations; a real cube needs a calibration with fitted or computed values.
 """
 
 _FREE_SHEAR_Z = 0.4
@@ -44,22 +48,29 @@ ILLUSTRATIVE_CUBE = {
     "+z-x:zx_x-yz_y": _FREE_SHEAR_Z,
     "+z-x:xy_y-zx_z": _FREE_SHEAR_X,
 }
-"""Illustrative coefficients of the layout cube: entries of the row of pad V1, in Pa per Pa.
+"""Illustrative coefficients of the response matrix of the layout cube, in Pa per Pa.
 
-The entries across the section of the pad (yy, yy_x, yy_z) and of the two free shears are chosen
-freely. The others make each section respond to plane modes as `ILLUSTRATIVE` does.
+They are the responses of the first pad, +z-x, to the modes after the colon. Those to modes of the
+plane z-x are chosen so that the pads in this plane respond as `ILLUSTRATIVE` states; the others
+(yy, yy_x, yy_z and the two shear gradients) are chosen freely.
 """
 
 _LARGEST_SYMMETRY = {"quad": "slab", "planar": "full", "cube": "full"}
 MAX_LISTED_NAMES = 6
-"""Number of names that an error message lists before it only counts the others."""
+"""Maximum number of names that an error message lists; of further names it states the number."""
 
 
 def illustrative_coefficients(structure: Structure) -> dict[str, float]:
-    """Return illustrative coefficients of a built-in layout under any of its symmetries.
+    """Return illustrative coefficients of the response of a built-in layout.
+
+    Args:
+        structure: Built-in layout, and any symmetry that it has.
+
+    Returns:
+        Value of each coefficient of the structure, in Pa per Pa.
 
     Raises:
-        LayoutError: The layout is not built in.
+        LayoutError: The layout is none of quad, planar and cube.
     """
     layout = structure.layout
     if layout.name not in _LARGEST_SYMMETRY:
@@ -71,7 +82,8 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
     if set(structure.names) == set(known):
         return {name: known[name] for name in structure.names}
 
-    # A smaller symmetry has more coefficients: read them off the most symmetric response.
+    # A smaller symmetry has more coefficients. They are computed from the response matrix of the
+    # largest symmetry, whose coefficients are known.
     symmetric = find_structure(layout, _LARGEST_SYMMETRY[layout.name])
     matrix = response(symmetric, illustrative_coefficients(symmetric))
     coefficients, _ = project(structure, matrix)
@@ -79,7 +91,11 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
 
 
 def generic_response(structure: Structure) -> Array:
-    """Return a response (P, M) with random coefficients; it has the ranks of almost all others."""
+    """Return a response matrix (P, M) with random coefficients.
+
+    Its rank is that of almost every response with this structure, so it shows which modes a layout
+    can determine.
+    """
     generator = np.random.default_rng(0)
     values = generator.uniform(0.5, 1.5, structure.n_coefficients)
     coefficients = dict(zip(structure.names, values.tolist(), strict=True))
@@ -87,11 +103,11 @@ def generic_response(structure: Structure) -> Array:
 
 
 def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
-    """Compute the response A = sum_k c_k B_k.
+    """Compute the response matrix A = sum_k c_k B_k.
 
     Args:
-        structure: The K basis matrices B_k.
-        coefficients: Value of each coefficient, in Pa per Pa.
+        structure: Structure with the K basis matrices B_k (entries 0, 1 and -1).
+        coefficients: Value c_k of each coefficient by its name, in Pa per Pa.
 
     Returns:
         Response (P, M), in Pa per Pa.
@@ -117,14 +133,17 @@ def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
 
 
 def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], float]:
-    """Find the member of a structure that is nearest to a response (P, M).
+    """Find the symmetric response matrix that is nearest to a given one.
 
-    Each coefficient is the mean over its orbit. This equals the average of P(R)^-1 A M(R) over the
-    symmetry group.
+    Each coefficient is the mean of the entries that the symmetry makes equal, up to their signs.
+
+    Args:
+        structure: Structure with the symmetry.
+        matrix: Response matrix A (P, M), in Pa per Pa.
 
     Returns:
-        The coefficients, and the relative remainder |A - A_sym| / |A|, which is 0 for a response
-        that has the symmetry.
+        Coefficients of the nearest symmetric matrix A_sym by name, and the relative remainder
+        |A - A_sym| / |A|, which is 0 for a matrix that has the symmetry.
 
     Raises:
         CalibrationError: The matrix has another shape.
@@ -147,14 +166,14 @@ def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], floa
 
 
 def prototype(shift: Array) -> Array:
-    """Compute the readings of the paper's prototype, eqs. 8 to 10 as they stand.
+    """Compute the three readings of the prototype of Kiyota & Shinoda, eqs. 8 to 10 as printed.
 
-    In terms of eq. 1 the readings are
+    In terms of their eq. 1 (letters: response coefficients, names: amplitudes of modes) they are
 
         -4 (a zz - b xx),   4 (c + d) zx,   -4 (e zz_x - h xx_x)
 
-    The normal reading includes sigma_xx. The third is the true gradient only where the gradient of
-    sigma_xx is known.
+    So the normal reading mixes sigma_zz with sigma_xx, and the gradient reading mixes the gradient
+    of sigma_zz with that of sigma_xx.
 
     Args:
         shift: Frequency shifts of the pads V1 to V4, (N, 4).

@@ -1,8 +1,8 @@
-"""Rows: the data that the steps of the program pass on, as frequencies and as stress.
+"""Rows: the tables of frequencies and of stress that the steps of the program pass on.
 
-One row is one sample: all pads of one cube at one instant. The rows of one scan come together.
-Several scans may come together, too: first all rows of the first scan, then all of the second, and
-so on.
+One row is one sample: all pads of one cube at one instant. A scan has at most one row per cube, all
+read at about the same time. A table holds the rows of one scan, or of several scans one after the
+other.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ COLUMN_TYPES: dict[str, type] = {
     "observed": np.uint16,
     "left_out": np.uint32,
 }
-"""Type of each column with one number per row, as in the messages."""
+"""Type of each column of rows that has one number per row, the same as in the ROS messages."""
 
 
 class _Rows:
-    """Base class of rows, whose fields are all arrays (N, ...)."""
+    """Base class of tables of N rows, whose fields are all arrays (N, ...)."""
 
     __slots__ = ()
     cube: NDArray[np.uint16]
@@ -48,7 +48,11 @@ class _Rows:
         return f"{name}({len(self)} rows of {cubes} cubes over {duration_s:.3g} s)"
 
     def select(self: _Kind, chosen: Any) -> _Kind:
-        """Return the rows that an index, a slice or a mask chooses, as numpy indexes arrays."""
+        """Return some of the rows.
+
+        Args:
+            chosen: Row numbers, a slice or a mask (N,), with which numpy indexes an array.
+        """
         columns = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
         return type(self)(*(column[chosen] for column in columns))
 
@@ -66,9 +70,9 @@ class FrequencyRows(_Rows):
         stamp_ns: Time at which the pads were read (N,), in ns of the source's clock.
         frequency: Frequency of each pad (N, P), in Hz. NaN where nothing was measured, and where
             the cube has no such pad.
-        temperature: Temperature (N,), in °C; NaN where it is unknown.
-        pad_fault: Bit p is set if the device reports that pad p is broken (N,).
-        status: Bits of `status.py` (N,). Only STAMP is used: the time stamp is doubtful.
+        temperature: Temperature of the cube (N,), in °C; NaN where it is unknown.
+        pad_fault: Bit masks (N,); bit p is set if the device reports that pad p is broken.
+        status: Bits of `status.py` (N,), of which only STAMP (doubtful time stamp) is used.
     """
 
     cube: NDArray[np.uint16]
@@ -91,13 +95,13 @@ class FrequencyRows(_Rows):
         pad_fault: Any = 0,
         status: Any = 0,
     ) -> FrequencyRows:
-        """Construct rows from plain numbers.
+        """Construct N rows from numbers, lists or arrays.
 
         Args:
             cube: Numbers of the cubes (N,).
             frequency: Frequencies (N, P), in Hz.
-            stamp_ns, sequence, temperature, pad_fault, status: The other attributes, as (N,) or
-                as one value for all rows.
+            stamp_ns, sequence, temperature, pad_fault, status: The other attributes, each with N
+                values or with one value for all rows.
         """
         columns = _fill_columns(
             cube,
@@ -115,16 +119,18 @@ class StressRows(_Rows):
     """Reconstructed stress: N rows, each in the frame of its cube, tension positive.
 
     Attributes:
-        cube, sequence, stamp_ns: Of the row of frequencies that each row was made from (N,).
-        stress: Stress (N, 6), in Pa, in the order xx, yy, zz, yz, zx, xy. NaN where a component is
-            not observed.
-        gradient: Gradients of the normal stresses (N, 9), in Pa/m: rows xx, yy, zz, columns d/dx,
-            d/dy, d/dz. NaN where a component is not observed.
-        residual: sqrt(chi-square / degrees of freedom) (N,), about 1 for noise alone. NaN where
-            there is no redundancy.
+        cube, sequence, stamp_ns: Cube number, sequence number and time stamp (N,), taken from the
+            `FrequencyRows` that the stress was computed from.
+        stress: Stress (N, 6), in Pa, in the order xx, yy, zz, yz, zx, xy. NaN where the pads do not
+            determine a component.
+        gradient: Gradients of the normal stresses (N, 9), in Pa/m: xx, yy and zz, each with its
+            derivatives along x, y and z. NaN where the pads do not determine a component.
+        residual: sqrt(chi-square / degrees of freedom) (N,), about 1 for noise alone. Chi-square
+            measures how far the signals of the pads contradict each other. NaN where the pads are
+            too few to contradict each other.
         status: Bits of `status.py` (N,).
-        observed: Bit i is set if component i of `modes.COMPONENTS` was recovered (N,).
-        left_out: Bit p is set if pad p was not used (N,).
+        observed: Bit masks (N,); bit i is set if component i of `modes.COMPONENTS` was recovered.
+        left_out: Bit masks (N,); bit p is set if pad p was not used.
     """
 
     cube: NDArray[np.uint16]
@@ -151,14 +157,14 @@ class StressRows(_Rows):
         sequence: Any = 0,
         left_out: Any = 0,
     ) -> StressRows:
-        """Construct rows from plain numbers.
+        """Construct N rows from numbers, lists or arrays.
 
         Args:
             cube: Numbers of the cubes (N,).
             stress: Stress (N, 6), in Pa.
-            gradient: Gradients (N, 9), in Pa/m.
-            residual, status, observed, stamp_ns, sequence, left_out: The other attributes, as (N,)
-                or as one value for all rows.
+            gradient: Gradients of the normal stresses (N, 9), in Pa/m.
+            residual, status, observed, stamp_ns, sequence, left_out: The other attributes, each
+                with N values or with one value for all rows.
         """
         columns = _fill_columns(
             cube,
@@ -173,7 +179,7 @@ class StressRows(_Rows):
 
 
 def concatenate(parts: Sequence[_Kind]) -> _Kind:
-    """Join the rows of one or more parts, in order."""
+    """Return one table with the rows of one or more tables of the same kind, in order."""
     kind = type(parts[0])
     columns = (
         np.concatenate([getattr(part, field.name) for part in parts])
@@ -183,7 +189,12 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
 
 
 def _fill_columns(cube: Any, **columns: Any) -> dict[str, AnyArray]:
-    """Return the columns (N,) of N rows, each from values (N,) or from one value for all rows."""
+    """Return the columns (N,) of N rows by name, with the types of `COLUMN_TYPES`.
+
+    Args:
+        cube: Numbers of the cubes (N,).
+        columns: Values of each other column, N or one for all rows.
+    """
     filled = {"cube": np.asarray(cube)}
     shape = filled["cube"].shape
     for name, values in columns.items():
@@ -193,21 +204,24 @@ def _fill_columns(cube: Any, **columns: Any) -> dict[str, AnyArray]:
 
 
 class Source(Protocol):
-    """A source of frequencies: live links, a bag, or a simulated skin.
+    """A source of frequencies: the links to real hubs, a bag (recording), or a simulated skin.
 
-    It is a context manager; iterating over it yields rows.
+    A source is a context manager; iterating over it yields `FrequencyRows`.
     """
 
     @property
     def skin(self) -> Any:
-        """The skin whose cubes `FrequencyRows.cube` numbers."""
+        """The skin; `FrequencyRows.cube` is an index into its cubes."""
 
     @property
     def is_live(self) -> bool:
-        """Whether rows arrive as they are measured, so that the next one takes time."""
+        """Whether rows arrive while they are measured, so that iterating waits for the next ones.
+
+        A bag is not live: its rows are there at once.
+        """
 
     def statistics(self) -> dict[str, object]:
-        """Return counts of delivered and lost data, by name."""
+        """Return counts of the data that were delivered or lost so far, by name of the count."""
 
     def __iter__(self) -> Iterator[FrequencyRows]: ...
 

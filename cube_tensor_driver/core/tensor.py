@@ -17,18 +17,19 @@ from .arrays import AnyArray, Array, Real
 from .errors import CubeError
 from .modes import to_matrix, to_voigt
 
-_FIXED_AXES = "sxyz"  # transforms3d's name for roll, pitch and yaw as URDF and REP 103 define them
+# The name by which transforms3d means roll, pitch and yaw about fixed axes, as in URDF and REP 103.
+_FIXED_AXES = "sxyz"
 
 
 def principal_stresses(stress: Real) -> tuple[Array, Array]:
     """Compute principal stresses and their directions.
 
     Args:
-        stress: Stress (..., 6).
+        stress: Stress (..., 6) in any unit, in the order xx, yy, zz, yz, zx, xy.
 
     Returns:
-        Principal stresses (..., 3), the largest first, and unit vectors (..., 3, 3), one a row. The
-        sign of a direction is arbitrary. Rows with NaN give NaN.
+        Principal stresses (..., 3), the largest first, and their directions as the rows of
+        matrices (..., 3, 3). The sign of a direction is arbitrary. A stress with a NaN gives NaN.
     """
     matrices = to_matrix(stress).astype(float)
     is_known = np.isfinite(matrices).all(axis=(-2, -1))
@@ -45,9 +46,9 @@ def principal_stresses(stress: Real) -> tuple[Array, Array]:
 
 
 def invariants(stress: Real) -> Array:
-    """Compute the invariants (..., 3) of a stress (..., 6) in Pa.
+    """Compute the invariants I1, I2, I3 (..., 3) of a stress tensor s (..., 6) in Pa.
 
-    They are I1 = tr s in Pa, I2 = (I1^2 - tr s^2) / 2 in Pa^2 and I3 = det s in Pa^3.
+    I1 = tr s in Pa, I2 = (I1^2 - tr s^2) / 2 in Pa^2, and I3 = det s in Pa^3.
     """
     xx, yy, zz, yz, zx, xy = _split(stress)
     trace = xx + yy + zz
@@ -57,7 +58,7 @@ def invariants(stress: Real) -> Array:
 
 
 def von_mises(stress: Real) -> Array:
-    """Compute the von Mises stress (...), sqrt(3/2 |deviator|^2), of a stress (..., 6)."""
+    """Compute the von Mises stress sqrt(3/2 |deviator|^2) of each stress tensor (..., 6)."""
     xx, yy, zz, yz, zx, xy = _split(stress)
     normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
     shear = yz**2 + zx**2 + xy**2
@@ -66,16 +67,16 @@ def von_mises(stress: Real) -> Array:
 
 
 def _split(stress: Real) -> AnyArray:
-    """Return the components (6, ...) of a stress (..., 6)."""
+    """Return a stress (..., 6) with its components as the first axis (6, ...)."""
     return np.moveaxis(np.asarray(stress), -1, 0)
 
 
 def traction(stress: Real, normal: ArrayLike) -> Array:
-    """Compute the traction sigma n (..., 3) on planes.
+    """Compute the traction sigma n (force per area on a plane), in the unit of the stress (..., 3).
 
     Args:
         stress: Stress (..., 6).
-        normal: Normals of the planes (..., 3) of any length but 0.
+        normal: Normals of the planes (..., 3), of any length but 0; they are normalised.
 
     Raises:
         CubeError: A normal has length 0.
@@ -92,7 +93,13 @@ def traction(stress: Real, normal: ArrayLike) -> Array:
 
 
 def rotate_stress(stress: Real, rotation: ArrayLike) -> Array:
-    """Compute the stress R s R' (..., 6) in a frame with the coordinates R x. NaN spreads."""
+    """Compute the stress R s R' (..., 6) in a rotated frame.
+
+    Args:
+        stress: Stress s (..., 6). A NaN in one component makes every component of the result NaN
+            that depends on it.
+        rotation: Matrix R (..., 3, 3) that takes coordinates x to R x in the rotated frame.
+    """
     r = np.asarray(rotation, dtype=float)
     inverse = np.swapaxes(r, -1, -2)
     rotated: Array = r @ to_matrix(stress) @ inverse
@@ -100,10 +107,14 @@ def rotate_stress(stress: Real, rotation: ArrayLike) -> Array:
 
 
 def rotate_gradient(gradient: Array, rotation: ArrayLike) -> Array:
-    """Compute the gradient R_ia R_jb R_kc G_abc (..., 3, 3, 3) in a frame with the coordinates R x.
+    """Compute the stress gradient R_ia R_jb R_kc G_abc (..., 3, 3, 3) in a rotated frame.
 
-    All 27 entries are needed, because the nine normal gradients in a rotated frame depend on
-    gradients of shear in the first frame.
+    All 27 entries are needed, because gradients of normal stress in the rotated frame depend on
+    gradients of shear stress in the first frame.
+
+    Args:
+        gradient: Gradient G_abc = d(sigma_ab)/dx_c (..., 3, 3, 3).
+        rotation: Matrix R (..., 3, 3) that takes coordinates x to R x in the rotated frame.
     """
     r = np.asarray(rotation, dtype=float)
     g = np.asarray(gradient)
@@ -116,9 +127,15 @@ def rotation_from_rpy(
     pitch: float,
     yaw: float,
 ) -> Array:
-    """Return Rz(yaw) Ry(pitch) Rx(roll) (3, 3) of angles in rad, fixed axes as in URDF.
+    """Return the rotation matrix Rz(yaw) Ry(pitch) Rx(roll) (3, 3).
 
-    It takes coordinates of the cube to those of its parent frame.
+    If the angles state the orientation of a frame in its parent frame, as in URDF, the matrix takes
+    coordinates in the frame to coordinates in the parent frame.
+
+    Args:
+        roll: Rotation about the x axis of the parent frame, in rad.
+        pitch: Rotation about its y axis after that, in rad.
+        yaw: Rotation about its z axis after that, in rad.
     """
     rotation: Array = euler.euler2mat(roll, pitch, yaw, _FIXED_AXES)
     return rotation
@@ -129,15 +146,18 @@ def quaternion_from_rpy(
     pitch: float,
     yaw: float,
 ) -> Array:
-    """Return the quaternion x, y, z, w (4,) of `rotation_from_rpy`, with w not negative."""
+    """Return the rotation by roll, pitch and yaw as a quaternion x, y, z, w (4,) with w >= 0.
+
+    `rotation_from_rpy` explains the angles, which are in rad.
+    """
     w, x, y, z = euler.euler2quat(roll, pitch, yaw, _FIXED_AXES)
-    # Both signs are the same rotation; choosing one makes equal rotations equal numbers.
+    # q and -q are the same rotation; choosing one sign gives equal rotations equal numbers.
     sign = 1 if w >= 0 else -1
     return np.array([x, y, z, w]) * sign
 
 
 def quaternion_from_rotation(rotation: Array) -> Array:
-    """Return the quaternion x, y, z, w (4,) of a rotation matrix (3, 3), with w not negative."""
+    """Return the quaternion x, y, z, w (4,), with w >= 0, of a rotation matrix (3, 3)."""
     matrix = np.asarray(rotation, dtype=float)
     w, x, y, z = quaternions.mat2quat(matrix)
     return np.array([x, y, z, w])
@@ -170,10 +190,10 @@ def rpy_from_quaternion(quaternion: ArrayLike) -> Array:
 
 
 def face_force(stress: Real, side: Array | float) -> Array:
-    """Compute the force w^2 sigma n on a square in the plane of the face +z.
+    """Compute the force w^2 sigma n on a square whose normal n is +z.
 
     Args:
-        stress: Stress (N, 6), in Pa. Components that are not observed count as 0.
+        stress: Stress (N, 6), in Pa. NaN (a component that is not known) counts as 0.
         side: Side w of the square, in m.
 
     Returns:
@@ -190,17 +210,18 @@ def contact_wrench(
     gradient: Real,
     side: float,
 ) -> tuple[Array, Array]:
-    """Compute force and torque on a square in the plane of the face +z.
+    """Compute the force and the torque about the centre of a square whose normal n is +z.
 
         force  = w^2 sigma n
         torque = (w^4 / 12) (d(szz)/dy, -d(szz)/dx, 0)
 
-    The torque about z needs gradients of shear, to which pads of normal stress do not respond, so
-    it is 0. Components that are not observed count as 0.
+    The torque about z is returned as 0, because it would need gradients of shear stress, which are
+    not among the published components. NaN (a component that is not known) counts as 0.
 
     Args:
         stress: Stress (N, 6), in Pa.
-        gradient: Gradients of the normal stresses (N, 9) as in `StressRows`, in Pa/m.
+        gradient: Gradients of the normal stresses (N, 9), in Pa/m: xx, yy and zz, each with its
+            derivatives along x, y and z.
         side: Side w of the square, in m.
 
     Returns:
@@ -210,6 +231,6 @@ def contact_wrench(
     zz_x, zz_y = known[..., 6], known[..., 7]
     unknown_twist = np.zeros_like(zz_x)
     direction = np.stack([zz_y, -zz_x, unknown_twist], axis=-1)
-    # A pressure that grows linearly over the square turns about its centre, as in a bent beam.
+    # A normal stress that grows linearly over the square causes a torque, as in a bent beam.
     second_moment_of_area = side**4 / 12
     return face_force(stress, side), second_moment_of_area * direction
