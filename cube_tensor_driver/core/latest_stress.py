@@ -12,36 +12,39 @@ from .rows import StressRows
 from .status import INVALID, RESIDUAL
 
 FINE = 0
-"""Health of a cube: its latest row is usable without reservation."""
+"""Health of a cube: the latest stress is usable without reservation."""
 DOUBTFUL = 1
-"""Health of a cube: a status bit is set, or many rows have a high residual."""
+"""Health of a cube: the latest stress has a status bit other than that of the residual, or many
+recent rows have a high residual."""
 FAULTY = 2
-"""Health of a cube: all components of its latest row are unknown (NaN)."""
+"""Health of a cube: all components of the latest stress are unknown (NaN)."""
 STALE = 3
-"""Health of a cube: no row of it has arrived for some time."""
+"""Health of a cube: no stress of this cube has arrived for some time (`STALE_S`, if the caller does
+not choose another)."""
 
 HEALTH_WORDS = ("ok", "doubtful", "no tensor", "stale")
-"""Words for `FINE`, `DOUBTFUL`, `FAULTY` and `STALE`, in this order."""
+"""Text for each health of a cube: `FINE`, `DOUBTFUL`, `FAULTY` and `STALE`, in this order."""
 
 STALE_S = 1.0
-"""Time without a row, in seconds, after which a cube is stale."""
+"""Default time without a stress message of a cube, in seconds, after which the cube is stale."""
 
 
 class LatestStress:
-    """The latest row of each of N cubes, and its time of arrival.
+    """The latest row of stress of each of N cubes, and the time at which it arrived.
 
-    The caller states the time, in seconds from any origin.
+    The class reads no clock: the caller states the time, in seconds from any origin.
 
     Attributes:
-        values: Components (N, 15), in Pa and Pa/m; NaN before the first row of a cube.
-        residual: Residual (N,).
-        status: Status bits (N,).
-        left_out: Bit masks of the pads that were not used (N,).
-        arrived: Time of arrival (N,), in s; minus infinity before the first row.
+        values: Components of stress in Pa and of gradient in Pa/m (N, 15); NaN before the first
+            row of a cube.
+        residual: Residual of the latest row (N,).
+        status: Status bits of the latest row (N,).
+        left_out: Bit masks of the pads that were not used for the latest row (N,).
+        arrived: Time of arrival of the latest row (N,), in s; minus infinity before the first row.
         count: Number of rows so far (N,).
-        high_residual: Whether many rows of a cube have a residual above its limit (N,), decided as
-            `Health` does. Noise alone exceeds the limit in one row of a thousand, so on a large
-            skin some cube exceeds it at any moment.
+        high_residual: Whether many recent rows of a cube have a residual above its limit (N,), by
+            the rule of `has_high_residual`. Noise alone exceeds the limit in one row of a thousand,
+            so on a large skin some cube exceeds it at any moment.
     """
 
     def __init__(self, n_cubes: int) -> None:
@@ -58,13 +61,13 @@ class LatestStress:
         self._over_limit = np.zeros(n_cubes, np.int64)
 
     def update(self, rows: StressRows, now: float) -> None:
-        """Take over rows; of several rows of a cube the last remains.
+        """Store new rows; of several rows of one cube, the last is kept.
 
         Rows of cubes that the skin does not have are ignored.
 
         Args:
             rows: New rows.
-            now: Time of their arrival, in s.
+            now: Time at which the rows arrived, in s.
         """
         is_known = rows.cube < len(self.status)
         if not is_known.all():
@@ -78,7 +81,7 @@ class LatestStress:
         self.arrived[cube] = now
 
         self._close_window_when_over(now)
-        # A cube may have several rows, which an indexed += would count once.
+        # If a cube has several of these rows, `count[cube] += 1` would count only one of them.
         np.add.at(self.count, cube, 1)
         is_over_limit = rows.status & RESIDUAL != 0
         if is_over_limit.any():
@@ -86,7 +89,7 @@ class LatestStress:
             np.add.at(self._over_limit, exceeding, 1)
 
     def health(self, now: float, stale_after: float) -> Index:
-        """Judge each cube.
+        """Return the health of each cube.
 
         Args:
             now: Present time, in s.
@@ -95,7 +98,8 @@ class LatestStress:
         Returns:
             `FINE`, `DOUBTFUL`, `FAULTY` or `STALE` of each cube (N,).
         """
-        # A single high residual is normal noise; many of them are counted in `high_residual`.
+        # A high residual of a single row may be noise. Whether many rows have one is stated by
+        # `high_residual`.
         other_bits = self.status & ~np.uint16(RESIDUAL)
         is_doubtful = self.high_residual | (other_bits != 0)
         health = np.where(is_doubtful, DOUBTFUL, FINE)
@@ -104,12 +108,21 @@ class LatestStress:
         return health
 
     def usable_values(self, health: Index) -> Array:
-        """Return the components (N, 15), NaN for cubes that are `FAULTY` or `STALE`."""
+        """Return the latest components (N, 15), in Pa and Pa/m.
+
+        Args:
+            health: Health of the cubes (N,), as `health` returns it. Cubes that are `FAULTY` or
+                `STALE` get NaN.
+        """
         is_usable: Mask = health < FAULTY
         return np.where(is_usable[:, None], self.values, np.nan)
 
     def _close_window_when_over(self, now: float) -> None:
-        """Close the window that counts high residuals if it is over, or if time jumped back."""
+        """Evaluate the counts of high residuals every `WINDOW_S`, and start new counts.
+
+        Args:
+            now: Present time, in s. A time before the start of the counts also ends them.
+        """
         if 0 <= now - self._window_start < WINDOW_S:
             return
         rows = self.count - self._count_at_start

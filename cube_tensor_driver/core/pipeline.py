@@ -1,13 +1,15 @@
 """Pipeline: rows of frequencies to rows of stress, without a loop over rows or cubes.
 
-Each calibration has a table with a stacked matrix: 15 rows that give the components, then the
-whitened null-space rows of the residual. Rows whose pads are all good need the pad law and one
-matrix product per calibration. Rows with bad pads are computed again with the estimator for their
-set of pads, with one product per distinct pair of calibration and bit mask. Whatever the numbers in
-a row are, they raise no error.
+A row (sample of one cube) is computed in two steps: the pad law (`oscillator.py`) gives the stress
+on each pad from its frequency, and a matrix product gives the 15 components of stress and gradient.
+The same matrix has further rows for the residual, combinations of the pads' stresses that only
+noise makes differ from 0. There is one matrix product per calibration if all pads are good. Rows
+with bad pads are computed again without these pads, with one matrix per distinct pair of
+calibration and bit mask. Whatever the numbers in a row are, they raise no error.
 
-The bits of a row do not depend on the number of scans that are processed with it. Therefore
-products are formed scan by scan, because the last bit of a matrix product may depend on its shape.
+A scan has at most one row per cube. The bits of a row do not depend on the number of scans that are
+processed with it. Therefore products are formed scan by scan, because the last bit of a matrix
+product may depend on its shape.
 """
 
 from __future__ import annotations
@@ -31,33 +33,39 @@ from .status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 N_COMPONENTS = len(COMPONENTS)
 
 MAX_CACHED_MASKS = 1024
-"""Number of estimators, one per calibration and set of pads, that are kept in memory."""
+"""Maximum number of matrices from pads to components that are kept in memory.
+
+There is one for each combination of a calibration and a set of bad pads that has occurred.
+"""
 
 MIN_BETA = 1e-12
-"""Smallest ratio of parasitic to active capacitance that the pad law is computed with.
+"""Smallest value of beta (ratio of a pad's parasitic to its active capacitance) in the pad law.
 
-With it every pad has a highest frequency. It changes the strain by 1e-12.
+The computation divides by beta, so a pad with beta = 0 is computed with this value. It changes the
+strain of the pad by 1e-12.
 """
 
 LOWEST_STRESS_MARGIN = 1e-6
-"""Relative distance from the pad stress of f = 0 within which a row is examined pad by pad.
+"""Relative margin around the pad stress that a frequency of 0 would give.
 
-It covers a few rounding errors of float32.
+If a stress is lower than that stress plus the margin, each pad is checked for a frequency outside
+the pad law. The margin covers a few rounding errors of float32.
 """
 
 MAX_SEPARATE_PRODUCTS = 8
-"""Up to this many different calibrations, each gets its own matrix product (BLAS). With more, one
-einsum over all cubes with the same number of pads is faster."""
+"""Maximum number of different calibrations for which one matrix product (BLAS) per calibration is
+computed. With more calibrations, one einsum over all cubes with the same number of pads is
+faster."""
 
 
 class _Table(NamedTuple):
-    """An estimator in the form in which rows are computed.
+    """Matrix and limits for the rows with one calibration and one set of good pads.
 
     Attributes:
-        matrix: Map (15 + D, P) from pad stresses divided by the stiffness to 15 components and D
-            whitened residuals divided by sqrt(dof).
-        limit: Limit of the residual.
-        observed: Bit mask of the observed components.
+        matrix: Map (15 + D, P) from v (pad stresses divided by the stiffness) to 15 components, and
+            to D residuals whose sum of squares is chi-square / degrees of freedom.
+        limit: Limit of the residual, sqrt(chi-square / degrees of freedom).
+        observed: Bit mask of the components that the pads determine.
     """
 
     matrix: Real
@@ -66,13 +74,14 @@ class _Table(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """Rows of a scan that share a product.
+    """Rows of a scan that are computed in one matrix product.
 
     Attributes:
-        rows: Places of the rows in the scan.
-        pads: Number of pads of each row.
-        matrix: Matrix (pads, 15 + D) for all rows, or (pads, recovered, rows) where each row has
-            its own calibration.
+        rows: Numbers of these rows in the scan.
+        pads: Number of pads of each of these rows.
+        matrix: One matrix (pads, 15 + D) for all rows, or one per row (pads, recovered, rows) if
+            the rows have different calibrations; "recovered" counts the components and residuals
+            that some calibration determines.
     """
 
     rows: slice | Index
@@ -84,15 +93,16 @@ class _Pattern(NamedTuple):
     """Quantities that depend only on the cube numbers of a scan of N rows.
 
     Attributes:
-        unknown: Whether the skin has no such cube (N,).
-        group: Number of the calibration (N,).
-        rest: Rest frequencies (N, P), in Hz.
-        highest: Highest frequencies of the pad law (N, P), in Hz.
-        lowest_v: Largest value of v, over all pads, that the frequency 0 gives.
-        n_pads: Number of pads of all rows.
-        blocks: Products that give the components.
+        unknown: Whether the row has a cube number that the skin does not have (N,).
+        group: Number of the calibration of the row's cube (N,).
+        rest: Frequencies without load (N, P), in Hz.
+        highest: Upper limits of the frequencies by the pad law (N, P), in Hz.
+        lowest_v: Value of v (pad stress divided by the stiffness) above which all frequencies of a
+            scan are above 0: the largest v, over all pads, that a frequency of 0 gives.
+        n_pads: Number of pads of all N rows together.
+        blocks: Rows that share a matrix product.
         limit: Limits of the residual (N,).
-        observed: Bit masks of the observed components (N,).
+        observed: Bit masks of the components that the pads determine (N,).
     """
 
     unknown: Mask
@@ -107,15 +117,16 @@ class _Pattern(NamedTuple):
 
 
 class _PadLaw(NamedTuple):
-    """Pads of B scans of N rows after the pad law.
+    """Results of the pad law (frequency to stress of a pad) for B scans of N rows.
 
     Attributes:
-        pattern: Pattern of a scan.
+        pattern: Quantities that depend only on the cubes of a scan.
         v: Pad stresses divided by the stiffness (B, N, P). Bad pads are 0. Pads that a cube does
             not have are NaN, or 0 if any pad is bad.
-        bad: Bit masks of the bad pads (B, N); None if there are none.
-        no_temperature: Rows whose temperature is needed and unknown (B, N); None if no calibration
-            has a temperature model.
+        bad: Bit masks of the bad pads (left out, or with an impossible frequency) (B, N); None if
+            there are none.
+        no_temperature: Whether a row needs a temperature that is unknown (B, N); None if no
+            calibration has a temperature model.
     """
 
     pattern: _Pattern
@@ -127,7 +138,8 @@ class _PadLaw(NamedTuple):
 class Pipeline:
     """Computes the stress of the cubes of one skin.
 
-    Cubes may have different layouts. Rows are as wide as the largest number of pads.
+    Cubes may have different layouts. Tables of pads have as many columns as the cube with most pads
+    has pads.
 
     Attributes:
         calibrations: Calibration of each cube.
@@ -140,10 +152,10 @@ class Pipeline:
 
         Args:
             calibrations: Calibration of each cube.
-            dtype: np.float32 or np.float64.
+            dtype: Precision of the computation, np.float32 or np.float64.
 
         Raises:
-            CubeError: The precision is another.
+            CubeError: `dtype` is neither of the two.
             CalibrationError: There are no cubes.
         """
         self.dtype = np.dtype(dtype)
@@ -159,7 +171,8 @@ class Pipeline:
         numbers = {key: number for number, key in enumerate(by_id)}
         self._groups = tuple(by_id.values())
         self._group = np.array([numbers[c.id] for c in self.calibrations])
-        # The fill values make the stiffness of missing pads 0, without a division by 0.
+        # For pads that a cube does not have, these values give a stiffness of 0 without a division
+        # by 0.
         beta = pad_table([c.beta for c in self._groups], self.n_pads, fill=1)
         modulus = pad_table([c.modulus for c in self._groups], self.n_pads, fill=0)
         self._beta = np.maximum(beta, MIN_BETA)
@@ -172,7 +185,7 @@ class Pipeline:
         self._estimator = lru_cache(maxsize=MAX_CACHED_MASKS)(self._make_estimator)
         self._table = lru_cache(maxsize=MAX_CACHED_MASKS)(self._make_table)
         groups = range(len(self._groups))
-        # At least one residual row, so that there is a place for its NaN.
+        # Even if no calibration has a residual, the tables have one row for it, which is NaN.
         most_dof = max(self._estimator(group, 0).dof for group in groups)
         self._n_residual = most_dof or 1
         tables = [self._make_table(group, 0) for group in groups]
@@ -193,10 +206,10 @@ class Pipeline:
 
     @property
     def rest_frequency(self) -> Array:
-        """Rest frequencies (cubes, P), in Hz, at the reference temperature; a tare sets them.
+        """Frequencies without load (cubes, P), in Hz, at the reference temperature.
 
-        They are NaN where a cube has no such pad. Setting them raises LayoutError for a wrong
-        shape, and CubeError for values that are not finite and above 0.
+        They are NaN where a cube has no such pad. Setting new ones, as a tare does, raises
+        LayoutError for a wrong shape, and CubeError for values that are not finite and above 0.
         """
         rest: Array = self._rest.copy()
         return rest
@@ -220,11 +233,13 @@ class Pipeline:
         self._patterns.clear()
 
     def temperature_factor(self, cube: Index, temperature: Real) -> Array:
-        """Return f0(T) / f0 (N, P) of rows; 1 without a model or a temperature.
+        """Return the ratio of rest frequencies at a temperature to those at the reference (N, P).
+
+        The ratio is 1 if a calibration has no temperature model or the temperature is unknown.
 
         Args:
             cube: Numbers of the cubes (N,).
-            temperature: Temperatures (N,), in °C.
+            temperature: Temperatures (N,), in °C; NaN where they are unknown.
         """
         return self._factor(self._group[cube], np.asarray(temperature, dtype=float))
 
@@ -232,9 +247,10 @@ class Pipeline:
         """Compute the stress of N rows.
 
         Args:
-            rows: Rows of one scan, or of several scans of the same cubes one after the other.
-            left_out: Bit masks of pads that are not used (N,). None stands for the pads that the
-                device reports as broken.
+            rows: Rows of one scan (at most one row per cube), or of several scans of the same cubes
+                one after the other.
+            left_out: Bit masks of the pads that are not used (N,). None stands for the pads that
+                the device reports as broken.
 
         Raises:
             LayoutError: Arrays have the wrong shape. Every other problem of a row becomes a bit of
@@ -247,7 +263,7 @@ class Pipeline:
             pattern, v, bad = law.pattern, law.v, law.bad
             out = self._multiply(pattern, v)
             limit = pattern.limit
-            # A copy, because rows with bad pads get their own values.
+            # This makes a copy of the cached array, in which rows with bad pads are changed.
             observed = np.concatenate([pattern.observed] * len(v))
             if bad is not None:
                 limit = np.tile(pattern.limit, (len(v), 1))
@@ -263,7 +279,8 @@ class Pipeline:
             status[observed == 0] |= INVALID
         if law.no_temperature is not None:
             status[law.no_temperature.ravel()] |= TEMPERATURE
-        # No other bit of the source is adopted, because a peer may write anything there.
+        # Only the STAMP bit of the source is adopted, because a sender of messages may have set any
+        # other bit by mistake.
         status |= rows.status & np.uint16(STAMP)
         components = out.reshape(-1, out.shape[2])
         return StressRows(
@@ -279,10 +296,14 @@ class Pipeline:
         )
 
     def _multiply(self, pattern: _Pattern, v: Real) -> Real:
-        """Multiply v (B, N, P) by the matrices of the rows' calibrations.
+        """Multiply pad stresses by the matrices of the rows' calibrations.
+
+        Args:
+            pattern: Pattern of a scan.
+            v: Pad stresses divided by the stiffness (B, N, P).
 
         Returns:
-            Components and whitened residuals (B, N, 15 + D).
+            15 components and D residuals of each row (B, N, 15 + D).
         """
         if len(pattern.blocks) == 1 and pattern.blocks[0].matrix.ndim == 2:
             # All cubes share one calibration: the product is the result, without a copy.
@@ -312,15 +333,15 @@ class Pipeline:
         limit: Array,
         observed: AnyArray,
     ) -> None:
-        """Compute rows with bad pads again, with the estimator for their good pads.
+        """Compute rows with bad pads again, with the matrix for their good pads.
 
-        Rows of unknown cubes become NaN.
+        Rows of cubes that the skin does not have become NaN.
 
         Args:
             pattern: Pattern of a scan.
             v: Pad stresses divided by the stiffness (B, N, P).
             bad: Bit masks of the bad pads (B, N).
-            out: Components and residual rows (B, N, 15 + D), which are changed.
+            out: Components and residuals of each row (B, N, 15 + D), which are changed.
             limit: Limits of the residual (B, N), which are changed.
             observed: Bit masks of the observed components (B N,), which are changed.
         """
@@ -330,7 +351,8 @@ class Pipeline:
         groups = np.tile(pattern.group, len(v))
         for group, mask, rows in _group_by_mask(groups, bad.ravel()):
             table = self._table(group, mask)
-            # Row by row: the last bit of one product for all rows may depend on their number.
+            # matmul forms one product per row, because the last bit of a single product for all
+            # rows may depend on their number.
             product = np.matmul(table.matrix, flat_v[rows][:, :, None])
             flat_out[rows] = product[:, :, 0]
             flat_limit[rows] = table.limit
@@ -339,9 +361,11 @@ class Pipeline:
         observed.reshape(len(v), -1)[:, pattern.unknown] = 0
 
     def _residual(self, out: Real) -> Real:
-        """Compute the residual of each row (B, N) from its product (B, N, 15 + D).
+        """Compute the residual sqrt(chi-square / degrees of freedom) of each row (B, N).
 
-        The last D numbers of a product are the whitened residuals divided by sqrt(dof).
+        Args:
+            out: 15 components and D residuals of each row (B, N, 15 + D). The sum of squares of the
+                D residuals is chi-square / degrees of freedom.
         """
         rest = out[:, :, N_COMPONENTS:]
         if self._n_residual == 1:
@@ -350,9 +374,15 @@ class Pipeline:
         return residual
 
     def pad_stress(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Array:
-        """Compute pad stresses (N, P), in Pa, by the pad law without gains.
+        """Compute pad stresses (N, P), in Pa, by the pad law.
 
-        They are NaN for bad pads, and for pads that the cube does not have.
+        They are not divided by the gains (relative sensitivities) of the pads. They are NaN for
+        bad pads, and for pads that the cube does not have.
+
+        Args:
+            rows: N rows of frequencies.
+            left_out: Bit masks of the pads that are not used (N,). None stands for the pads that
+                the device reports as broken.
         """
         group, unknown, stress, bad = self._apply_law_by_row(rows, left_out)
         is_bad = _unpack_bits(bad, self.n_pads)
@@ -360,9 +390,9 @@ class Pipeline:
         return np.where(is_missing, np.nan, stress)
 
     def suspects(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Mask:
-        """Find the pads (N, P) that, broken alone, explain a high residual.
+        """Find the pads (N, P) that explain a high residual if just this one pad is broken.
 
-        `Estimator.suspects` states the rule.
+        `Estimator.suspects` states the rule; `pad_stress` explains the arguments.
         """
         groups, unknown, stress, bad = self._apply_law_by_row(rows, left_out)
         result = np.zeros(stress.shape, dtype=bool)
@@ -375,11 +405,11 @@ class Pipeline:
     def _apply_law_by_row(
         self, rows: FrequencyRows, left_out: PadMasks | None
     ) -> tuple[Index, Mask, Array, Times]:
-        """Apply the pad law to N rows.
+        """Apply the pad law (frequency to stress of a pad) to N rows.
 
         Returns:
-            Group of each row (N,), whether its cube is unknown (N,), its pad stresses (N, P) in Pa,
-            and the bit mask of its bad pads (N,).
+            Number of the calibration of each row (N,), whether the skin lacks the row's cube (N,),
+            pad stresses (N, P) in Pa, and bit masks of the bad pads (N,).
         """
         if left_out is None:
             left_out = rows.pad_fault
@@ -396,15 +426,16 @@ class Pipeline:
         return group, unknown, stress, bad
 
     def matrix(self, cube: int, left_out: int = 0) -> Array:
-        """Return the map (15, P) from a cube's pad stresses in Pa to its components.
+        """Return the matrix (15, P) from the stresses on a cube's pads to its components.
 
         Args:
             cube: Number of the cube.
-            left_out: Bit mask of pads that are not used.
+            left_out: Bit mask of the pads that are not used.
 
         Returns:
-            Rows in Pa per Pa for stresses and in Pa/m per Pa for gradients; NaN for components that
-            are not observed. Columns of pads that are left out are 0.
+            Matrix with rows in Pa per Pa for the 6 stresses and in Pa/m per Pa for the 9 gradients.
+            Rows of components that the pads do not determine are NaN, and columns of pads that are
+            not used are 0.
         """
         estimator, scale = self._find_estimator(cube, left_out)
         return estimator.matrix * scale[:, None]
@@ -414,27 +445,44 @@ class Pipeline:
 
         Args:
             cube: Number of the cube.
-            left_out: Bit mask of pads that are not used.
+            left_out: Bit mask of the pads that are not used.
 
         Returns:
-            Products of Pa for stresses and Pa/m for gradients; NaN for components that are not
-            observed.
+            Covariance of 6 stresses in Pa and 9 gradients in Pa/m; NaN in the rows and columns of
+            components that the pads do not determine.
         """
         estimator, scale = self._find_estimator(cube, left_out)
         return estimator.covariance * np.outer(scale, scale)
 
     def _find_estimator(self, cube: int, left_out: int) -> tuple[Estimator, Array]:
-        """Return the estimator of a cube, and the unit (15,) of its components."""
+        """Return the estimator of a cube, and factors for the units of its components.
+
+        Args:
+            cube: Number of the cube.
+            left_out: Bit mask of the pads that are not used.
+
+        Returns:
+            Estimator, and the factors (15,) from its components, in Pa, to Pa and Pa/m.
+        """
         group = int(self._group[cube])
-        # Bits of pads that the cube does not have would fill the cache with equal estimators.
+        # Bits of pads that the cube does not have are removed, because they would fill the cache
+        # with equal estimators.
         mask = int(left_out) & int(_pack_bits(self._exists[group]))
         return self._estimator(group, mask), self._scale(group)
 
     def _apply_law(self, rows: FrequencyRows, left_out: PadMasks) -> _PadLaw:
-        """Apply the pad law in three passes: v = E (1 + beta) / beta (f - f0) / (f_highest - f).
+        """Apply the pad law v = (f - f0) / (f_highest - f), in three passes over the rows.
 
-        Several scans of the same rising cube numbers become as many scans in the result; rows in
-        another order become one scan.
+        The stress on a pad is v times its stiffness E (1 + beta) / beta. Several scans with the
+        same rising cube numbers become as many scans in the result; rows in any other order become
+        one scan.
+
+        Args:
+            rows: Rows of frequencies f.
+            left_out: Bit masks of the pads that are not used (N,).
+
+        Raises:
+            LayoutError: The frequencies have the wrong shape.
         """
         f = np.asarray(rows.frequency, dtype=self.dtype)
         if f.ndim != 2 or f.shape != (len(rows), self.n_pads):
@@ -446,7 +494,7 @@ class Pipeline:
         n = len(pattern.group)
         count = len(rows) // n if n else 1
         if count > 1:
-            # Only for several scans, because numpy is faster with two axes than with three.
+            # A single scan keeps two axes, because numpy is faster with two axes than with three.
             f = f.reshape(count, n, self.n_pads)
         rest, highest = pattern.rest, pattern.highest
         no_temperature = None
@@ -461,8 +509,8 @@ class Pipeline:
         any_reported = np.count_nonzero(left_out) > 0
         try:
             v /= below_highest
-            # v falls with f down to f = 0 and is below -1 beyond the highest frequency, so one
-            # comparison of the minimum finds all frequencies outside the law.
+            # As f falls to 0, v falls to `lowest_v`; for f above the highest frequency, v is below
+            # -1. So one comparison of the smallest v finds any frequency outside the pad law.
             is_full = f.size == count * pattern.n_pads
             is_within = n > 0 and is_full and v.min() > pattern.lowest_v
         except FloatingPointError:  # f equals the highest frequency
@@ -471,7 +519,7 @@ class Pipeline:
         if is_within and not any_reported:
             return _PadLaw(pattern, v, None, no_temperature)
 
-        # NaN, Inf and frequencies outside the range of the law all fail one of the comparisons.
+        # NaN, Inf and frequencies outside the range of the pad law fail one of these comparisons.
         is_good = (f > 0) & (below_highest > 0)
         is_good = is_good.reshape(v.shape)
         if np.count_nonzero(is_good) == count * pattern.n_pads and not any_reported:
@@ -484,9 +532,11 @@ class Pipeline:
         return _PadLaw(pattern, v, bad, no_temperature)
 
     def _make_pattern(self, cube: AnyArray) -> _Pattern:
-        """Compute the pattern of a column of cube numbers.
+        """Compute the quantities that depend only on the cube numbers of rows.
 
-        A column of several scans of the same cubes gets the pattern of one scan.
+        Args:
+            cube: Cube numbers of one scan, or of several scans of the same cubes. The result is
+                then that of one of these scans.
         """
         repeats = count_repeats(cube)
         if repeats > 1:
@@ -495,11 +545,12 @@ class Pipeline:
         known_cube = np.where(unknown, 0, cube).astype(int)
         group, rest = self._group[known_cube], self._rest[known_cube]
         highest = highest_frequency(rest, self._beta[group])
-        # v is lowest at f = 0. The largest of these values, of all pads, is safe for every pad.
+        # Each pad has its lowest v at f = 0. The largest of these values serves as the limit of all
+        # pads.
         at_zero = -rest / highest
         lowest_v = float(np.fmax.reduce(at_zero, axis=None, initial=-1.0))
-        # A scan with an unknown cube has one pad more than there are, so that it never counts as
-        # full and is always corrected, which sets the row of the unknown cube to NaN.
+        # For a scan with a cube that the skin does not have, one pad too many is counted. So it
+        # always appears to have a bad pad, and `_correct_bad_rows` sets that cube's row to NaN.
         n_pads = int(np.count_nonzero(self._exists[group]))
         n_pads += int(unknown.any())
         return _Pattern(
@@ -527,7 +578,7 @@ class Pipeline:
         for value in np.unique(shared).tolist():
             index = np.flatnonzero(shared == value)
             first, last = int(index[0]), int(index[-1])
-            # A slice makes no copies.
+            # Indexing with a slice makes no copy of an array, indexing with numbers does.
             are_neighbours = last - first + 1 == len(index)
             rows = slice(first, last + 1) if are_neighbours else index
             pads = int(n_pads[first])
@@ -540,7 +591,15 @@ class Pipeline:
         return blocks
 
     def _factor(self, group: Index, temperature: Array) -> Array:
-        """Return f0(T) / f0 (..., P) of rows of these groups (N,) at temperatures (..., N)."""
+        """Return the ratio of rest frequencies at temperatures to those at the reference.
+
+        Args:
+            group: Number of the calibration of each row (N,).
+            temperature: Temperatures (..., N), in °C; NaN where they are unknown.
+
+        Returns:
+            Ratio for each pad (..., N, P); 1 without a temperature or a temperature model.
+        """
         factor = np.ones((*temperature.shape, self.n_pads))
         for number, calibration in enumerate(self._groups):
             if calibration.temperature is not None:
@@ -550,7 +609,13 @@ class Pipeline:
         return factor
 
     def _scale(self, group: int) -> Array:
-        """Return the unit (15,) of the components: gradients are solved for times d0."""
+        """Return the factors (15,) from the components of an estimator to Pa and Pa/m.
+
+        An estimator gives gradients times d0 (half the side of the cube), in Pa.
+
+        Args:
+            group: Number of the calibration.
+        """
         is_stress = np.arange(N_COMPONENTS) < len(STRESS)
         return np.where(is_stress, 1, 1 / self._groups[group].half_side)
 
@@ -570,27 +635,28 @@ class Pipeline:
         n_pads = self._groups[group].layout.n_pads
         matrix = np.zeros((N_COMPONENTS + self._n_residual, self.n_pads))
         matrix[:N_COMPONENTS, :n_pads] = estimator.matrix * self._scale(group)[:, None]
-        # Without redundancy the residual is unknown.
+        # The residual is NaN (unknown) if there are no more pads than determined modes.
         matrix[N_COMPONENTS:, :n_pads] = np.nan
-        # If pads are missing and the rank falls by more than their number, there are more null rows
-        # than the table has room for. Then only the first of them are used.
+        # If pads are missing and the rank falls by more than their number, the residual has more
+        # degrees of freedom than the table has rows for it. Then only the first of them are used.
         null = estimator.null[: self._n_residual]
         dof = len(null)
         limit = np.nan
         if dof:
-            # The residual is sqrt(chi-square / dof), so that noise alone gives about 1.
+            # These rows give sqrt(chi-square / dof), which is about 1 for noise alone.
             end = N_COMPONENTS + dof
             matrix[N_COMPONENTS:, :n_pads] = 0
             matrix[N_COMPONENTS:end, :n_pads] = null / np.sqrt(dof)
             limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof)
-        # v is the pad stress divided by the stiffness, so the stiffness goes into the matrix.
+        # Rows hold pad stresses divided by the stiffness, so the matrix is multiplied by the
+        # stiffness.
         matrix *= self._stiffness[group]
         observed = int(_pack_bits(estimator.observed))
         return _Table(matrix.astype(self.dtype, order="F"), limit, observed)
 
 
 def _unpack_bits(mask: AnyArray | int, count: int) -> Mask:
-    """Return the lowest bits (..., count) of bit masks."""
+    """Return bits 0 to count - 1 of bit masks (...) as an array (..., count)."""
     masks = np.asarray(mask, dtype=np.int64)
     shifted = masks[..., None] >> np.arange(count)
     bits: Mask = shifted & 1 > 0
@@ -609,21 +675,21 @@ def _group_by_mask(
     mask: Times,
     also_good: bool = False,
 ) -> Iterator[tuple[int, int, Index]]:
-    """Collect the rows of each distinct pair of group and bit mask of bad pads.
+    """Collect the rows of each distinct pair of calibration and bit mask of bad pads.
 
     Args:
-        group: Groups (N,).
-        mask: Bit masks (N,).
+        group: Number of the calibration of each row (N,).
+        mask: Bit mask of the bad pads of each row (N,).
         also_good: Whether rows without bad pads are collected, too.
 
     Yields:
-        Group, mask and row numbers.
+        Number of the calibration, bit mask, and the numbers of the rows that have both.
     """
     rows = np.arange(len(mask)) if also_good else np.flatnonzero(mask)
-    # Masks have 32 bits, so group and mask fit into one integer that can be sorted.
+    # Masks have 32 bits, so the number of the calibration and the mask fit one 64-bit integer.
     keys = group[rows] << 32 | mask[rows]
     pairs, which = np.unique(keys, return_inverse=True)
-    # A stable sort keeps the rows of a pair in their order.
+    # A stable sort keeps the order of rows with the same calibration and mask.
     order = np.argsort(which, kind="stable")
     bounds = np.searchsorted(which[order], np.arange(len(pairs) + 1))
     for number, pair in enumerate(pairs.tolist()):

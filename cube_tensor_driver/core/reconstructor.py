@@ -1,8 +1,10 @@
 """Reconstructor: from rows of frequencies to rows of stress, the central step of the program.
 
-It combines the health of the pads, the pipeline, drift and tare. It has no clock, no input or
-output, no threads and no ROS: time is what the rows state. The node, reprocessing of a bag, the
-check of the demo and a notebook all use it, and all get the same bits.
+It combines the health of the pads (which of them are broken), the pipeline (the computation of the
+stress), the tracking of drift, and tare (taking the present load as the unloaded state). It reads
+no clock and no files, and needs no threads and no ROS: times are the time stamps of the rows. The
+ROS node, reprocessing of a bag, the check of the demo and a notebook all use it, and all get the
+same bits.
 """
 
 from __future__ import annotations
@@ -23,12 +25,12 @@ from .rows import FrequencyRows, StressRows
 
 
 class RecordedHealth(NamedTuple):
-    """The health of pads that was found when N rows were recorded.
+    """Results of the health check of the pads, as a recording states them for N rows.
 
     Attributes:
-        known: Whether the recording states it (N,).
+        known: Whether the recording states the results for this row (N,).
         left_out: Bit masks of the pads that were not used (N,).
-        status: Conditions of the pads of the row's cube (N,), bits of `status.py`.
+        status: Conditions of all pads of the row's cube together (N,), bits of `status.py`.
     """
 
     known: Mask
@@ -36,7 +38,11 @@ class RecordedHealth(NamedTuple):
     status: StatusBits
 
     def select(self, chosen: Any) -> RecordedHealth:
-        """Return the recorded health of the rows that an index, a slice or a mask chooses."""
+        """Return the recorded health of some of the rows.
+
+        Args:
+            chosen: Row numbers, a slice or a mask (N,), with which numpy indexes an array.
+        """
         return RecordedHealth(self.known[chosen], self.left_out[chosen], self.status[chosen])
 
 
@@ -57,9 +63,9 @@ class Reconstructor:
         pipeline: Pipeline from frequencies to stress.
         health: Health of the pads.
         names: Names of the cubes, for messages.
-        drift_time: Time constant with which rest frequencies follow slow drift, in s. With 0 they
-            do not follow.
-        rest_changes: Number of changes of the rest frequencies so far.
+        drift_time: Time constant of the tracking of slow drift of the rest frequencies (frequencies
+            without load), in s. 0 turns the tracking off.
+        rest_changes: Number of changes of the rest frequencies so far, by tare or drift.
     """
 
     def __init__(
@@ -100,7 +106,8 @@ class Reconstructor:
     def rest_frequency(self) -> Array:
         """Frequencies of the pads without load (cubes, P), in Hz; NaN where a cube has no such pad.
 
-        Setting them raises LayoutError for a wrong shape, and CubeError for impossible values.
+        Setting the frequencies raises LayoutError for a wrong shape, and CubeError for values that
+        are not finite and above 0.
         """
         return self.pipeline.rest_frequency
 
@@ -115,7 +122,8 @@ class Reconstructor:
 
         Args:
             rows: Rows of one scan, or of several scans one after the other.
-            recorded: Health of the pads that replaces the one found now, where it is known.
+            recorded: Health of the pads from a recording. For the rows for which it is known, it
+                replaces the health that is found now.
 
         Raises:
             LayoutError: The rows have cubes or pads that the skin does not have. Every other
@@ -131,7 +139,8 @@ class Reconstructor:
         self.health.count_residuals(rows.cube, stress.status)
         stress.status[:] |= pad_status
 
-        # The drift is tracked after the rows, so that they all see the same rest frequencies.
+        # Drift is tracked after the rows are computed, so that the same rest frequencies hold for
+        # all of them.
         has_closed_window = self.health.closed != windows
         if self.drift_time and has_closed_window and self._drift.step(self.drift_time):
             self.rest_changes += 1
@@ -140,21 +149,30 @@ class Reconstructor:
     __call__ = process
 
     def process_known(self, rows: FrequencyRows, recorded: RecordedHealth) -> StressRows:
-        """Reconstruct the stress of rows whose recorded health is known for all of them.
+        """Reconstruct the stress of rows from a recording that states the health of their pads.
 
-        `Health` does not examine the rows, which saves two fifths of the time that reading and
+        The pads are not examined again, which saves two fifths of the time that reading and
         reconstructing a bag takes.
+
+        Args:
+            rows: Rows of one scan, or of several scans one after the other.
+            recorded: Recorded health, known for every row.
         """
         stress = self.pipeline.process(rows, recorded.left_out)
         stress.status[:] |= recorded.status
         return stress
 
     def covariance(self, cube: int, left_out: int = 0) -> Array:
-        """Return the covariance (15, 15) of a cube's components; see `Pipeline.covariance`."""
+        """Return the covariance (15, 15) of a cube's components due to the noise of its pads.
+
+        `Pipeline.covariance` states arguments and units.
+        """
         return self.pipeline.covariance(cube, left_out)
 
     def tare(self, cubes: Sequence[int] | None = None, duration: float = 1.0) -> Array:
         """Take the present load of cubes as their unloaded state.
+
+        The mean frequencies of the newest data become the frequencies without load.
 
         Args:
             cubes: Numbers of the cubes; None means all.
@@ -164,22 +182,33 @@ class Reconstructor:
             The new rest frequencies of all cubes (cubes, P), in Hz.
 
         Raises:
-            TareError: The signal moves, is noisy, too short or too far from the calibration. In
-                this case nothing is changed.
+            TareError: The frequencies of a cube moved, are noisy, are too far from its calibration,
+                or were received for a shorter time than `duration`. Nothing is changed then.
         """
         chosen = range(len(self.names)) if cubes is None else cubes
         self.rest_frequency = self.measure_rest(chosen, duration)
         return self.rest_frequency
 
     def measure_rest(self, cubes: Sequence[int], duration: float) -> Array:
-        """Return the rest frequencies (cubes, P), in Hz, that `tare` would set, without setting
-        them. TareError: as in `tare`."""
+        """Return the rest frequencies of all cubes (cubes, P), in Hz, that `tare` would set.
+
+        Args:
+            cubes: Numbers of the cubes to tare.
+            duration: Duration of the newest data to average, in s.
+
+        Raises:
+            TareError: No cube is given, or for the reasons that `tare` states.
+        """
         if not len(cubes):
             raise TareError("tare of no cube; name one, or leave the list out for all")
         return measure_rest(self.pipeline, self.health, cubes, duration, self.names)
 
     def clear_tare(self, cubes: Sequence[int] | None = None) -> None:
-        """Return to the rest frequencies of the calibrations, for some cubes or (None) for all."""
+        """Use the rest frequencies of the calibrations again, as before any tare.
+
+        Args:
+            cubes: Numbers of the cubes; None means all.
+        """
         chosen = slice(None) if cubes is None else list(cubes)
         rest = self.rest_frequency
         rest[chosen] = self._calibrated_rest[chosen]
